@@ -1,0 +1,1 @@
+"""Networks, data and commands that learn from colour spike streams, built on spikekit."""

@@ -1,0 +1,72 @@
+"""spikekit: differentiable operators for the colour spike camera."""
+
+from spikekit.cfa import (
+    PATTERNS,
+    BayerMask,
+    BinToSensor,
+    MergeBayer,
+    Mosaic,
+    SplitBayer,
+    SplitColors,
+    bayer_mask,
+    bayer_pattern,
+    bayer_sites,
+    bin_to_sensor,
+    merge_bayer,
+    mosaic,
+    split_bayer,
+    split_colors,
+)
+from spikekit.decoders import SpikeInterval, Tfi, Tfp, spike_interval, tfi, tfp
+from spikekit.demosaic import Demosaic, demosaic
+from spikekit.metrics import psnr, ssim
+from spikekit.motion import JointFlow, LinearMotion, UpsampleFlow, joint_flow, linear_motion, upsample_flow
+from spikekit.pictures import flow_to_rgb, panel, read_picture, write_picture
+from spikekit.sensor import SpikeIntegrateFire, spike_integrate_fire
+from spikekit.warp import FlowWarp, FlowWarpIdw, flow_warp, flow_warp_idw
+
+__version__ = "0.1.0.dev0"
+
+__all__ = [
+    "PATTERNS",
+    "BayerMask",
+    "BinToSensor",
+    "Demosaic",
+    "FlowWarp",
+    "FlowWarpIdw",
+    "JointFlow",
+    "LinearMotion",
+    "MergeBayer",
+    "Mosaic",
+    "SpikeIntegrateFire",
+    "SpikeInterval",
+    "SplitBayer",
+    "SplitColors",
+    "Tfi",
+    "Tfp",
+    "UpsampleFlow",
+    "bayer_mask",
+    "bayer_pattern",
+    "bayer_sites",
+    "bin_to_sensor",
+    "demosaic",
+    "flow_to_rgb",
+    "flow_warp",
+    "flow_warp_idw",
+    "joint_flow",
+    "linear_motion",
+    "merge_bayer",
+    "mosaic",
+    "panel",
+    "psnr",
+    "read_picture",
+    "spike_integrate_fire",
+    "spike_interval",
+    "split_bayer",
+    "split_colors",
+    "ssim",
+    "tfi",
+    "tfp",
+    "upsample_flow",
+    "write_picture",
+]

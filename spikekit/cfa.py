@@ -1,0 +1,410 @@
+"""The colour filter array: which colour every sensor pixel sees, and how pictures become mosaics and back."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from kornia.color import CFA
+from torch import Tensor, nn
+
+from spikekit.check import check_planes, check_scale
+
+#: Bayer phases by name, read along the rows of the top-left 2 x 2 cell.
+PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
+
+_PATTERN_OF_CFA = {CFA.BG: "RGGB", CFA.RG: "BGGR", CFA.GB: "GRBG", CFA.GR: "GBRG"}
+
+
+def bayer_pattern(pattern: str | CFA) -> str:
+    """Return the name of a Bayer phase.
+
+    Args:
+        pattern: one of :data:`PATTERNS`, or a :class:`kornia.color.CFA`, whose members are named after the pixel at
+            (1, 1) as in OpenCV: ``CFA.BG`` is RGGB.
+
+    Returns:
+        One of :data:`PATTERNS`.
+
+    Raises:
+        ValueError: neither of these.
+
+    Example:
+        >>> from kornia.color import CFA
+        >>> bayer_pattern(CFA.BG)
+        'RGGB'
+    """
+    name = _PATTERN_OF_CFA.get(pattern, pattern) if isinstance(pattern, CFA) else pattern
+    if name not in PATTERNS:
+        raise ValueError(f"pattern: expected one of {', '.join(PATTERNS)} or a kornia.color.CFA, got {pattern!r}")
+    return name
+
+
+def bayer_sites(pattern: str | CFA) -> tuple[tuple[int, int, int], ...]:
+    """Return ``(colour, row, column)`` of R, G1, G2 and B in the 2 x 2 cell; colour is 0, 1, 2 for R, G, B.
+
+    G1 is the green pixel of the upper row, G2 that of the lower row.
+
+    Example:
+        >>> bayer_sites("BGGR")
+        ((0, 1, 1), (1, 0, 1), (1, 1, 0), (2, 0, 0))
+    """
+    name = bayer_pattern(pattern)
+    sites = [("RGB".index(letter), i // 2, i % 2) for i, letter in enumerate(name)]
+    return tuple(sorted(sites, key=lambda site: site[0]))
+
+
+def bayer_mask(
+    height: int,
+    width: int,
+    pattern: str | CFA = "RGGB",
+    *,
+    scale: int = 1,
+    device: torch.device | str | None = None,
+    dtype: torch.dtype | None = None,
+) -> Tensor:
+    r"""Which pixels of a Bayer sensor are known, colour by colour, optionally after upsampling.
+
+    Convention:
+        Planes are R, G, B. One known sensor pixel becomes a block of ``scale`` x ``scale`` known pixels. The three
+        planes add up to one everywhere. Odd sizes are legal: the last row or column is simply cut.
+
+    Args:
+        height: rows of the sensor.
+        width: columns of the sensor.
+        pattern: Bayer phase, see :func:`bayer_pattern`.
+        scale: super-resolution factor.
+        device: where to put the mask.
+        dtype: its type; torch's default type when not given.
+
+    Returns:
+        Zeros and ones of shape :math:`(3, scale \cdot height, scale \cdot width)`.
+
+    Raises:
+        ValueError: a size or the scale is below 1, or the pattern is unknown.
+
+    Example:
+        >>> bayer_mask(2, 2, "RGGB", dtype=torch.uint8).tolist()
+        [[[1, 0], [0, 0]], [[0, 1], [1, 0]], [[0, 0], [0, 1]]]
+        >>> bayer_mask(2, 2, "RGGB", scale=2, dtype=torch.uint8)[0].tolist()
+        [[1, 1, 0, 0], [1, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]
+
+    Reference:
+        Dong et al., Super-Resolution Reconstruction from Bayer-Pattern Spike Streams, CVPR 2024, Fig. 5 (b).
+    """
+    check_scale(scale)
+    if height < 1 or width < 1:
+        raise ValueError(f"height, width: expected at least 1, got {height}, {width}")
+    rows = torch.arange(scale * height, device=device) // scale % 2
+    columns = torch.arange(scale * width, device=device) // scale % 2
+    planes: list[Tensor | None] = [None, None, None]
+    for colour, row, column in bayer_sites(pattern):
+        site = (rows == row)[:, None] & (columns == column)[None, :]
+        plane = planes[colour]
+        planes[colour] = site if plane is None else plane | site
+    return torch.stack(planes).to(dtype or torch.get_default_dtype())  # type: ignore[arg-type]
+
+
+class BayerMask(nn.Module):
+    r"""See the Convention block on :func:`bayer_mask`.
+
+    Shape:
+        - Input: any tensor :math:`(*, H, W)`; only its size, device and dtype are read.
+        - Output: :math:`(3, scale \cdot H, scale \cdot W)`.
+
+    Example:
+        >>> BayerMask("GRBG", scale=2)(torch.zeros(1, 41, 4, 6)).shape
+        torch.Size([3, 8, 12])
+    """
+
+    def __init__(self, pattern: str | CFA = "RGGB", *, scale: int = 1) -> None:
+        super().__init__()
+        check_scale(scale)
+        self.pattern = bayer_pattern(pattern)
+        self.scale = scale
+
+    def forward(self, raw: Tensor) -> Tensor:  # noqa: D102
+        check_planes("raw", raw, 2, "(*, H, W)")
+        height, width = raw.shape[-2:]
+        return bayer_mask(height, width, self.pattern, scale=self.scale, device=raw.device, dtype=raw.dtype)
+
+    def extra_repr(self) -> str:  # noqa: D102
+        return f"pattern={self.pattern!r}, scale={self.scale}"
+
+
+def mosaic(rgb: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
+    r"""Keep, at every pixel, the one colour that a Bayer sensor sees there.
+
+    Convention:
+        As :func:`kornia.color.rgb_to_raw`, without the channel axis that it keeps.
+
+    Args:
+        rgb: colour image :math:`(*, 3, H, W)`; odd sizes are legal.
+        pattern: Bayer phase, see :func:`bayer_pattern`.
+
+    Returns:
+        The mosaic :math:`(*, H, W)`, in the dtype of ``rgb``.
+
+    Raises:
+        TypeError: ``rgb`` is not a tensor of real numbers.
+        ValueError: ``rgb`` has no three channels, or the pattern is unknown.
+
+    Example:
+        >>> mosaic(torch.tensor([1.0, 2.0, 3.0]).reshape(3, 1, 1).expand(3, 2, 2)).tolist()
+        [[1.0, 2.0], [2.0, 3.0]]
+    """
+    return bin_to_sensor(rgb, pattern, scale=1)
+
+
+class Mosaic(nn.Module):
+    r"""See the Convention block on :func:`mosaic`.
+
+    Shape:
+        - Input: :math:`(*, 3, H, W)`
+        - Output: :math:`(*, H, W)`
+
+    Example:
+        >>> Mosaic("BGGR")(torch.rand(2, 3, 4, 4)).shape
+        torch.Size([2, 4, 4])
+    """
+
+    def __init__(self, pattern: str | CFA = "RGGB") -> None:
+        super().__init__()
+        self.pattern = bayer_pattern(pattern)
+
+    def forward(self, rgb: Tensor) -> Tensor:  # noqa: D102
+        return mosaic(rgb, self.pattern)
+
+    def extra_repr(self) -> str:  # noqa: D102
+        return f"pattern={self.pattern!r}"
+
+
+def bin_to_sensor(rgb: Tensor, pattern: str | CFA = "RGGB", *, scale: int) -> Tensor:
+    r"""What a Bayer sensor of ``scale`` times coarser pixels sees of a high-resolution picture.
+
+    .. math:: R(x, y) = \frac{1}{s^2} \sum_{0 \le a, b < s} I_{C(x, y)}(s x + a, s y + b)
+
+    Convention:
+        The sensor pixel (x, y) covers the block that starts at (s x, s y), and averages the block's pixels of its own
+        colour only. The sum runs in float32 or wider.
+
+    Args:
+        rgb: colour image :math:`(*, 3, H, W)`, H and W multiples of ``scale``.
+        pattern: Bayer phase of the sensor, see :func:`bayer_pattern`.
+        scale: how many picture pixels a sensor pixel is wide.
+
+    Returns:
+        The mosaic :math:`(*, H / s, W / s)`, in the dtype of ``rgb`` (integer pictures need ``scale=1``).
+
+    Raises:
+        TypeError: ``rgb`` is not a tensor of real numbers.
+        ValueError: no three channels, a size that ``scale`` does not divide, an unknown pattern.
+
+    Example:
+        >>> bin_to_sensor(torch.arange(48.0).reshape(3, 4, 4), scale=2).tolist()
+        [[2.5, 20.5], [26.5, 44.5]]
+
+    Reference:
+        Dong et al., CVPR 2024, section 5.1: "accumulate signals of 4 pixels to generate the signal of one target
+        pixel in the x2 case ... the 4 pixels come from one of the channels".
+    """
+    check_scale(scale)
+    check_planes("rgb", rgb, 3, "(*, 3, H, W)", floating=scale > 1)
+    channels, height, width = rgb.shape[-3:]
+    if channels != 3 or height % scale or width % scale:
+        raise ValueError(f"rgb: expected (*, 3, H, W) with H and W multiples of {scale}, got {tuple(rgb.shape)}")
+    rows, columns = height // scale, width // scale
+    planes = rgb.unbind(-3)
+    if scale > 1:
+        wide = torch.promote_types(rgb.dtype, torch.float32)
+        blocks = rgb.unflatten(-1, (columns, scale)).unflatten(-3, (rows, scale))
+        planes = blocks.mean(dim=(-3, -1), dtype=wide).to(rgb.dtype).unbind(-3)
+    mask = bayer_mask(rows, columns, pattern, device=rgb.device, dtype=torch.bool)
+    return torch.where(mask[0], planes[0], torch.where(mask[1], planes[1], planes[2]))
+
+
+class BinToSensor(nn.Module):
+    r"""See the Convention block on :func:`bin_to_sensor`.
+
+    Shape:
+        - Input: :math:`(*, 3, H, W)`
+        - Output: :math:`(*, H / scale, W / scale)`
+
+    Example:
+        >>> BinToSensor(scale=4)(torch.rand(2, 3, 16, 8)).shape
+        torch.Size([2, 4, 2])
+    """
+
+    def __init__(self, pattern: str | CFA = "RGGB", *, scale: int) -> None:
+        super().__init__()
+        check_scale(scale)
+        self.pattern = bayer_pattern(pattern)
+        self.scale = scale
+
+    def forward(self, rgb: Tensor) -> Tensor:  # noqa: D102
+        return bin_to_sensor(rgb, self.pattern, scale=self.scale)
+
+    def extra_repr(self) -> str:  # noqa: D102
+        return f"pattern={self.pattern!r}, scale={self.scale}"
+
+
+def split_colors(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
+    r"""Split a mosaic, or a stream of mosaics, into three full-size ones that hold one colour each and 0 elsewhere.
+
+    Convention:
+        The colour is the **first** axis of the result, so that ``red, green, blue = split_colors(spikes)`` leaves
+        time at -3. Their sum is the input.
+
+    Args:
+        raw: mosaic or spike stream :math:`(*, H, W)`, any dtype.
+        pattern: Bayer phase, see :func:`bayer_pattern`.
+
+    Returns:
+        :math:`(3, *, H, W)`, in the dtype of ``raw``.
+
+    Raises:
+        TypeError: ``raw`` is not a tensor of real numbers.
+        ValueError: fewer than two dimensions, or an unknown pattern.
+
+    Example:
+        >>> red, green, blue = split_colors(torch.tensor([[1, 2], [3, 4]]))
+        >>> green.tolist()
+        [[0, 2], [3, 0]]
+
+    Reference:
+        Dong et al., CVPR 2024, section 4.2.
+    """
+    check_planes("raw", raw, 2, "(*, H, W)")
+    height, width = raw.shape[-2:]
+    mask = bayer_mask(height, width, pattern, device=raw.device, dtype=raw.dtype)
+    return raw * mask.reshape(3, *[1] * (raw.ndim - 2), height, width)
+
+
+class SplitColors(nn.Module):
+    r"""See the Convention block on :func:`split_colors`.
+
+    Shape:
+        - Input: :math:`(*, H, W)`
+        - Output: :math:`(3, *, H, W)`
+
+    Example:
+        >>> SplitColors()(torch.ones(2, 41, 8, 6)).shape
+        torch.Size([3, 2, 41, 8, 6])
+    """
+
+    def __init__(self, pattern: str | CFA = "RGGB") -> None:
+        super().__init__()
+        self.pattern = bayer_pattern(pattern)
+
+    def forward(self, raw: Tensor) -> Tensor:  # noqa: D102
+        return split_colors(raw, self.pattern)
+
+    def extra_repr(self) -> str:  # noqa: D102
+        return f"pattern={self.pattern!r}"
+
+
+def split_bayer(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
+    r"""Split a mosaic, or a stream of mosaics, into its four half-size sub-streams R, G1, G2, B.
+
+    Convention:
+        The sub-stream is the **first** axis of the result, so that ``r, g1, g2, b = split_bayer(spikes)`` leaves time
+        at -3. G1 is the green of the row that the cell begins with, G2 that of the row below. Pixel (x, y) of a
+        sub-stream lies at (2 x + column, 2 y + row) of the sensor, see :func:`bayer_sites`. :func:`merge_bayer` is
+        the inverse.
+
+    Args:
+        raw: mosaic or spike stream :math:`(*, H, W)`, any dtype, H and W even.
+        pattern: Bayer phase, see :func:`bayer_pattern`.
+
+    Returns:
+        :math:`(4, *, H / 2, W / 2)`, in the dtype of ``raw``.
+
+    Raises:
+        TypeError: ``raw`` is not a tensor of real numbers.
+        ValueError: H or W is odd, or the pattern is unknown.
+
+    Example:
+        >>> r, g1, g2, b = split_bayer(torch.tensor([[1, 2], [3, 4]]), "GBRG")
+        >>> r.item(), g1.item(), g2.item(), b.item()
+        (3, 1, 4, 2)
+
+    Reference:
+        Dong et al., CVPR 2024, section 4.3, joint motion estimation.
+    """
+    check_planes("raw", raw, 2, "(*, H, W)")
+    if raw.shape[-2] % 2 or raw.shape[-1] % 2:
+        raise ValueError(f"raw: expected (*, H, W) with H and W even, got {tuple(raw.shape)}")
+    return torch.stack([raw[..., row::2, column::2] for _, row, column in bayer_sites(pattern)])
+
+
+class SplitBayer(nn.Module):
+    r"""See the Convention block on :func:`split_bayer`.
+
+    Shape:
+        - Input: :math:`(*, H, W)`
+        - Output: :math:`(4, *, H / 2, W / 2)`
+
+    Example:
+        >>> SplitBayer()(torch.ones(2, 41, 8, 6)).shape
+        torch.Size([4, 2, 41, 4, 3])
+    """
+
+    def __init__(self, pattern: str | CFA = "RGGB") -> None:
+        super().__init__()
+        self.pattern = bayer_pattern(pattern)
+
+    def forward(self, raw: Tensor) -> Tensor:  # noqa: D102
+        return split_bayer(raw, self.pattern)
+
+    def extra_repr(self) -> str:  # noqa: D102
+        return f"pattern={self.pattern!r}"
+
+
+def merge_bayer(planes: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
+    r"""Put the four sub-streams R, G1, G2, B back into one mosaic; the inverse of :func:`split_bayer`.
+
+    Args:
+        planes: :math:`(4, *, H, W)`, any dtype.
+        pattern: Bayer phase, see :func:`bayer_pattern`.
+
+    Returns:
+        :math:`(*, 2 H, 2 W)`, in the dtype of ``planes``.
+
+    Raises:
+        TypeError: ``planes`` is not a tensor of real numbers.
+        ValueError: the first axis is not of length 4, or the pattern is unknown.
+
+    Example:
+        >>> raw = torch.rand(5, 4, 6)
+        >>> bool((merge_bayer(split_bayer(raw, "GRBG"), "GRBG") == raw).all())
+        True
+    """
+    check_planes("planes", planes, 3, "(4, *, H, W)")
+    if planes.shape[0] != 4:
+        raise ValueError(f"planes: expected (4, *, H, W), got {tuple(planes.shape)}")
+    cell = [planes[0]] * 4
+    for plane, (_, row, column) in zip(planes, bayer_sites(pattern), strict=True):
+        cell[2 * row + column] = plane
+    return F.pixel_shuffle(torch.stack(cell, dim=-3), 2).squeeze(-3)
+
+
+class MergeBayer(nn.Module):
+    r"""See :func:`merge_bayer`.
+
+    Shape:
+        - Input: :math:`(4, *, H, W)`
+        - Output: :math:`(*, 2 H, 2 W)`
+
+    Example:
+        >>> MergeBayer()(torch.ones(4, 41, 4, 3)).shape
+        torch.Size([41, 8, 6])
+    """
+
+    def __init__(self, pattern: str | CFA = "RGGB") -> None:
+        super().__init__()
+        self.pattern = bayer_pattern(pattern)
+
+    def forward(self, planes: Tensor) -> Tensor:  # noqa: D102
+        return merge_bayer(planes, self.pattern)
+
+    def extra_repr(self) -> str:  # noqa: D102
+        return f"pattern={self.pattern!r}"

@@ -1,0 +1,54 @@
+"""The guards that every operator uses, so that the same mistake gives the same message everywhere."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def check_planes(name: str, value: Tensor, ndim: int, shape: str, *, floating: bool = False) -> None:
+    """Raise unless ``value`` is a tensor of at least ``ndim`` dimensions, none of the last ``ndim`` empty.
+
+    Args:
+        name: what the caller calls it.
+        value: what came.
+        ndim: how many trailing dimensions the operator reads.
+        shape: the expected shape, for the message, such as ``"(*, T, H, W)"``.
+        floating: refuse integer and bool tensors.
+
+    Raises:
+        TypeError: not a tensor, complex, or not floating where that is asked for.
+        ValueError: too few dimensions, or one of the last ``ndim`` is empty.
+    """
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name}: expected a tensor of shape {shape}, got {type(value).__name__}")
+    if value.ndim < ndim or 0 in value.shape[value.ndim - ndim :]:
+        raise ValueError(f"{name}: expected a non-empty tensor of shape {shape}, got {tuple(value.shape)}")
+    if value.is_complex() or (floating and not value.is_floating_point()):
+        kind = "a floating-point" if floating else "a real"
+        raise TypeError(f"{name}: expected {kind} tensor, got {value.dtype}")
+
+
+def check_positive(name: str, value: float) -> None:
+    """Raise unless ``value`` is a finite number above zero.
+
+    Raises:
+        ValueError: zero, negative, infinite or NaN.
+    """
+    if not 0 < value < float("inf"):
+        raise ValueError(f"{name}: expected a finite number above 0, got {value}")
+
+
+def check_scale(scale: int) -> None:
+    """Raise unless ``scale`` is a whole number, 1 or more.
+
+    Raises:
+        ValueError: anything else.
+    """
+    if isinstance(scale, bool) or int(scale) != scale or scale < 1:
+        raise ValueError(f"scale: expected a whole number >= 1, got {scale!r}")
+
+
+def default_float(value: Tensor) -> torch.dtype:
+    """Return the dtype of ``value`` where it is floating, else torch's default floating type."""
+    return value.dtype if value.is_floating_point() else torch.get_default_dtype()

@@ -1,0 +1,84 @@
+"""Metrics, as the authors of CSCSR compute them: colour, float, no border crop, one figure a picture."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from spikekit.check import check_planes
+
+
+def _pair(rgb: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    check_planes("rgb", rgb, 3, "(*, 3, H, W)", floating=True)
+    check_planes("target", target, 3, "(*, 3, H, W)", floating=True)
+    if rgb.shape != target.shape:
+        raise ValueError(f"rgb, target: expected one size, got {tuple(rgb.shape)} and {tuple(target.shape)}")
+    wide = torch.promote_types(torch.promote_types(rgb.dtype, target.dtype), torch.float32)
+    return rgb.to(wide).clamp(0, 1), target.to(wide).clamp(0, 1)
+
+
+def psnr(rgb: Tensor, target: Tensor) -> Tensor:
+    r"""Peak signal-to-noise ratio of every picture, in dB.
+
+    Convention:
+        Both are clamped to [0, 1] and not rounded; one mean square error over all colours and pixels of a picture;
+        no border crop. Average the result over pictures: averaging errors first gives another number.
+
+    Args:
+        rgb: :math:`(*, 3, H, W)`, [0, 1].
+        target: the truth, of the same size.
+
+    Returns:
+        dB, of shape :math:`(*)`; infinite where the two are equal.
+
+    Raises:
+        TypeError: not floating-point tensors.
+        ValueError: sizes that differ.
+
+    Example:
+        >>> round(psnr(torch.full((3, 8, 8), 0.5), torch.full((3, 8, 8), 0.6)).item(), 3)
+        20.0
+    """
+    rgb, target = _pair(rgb, target)
+    return -10 * (rgb - target).square().mean(dim=(-3, -2, -1)).log10()
+
+
+def ssim(rgb: Tensor, target: Tensor) -> Tensor:
+    r"""Structural similarity of every picture.
+
+    Convention:
+        As ``skimage.metrics.structural_similarity`` with its defaults and ``channel_axis``: 7 x 7 uniform window,
+        sample covariance, only windows that lie inside, mean over pixels and colours. Both are clamped to [0, 1].
+
+    Args:
+        rgb: :math:`(*, 3, H, W)`, [0, 1], H and W at least 7.
+        target: the truth, of the same size.
+
+    Returns:
+        The similarity, of shape :math:`(*)`.
+
+    Raises:
+        TypeError: not floating-point tensors.
+        ValueError: sizes that differ, or below 7 x 7.
+
+    Example:
+        >>> picture = torch.rand(2, 3, 16, 16)
+        >>> ssim(picture, picture).tolist()
+        [1.0, 1.0]
+
+    Reference:
+        Wang et al., Image quality assessment, IEEE TIP 2004.
+    """
+    rgb, target = _pair(rgb, target)
+    if rgb.shape[-2] < 7 or rgb.shape[-1] < 7:
+        raise ValueError(f"rgb: expected at least 7 x 7 pixels, got {tuple(rgb.shape)}")
+    a, b = (picture.reshape(-1, *picture.shape[-3:]).double() for picture in (rgb, target))
+    mean_a, mean_b, mean_aa, mean_bb, mean_ab = (F.avg_pool2d(x, 7, stride=1) for x in (a, b, a * a, b * b, a * b))
+    sample = 49 / 48
+    var_a, var_b = sample * (mean_aa - mean_a * mean_a), sample * (mean_bb - mean_b * mean_b)
+    cov = sample * (mean_ab - mean_a * mean_b)
+    c1, c2 = 0.01**2, 0.03**2
+    similarity = (2 * mean_a * mean_b + c1) * (2 * cov + c2)
+    similarity = similarity / ((mean_a * mean_a + mean_b * mean_b + c1) * (var_a + var_b + c2))
+    return similarity.mean(dim=(-3, -2, -1)).to(rgb.dtype).reshape(rgb.shape[:-3])

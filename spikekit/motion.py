@@ -1,0 +1,242 @@
+"""Motion: one flow from the four colours, and where every pixel is at other times."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from spikekit.check import check_planes, check_scale
+
+
+def _check_flow(name: str, flow: Tensor) -> None:
+    check_planes(name, flow, 3, "(*, 2, H, W)", floating=True)
+    if flow.shape[-3] != 2:
+        raise ValueError(f"{name}: expected (*, 2, H, W), got {tuple(flow.shape)}")
+
+
+def joint_flow(flows: Tensor | Sequence[Tensor]) -> Tensor:
+    r"""Average the flows that were estimated from the sub-streams R, G1, G2, B.
+
+    .. math:: w = \frac{1}{4} \sum_C w^C
+
+    Convention:
+        The colours are the **first** axis, as :func:`spikekit.split_bayer` leaves them; the result stays at the
+        resolution of the flows that came. The four phases of a Bayer cell average to the centre of the cell, which is
+        where :func:`upsample_flow` expects them.
+
+    Args:
+        flows: (C, \*, 2, H, W), or a sequence of C flows (\*, 2, H, W); any C of at least one.
+
+    Returns:
+        (\*, 2, H, W), in the dtype of ``flows``.
+
+    Raises:
+        TypeError: not floating-point tensors.
+        ValueError: no flow at all, sizes that differ, no two channels.
+
+    Example:
+        >>> joint_flow([torch.zeros(1, 2, 4, 4), torch.ones(1, 2, 4, 4)]).unique().item()
+        0.5
+
+    Reference:
+        Dong et al., CVPR 2024, eq. (7).
+    """
+    if not isinstance(flows, Tensor):
+        flows = list(flows)
+        if not flows:
+            raise ValueError("flows: expected at least one flow, got none")
+        for flow in flows:
+            _check_flow("flows", flow)
+        if len({flow.shape for flow in flows}) > 1:
+            raise ValueError(f"flows: expected one size, got {[tuple(flow.shape) for flow in flows]}")
+        flows = torch.stack(flows)
+    check_planes("flows", flows, 4, "(C, *, 2, H, W)", floating=True)
+    _check_flow("flows", flows)
+    return flows.mean(dim=0)
+
+
+class JointFlow(nn.Module):
+    r"""See the Convention block on :func:`joint_flow`.
+
+    Shape:
+        - Input: :math:`(C, *, 2, H, W)`
+        - Output: :math:`(*, 2, H, W)`
+
+    Example:
+        >>> JointFlow()(torch.zeros(4, 1, 2, 8, 8)).shape
+        torch.Size([1, 2, 8, 8])
+    """
+
+    def forward(self, flows: Tensor | Sequence[Tensor]) -> Tensor:  # noqa: D102
+        return joint_flow(flows)
+
+
+def upsample_flow(flow: Tensor, scale: int) -> Tensor:
+    r"""Bring flow to a finer grid: bilinear in space, and ``scale`` times as many pixels long.
+
+    Convention:
+        A coarse pixel is the block of ``scale`` x ``scale`` fine ones that begins at (scale x, scale y)
+        (``align_corners=False``), as in :func:`spikekit.bayer_mask` and :func:`spikekit.bin_to_sensor`.
+
+    Args:
+        flow: :math:`(*, 2, H, W)`, floating.
+        scale: how much finer.
+
+    Returns:
+        :math:`(*, 2, scale \cdot H, scale \cdot W)`, in the dtype of ``flow``.
+
+    Raises:
+        TypeError: not a floating-point tensor.
+        ValueError: no two channels, or a scale below 1.
+
+    Example:
+        >>> upsample_flow(torch.ones(1, 2, 2, 2), 4).unique().item()
+        4.0
+    """
+    _check_flow("flow", flow)
+    check_scale(scale)
+    if scale == 1:
+        return flow
+    planes = flow.reshape(-1, *flow.shape[-3:])
+    fine = F.interpolate(planes, scale_factor=scale, mode="bilinear", align_corners=False)
+    return (fine * scale).reshape(*flow.shape[:-2], *fine.shape[-2:])
+
+
+class UpsampleFlow(nn.Module):
+    r"""See the Convention block on :func:`upsample_flow`.
+
+    Shape:
+        - Input: :math:`(*, 2, H, W)`
+        - Output: :math:`(*, 2, scale \cdot H, scale \cdot W)`
+
+    Example:
+        >>> UpsampleFlow(2)(torch.zeros(2, 5, 7)).shape
+        torch.Size([2, 10, 14])
+    """
+
+    def __init__(self, scale: int) -> None:
+        super().__init__()
+        check_scale(scale)
+        self.scale = scale
+
+    def forward(self, flow: Tensor) -> Tensor:  # noqa: D102
+        return upsample_flow(flow, self.scale)
+
+    def extra_repr(self) -> str:  # noqa: D102
+        return f"scale={self.scale}"
+
+
+def linear_motion(
+    flow_to_first: Tensor,
+    flow_to_last: Tensor,
+    times: Sequence[float],
+    *,
+    first: float | None = None,
+    middle: float | None = None,
+    last: float | None = None,
+    scale: int = 1,
+) -> Tensor:
+    r"""How far every pixel of the middle frame has moved at each time, if motion is linear on both sides of it.
+
+    .. math::
+        o_t = s \cdot \begin{cases}
+            \frac{t - j}{i - j} \, w_{j,i} & t < j \\
+            \frac{t - j}{k - j} \, w_{j,k} & t \ge j
+        \end{cases}
+
+    Convention:
+        i, j, k are the times of the first, the middle and the last frame that the flows were estimated between; the
+        offset at j is zero. With ``scale`` the flow is brought to the finer grid first, see :func:`upsample_flow`.
+        Backward sampling: the pixel (x, y) of the middle frame is found at (x, y) + offset at time t, as
+        :func:`spikekit.flow_warp` and :func:`spikekit.flow_warp_idw` read it.
+
+    Args:
+        flow_to_first: :math:`w_{j,i}`, :math:`(*, 2, H, W)`.
+        flow_to_last: :math:`w_{j,k}`, of the same size.
+        times: the T times that are asked for, in the unit of ``first`` and ``last`` (spike frames, say).
+        first: i; the first of ``times`` when not given.
+        middle: j; half way between ``first`` and ``last`` when not given.
+        last: k; the last of ``times`` when not given.
+        scale: super-resolution factor s.
+
+    Returns:
+        The offsets :math:`(*, T, 2, s \cdot H, s \cdot W)` in pixels of the fine grid, in the dtype of the flows.
+
+    Raises:
+        TypeError: the flows are not floating-point tensors.
+        ValueError: the flows differ in size, no times, or not first < middle < last.
+
+    Example:
+        >>> to_first, to_last = torch.full((1, 2, 1, 1), -2.0), torch.full((1, 2, 1, 1), 4.0)
+        >>> linear_motion(to_first, to_last, [5, 8, 20, 35])[0, :, 0].flatten().tolist()
+        [-2.0, -1.6..., 0.0, 4.0]
+
+    Reference:
+        Dong et al., CVPR 2024, eq. (8).
+    """
+    _check_flow("flow_to_first", flow_to_first)
+    _check_flow("flow_to_last", flow_to_last)
+    if flow_to_first.shape != flow_to_last.shape:
+        raise ValueError(
+            f"flow_to_first, flow_to_last: expected one size, got {tuple(flow_to_first.shape)} and "
+            f"{tuple(flow_to_last.shape)}"
+        )
+    times = [float(t) for t in times]
+    if not times:
+        raise ValueError("times: expected at least one time, got none")
+    first = times[0] if first is None else first
+    last = times[-1] if last is None else last
+    middle = (first + last) / 2 if middle is None else middle
+    if not first < middle < last:
+        raise ValueError(f"first, middle, last: expected rising times, got {first}, {middle}, {last}")
+    to_first, to_last = upsample_flow(flow_to_first, scale), upsample_flow(flow_to_last, scale)
+    offsets = [
+        to_first * ((t - middle) / (first - middle)) if t < middle else to_last * ((t - middle) / (last - middle))
+        for t in times
+    ]
+    return torch.stack(offsets, dim=-4)
+
+
+class LinearMotion(nn.Module):
+    r"""See the Convention block on :func:`linear_motion`.
+
+    Shape:
+        - Input: two flows :math:`(*, 2, H, W)`
+        - Output: :math:`(*, T, 2, scale \cdot H, scale \cdot W)`
+
+    Example:
+        >>> LinearMotion(range(5, 36, 3), scale=4)(torch.zeros(1, 2, 8, 8), torch.zeros(1, 2, 8, 8)).shape
+        torch.Size([1, 11, 2, 32, 32])
+    """
+
+    def __init__(
+        self,
+        times: Sequence[float],
+        *,
+        first: float | None = None,
+        middle: float | None = None,
+        last: float | None = None,
+        scale: int = 1,
+    ) -> None:
+        super().__init__()
+        check_scale(scale)
+        self.times = tuple(float(t) for t in times)
+        self.first, self.middle, self.last = first, middle, last
+        self.scale = scale
+
+    def forward(self, flow_to_first: Tensor, flow_to_last: Tensor) -> Tensor:  # noqa: D102
+        return linear_motion(
+            flow_to_first,
+            flow_to_last,
+            self.times,
+            first=self.first,
+            middle=self.middle,
+            last=self.last,
+            scale=self.scale,
+        )
+
+    def extra_repr(self) -> str:  # noqa: D102
+        return f"times={self.times}, scale={self.scale}"

@@ -1,0 +1,130 @@
+"""Pictures in and out: reading files, writing PNG, panels, and flow in the field's colours."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from kornia.color import hsv_to_rgb
+from torch import Tensor
+
+from spikekit.check import check_planes
+
+
+def read_picture(path: str | Path) -> Tensor:
+    """Read a picture file as a colour image.
+
+    Grey pictures get three equal channels, alpha is laid over white, 16-bit files keep their depth. Values stay
+    gamma-encoded as in the file.
+
+    Args:
+        path: any file that scikit-image reads (PNG, JPEG, TIFF, ...).
+
+    Returns:
+        ``rgb`` of shape (3, H, W), float32, in [0, 1].
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is not a picture that can be read; the message names it.
+    """
+    from skimage import color, io, util
+
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: no such picture")
+    try:
+        pixels = util.img_as_float32(io.imread(path))
+        if pixels.ndim == 3 and pixels.shape[-1] == 4:
+            pixels = color.rgba2rgb(pixels)
+        elif pixels.ndim == 2 or pixels.shape[-1] == 1:
+            pixels = color.gray2rgb(pixels.reshape(pixels.shape[:2]))
+    except Exception as error:
+        raise ValueError(f"{path}: not a picture that can be read ({error})") from error
+    if pixels.ndim != 3 or pixels.shape[-1] != 3 or 0 in pixels.shape:
+        raise ValueError(f"{path}: expected a grey or colour picture, got an array of shape {pixels.shape}")
+    return torch.from_numpy(pixels.astype("float32")).permute(2, 0, 1).contiguous()
+
+
+def write_picture(path: str | Path, image: Tensor) -> None:
+    """Write an image to a file; the folder is made when it is missing.
+
+    Args:
+        path: where to; the ending names the format, PNG for lossless.
+        image: (3, H, W) or (H, W), floating, [0, 1]; clamped, and rounded to 8 bits.
+
+    Raises:
+        ValueError: the image has another shape.
+    """
+    from skimage import io
+
+    check_planes("image", image, 2, "(3, H, W) or (H, W)", floating=True)
+    if image.ndim > 3 or (image.ndim == 3 and image.shape[0] != 3):
+        raise ValueError(f"image: expected (3, H, W) or (H, W), got {tuple(image.shape)}")
+    pixels = (image.detach().float().cpu().nan_to_num(0).clamp(0, 1) * 255).round().to(torch.uint8)
+    if pixels.ndim == 3:
+        pixels = pixels.permute(1, 2, 0)
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        io.imsave(path, pixels.numpy(), check_contrast=False)
+
+
+def panel(rows: Sequence[Sequence[Tensor]], gap: int = 4) -> Tensor:
+    """Lay pictures out in rows and columns on white.
+
+    Args:
+        rows: pictures (3, H, W) or (H, W); rows may differ in length, pictures in size.
+        gap: white pixels between two pictures.
+
+    Returns:
+        One picture (3, H, W); every picture stands at the top left of its cell.
+
+    Example:
+        >>> panel([[torch.zeros(3, 4, 4), torch.zeros(4, 4)], [torch.zeros(3, 2, 4)]], gap=1).shape
+        torch.Size([3, 7, 9])
+    """
+    heights = [max(picture.shape[-2] for picture in row) for row in rows]
+    columns = range(max(len(row) for row in rows))
+    widths = [max(row[i].shape[-1] for row in rows if i < len(row)) for i in columns]
+    sheet = torch.ones(3, sum(heights) + gap * (len(heights) - 1), sum(widths) + gap * (len(widths) - 1))
+    top = 0
+    for row, height in zip(rows, heights, strict=True):
+        left = 0
+        for picture, width in zip(row, widths, strict=False):
+            h, w = picture.shape[-2:]
+            sheet[:, top : top + h, left : left + w] = picture.detach().float().cpu()
+            left += width + gap
+        top += height + gap
+    return sheet
+
+
+def flow_to_rgb(flow: Tensor, max_flow: float | None = None) -> Tensor:
+    """Show flow as colour: the direction is the hue, the length is the saturation, white stands still.
+
+    Convention:
+        Flow in pixels, order (x, y), x right, y down. Red points right, and the hue turns clockwise on the screen.
+
+    Args:
+        flow: (*, 2, H, W), floating.
+        max_flow: the length that is fully saturated; the longest of the tensor when not given.
+
+    Returns:
+        ``rgb`` of shape (*, 3, H, W), [0, 1].
+
+    Raises:
+        ValueError: the flow has no two channels.
+
+    Example:
+        >>> flow_to_rgb(torch.zeros(2, 1, 1)).flatten().tolist()
+        [1.0, 1.0, 1.0]
+    """
+    check_planes("flow", flow, 3, "(*, 2, H, W)", floating=True)
+    if flow.shape[-3] != 2:
+        raise ValueError(f"flow: expected (*, 2, H, W), got {tuple(flow.shape)}")
+    x, y = flow.unbind(-3)
+    length = torch.hypot(x, y)
+    longest = length.amax().clamp(min=1e-6) if max_flow is None else max_flow
+    hue = torch.atan2(y, x).remainder(2 * math.pi)
+    return hsv_to_rgb(torch.stack([hue, (length / longest).clamp(max=1), torch.ones_like(length)], dim=-3))
