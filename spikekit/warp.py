@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from weakref import WeakKeyDictionary
-
 import numpy as np
 import torch
 from kornia.geometry import create_meshgrid
 from kornia.geometry.transform import remap
 from torch import Tensor, nn
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from spikekit.check import check_planes
 
@@ -94,7 +93,8 @@ def _nearest_on_axis(known: np.ndarray, length: int, neighbors: int) -> np.ndarr
 
 
 _Tables = list[tuple[Tensor, Tensor]]
-_tables_of_mask: WeakKeyDictionary[Tensor, tuple[int, int, _Tables]] = WeakKeyDictionary()
+# By identity: a WeakKeyDictionary would compare tensors with ==.
+_tables_of_mask = WeakTensorKeyDictionary()
 
 
 def _tables(mask: Tensor, neighbors: int) -> _Tables:
@@ -103,10 +103,12 @@ def _tables(mask: Tensor, neighbors: int) -> _Tables:
     Rows with the same known columns belong together, so that every mask is a union of such products: one for red and
     for blue of a Bayer filter, two for green.
     """
-    version, kept_neighbors, tables = _tables_of_mask.get(mask, (-1, 0, []))
-    if (version, kept_neighbors) == (mask._version, neighbors):
+    # inference tensors do not count their changes, so nothing is kept for them
+    state = None if mask.is_inference() else (mask._version, neighbors)
+    kept_state, tables = _tables_of_mask.get(mask, (None, []))
+    if state is not None and state == kept_state:
         return tables
-    known = mask.detach().cpu().numpy() != 0
+    known = (mask.detach() != 0).cpu().numpy()
     height, width = known.shape
     rows_of_pattern: dict[bytes, list[int]] = {}
     for row, pattern in enumerate(known):
@@ -120,7 +122,8 @@ def _tables(mask: Tensor, neighbors: int) -> _Tables:
             tables.append((lookup[0], lookup[1]))
     if not tables:
         raise ValueError("mask: expected at least one known pixel, got none")
-    _tables_of_mask[mask] = (mask._version, neighbors, tables)
+    if state is not None:
+        _tables_of_mask[mask] = (state, tables)
     return tables
 
 
