@@ -51,7 +51,9 @@ def demosaic(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
     wide = torch.promote_types(raw.dtype, torch.float32)
     known = raw.reshape(-1, 1, height, width).to(wide)
     filters = known.new_tensor([_GREEN, _SAME_ROW, _SAME_COLUMN, _DIAGONAL])[:, None] / 8
-    green, same_row, same_column, diagonal = F.conv2d(F.pad(known, (2, 2, 2, 2), "reflect"), filters).unbind(1)
+    with torch.autocast(raw.device.type, enabled=False):
+        filtered = F.conv2d(F.pad(known, (2, 2, 2, 2), "reflect"), filters)
+    green, same_row, same_column, diagonal = filtered.unbind(1)
     known = known[:, 0]
 
     red, _, blue = bayer_mask(height, width, pattern, device=raw.device, dtype=torch.bool)

@@ -17,9 +17,9 @@ def _integrate_fire(light: Tensor, threshold: float, charge: Tensor) -> tuple[Te
     charge = charge.clone()
     for light_t, spike_t in zip(light.unbind(-3), spikes.unbind(-3), strict=True):
         charge += light_t
-        whole = torch.floor(charge / threshold)
-        spike_t.copy_(whole > 0)
-        charge -= whole * threshold
+        spike_t.copy_(charge >= threshold)
+        # exact, unlike charge - floor(charge / threshold) * threshold, which can end below 0
+        charge.remainder_(threshold)
     return spikes, charge
 
 
