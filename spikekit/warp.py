@@ -118,7 +118,9 @@ def _tables(mask: Tensor, neighbors: int) -> _Tables:
         columns = np.flatnonzero(np.frombuffer(pattern, dtype=bool))
         if len(columns):
             axes = (np.array(rows), height), (columns, width)
-            lookup = [torch.from_numpy(_nearest_on_axis(*axis, neighbors)).to(mask.device) for axis in axes]
+            lookup = [
+                torch.from_numpy(_nearest_on_axis(*axis, neighbors)).to(mask.device, torch.int32) for axis in axes
+            ]
             tables.append((lookup[0], lookup[1]))
     if not tables:
         raise ValueError("mask: expected at least one known pixel, got none")
@@ -155,20 +157,22 @@ def _nearest_known(cell: Tensor, part: Tensor, mask: Tensor, neighbors: int) -> 
             row, row_distance = _on_axis(rows, y[chunk], y_part[chunk])
             column, column_distance = _on_axis(columns, x[chunk], x_part[chunk])
             for i in range(len(row)):
-                # (i + 1) (j + 1) - 1 pixels of the product come before (i, j)
                 for j in range(min(len(column), neighbors // (i + 1))):
-                    _insert(best, row_distance[i] + column_distance[j], row[i] * width + column[j], neighbors)
+                    before = (i + 1) * (j + 1) - 1  # so many pixels of this product are at least as near
+                    _insert(best, row_distance[i] + column_distance[j], row[i] * width + column[j], before, neighbors)
         for slot, (_, index) in enumerate(best):
             nearest[slot, chunk] = index
     return nearest.reshape(neighbors, count, height, width).movedim(0, 1).contiguous()
 
 
-def _insert(best: list[tuple[Tensor, Tensor]], distance: Tensor, index: Tensor, most: int) -> None:
-    """Keep the smallest (distance, index), in order."""
-    for slot, (other, other_index) in enumerate(best):
+def _insert(best: list[tuple[Tensor, Tensor]], distance: Tensor, index: Tensor, before: int, most: int) -> None:
+    """Keep the smallest (distance, index), in order; the new one cannot be among the first ``before``."""
+    for slot in range(before, len(best)):
+        other, other_index = best[slot]
         closer = (distance < other) | ((distance == other) & (index < other_index))
         best[slot] = torch.where(closer, distance, other), torch.where(closer, index, other_index)
-        distance, index = torch.where(closer, other, distance), torch.where(closer, other_index, index)
+        if slot + 1 < most:
+            distance, index = torch.where(closer, other, distance), torch.where(closer, other_index, index)
     if len(best) < most:
         best.append((distance, index))
 

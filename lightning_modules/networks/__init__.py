@@ -1,0 +1,6 @@
+"""Networks as plain ``torch.nn``, usable without a Trainer."""
+
+from lightning_modules.networks.classical import ClassicalDecoder
+from lightning_modules.networks.cscsr import CSCSR
+
+__all__ = ["CSCSR", "ClassicalDecoder"]

@@ -1,0 +1,277 @@
+"""CSCSR: colour spike camera super-resolution (Dong et al., CVPR 2024), one module per section of the paper."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from lightning_modules.motion import ClassicalFlow
+from lightning_modules.networks.classical import ClassicalDecoder
+from spikekit import bayer_mask, bayer_pattern, flow_warp_idw, linear_motion, split_colors
+from spikekit.check import check_planes, check_scale
+
+
+def conv(inputs: int, outputs: int) -> nn.Conv2d:
+    """3 x 3 convolution that keeps the size."""
+    return nn.Conv2d(inputs, outputs, 3, padding=1)
+
+
+class ConvBlock(nn.Sequential):
+    """3 x 3 convolution and ReLU (Fig. 4)."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__(conv(inputs, outputs), nn.ReLU(inplace=True))
+
+
+class ResBlock(nn.Module):
+    """Convolution, ReLU, convolution, plus the input: a residual block (He et al., 2016) without normalisation."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.body = nn.Sequential(conv(width, width), nn.ReLU(inplace=True), conv(width, width))
+
+    def forward(self, x: Tensor) -> Tensor:  # noqa: D102
+        return x + self.body(x)
+
+
+class SpikeRepresentation(nn.Module):
+    """BSSR of one colour (section 4.2, Fig. 4): features of every time point, from its window and the whole clip.
+
+    Args:
+        frames: spike frames N of a clip.
+        window: frames that a time point sees.
+        stride: frames between two time points.
+        width: channels inside.
+        features: channels of the result, for every time point.
+
+    Shape:
+        - Input: the spikes of one colour, zero elsewhere, :math:`(B, N, H, W)`
+        - Output: :math:`(B, T, features, H, W)` with :math:`T = (N - window) / stride + 1`
+    """
+
+    def __init__(self, frames: int, window: int, stride: int, width: int, features: int) -> None:
+        super().__init__()
+        self.window = window
+        self.stride = stride
+        self.local = nn.Sequential(ConvBlock(window, width), ResBlock(width))
+        self.whole = nn.Sequential(ConvBlock(frames, width), ResBlock(width))  # global perception
+        self.fuse = nn.Sequential(ConvBlock(2 * width, width), ResBlock(width), conv(width, features))
+
+    def forward(self, spikes: Tensor) -> Tensor:  # noqa: D102
+        windows = spikes.unfold(1, self.window, self.stride).movedim(-1, 2)
+        batch, times = windows.shape[:2]
+        local = self.local(windows.flatten(0, 1))
+        whole = self.whole(spikes).repeat_interleave(times, dim=0)
+        return self.fuse(torch.cat([local, whole], dim=1)).unflatten(0, (batch, times))
+
+
+class FeatureRefinement(nn.Module):
+    """FR (section 4.3, Fig. 5 c): what deviates from the mean over time is looked at by itself.
+
+    Args:
+        times: time points T.
+        features: channels of every time point.
+        width: channels of the result.
+
+    Shape:
+        - Input: temporal-pixel features :math:`(B, T, features, H, W)`
+        - Output: :math:`(B, width, H, W)`
+    """
+
+    def __init__(self, times: int, features: int, width: int) -> None:
+        super().__init__()
+        self.base = nn.Sequential(ConvBlock(times * features, width), conv(width, width))
+        self.residual = nn.Sequential(ConvBlock(times * features, width), conv(width, width))
+
+    def forward(self, pixels: Tensor) -> Tensor:  # noqa: D102
+        residual = pixels - pixels.mean(dim=1, keepdim=True)
+        return self.base(pixels.flatten(1, 2)) + self.residual(residual.flatten(1, 2))
+
+
+class ColorCorrelation(nn.Module):
+    """CCR (section 4.4, Fig. 6 a): the colours are refined side by side and fused after every stage.
+
+    Args:
+        width: channels, of every colour and inside.
+        stages: how often the colours are fused.
+        blocks: residual blocks of every colour in every stage.
+        end_blocks: residual blocks after the last fusion.
+
+    Shape:
+        - Input: features of R, G and B, each :math:`(B, width, H, W)`
+        - Output: rgb :math:`(B, 3, H, W)`
+    """
+
+    def __init__(self, width: int, stages: int, blocks: int, end_blocks: int) -> None:
+        super().__init__()
+        self.refine = nn.ModuleList(
+            nn.ModuleList(nn.Sequential(*(ResBlock(width) for _ in range(blocks))) for _ in range(3))
+            for _ in range(stages)
+        )
+        self.fuse = nn.ModuleList(ConvBlock((3 if stage == 0 else 4) * width, width) for stage in range(stages))
+        self.end = nn.Sequential(*(ResBlock(width) for _ in range(end_blocks)))
+        self.rgb = conv(width, 3)
+
+    def forward(self, colors: list[Tensor]) -> Tensor:  # noqa: D102
+        fused: list[Tensor] = []
+        for refine, fuse in zip(self.refine, self.fuse, strict=True):
+            colors = [branch(color) for branch, color in zip(refine, colors, strict=True)]
+            fused = [fuse(torch.cat(colors + fused, dim=1))]
+        features = fused[0] + self.end(fused[0])
+        # half precision would round the picture itself
+        with torch.autocast(features.device.type, enabled=False):
+            return self.rgb(features.to(self.rgb.weight.dtype))
+
+
+class CSCSR(nn.Module):
+    r"""Super-resolution of a colour picture from a Bayer-pattern spike stream.
+
+    The middle frame of the clip is reconstructed. Widths and depths are not in the paper; the defaults are size M of
+    this project, see ``configs/size``.
+
+    Args:
+        scale: super-resolution factor s.
+        frames: spike frames N of a clip, odd.
+        window: spike frames that a time point sees, odd.
+        stride: spike frames between two time points; must divide frames - window.
+        pattern: Bayer phase of the streams.
+        width: channels of refinement and reconstruction, at high resolution.
+        representation_width: channels of the spike representation, at sensor resolution.
+        features: channels of every time point that are warped.
+        stages: fusions of the colours.
+        blocks: residual blocks of every colour before every fusion.
+        end_blocks: residual blocks after the last fusion.
+        skip: learn what to add to the enlarged TFP picture instead of the picture itself. The paper has no such
+            skip; with it training starts where the classical decoder ends.
+        alpha: gain of the camera, what a white pixel receives per clock in thresholds; only the skip divides by it.
+        neighbors: known pixels that the temporal pixel search weighs.
+        motion: estimator that is asked where no flow is given; called with spikes, times and pattern. When not
+            given, :class:`lightning_modules.motion.ClassicalFlow`.
+
+    Shape:
+        - Input: spikes :math:`(B, N, H, W)`, zeros and ones, any real dtype, any H and W of at least 3; optionally
+          the flows from the middle to the first and to the last time point, :math:`(B, 2, 2, H, W)`, in sensor pixels
+        - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
+
+    Example:
+        >>> network = CSCSR(scale=2, width=8, representation_width=8, features=1, stages=1, end_blocks=1)
+        >>> network(torch.zeros(1, 41, 12, 10), torch.zeros(1, 2, 2, 12, 10)).shape
+        torch.Size([1, 3, 24, 20])
+
+    Reference:
+        Dong et al., Super-Resolution Reconstruction from Bayer-Pattern Spike Streams, CVPR 2024.
+    """
+
+    def __init__(
+        self,
+        scale: int = 4,
+        frames: int = 41,
+        window: int = 11,
+        stride: int = 3,
+        pattern: str = "RGGB",
+        width: int = 32,
+        representation_width: int = 32,
+        features: int = 4,
+        stages: int = 3,
+        blocks: int = 1,
+        end_blocks: int = 3,
+        skip: bool = False,
+        alpha: float = 0.4,
+        neighbors: int = 4,
+        motion: nn.Module | None = None,
+    ) -> None:
+        super().__init__()
+        #: what the checkpoint remembers of the constructor, so that it is not loaded into another network unnoticed
+        self.settings = {
+            "scale": scale,
+            "frames": frames,
+            "window": window,
+            "stride": stride,
+            "pattern": bayer_pattern(pattern),
+            "width": width,
+            "representation_width": representation_width,
+            "features": features,
+            "stages": stages,
+            "blocks": blocks,
+            "end_blocks": end_blocks,
+            "skip": skip,
+            "alpha": alpha,
+            "neighbors": neighbors,
+        }
+        check_scale(scale)
+        if frames % 2 == 0 or window % 2 == 0 or not 1 <= window < frames or (frames - window) % stride:
+            raise ValueError(
+                "frames, window, stride: expected odd frames and window, and a stride that divides frames - window, "
+                f"got {frames}, {window}, {stride}"
+            )
+        if min(width, representation_width, features, stages, blocks, end_blocks, neighbors) < 1:
+            raise ValueError("widths, stages, blocks and neighbors: expected 1 or more of each")
+        self.scale = scale
+        self.frames = frames
+        self.pattern = bayer_pattern(pattern)
+        #: centres of the windows, in spike frames
+        self.times = tuple(range(window // 2, frames - window // 2, stride))
+        self.neighbors = neighbors
+        self.motion = ClassicalFlow() if motion is None else motion
+        self.representation = nn.ModuleList(
+            SpikeRepresentation(frames, window, stride, representation_width, features) for _ in range(3)
+        )
+        self.refinement = nn.ModuleList(FeatureRefinement(len(self.times), features, width) for _ in range(3))
+        self.reconstruction = ColorCorrelation(width, stages, blocks, end_blocks)
+        self.base = ClassicalDecoder("tfp", scale, pattern, alpha, window=frames) if skip else None
+        if skip:
+            nn.init.zeros_(self.reconstruction.rgb.weight)
+            nn.init.zeros_(self.reconstruction.rgb.bias)
+        self._masks: dict[Any, Tensor] = {}
+
+    @property
+    def flow_times(self) -> tuple[int, int, int]:
+        """Times of the first, the middle and the last time point, which the flows run between."""
+        return self.times[0], self.frames // 2, self.times[-1]
+
+    def estimate_flow(self, spikes: Tensor) -> Tensor:
+        """Flows from the middle to the first and to the last time point, (B, 2, 2, H, W), in sensor pixels."""
+        return torch.stack(self.motion(spikes, self.flow_times, self.pattern), dim=1)
+
+    def forward(self, spikes: Tensor, flow: Tensor | None = None) -> Tensor:  # noqa: D102
+        check_planes("spikes", spikes, 4, "(B, N, H, W)")
+        if spikes.ndim != 4 or spikes.shape[1] != self.frames:
+            raise ValueError(f"spikes: expected (B, {self.frames}, H, W), got {tuple(spikes.shape)}")
+        batch, _, height, width = spikes.shape
+        spikes = spikes.to(self.reconstruction.rgb.weight.dtype)
+        flow = self.estimate_flow(spikes) if flow is None else flow
+        if flow.shape != (batch, 2, 2, height, width):
+            raise ValueError(f"flow: expected {(batch, 2, 2, height, width)}, got {tuple(flow.shape)}")
+        first, middle, last = self.flow_times
+        offsets = linear_motion(
+            flow[:, 0], flow[:, 1], self.times, first=first, middle=middle, last=last, scale=self.scale
+        )
+        colors = [
+            refine(self._search(encode(plane), offsets, mask))
+            for plane, mask, encode, refine in zip(
+                split_colors(spikes, self.pattern),
+                self._mask(height, width, spikes.device),
+                self.representation,
+                self.refinement,
+                strict=True,
+            )
+        ]
+        rgb = self.reconstruction(colors)
+        return rgb if self.base is None else rgb + self.base(spikes)
+
+    def _search(self, features: Tensor, offsets: Tensor, mask: Tensor) -> Tensor:
+        """Temporal pixel search (section 4.3, Fig. 5 b): (B, T, C, H, W) to (B, T, C, s H, s W)."""
+        if self.scale > 1:
+            fine = F.interpolate(features.flatten(0, 1), scale_factor=self.scale, mode="bilinear", align_corners=False)
+            features = fine.unflatten(0, features.shape[:2])
+        return flow_warp_idw(features, offsets, mask, neighbors=self.neighbors)
+
+    def _mask(self, height: int, width: int, device: torch.device) -> tuple[Tensor, ...]:
+        key = height, width, device
+        if key not in self._masks:
+            mask = bayer_mask(height, width, self.pattern, scale=self.scale, device=device, dtype=torch.bool)
+            self._masks = {key: mask.unbind(0)}  # the same tensors every time: their tables are kept
+        return self._masks[key]
