@@ -1,0 +1,108 @@
+"""Where the pictures of the scenes come from: any folder, or the photographs inside scikit-image's wheel."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from spikekit import read_picture
+
+_ENDINGS = {".png", ".jpg", ".jpeg", ".jpe", ".tif", ".tiff", ".bmp", ".webp", ".ppm", ".pgm", ".pnm"}
+
+# Colour first, then grey. motorcycle_right is left out: it shows what is held out.
+_TRAIN = [
+    "astronaut.png",
+    "rocket.jpg",
+    "ihc.png",
+    "retina.jpg",
+    "hubble_deep_field.jpg",
+    "color.png",
+    "brick.png",
+    "grass.png",
+    "camera.png",
+    "moon.png",
+    "coins.png",
+    "page.png",
+]
+_HELD_OUT = ["coffee.png", "chelsea.png", "motorcycle_left.png", "gravel.png"]
+
+
+def folder_pictures(root: str | Path) -> list[Path]:
+    """List the pictures of a folder and of all folders in it, sorted; hidden ones are left out.
+
+    Args:
+        root: the folder.
+
+    Returns:
+        Paths of PNG, JPEG, TIFF, BMP, WebP and PNM files, at least one.
+
+    Raises:
+        FileNotFoundError: there is no such folder, or no picture in it.
+        NotADirectoryError: it is a file.
+    """
+    root = Path(root).expanduser()
+    if not root.exists():
+        raise FileNotFoundError(f"{root}: no such folder of pictures")
+    if not root.is_dir():
+        raise NotADirectoryError(f"{root}: expected a folder of pictures, got a file")
+    inside = sorted(root.rglob("*"))
+    found = [path for path in inside if path.suffix.lower() in _ENDINGS and path.is_file()]
+    found = [path for path in found if not any(part.startswith(".") for part in path.relative_to(root).parts)]
+    if not found:
+        raise FileNotFoundError(f"{root}: no picture in this folder (looked for {' '.join(sorted(_ENDINGS))})")
+    return found
+
+
+def embedded_pictures(held_out: bool = False) -> list[Path]:
+    """List the photographs that lie inside scikit-image's wheel; nothing is ever downloaded.
+
+    Args:
+        held_out: the four that are kept for validation, instead of those for training.
+
+    Returns:
+        Paths, at least one.
+
+    Raises:
+        FileNotFoundError: this build of scikit-image came without any of them.
+    """
+    import skimage.data
+
+    here = Path(skimage.data.__file__).parent
+    found = [here / name for name in (_HELD_OUT if held_out else _TRAIN) if (here / name).is_file()]
+    if not found:
+        raise FileNotFoundError(f"{here}: scikit-image came without its photographs; give a folder of pictures instead")
+    return found
+
+
+def split_pictures(pictures: list[Path], fraction: float, seed: int) -> tuple[list[Path], list[Path]]:
+    """Split pictures at random in two, at least one in each.
+
+    Args:
+        pictures: what to split.
+        fraction: the share of the second part.
+        seed: the same seed gives the same split.
+
+    Returns:
+        What stays, and what is held out, each in the order given. One picture alone is in both.
+    """
+    if len(pictures) == 1:
+        return pictures, pictures
+    count = min(max(1, round(fraction * len(pictures))), len(pictures) - 1)
+    out = set(np.random.default_rng(seed).permutation(len(pictures))[:count].tolist())
+    return (
+        [picture for i, picture in enumerate(pictures) if i not in out],
+        [picture for i, picture in enumerate(pictures) if i in out],
+    )
+
+
+@lru_cache(maxsize=16)
+def cached_picture(path: Path) -> Tensor:
+    """Read a picture, or give the one in memory; not to be written to.
+
+    Raises:
+        ValueError: the file is not a picture; the message names it.
+    """
+    return read_picture(path)

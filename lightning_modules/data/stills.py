@@ -1,0 +1,347 @@
+"""Still pictures set in motion: clips for training and validation, with sharp truth and exact flow."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytorch_lightning as pl
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset, Sampler
+
+from lightning_modules.data.pictures import cached_picture, embedded_pictures, folder_pictures, split_pictures
+from lightning_modules.data.textures import outline_mask, texture
+from spikekit.scene import Layer, Motion, Scene, simulate_spikes
+
+_TEXTURES = 0.4  # share of procedural pictures among embedded ones
+_HELD_OUT = 0.05  # share of a folder that validation keeps, where it has no folder of its own
+_MOST_WORKERS = 8
+
+
+class StillClips(Dataset):
+    """Clips of random scenes; which one, only the seed and the index say, in whatever process and order.
+
+    Args:
+        pictures: files to make scenes of.
+        scale: how many view pixels a sensor pixel is wide.
+        patch: side of the clip in sensor pixels.
+        frames: clocks of a clip; the truth is the view at clock ``frames // 2``.
+        pattern: Bayer phase of the sensor.
+        alpha: light of a white pixel per clock, the threshold being 1.
+        motion: largest displacement of the middle of the background from the middle of the clip to its first or last
+            frame, in sensor pixels; an object moves by up to as much again relative to the background.
+        rotation: largest turn in the same time, in degrees.
+        zoom: largest growth or shrinkage in the same time; 0.01 is one per cent.
+        objects: most objects in front of the background.
+        brightness: darkest and brightest exposure; a clip's pictures, so its truth and its light, are multiplied by one
+            number between.
+        photons: photons that make one threshold, for photon noise; ``None`` for none.
+        flow_times: clocks to which the flow from the middle is given.
+        seed: where chance begins.
+        augment: mirror, turn and recolour the pictures. Without it the pictures take their turns, one an index.
+        textures: take some of the pictures from :func:`lightning_modules.data.textures.texture`.
+        length: what ``len`` says; any index from 0 on can be had.
+
+    Raises:
+        ValueError: an argument that makes no sense; the message names it.
+    """
+
+    def __init__(
+        self,
+        pictures: Sequence[Path],
+        *,
+        scale: int = 4,
+        patch: int = 96,
+        frames: int = 41,
+        pattern: str = "RGGB",
+        alpha: float = 0.4,
+        motion: float = 3.0,
+        rotation: float = 1.0,
+        zoom: float = 0.01,
+        objects: int = 2,
+        brightness: tuple[float, float] = (0.5, 1.0),
+        photons: float | None = None,
+        flow_times: tuple[int, int] = (5, 35),
+        seed: int = 0,
+        augment: bool = True,
+        textures: bool = False,
+        length: int = 1200,
+    ) -> None:
+        self.pictures = list(pictures)
+        self.scale, self.patch, self.frames, self.pattern, self.alpha = scale, patch, frames, pattern, alpha
+        self.motion, self.rotation, self.zoom, self.objects = motion, rotation, zoom, objects
+        self.brightness, self.photons, self.flow_times = tuple(brightness), photons, tuple(flow_times)
+        self.seed, self.augment, self.textures, self.length = seed, augment, textures, length
+        _check(self)
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        """Return a clip: ``spikes`` uint8 (N, H, W), ``rgb`` (3, s H, s W) and ``flow`` (times, 2, H, W) float32."""
+        scene = self.scene(index)
+        light = scene.light(self.pattern, scale=self.scale, alpha=self.alpha)
+        generator = torch.Generator().manual_seed(int(self._rng(index, "spikes").integers(2**63)))
+        return {
+            "spikes": simulate_spikes(light, photons=self.photons, generator=generator),
+            "rgb": scene.rgb(scene.middle),
+            "flow": torch.stack([scene.flow(clock, scale=self.scale) for clock in self.flow_times]),
+        }
+
+    def scene(self, index: int) -> Scene:
+        """Return the scene of a clip, to look at other clocks or sizes than the clip has."""
+        rng = self._rng(index, "scene")
+        side, half = self.scale * self.patch, max(self.frames // 2, 1)
+        brightness = rng.uniform(*self.brightness)
+        middle = (side - 1) / 2
+        velocity = _in_disc(rng) * self.motion * self.scale / half
+
+        # what comes into view: the corners by motion, rotation and zoom
+        reach = middle * math.sqrt(2) * (math.radians(self.rotation) + self.zoom) + self.motion * self.scale
+        margin = math.ceil(reach) + 2
+        background = self._picture(side + 2 * margin, rng, index) * brightness
+        layers = [Layer(background, self._motion(velocity, (middle, middle), half, rng), (-margin, -margin))]
+        for _ in range(rng.integers(self.objects + 1)):
+            size = max(4, round(side * rng.uniform(0.15, 0.5)))
+            picture = self._picture(size, rng) * brightness
+            x, y = (int(corner) for corner in rng.integers(-size // 2, side - size // 2, 2))
+            moves = velocity + _in_disc(rng) * self.motion * self.scale / half
+            centre = (x + (size - 1) / 2, y + (size - 1) / 2)
+            layers.append(Layer(picture, self._motion(moves, centre, half, rng), (x, y), outline_mask(size, rng)))
+        return Scene(layers, side, side, self.frames)
+
+    def _rng(self, index: int, purpose: str) -> np.random.Generator:
+        return np.random.default_rng([self.seed, self.augment, index, purpose == "spikes"])
+
+    def _motion(self, velocity: np.ndarray, centre: tuple[float, float], half: int, rng: np.random.Generator) -> Motion:
+        rotation = math.radians(self.rotation * rng.uniform(-1, 1)) / half
+        zoom = (1 + self.zoom) ** (rng.uniform(-1, 1) / half)
+        return Motion((float(velocity[0]), float(velocity[1])), rotation, zoom, centre)
+
+    def _picture(self, side: int, rng: np.random.Generator, turn: int | None = None) -> Tensor:
+        """A random square out of a picture: ``turn`` says whose turn it is, where pictures take turns."""
+        if self.textures and rng.uniform() < _TEXTURES:
+            return texture(side, side, rng)
+        if self.augment or turn is None:
+            turn = int(rng.integers(len(self.pictures)))
+        picture = _crop(cached_picture(self.pictures[turn % len(self.pictures)]), side, rng)
+        return _augment(picture, rng) if self.augment else picture
+
+
+def _check(clips: StillClips) -> None:
+    low, high = clips.brightness
+    for name, good, expected in (
+        ("pictures", len(clips.pictures) > 0, "at least one"),
+        ("patch", clips.patch >= 1, "at least 1"),
+        ("frames", clips.frames >= 1, "at least 1"),
+        ("motion", 0 <= clips.motion < math.inf, "0 or more"),
+        ("rotation", 0 <= clips.rotation < math.inf, "0 or more degrees"),
+        ("zoom", 0 <= clips.zoom < math.inf, "0 or more"),
+        ("objects", clips.objects >= 0, "0 or more"),
+        ("brightness", 0 <= low <= high <= 1, "two numbers 0 <= low <= high <= 1"),
+        ("flow_times", all(0 <= t < clips.frames for t in clips.flow_times), f"clocks in [0, {clips.frames})"),
+        ("photons", clips.photons is None or 0 < clips.photons < math.inf, "a number above 0, or null for no noise"),
+        ("seed", clips.seed >= 0, "0 or more"),
+        ("length", clips.length >= 1, "at least 1 clip"),
+    ):
+        if not good:
+            raise ValueError(f"{name}: expected {expected}, got {getattr(clips, name)}")
+
+
+def _in_disc(rng: np.random.Generator) -> np.ndarray:
+    """(x, y) in the unit disc: any direction, any length, all equally likely."""
+    angle, length = rng.uniform(0, 2 * math.pi), rng.uniform()
+    return length * np.array([math.cos(angle), math.sin(angle)])
+
+
+def _crop(picture: Tensor, side: int, rng: np.random.Generator) -> Tensor:
+    """Cut a square at a random place and size; what is too small is enlarged a little and mirrored."""
+    # Shrinking makes grain small and edges sharp. At most half as much again may be mirrored.
+    smallest = max(0.5, side / (1.5 * min(picture.shape[1:])))
+    factor = math.exp(rng.uniform(math.log(smallest), math.log(max(smallest, 1.0))))
+    for axis in (1, 2):
+        length = min(math.ceil(side / factor), picture.shape[axis])
+        picture = picture.narrow(axis, int(rng.integers(picture.shape[axis] - length + 1)), length)
+    size = [max(1, round(length * factor)) for length in picture.shape[1:]]
+    picture = F.interpolate(picture[None], size, mode="bicubic", antialias=True)[0].clamp(0, 1)
+    for axis in (1, 2):
+        length = picture.shape[axis]
+        index = (torch.arange(side) + int(rng.integers(max(length - side, 0) + 1))) % (2 * length)
+        picture = picture.index_select(axis, torch.minimum(index, 2 * length - 1 - index))
+    return picture
+
+
+def _augment(picture: Tensor, rng: np.random.Generator) -> Tensor:
+    """Mirror and turn at random; rarely, swap colours, or tint what is grey."""
+    flips = [axis for axis in (1, 2) if rng.uniform() < 0.5]
+    picture = picture.flip(flips).rot90(int(rng.integers(4)), (1, 2))
+    if rng.uniform() < 0.1:
+        picture = picture[torch.from_numpy(rng.permutation(3))]
+    dark, bright = np.sort(rng.uniform(0, 1, (2, 3)) ** [[2.0], [0.5]], axis=0)
+    if rng.uniform() < 0.5 and torch.equal(picture[0], picture[1]) and torch.equal(picture[0], picture[2]):
+        dark, bright = (torch.from_numpy(ends).float()[:, None, None] for ends in (dark, bright))
+        picture = dark + (bright - dark) * picture
+    return picture.contiguous()
+
+
+class _FreshClips(Sampler[int]):
+    """Consecutive indices that go on where training stands, so that a resumed run sees what an unbroken one would."""
+
+    def __init__(self, data: StillScenes) -> None:
+        self.data = data
+
+    def __len__(self) -> int:
+        return self.data.train_clips
+
+    def __iter__(self) -> Iterator[int]:
+        start, trainer = 0, self.data.trainer
+        if trainer is not None:
+            a_step = self.data.batch_size * trainer.accumulate_grad_batches * trainer.world_size
+            start = trainer.global_step * a_step
+        return iter(range(start, start + len(self)))
+
+
+def _to_arrays(clips: list[dict[str, Tensor]]) -> dict[str, np.ndarray]:
+    return {name: np.stack([clip[name].numpy() for clip in clips]) for name in clips[0]}
+
+
+class _ClipLoader(DataLoader):
+    """A loader whose workers send arrays through pipes: tensors would need more shared memory than containers give."""
+
+    def __iter__(self) -> Iterator[dict[str, Tensor]]:
+        return ({name: torch.from_numpy(value) for name, value in batch.items()} for batch in super().__iter__())
+
+
+def _one_thread(_: int) -> None:
+    torch.set_num_threads(1)
+
+
+def _default_workers() -> int:
+    # One core stays with training; beyond eight workers no single GPU was found waiting. A lone core makes its clips
+    # between the steps: a process beside it would only take turns with it.
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(0, min(_MOST_WORKERS, cores - 1))
+
+
+class StillScenes(pl.LightningDataModule):
+    """Clips of still pictures in motion, made while training runs.
+
+    Args:
+        root: folder of training pictures, read with all folders in it. Without it, the photographs inside
+            scikit-image's wheel and procedural textures: no files are needed.
+        val_root: folder of validation pictures. Without it, one picture in twenty of ``root`` is kept for validation;
+            without both, four held-out photographs of scikit-image.
+        scale: super-resolution factor.
+        patch: side of a training clip in sensor pixels.
+        val_patch: side of a validation or test clip in sensor pixels.
+        frames: spike frames of a clip. The truth is the view at frame ``frames // 2``.
+        pattern: Bayer phase of the sensor: RGGB, BGGR, GRBG or GBRG.
+        alpha: light of a white pixel per clock; a threshold of charge is 1.
+        motion: largest displacement of the background, at its centre, from the middle frame to the first or last one,
+            in sensor pixels. An object moves by up to as much again relative to the background.
+        rotation: largest turn of the background and of each object in that time, in degrees.
+        zoom: largest growth or shrinkage of the background and of each object in that time; 0.01 is one per cent.
+        objects: most objects that move in front of the background.
+        brightness: darkest and brightest exposure. Truth and light of a clip are both multiplied by one number between.
+        photons: photons that make one threshold, for photon noise; null for none.
+        flow_times: frames to which the flow from the middle frame is given; with 41 frames and a window of 11, 5 and 35
+            are the centres of the first and of the last window.
+        train_clips: training clips in an epoch. They are new in every epoch.
+        val_clips: validation clips, the same every time; also those of ``test``.
+        batch_size: clips in a batch.
+        workers: processes that make clips. Null takes one less than there are cores, eight at most: one core is left
+            to training.
+        seed: where chance begins. The same seed gives the same clips, whatever the number of workers.
+    """
+
+    def __init__(
+        self,
+        root: str | None = None,
+        val_root: str | None = None,
+        scale: int = 4,
+        patch: int = 96,
+        val_patch: int = 96,
+        frames: int = 41,
+        pattern: str = "RGGB",
+        alpha: float = 0.4,
+        motion: float = 3.0,
+        rotation: float = 1.0,
+        zoom: float = 0.01,
+        objects: int = 2,
+        brightness: tuple[float, float] = (0.5, 1.0),
+        photons: float | None = None,
+        flow_times: tuple[int, int] = (5, 35),
+        train_clips: int = 1200,
+        val_clips: int = 16,
+        batch_size: int = 4,
+        workers: int | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.root, self.val_root = root, val_root
+        self.patch, self.val_patch = patch, val_patch
+        self.train_clips, self.val_clips = train_clips, val_clips
+        self.batch_size, self.seed = batch_size, seed
+        self.workers = _default_workers() if workers is None else workers
+        self.options = {
+            "scale": scale,
+            "frames": frames,
+            "pattern": pattern,
+            "alpha": alpha,
+            "motion": motion,
+            "rotation": rotation,
+            "zoom": zoom,
+            "objects": objects,
+            "brightness": brightness,
+            "photons": photons,
+            "flow_times": flow_times,
+            "seed": seed,
+        }
+
+    def setup(self, stage: str | None = None) -> None:
+        """Find the pictures.
+
+        Raises:
+            FileNotFoundError: a folder is missing or holds no picture.
+            ValueError: an argument that makes no sense.
+        """
+        train, val = self._pictures()
+        embedded = self.root is None
+        options = self.options
+        self.train_set = StillClips(train, **options, patch=self.patch, length=self.train_clips, textures=embedded)
+        self.val_set = StillClips(val, **options, patch=self.val_patch, length=self.val_clips, augment=False)
+
+    def _pictures(self) -> tuple[list[Path], list[Path]]:
+        if self.root is None:
+            train, val = embedded_pictures(), embedded_pictures(held_out=True)
+        elif self.val_root is None:
+            return split_pictures(folder_pictures(self.root), _HELD_OUT, self.seed)
+        else:
+            train, val = folder_pictures(self.root), []
+        return train, val if self.val_root is None else folder_pictures(self.val_root)
+
+    def train_dataloader(self) -> DataLoader:  # noqa: D102
+        return self._loader(self.train_set, sampler=_FreshClips(self), drop_last=True)
+
+    def val_dataloader(self) -> DataLoader:  # noqa: D102
+        return self._loader(self.val_set)
+
+    def test_dataloader(self) -> DataLoader:  # noqa: D102
+        return self._loader(self.val_set)
+
+    def _loader(self, clips: StillClips, **how: object) -> DataLoader:
+        workers = min(self.workers, -(-len(clips) // self.batch_size))
+        return _ClipLoader(
+            clips,
+            batch_size=self.batch_size,
+            num_workers=workers,
+            persistent_workers=workers > 0,
+            worker_init_fn=_one_thread,
+            collate_fn=_to_arrays,
+            **how,
+        )
