@@ -1,0 +1,226 @@
+"""The decoders against loops over every pixel, written from the contract."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.autograd import gradcheck
+
+from spikekit import spike_interval, tfi, tfp
+
+DTYPES = [torch.float64, torch.float32, torch.bfloat16, torch.float16]
+
+
+def enclosing(fired, n):
+    """Last spike before n and first spike at or after n; None where there is none."""
+    before = [k for k in range(n) if fired[k]]
+    after = [k for k in range(n, len(fired)) if fired[k]]
+    return before[-1] if before else None, after[0] if after else None
+
+
+def interval_loop(fired):
+    frames = len(fired)
+    times = [k for k in range(frames) if fired[k]]
+    complete = [b - a for a, b in pairwise(times)]
+    result = []
+    for n in range(frames):
+        before, after = enclosing(fired, n)
+        observed = (frames if after is None else after) - (-1 if before is None else before)
+        if before is not None and after is not None:
+            result.append(observed)
+        elif complete and (before is None) != (after is None):
+            result.append(max(observed, complete[0] if before is None else complete[-1]))
+        else:
+            result.append(observed)
+    return result
+
+
+def over_pixels(function, spikes):
+    """Apply a function of one pixel's stream to every pixel of an array (*, T, H, W)."""
+    return np.apply_along_axis(lambda stream: np.array(function(stream)), -3, spikes)
+
+
+def streams(frames, seed=0):
+    """One pixel of every density, and the ends: (frames, 5, 8)."""
+    rng = np.random.default_rng(seed)
+    density = np.concatenate([np.linspace(0, 1, 32), [0.02, 0.05, 0.1, 0.9]])
+    spikes = (rng.random((frames, 36)) < density).astype(np.uint8)
+    ends = np.zeros((frames, 4), dtype=np.uint8)
+    ends[0, 0] = ends[-1, 1] = ends[frames // 2, 2] = ends[0, 3] = ends[-1, 3] = 1
+    return np.concatenate([spikes, ends], axis=1).reshape(frames, 5, 8)
+
+
+CLIPS = pytest.mark.parametrize("frames", [1, 2, 3, 17, 41])
+
+
+@CLIPS
+def test_interval_loop(frames):
+    spikes = np.stack([streams(frames, seed) for seed in range(3)])
+    expected = over_pixels(interval_loop, spikes)
+    interval = spike_interval(torch.from_numpy(spikes))
+    assert interval.dtype == torch.int16
+    assert np.array_equal(interval.numpy(), expected)
+    assert torch.equal(spike_interval(torch.from_numpy(spikes)[None, 1])[0], interval[1])
+    for dtype in (torch.bool, torch.int64, torch.float64, torch.float32, torch.float16, torch.bfloat16):
+        got = spike_interval(torch.from_numpy(spikes).to(dtype))
+        assert got.dtype == (dtype if dtype.is_floating_point else torch.int16)
+        assert np.array_equal(got.double().numpy(), expected)
+
+
+@pytest.mark.parametrize(
+    ("fired", "expected"),
+    [
+        ("0000", [5, 5, 5, 5]),
+        ("1111", [1, 1, 1, 1]),
+        ("1000", [1, 4, 4, 4]),
+        ("0001", [4, 4, 4, 4]),
+        ("0100", [2, 2, 3, 3]),
+        ("01100000", [2, 2, 1, 6, 6, 6, 6, 6]),  # waited longer than the last interval
+        ("0100010", [4, 4, 4, 4, 4, 4, 4]),  # the nearest interval is longer than what was waited
+        ("1100010", [1, 1, 4, 4, 4, 4, 4]),
+    ],
+)
+def test_interval_by_hand(fired, expected):
+    spikes = torch.tensor([int(c) for c in fired]).reshape(-1, 1, 1)
+    assert spike_interval(spikes).flatten().tolist() == expected
+    assert interval_loop(spikes.flatten().tolist()) == expected
+
+
+@given(st.lists(st.booleans(), min_size=1, max_size=41))
+def test_interval_laws(fired):
+    spikes = torch.tensor(fired).reshape(-1, 1, 1)
+    interval = spike_interval(spikes).flatten().tolist()
+    assert interval == interval_loop(fired)
+    assert min(interval) >= 1
+    assert max(interval) <= len(fired) + 1
+    assert tfp(spikes, 2 * len(fired) + 1)[0].item() == pytest.approx(sum(fired) / len(fired))
+
+
+@pytest.mark.parametrize("period", [1, 2, 5, 7])
+@pytest.mark.parametrize("phase", [0, 1, 4])
+def test_regular_train(period, phase):
+    """Constant light decodes to its rate everywhere, ends included, as soon as one interval is complete."""
+    spikes = (torch.arange(41) % period == phase % period).reshape(-1, 1, 1)
+    assert (spike_interval(spikes) == period).all()
+    assert torch.allclose(tfi(spikes.double(), 3.0), torch.tensor(3.0 / period, dtype=torch.float64), rtol=1e-15)
+
+
+@pytest.mark.parametrize(("frames", "dtype"), [(32766, torch.int16), (32767, torch.int32)])
+def test_interval_of_long_clips(frames, dtype):
+    interval = spike_interval(torch.zeros(frames, 1, 1, dtype=torch.bool))
+    assert interval.dtype == dtype
+    assert (interval == frames + 1).all()
+
+
+@CLIPS
+@pytest.mark.parametrize("max_range", [1.0, 255.0])
+def test_tfi(frames, max_range):
+    spikes = torch.from_numpy(streams(frames))
+    expected = max_range / over_pixels(interval_loop, spikes.numpy())
+    assert np.allclose(tfi(spikes.double(), max_range).numpy(), expected, rtol=1e-15, atol=0)
+    for dtype in (torch.bool, torch.uint8, torch.float32, torch.float16, torch.bfloat16):
+        got = tfi(spikes.to(dtype), max_range)
+        assert got.dtype == (dtype if dtype.is_floating_point else torch.get_default_dtype())
+        assert torch.equal(got, (max_range / spike_interval(spikes).float()).to(got.dtype))
+
+
+@CLIPS
+@pytest.mark.parametrize("max_range", [1.0, 4.0])
+def test_tfi_gradient(frames, max_range):
+    array = streams(frames)
+    weight = np.random.default_rng(1).integers(-8, 9, array.shape).astype(float)
+    expected = np.zeros(array.shape)
+    for y, x in np.ndindex(*array.shape[1:]):
+        fired = array[:, y, x]
+        interval = interval_loop(fired)
+        for n in range(frames):
+            before, after = enclosing(fired, n)
+            begin = 0 if before is None else before + 1
+            end = frames if after is None else after + 1
+            expected[begin:end, y, x] += weight[n, y, x] * max_range / interval[n]
+    spikes = torch.from_numpy(array).double().requires_grad_()
+    (grad,) = torch.autograd.grad((tfi(spikes, max_range) * torch.from_numpy(weight)).sum(), spikes)
+    assert np.allclose(grad.numpy(), expected, rtol=1e-12, atol=1e-12)
+    for dtype in (torch.float32, torch.float16, torch.bfloat16):
+        spikes = torch.from_numpy(array).to(dtype).requires_grad_()
+        (grad,) = torch.autograd.grad((tfi(spikes, max_range) * torch.from_numpy(weight).to(dtype)).sum(), spikes)
+        assert grad.dtype == dtype
+        eps = torch.finfo(dtype).eps
+        assert np.allclose(grad.double().numpy(), expected, rtol=2 * eps, atol=64 * eps)
+
+
+def tfp_loop(stream, window, max_range):
+    half, frames = (window - 1) // 2, len(stream)
+    inside = [[stream[k] for k in range(frames) if abs(k - n) <= half] for n in range(frames)]
+    return [max_range * sum(map(float, values)) / len(values) for values in inside]
+
+
+@CLIPS
+@pytest.mark.parametrize("window", [1, 3, 11, 41, 99])
+@pytest.mark.parametrize("max_range", [1.0, 255.0])
+def test_tfp(frames, window, max_range):
+    spikes = np.stack([streams(frames), streams(frames, 1)])
+    expected = over_pixels(lambda stream: tfp_loop(stream, window, max_range), spikes)
+    for dtype in (torch.bool, torch.uint8, torch.int32, *DTYPES):
+        got = tfp(torch.from_numpy(spikes).to(dtype), window, max_range)
+        assert got.dtype == (dtype if dtype.is_floating_point else torch.get_default_dtype())
+        assert np.allclose(got.double().numpy(), expected, rtol=torch.finfo(got.dtype).eps * 2, atol=0)
+    assert torch.equal(tfp(torch.from_numpy(spikes[1]), window), tfp(torch.from_numpy(spikes), window)[1])
+
+
+def test_tfp_counts_uint8_past_255():
+    for dtype in (torch.uint8, torch.bool):
+        assert torch.allclose(tfp(torch.ones(600, 1, 1, dtype=dtype), 601), torch.ones(1))
+    assert (tfp(torch.ones(5000, 1, 1, dtype=torch.float16), 3) == 1).all()
+
+
+def test_tfp_is_linear():
+    a, b = torch.rand(2, 9, 2, 2, dtype=torch.float64)
+    assert torch.allclose(tfp(2 * a - b, 5), 2 * tfp(a, 5) - tfp(b, 5))
+
+
+@pytest.mark.parametrize(("frames", "window"), [(1, 1), (4, 3), (7, 5), (3, 9)])
+def test_tfp_gradcheck(frames, window):
+    spikes = torch.rand(frames, 1, 2, dtype=torch.float64, requires_grad=True)
+    assert gradcheck(lambda s: tfp(s, window, 2.0), spikes)
+
+
+def test_memory_layouts():
+    spikes = (torch.rand(2, 9, 5, 4) < 0.3).float()
+    view = spikes.permute(3, 2, 1, 0).contiguous().permute(3, 2, 1, 0)
+    frame = spikes[0, :1].expand(9, 5, 4)
+    for op in (spike_interval, tfi, lambda s: tfp(s, 5)):
+        assert torch.equal(op(view), op(spikes))
+        assert torch.equal(op(frame), op(frame.contiguous()))
+
+
+@pytest.mark.parametrize("op", [spike_interval, tfi, lambda s: tfp(s, 3)])
+@pytest.mark.parametrize(
+    ("error", "spikes"),
+    [
+        (TypeError, [[[1]]]),
+        (TypeError, torch.ones(3, 2, 2, dtype=torch.complex64)),
+        (ValueError, torch.ones(2, 2)),
+        (ValueError, torch.ones(0, 2, 2)),
+        (ValueError, torch.ones(3, 0, 2)),
+    ],
+)
+def test_wrong_spikes(op, error, spikes):
+    with pytest.raises(error):
+        op(spikes)
+
+
+@pytest.mark.parametrize("window", [0, 2, -1, 2.5, True])
+def test_wrong_window(window):
+    with pytest.raises(ValueError, match="window"):
+        tfp(torch.ones(3, 2, 2), window)
+
+
+@pytest.mark.parametrize("max_range", [0, -1.0, float("inf"), float("nan")])
+def test_wrong_range(max_range):
+    for op in (tfi, lambda s, max_range: tfp(s, 3, max_range)):
+        with pytest.raises(ValueError, match="max_range"):
+            op(torch.ones(3, 2, 2), max_range)

@@ -1,0 +1,123 @@
+"""Flow averaged, brought to a finer grid, and spread over time."""
+
+import numpy as np
+import pytest
+import torch
+from torch.autograd import gradcheck
+
+from spikekit import joint_flow, linear_motion, upsample_flow
+
+LEADS = pytest.mark.parametrize("lead", [(), (2,), (3, 2)])
+
+
+@LEADS
+def test_joint_flow(lead):
+    flows = torch.randint(-32, 33, (4, *lead, 2, 3, 5)).double()
+    expected = (flows[0] + flows[1] + flows[2] + flows[3]) / 4
+    assert torch.equal(joint_flow(flows), expected)
+    assert torch.equal(joint_flow(list(flows)), expected)
+    assert torch.equal(joint_flow(tuple(flows[:1])), flows[0])
+
+
+def upsample_loop(flow, scale):
+    """Bilinear with pixel areas aligned: fine centre X lies at (X + 1/2) / s - 1/2, the border is repeated."""
+    height, width = flow.shape[-2:]
+    fine = np.zeros((*flow.shape[:-2], scale * height, scale * width))
+    for y, x in np.ndindex(*fine.shape[-2:]):
+        py = min(max((y + 0.5) / scale - 0.5, 0), height - 1)
+        px = min(max((x + 0.5) / scale - 0.5, 0), width - 1)
+        for j in range(height):
+            for i in range(width):
+                fine[..., y, x] += max(0, 1 - abs(py - j)) * max(0, 1 - abs(px - i)) * flow[..., j, i]
+    return fine * scale
+
+
+@LEADS
+@pytest.mark.parametrize("scale", [1, 2, 3, 4])
+@pytest.mark.parametrize("size", [(1, 1), (3, 4)])
+def test_upsample_flow(lead, scale, size):
+    flow = torch.randn(*lead, 2, *size, dtype=torch.float64)
+    assert np.allclose(upsample_flow(flow, scale).numpy(), upsample_loop(flow.numpy(), scale), atol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [2, 3, 4])
+def test_linear_flow_stays_linear(scale):
+    """A rotation and zoom about a point is the same motion on the fine grid."""
+
+    def motion(x, y, unit):
+        x, y = (x + 0.5) / unit - 3, (y + 0.5) / unit - 2
+        return torch.stack([0.25 * x - 0.5 * y, 0.5 * x + 0.25 * y + 1]) * unit
+
+    def field(unit):
+        y, x = torch.meshgrid(*(torch.arange(n * unit, dtype=torch.float64) for n in (5, 6)), indexing="ij")
+        return motion(x, y, unit)
+
+    inside = (slice(None), slice(scale, -scale), slice(scale, -scale))
+    assert torch.allclose(upsample_flow(field(1), scale)[inside], field(scale)[inside], rtol=0, atol=1e-12)
+
+
+@LEADS
+@pytest.mark.parametrize("scale", [1, 2, 3])
+def test_linear_motion(lead, scale):
+    to_first, to_last = torch.randn(2, *lead, 2, 3, 4, dtype=torch.float64)
+    times, (i, j, k) = [0.0, 5, 19.5, 20, 20.5, 38, 40, 44], (1, 20, 39)
+    offsets = linear_motion(to_first, to_last, times, first=i, middle=j, last=k, scale=scale)
+    assert offsets.shape == (*lead, len(times), 2, 3 * scale, 4 * scale)
+    first, last = (upsample_loop(flow.numpy(), scale) for flow in (to_first, to_last))
+    for n, t in enumerate(times):
+        expected = (t - j) / (i - j) * first if t < j else (t - j) / (k - j) * last
+        assert np.allclose(offsets[..., n, :, :, :].numpy(), expected, atol=1e-12)
+        if t == j:
+            assert (offsets[..., n, :, :, :] == 0).all()
+
+
+def test_constant_motion():
+    """Pixels that move v per frame are t - j frames away, on both sides and beyond."""
+    velocity = torch.tensor([0.5, -0.25]).reshape(2, 1, 1).expand(2, 2, 3)
+    offsets = linear_motion(velocity * -20, velocity * 20, range(-2, 45), first=0, middle=20, last=40, scale=2)
+    for n, t in enumerate(range(-2, 45)):
+        assert torch.allclose(offsets[n, :, 0, 0], velocity[:, 0, 0] * 2 * (t - 20), rtol=1e-6, atol=1e-6)
+
+
+def test_ends_of_the_times_by_default():
+    to_first, to_last = torch.randn(2, 1, 2, 2, 2)
+    times = range(5, 36, 3)
+    offsets = linear_motion(to_first, to_last, times)
+    assert torch.equal(offsets, linear_motion(to_first, to_last, times, first=5, middle=20, last=35))
+    assert torch.equal(offsets[:, 0], to_first)
+    assert torch.equal(offsets[:, -1], to_last)
+    assert (offsets[:, 5] == 0).all()
+
+
+def test_gradients():
+    flows = torch.randn(2, 2, 2, 3, dtype=torch.float64, requires_grad=True)
+    assert gradcheck(joint_flow, flows)
+    assert gradcheck(lambda f: upsample_flow(f, 3), flows)
+    assert gradcheck(lambda f: linear_motion(f[0], f[1], [0, 1, 3, 5], middle=2, scale=2), flows)
+
+
+FLOW = torch.zeros(1, 2, 3, 3)
+
+
+@pytest.mark.parametrize(
+    ("error", "call"),
+    [
+        (ValueError, lambda: joint_flow([])),
+        (ValueError, lambda: joint_flow([FLOW, torch.zeros(1, 2, 3, 4)])),
+        (ValueError, lambda: joint_flow(torch.zeros(4, 3, 3, 3))),
+        (ValueError, lambda: joint_flow(torch.zeros(2, 3, 3))),
+        (TypeError, lambda: joint_flow([1.0])),
+        (ValueError, lambda: upsample_flow(torch.zeros(1, 3, 3, 3), 2)),
+        (ValueError, lambda: upsample_flow(FLOW, 0)),
+        (TypeError, lambda: upsample_flow(FLOW.long(), 2)),
+        (ValueError, lambda: linear_motion(FLOW, FLOW, [])),
+        (ValueError, lambda: linear_motion(FLOW, FLOW, [1])),
+        (ValueError, lambda: linear_motion(FLOW, FLOW, [2, 1])),
+        (ValueError, lambda: linear_motion(FLOW, FLOW, [0, 4], middle=4)),
+        (ValueError, lambda: linear_motion(FLOW, FLOW[:, :, 1:], [0, 4])),
+        (TypeError, lambda: linear_motion(FLOW, None, [0, 4])),
+    ],
+)
+def test_errors(error, call):
+    with pytest.raises(error):
+        call()

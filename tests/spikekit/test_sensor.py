@@ -1,0 +1,199 @@
+"""The sensor against a loop, and the laws of its charge."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from spikekit import spike_integrate_fire
+
+DTYPES = [torch.float64, torch.float32, torch.bfloat16, torch.float16]
+
+
+def loop(light, threshold, charge):
+    """Integrate and fire in the dtype of ``charge``; fmod is exact."""
+    threshold = charge.dtype.type(threshold)
+    spikes, charge = np.zeros_like(light), charge.copy()
+    for where in np.ndindex(charge.shape):
+        for t in range(light.shape[-3]):
+            here = (*where[:-2], t, *where[-2:])
+            u = charge[where] + light[here].astype(charge.dtype)
+            spikes[here] = u >= threshold
+            charge[where] = np.fmod(u, threshold)
+    return spikes, charge
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("threshold", [0.3, 1, 7])
+@pytest.mark.parametrize("most", [0.2, 1, 5])
+@pytest.mark.parametrize("lead", [(), (2, 1)])
+def test_loop(dtype, threshold, most, lead):
+    rng = np.random.default_rng(0)
+    light = (rng.random((*lead, 17, 3, 2)) * most * threshold).astype(dtype)
+    start = (rng.random((*lead, 3, 2)) * threshold * 0.99).astype(dtype)
+    for charge in (None, start):
+        spikes, left = spike_integrate_fire(
+            torch.from_numpy(light), threshold, None if charge is None else torch.from_numpy(charge)
+        )
+        expected = loop(light, threshold, np.zeros_like(start) if charge is None else charge)
+        assert spikes.dtype == left.dtype == torch.from_numpy(light).dtype
+        assert np.array_equal(spikes.numpy(), expected[0])
+        assert np.array_equal(left.numpy(), expected[1])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("threshold", [0.1, 0.3, 1, 7, 41, 47])  # 41 * (1 / 41) is below 1 in float32
+def test_fires_at_the_threshold_exactly(dtype, threshold):
+    at = torch.tensor(threshold, dtype=dtype)
+    below = torch.nextafter(at, at * 0)
+    light = torch.stack([below, at]).reshape(1, 1, 2)
+    spikes, charge = spike_integrate_fire(light, threshold)
+    assert spikes.flatten().tolist() == [0, 1]
+    assert charge.flatten().tolist() == [below.item(), 0]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("threshold", [0.1, 0.3, 0.7, 1, 7])
+def test_charge_stays_below_the_threshold(dtype, threshold):
+    """Also where u / threshold rounds up to a whole number."""
+    multiple = torch.arange(1, 2000, dtype=dtype) * threshold
+    light = torch.stack([multiple, torch.nextafter(multiple, multiple * 0), torch.nextafter(multiple, multiple * 2)])
+    spikes, charge = spike_integrate_fire(light[None], threshold)
+    assert ((charge >= 0) & (charge < torch.tensor(threshold, dtype=dtype))).all()
+    assert torch.equal(spikes[0] == 1, light >= torch.tensor(threshold, dtype=dtype))
+
+
+def test_one_spike_a_clock_and_the_surplus_is_lost():
+    spikes, charge = spike_integrate_fire(torch.tensor([3.25, 0.0, 0.75]).reshape(3, 1, 1))
+    assert spikes.flatten().tolist() == [1, 0, 1]
+    assert charge.item() == 0
+
+
+@given(
+    light=st.lists(st.integers(0, 128), min_size=1, max_size=41),
+    start=st.integers(0, 127),
+    threshold=st.sampled_from([0.5, 1.0, 8.0]),
+    dtype=st.sampled_from(DTYPES),
+)
+def test_charge_is_conserved(light, start, threshold, dtype):
+    # 128ths of the threshold: exact in every dtype
+    light = torch.tensor(light, dtype=torch.float64).reshape(-1, 1, 1) / 128 * threshold
+    start = torch.full((1, 1), start / 128 * threshold)
+    spikes, charge = spike_integrate_fire(light.to(dtype), threshold, start)
+    assert threshold * spikes.double().sum() + charge.double().sum() == start.double().sum() + light.sum()
+    assert (charge >= 0).all()
+    assert (charge < threshold).all()
+
+
+@given(data=st.data(), threshold=st.sampled_from([0.3, 1.0, 7.0]), dtype=st.sampled_from(DTYPES))
+def test_chunks_equal_one_run(data, threshold, dtype):
+    frames = data.draw(st.integers(1, 20))
+    cuts = sorted(data.draw(st.lists(st.integers(1, frames), max_size=4)))
+    light = (torch.rand(2, frames, 2, 3) * 2 * threshold).to(dtype)
+    spikes, charge = spike_integrate_fire(light, threshold)
+    parts, left = [], None
+    for begin, end in zip([0, *cuts], [*cuts, frames], strict=True):
+        if begin < end:
+            part, left = spike_integrate_fire(light[:, begin:end], threshold, left)
+            parts.append(part)
+    assert torch.equal(torch.cat(parts, dim=1), spikes)
+    assert torch.equal(left, charge)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_charge_of_half_light_is_float32(dtype):
+    light = torch.full((300, 1, 1), 0.01, dtype=dtype)
+    spikes, charge = spike_integrate_fire(light)
+    assert spikes.dtype == dtype
+    assert charge.dtype == torch.float32
+    assert spikes.sum() == 3  # in half precision the charge would stop growing
+
+
+def test_charge_may_be_wider_than_light():
+    _, charge = spike_integrate_fire(torch.rand(3, 2, 2), charge=torch.rand(2, 2, dtype=torch.float64))
+    assert charge.dtype == torch.float64
+
+
+@pytest.mark.parametrize("threshold", [1.0, 0.25, 4.0])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_straight_through_gradient(threshold, dtype):
+    one = torch.tensor(threshold, dtype=dtype)
+    above = torch.tensor(threshold * (1 + 2 * torch.finfo(dtype).eps), dtype=dtype)
+    tiny = torch.tensor(torch.finfo(dtype).tiny, dtype=dtype)
+    light = torch.stack([-one, -tiny, one * 0, tiny, one / 2, one, above, 3 * one]).reshape(1, 1, -1)
+    light = light.repeat(3, 2, 1).requires_grad_()
+    spikes, charge = spike_integrate_fire(light, threshold)
+    weight = torch.randint(-4, 5, spikes.shape).to(dtype)
+    (grad,) = torch.autograd.grad((spikes * weight).sum(), light)
+    expected = weight / threshold * torch.tensor([0, 0, 1, 1, 1, 1, 0, 0], dtype=dtype)
+    assert torch.equal(grad, expected)
+    assert grad.dtype == dtype
+    assert not charge.requires_grad
+
+
+def test_charge_that_comes_in_gets_no_gradient():
+    light = torch.rand(4, 2, 2, requires_grad=True)
+    start = torch.rand(2, 2, requires_grad=True)
+    spikes, charge = spike_integrate_fire(light, charge=start)
+    assert not charge.requires_grad
+    spikes.sum().backward()
+    assert start.grad is None or (start.grad == 0).all()
+    assert torch.equal(light.grad, torch.ones_like(light))
+
+
+def test_memory_layouts():
+    light = torch.rand(3, 5, 7, 4)
+    expected = spike_integrate_fire(light)
+    for view in (
+        light.transpose(1, 2).contiguous().transpose(1, 2),
+        light.permute(3, 2, 1, 0).contiguous().permute(3, 2, 1, 0),
+    ):
+        assert not view.is_contiguous()
+        for got, want in zip(spike_integrate_fire(view), expected, strict=True):
+            assert torch.equal(got, want)
+    frame = torch.rand(7, 4)
+    for got, want in zip(
+        spike_integrate_fire(frame.expand(5, 7, 4)), spike_integrate_fire(frame.repeat(5, 1, 1)), strict=True
+    ):
+        assert torch.equal(got, want)
+
+
+def test_inputs_are_left_alone():
+    light, start = torch.rand(5, 2, 3), torch.rand(2, 3)
+    kept = light.clone(), start.clone()
+    _, charge = spike_integrate_fire(light, charge=start)
+    charge += 1
+    assert torch.equal(light, kept[0])
+    assert torch.equal(start, kept[1])
+
+
+def test_charge_broadcasts():
+    light = torch.rand(2, 5, 2, 3)
+    start = torch.rand(1, 3)
+    for got, want in zip(
+        spike_integrate_fire(light, charge=start),
+        spike_integrate_fire(light, charge=start.expand(2, 2, 3)),
+        strict=True,
+    ):
+        assert torch.equal(got, want)
+
+
+@pytest.mark.parametrize(
+    ("error", "arguments"),
+    [
+        (TypeError, (torch.ones(3, 2, 2, dtype=torch.uint8),)),
+        (TypeError, (np.ones((3, 2, 2)),)),
+        (ValueError, (torch.ones(2, 2),)),
+        (ValueError, (torch.ones(0, 2, 2),)),
+        (ValueError, (torch.ones(3, 2, 2), 0)),
+        (ValueError, (torch.ones(3, 2, 2), -1.0)),
+        (ValueError, (torch.ones(3, 2, 2), float("nan"))),
+        (ValueError, (torch.ones(3, 2, 2), 1.0, torch.ones(3, 2))),
+        (ValueError, (torch.ones(3, 2, 2), 1.0, torch.ones(5, 2, 2))),
+        (TypeError, (torch.ones(3, 2, 2), 1.0, torch.ones(2, 2, dtype=torch.int64))),
+    ],
+)
+def test_errors(error, arguments):
+    with pytest.raises(error):
+        spike_integrate_fire(*arguments)
