@@ -247,14 +247,13 @@ def flow_warp_idw(features: Tensor, flow: Tensor, mask: Tensor, *, neighbors: in
     distance = torch.where(hit, 1, square).sqrt() * ~hit
     # 1 / d, relative to the nearest: no overflow next to a known pixel, and a gradient that stays accurate there
     weight = torch.where(exists[:, 1:], distance[:, :1] / torch.where(exists, distance, 1)[:, 1:], 0)
-    total = 1 + weight.sum(dim=1, keepdim=True)
+    weight = torch.cat([torch.ones_like(distance[:, :1]), weight], dim=1)
+    share = weight / weight.sum(dim=1, keepdim=True)
 
     values = features.reshape(-1, features.shape[-3], height * width)
     result = 0
-    for index, share in zip(
-        nearest.flatten(2).split(1, dim=1), [1 / total, *(weight / total).split(1, dim=1)], strict=True
-    ):
-        result = result + values.gather(-1, index.expand(values.shape)) * share.flatten(2)
+    for index, share_i in zip(nearest.flatten(2).split(1, dim=1), share.flatten(2).split(1, dim=1), strict=True):
+        result = result + values.gather(-1, index.expand(values.shape)) * share_i
     return result.to(features.dtype).reshape(features.shape)
 
 

@@ -1,0 +1,291 @@
+"""The warps against brute force over all pixels, with distances in whole numbers, so that ties are exact."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.autograd import gradcheck
+
+from spikekit import bayer_mask, flow_warp, flow_warp_idw
+
+UNIT = 4096  # the flows below are multiples of 1 / UNIT
+
+
+def idw_brute(features, flow, mask, neighbors):
+    """Search all known pixels of (B, C, H, W) for every position; float64, and integers in units of 1 / UNIT."""
+    features, flow, mask = (np.asarray(a.detach().double()) for a in (features, flow, mask))
+    rows, columns = np.nonzero(mask)  # row-major
+    moved = np.rint(flow * UNIT).astype(np.int64)
+    assert (moved == flow * UNIT).all()
+    result = np.zeros(features.shape)
+    for b, y, x in np.ndindex(flow.shape[0], *flow.shape[2:]):
+        dx = columns * UNIT - (x * UNIT + moved[b, 0, y, x])
+        dy = rows * UNIT - (y * UNIT + moved[b, 1, y, x])
+        square = dx * dx + dy * dy
+        nearest = np.argsort(square, kind="stable")[:neighbors]
+        if square[nearest[0]] == 0:
+            nearest, weight = nearest[:1], np.ones(1)
+        else:
+            weight = 1 / np.sqrt(square[nearest].astype(np.float64))
+        result[b, :, y, x] = features[b][:, rows[nearest], columns[nearest]] @ weight / weight.sum()
+    return torch.from_numpy(result)
+
+
+def flows(height, width, dtype=torch.float64):
+    """Zero, whole, half (ties), quarter, any, far outside and very far outside: (7, 2, height, width)."""
+
+    def draw(most, unit):
+        return torch.randint(-most * unit, most * unit + 1, (2, height, width)).to(dtype) / unit
+
+    return torch.stack([draw(0, 1), draw(3, 1), draw(3, 2), draw(2, 4), draw(4, UNIT), draw(50, 8), draw(10000, 2)])
+
+
+def check_idw(mask, neighbors, dtype=torch.float64, rtol=1e-12):
+    flow = flows(*mask.shape, dtype)
+    features = torch.randn(len(flow), 2, *mask.shape, dtype=dtype)
+    warped = flow_warp_idw(features, flow, mask, neighbors=neighbors)
+    assert warped.dtype == dtype
+    torch.testing.assert_close(warped.double(), idw_brute(features, flow, mask, neighbors), rtol=rtol, atol=rtol)
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
+@pytest.mark.parametrize(("scale", "neighbors"), [(1, 4), (2, 4), (3, 4), (4, 4), (1, 6), (2, 5)])
+def test_idw_of_bayer_masks(pattern, scale, neighbors):
+    for mask in bayer_mask(3, 4 if scale > 2 else 5, pattern, scale=scale):
+        check_idw(mask, neighbors)
+
+
+@pytest.mark.parametrize("neighbors", [1, 2, 3, 4, 5, 6])
+@pytest.mark.parametrize("density", [0.05, 0.3, 0.8, 1])
+@pytest.mark.parametrize("size", [(7, 9), (1, 11), (8, 1)])
+def test_idw_of_any_mask(neighbors, density, size):
+    mask = torch.rand(size) < density
+    mask[-1, 0] = True
+    check_idw(mask, neighbors)
+
+
+@pytest.mark.parametrize("neighbors", [1, 4, 9])
+def test_idw_of_few_known_pixels(neighbors):
+    check_idw(torch.ones(1, 1), neighbors)
+    for known in ([(2, 3)], [(0, 0), (4, 5)], [(1, 0), (1, 4), (3, 0)]):
+        mask = torch.zeros(5, 6)
+        for y, x in known:
+            mask[y, x] = 1
+        check_idw(mask, neighbors)
+
+
+@given(st.integers(0, 2**20 - 1), st.integers(1, 7))
+def test_idw_of_every_small_mask(bits, neighbors):
+    mask = torch.tensor([bits >> i & 1 for i in range(20)]).reshape(4, 5)
+    if bits:
+        check_idw(mask, neighbors)
+    else:
+        with pytest.raises(ValueError, match="mask"):
+            check_idw(mask, neighbors)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
+def test_idw_of_narrow_dtypes(dtype):
+    """What comes in is what counts: the same flow in float64 gives the same pixels."""
+    for mask in [*bayer_mask(3, 4, scale=3), torch.rand(9, 12) < 0.4]:
+        features = torch.randn(5, 2, 9, 12).to(dtype)
+        flow = flows(9, 12).to(dtype)[:5]
+        flow = (flow.double() * UNIT).round().div(UNIT).to(dtype)
+        warped = flow_warp_idw(features, flow, mask.to(dtype))
+        assert warped.dtype == dtype
+        eps = max(torch.finfo(dtype).eps, 1e-6)
+        torch.testing.assert_close(warped.double(), idw_brute(features, flow, mask, 4), rtol=eps, atol=eps)
+
+
+def test_idw_takes_features_and_flow_of_two_dtypes():
+    features, flow, mask = torch.randn(5, 2, 6, 8).half(), flows(6, 8, torch.float32)[:5], bayer_mask(6, 8)[1]
+    warped = flow_warp_idw(features, flow, mask)
+    assert warped.dtype == torch.float16
+    torch.testing.assert_close(warped.double(), idw_brute(features, flow, mask, 4), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16, torch.float16])
+def test_idw_by_zero_flow_keeps_known_pixels(dtype):
+    features, flow = torch.randn(2, 3, 9, 12).to(dtype), torch.zeros(2, 2, 9, 12, dtype=dtype)
+    for mask in [*bayer_mask(3, 4, scale=3, dtype=torch.bool), torch.rand(9, 12) < 0.4]:
+        warped = flow_warp_idw(features, flow, mask)
+        assert torch.equal(warped[..., mask], features[..., mask])
+    assert torch.equal(flow_warp_idw(features, flow, torch.ones(9, 12)), features)
+
+
+def test_idw_shifts_by_whole_pixels():
+    features = torch.randn(1, 2, 6, 8)
+    flow = torch.tensor([2.0, -1.0]).reshape(1, 2, 1, 1).expand(1, 2, 6, 8)
+    warped = flow_warp_idw(features, flow, torch.ones(6, 8))
+    assert torch.equal(warped[..., 1:, :-2], features[..., :-1, 2:])
+
+
+def test_idw_is_as_exact_far_to_the_right():
+    """Bit for bit the same at column 4000 as at column 0."""
+    features, flow = torch.randn(1, 1, 4, 8), torch.rand(1, 2, 4, 8) * 6 - 3
+    mask = bayer_mask(2, 4, "GRBG", scale=2)[1]
+    warped = flow_warp_idw(features.repeat(1, 1, 1, 512), flow.repeat(1, 1, 1, 512), mask.repeat(1, 512))
+    assert torch.equal(warped[..., 8:16], warped[..., 4008:4016])
+
+
+@pytest.mark.parametrize("kind", ["bayer", "random"])
+def test_idw_reads_known_pixels_only(kind):
+    mask = bayer_mask(4, 5, scale=2, dtype=torch.bool)[0] if kind == "bayer" else torch.rand(8, 10) < 0.2
+    flow = flows(8, 10)
+    features = torch.randn(len(flow), 2, 8, 10, dtype=torch.float64, requires_grad=True)
+    warped = flow_warp_idw(features, flow, mask)
+    assert torch.equal(flow_warp_idw(features.masked_fill(~mask, float("nan")), flow, mask), warped)
+    known = features[..., mask]
+    low, high = known.amin(-1)[..., None, None], known.amax(-1)[..., None, None]
+    assert ((warped >= low - 1e-12) & (warped <= high + 1e-12)).all()
+    (grad,) = torch.autograd.grad(warped.sum(), features)
+    assert (grad[..., ~mask] == 0).all()
+    assert grad.sum().item() == pytest.approx(warped.numel())  # the weights of a pixel add up to one
+
+
+@pytest.mark.parametrize("neighbors", [1, 3, 4])
+def test_idw_gradcheck(neighbors):
+    flow = (torch.rand(2, 2, 4, 6, dtype=torch.float64) * 4 - 2).requires_grad_()
+    features = torch.randn(2, 1, 4, 6, dtype=torch.float64, requires_grad=True)
+    for mask in (bayer_mask(2, 3, scale=2)[1], torch.rand(4, 6) < 0.5):
+        assert gradcheck(lambda f, w, mask=mask: flow_warp_idw(f, w, mask, neighbors=neighbors), (features, flow))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16, torch.float16])
+def test_idw_is_finite_everywhere(dtype):
+    """On hits, on ties, and as near to them as the dtype allows, far outside and at infinity."""
+    finfo = torch.finfo(dtype)
+    steps = [0, 1, 0.5, finfo.eps, finfo.eps**2, finfo.tiny**0.5, finfo.tiny, finfo.smallest_normal / 2, finfo.max]
+    steps = torch.tensor([*steps, float("inf")], dtype=torch.float64).to(dtype)
+    steps = torch.cat([-steps, steps])
+    pairs = torch.cartesian_prod(steps, steps)
+    flow = pairs[:, :, None, None].repeat(1, 1, 4, 6).requires_grad_()
+    features = torch.randn(len(pairs), 1, 4, 6).to(dtype).requires_grad_()
+    for mask in (*bayer_mask(4, 6), torch.ones(4, 6), torch.eye(4, 6)):
+        warped = flow_warp_idw(features, flow, mask)
+        grads = torch.autograd.grad(warped.sum(), (features, flow))
+        for tensor in (warped, *grads):
+            assert tensor.isfinite().all()
+        assert grads[1].abs().max() < 100
+
+
+def test_idw_gradient_of_the_flow_is_zero_on_a_known_pixel():
+    flow = torch.zeros(1, 2, 4, 6, requires_grad=True)
+    mask = bayer_mask(4, 6, dtype=torch.bool)[1]
+    (grad,) = torch.autograd.grad(flow_warp_idw(torch.randn(1, 1, 4, 6), flow, mask).sum(), flow)
+    assert (grad[..., mask] == 0).all()
+
+
+@pytest.mark.parametrize("lead", [(), (2,), (2, 3)])
+def test_leading_dimensions(lead):
+    features, flow, mask = torch.randn(*lead, 3, 4, 6), torch.randn(*lead, 2, 4, 6), bayer_mask(4, 6)[0]
+    for op in (flow_warp, lambda f, w: flow_warp_idw(f, w, mask)):
+        warped = op(features, flow)
+        assert warped.shape == features.shape
+        flat = op(features.reshape(-1, 3, 4, 6), flow.reshape(-1, 2, 4, 6))
+        torch.testing.assert_close(warped.reshape(-1, 3, 4, 6), flat, rtol=0, atol=0)
+        one = op(features.reshape(-1, 3, 4, 6)[:1], flow.reshape(-1, 2, 4, 6)[:1])
+        torch.testing.assert_close(one[0], flat[0], rtol=0, atol=0)
+
+
+def test_idw_remembers_masks_but_not_too_well():
+    """The tables of a mask are kept between calls; a mask that changes, or another number, must not get old ones."""
+    features, flow = torch.randn(1, 1, 6, 8, dtype=torch.float64), flows(6, 8)[4:5]
+    mask = (torch.rand(6, 8) < 0.3).double()
+    for neighbors in (4, 4, 2, 4):
+        torch.testing.assert_close(
+            flow_warp_idw(features, flow, mask, neighbors=neighbors), idw_brute(features, flow, mask, neighbors)
+        )
+    mask[:3] = 1 - mask[:3]
+    torch.testing.assert_close(flow_warp_idw(features, flow, mask), idw_brute(features, flow, mask, 4))
+    for _ in range(20):  # the memory of a mask that is gone is soon another's
+        mask = torch.rand(6, 8) < 0.3
+        mask[0, 0] = True
+        torch.testing.assert_close(flow_warp_idw(features, flow, mask), idw_brute(features, flow, mask, 4))
+
+
+def test_idw_under_inference_mode():
+    features, flow, kept = torch.randn(1, 1, 6, 8, dtype=torch.float64), flows(6, 8)[4:5], bayer_mask(6, 8)[1]
+    with torch.inference_mode():
+        mask = bayer_mask(6, 8)[1]
+        expected = flow_warp_idw(features, flow, mask)
+        mask.zero_()
+        mask[0, 0] = 1
+        torch.testing.assert_close(flow_warp_idw(features, flow, mask), features[..., :1, :1].expand(1, 1, 6, 8))
+        assert torch.equal(flow_warp_idw(features, flow, kept), expected)
+    flow = flow.clone().requires_grad_()
+    warped = flow_warp_idw(features.clone(), flow, kept)
+    assert torch.equal(warped, expected)
+    warped.sum().backward()
+
+
+def bilinear_loop(image, flow):
+    """Bilinear interpolation at positions that are moved to the border."""
+    image, flow = image.numpy(), flow.numpy()
+    height, width = image.shape[-2:]
+    result = np.zeros(image.shape)
+    for b, y, x in np.ndindex(len(image), height, width):
+        px, py = min(max(x + flow[b, 0, y, x], 0), width - 1), min(max(y + flow[b, 1, y, x], 0), height - 1)
+        for j in range(height):
+            for i in range(width):
+                result[b, :, y, x] += max(0, 1 - abs(py - j)) * max(0, 1 - abs(px - i)) * image[b, :, j, i]
+    return torch.from_numpy(result)
+
+
+@pytest.mark.parametrize("size", [(5, 7), (1, 6), (4, 1), (1, 1)])
+def test_flow_warp(size):
+    flow = flows(*size)
+    image = torch.randn(len(flow), 2, *size, dtype=torch.float64)
+    torch.testing.assert_close(flow_warp(image, flow), bilinear_loop(image, flow), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(
+        flow_warp(image.float(), flow.float())[:6], bilinear_loop(image, flow).float()[:6], rtol=1e-4, atol=1e-4
+    )
+
+
+@pytest.mark.parametrize(("dtype", "atol"), [(torch.float64, 1e-12), (torch.float32, 1e-5), (torch.bfloat16, 1e-2)])
+def test_flow_warp_by_zero_flow(dtype, atol):
+    image = torch.rand(2, 3, 11, 13).to(dtype)
+    warped = flow_warp(image, torch.zeros(2, 2, 11, 13, dtype=dtype))
+    assert warped.dtype == dtype
+    torch.testing.assert_close(warped, image, rtol=0, atol=atol)
+
+
+def test_flow_warp_gradcheck():
+    image = torch.randn(1, 2, 4, 5, dtype=torch.float64, requires_grad=True)
+    flow = (torch.rand(1, 2, 4, 5, dtype=torch.float64) * 3 - 1.5).requires_grad_()
+    assert gradcheck(flow_warp, (image, flow))
+
+
+IMAGE, FLOW, MASK = torch.rand(2, 3, 4, 6), torch.rand(2, 2, 4, 6), torch.ones(4, 6)
+
+
+@pytest.mark.parametrize("op", [flow_warp, lambda f, w: flow_warp_idw(f, w, MASK)])
+@pytest.mark.parametrize(
+    ("error", "image", "flow"),
+    [
+        (TypeError, IMAGE.long(), FLOW),
+        (TypeError, IMAGE, FLOW.long()),
+        (TypeError, IMAGE.numpy(), FLOW),
+        (ValueError, IMAGE, FLOW[:1]),
+        (ValueError, IMAGE, FLOW[..., 1:]),
+        (ValueError, IMAGE, IMAGE),
+        (ValueError, IMAGE[0], FLOW),
+        (ValueError, IMAGE[0, 0], FLOW[0, 0]),
+    ],
+)
+def test_wrong_sizes(op, error, image, flow):
+    with pytest.raises(error):
+        op(image, flow)
+
+
+@pytest.mark.parametrize("mask", [MASK * 0, MASK[1:], MASK[None].expand(3, 4, 6), None, MASK.numpy()])
+def test_wrong_mask(mask):
+    with pytest.raises(ValueError, match="mask"):
+        flow_warp_idw(IMAGE, FLOW, mask)
+
+
+@pytest.mark.parametrize("neighbors", [0, -1, 1.5, True])
+def test_wrong_neighbors(neighbors):
+    with pytest.raises(ValueError, match="neighbors"):
+        flow_warp_idw(IMAGE, FLOW, MASK, neighbors=neighbors)
