@@ -1,0 +1,110 @@
+"""Demosaicing against the formulas of Malvar, He and Cutler, pixel by pixel."""
+
+import numpy as np
+import pytest
+import torch
+from torch.autograd import gradcheck
+
+from spikekit import bayer_mask, demosaic, mosaic
+
+PATTERNS = ["RGGB", "BGGR", "GRBG", "GBRG"]
+HFLIP = {"RGGB": "GRBG", "GRBG": "RGGB", "BGGR": "GBRG", "GBRG": "BGGR"}
+VFLIP = {"RGGB": "GBRG", "GBRG": "RGGB", "BGGR": "GRBG", "GRBG": "BGGR"}
+
+
+def malvar(raw, pattern):
+    height, width = raw.shape
+
+    def at(y, x):
+        y, x = abs(y), abs(x)
+        return raw[min(y, 2 * (height - 1) - y), min(x, 2 * (width - 1) - x)]
+
+    def color(y, x):
+        return pattern[2 * (y % 2) + x % 2]
+
+    rgb = np.zeros((3, height, width))
+    for y, x in np.ndindex(height, width):
+        here = at(y, x)
+        near_x, near_y = at(y, x - 1) + at(y, x + 1), at(y - 1, x) + at(y + 1, x)
+        far_x, far_y = at(y, x - 2) + at(y, x + 2), at(y - 2, x) + at(y + 2, x)
+        diagonal = at(y - 1, x - 1) + at(y - 1, x + 1) + at(y + 1, x - 1) + at(y + 1, x + 1)
+        for c, wanted in enumerate("RGB"):
+            if color(y, x) == wanted:  # known
+                value = here
+            elif wanted == "G":  # equal gain for the Laplacian of red or blue: 1/2
+                value = (near_x + near_y) / 4 + (here - (far_x + far_y) / 4) / 2
+            elif color(y, x + 1) == wanted:  # the wanted colour is left and right, gain 5/8
+                value = near_x / 2 + (5 * here - far_x - diagonal + far_y / 2) / 8
+            elif color(y + 1, x) == wanted:
+                value = near_y / 2 + (5 * here - far_y - diagonal + far_x / 2) / 8
+            else:  # red at blue or blue at red, gain 3/4
+                value = diagonal / 4 + 3 / 4 * (here - (far_x + far_y) / 4)
+            rgb[c, y, x] = value
+    return rgb
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("size", [(3, 3), (5, 8), (6, 7)])
+def test_malvar(pattern, size):
+    raw = torch.randint(-64, 65, size).double()  # whole numbers in, sixteenths out: exact
+    expected = torch.from_numpy(malvar(raw.numpy(), pattern))
+    for dtype in (torch.float64, torch.float32):
+        rgb = demosaic(raw.to(dtype), pattern)
+        assert rgb.dtype == dtype
+        assert torch.equal(rgb.double(), expected)
+    for dtype in (torch.bfloat16, torch.float16):
+        assert torch.equal(demosaic(raw.to(dtype), pattern), expected.to(dtype))
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_known_values_are_kept(pattern):
+    raw = torch.rand(2, 3, 6, 5)
+    rgb = demosaic(raw, pattern)
+    assert rgb.shape == (2, 3, 3, 6, 5)
+    assert torch.equal(mosaic(rgb, pattern), raw)
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_phases_are_shifts_and_flips_of_each_other(pattern):
+    raw = torch.randint(0, 64, (8, 10)).double()
+    rgb = demosaic(raw, pattern)
+    assert torch.equal(demosaic(raw.flip(1), HFLIP[pattern]), rgb.flip(-1))
+    assert torch.equal(demosaic(raw.flip(0), VFLIP[pattern]), rgb.flip(-2))
+    assert torch.equal(demosaic(raw[:, 1:], HFLIP[pattern])[..., 2:], rgb[..., 3:])
+    assert torch.equal(demosaic(raw[1:], VFLIP[pattern])[..., 2:, :], rgb[..., 3:, :])
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_ramps_are_reproduced(pattern):
+    """Colours that rise differently, each in its own direction, come back away from the border."""
+    y, x = torch.meshgrid(torch.arange(9.0), torch.arange(11.0), indexing="ij")
+    rgb = torch.stack([3 * x - y + 5, x + 2 * y, 7 - 2 * x + 4 * y])
+    restored = demosaic((rgb * bayer_mask(9, 11, pattern)).sum(0), pattern)
+    assert torch.equal(restored[:, 2:-2, 2:-2], rgb[:, 2:-2, 2:-2])
+
+
+def test_autocast_does_not_round():
+    raw = torch.rand(6, 8)
+    expected = demosaic(raw)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(demosaic(raw), expected)
+
+
+def test_gradcheck():
+    assert gradcheck(lambda raw: demosaic(raw, "GBRG"), torch.rand(2, 4, 5, dtype=torch.float64, requires_grad=True))
+
+
+@pytest.mark.parametrize(
+    ("error", "raw", "pattern"),
+    [
+        (ValueError, torch.rand(2, 5), "RGGB"),
+        (ValueError, torch.rand(5, 2), "RGGB"),
+        (ValueError, torch.rand(5), "RGGB"),
+        (ValueError, torch.rand(5, 5), "RGBG"),
+        (TypeError, torch.ones(5, 5, dtype=torch.uint8), "RGGB"),
+        (TypeError, np.ones((5, 5)), "RGGB"),
+    ],
+)
+def test_errors(error, raw, pattern):
+    with pytest.raises(error):
+        demosaic(raw, pattern)

@@ -1,0 +1,95 @@
+"""The metrics against scikit-image."""
+
+import pytest
+import torch
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from torch.autograd import gradcheck
+
+from spikekit import psnr, ssim
+
+
+def skimage_psnr(rgb, target):
+    return peak_signal_noise_ratio(target.numpy(), rgb.numpy(), data_range=1)
+
+
+def skimage_ssim(rgb, target):
+    return structural_similarity(rgb.numpy(), target.numpy(), channel_axis=0, data_range=1)
+
+
+JUDGES = pytest.mark.parametrize(("metric", "judge"), [(psnr, skimage_psnr), (ssim, skimage_ssim)])
+
+
+def pair(*lead, size=(9, 12)):
+    target = torch.rand(*lead, 3, *size, dtype=torch.float64)
+    return (target + 0.1 * torch.randn_like(target)).clamp(0, 1), target
+
+
+@JUDGES
+@pytest.mark.parametrize("size", [(7, 7), (9, 12), (20, 8)])
+def test_against_skimage(metric, judge, size):
+    rgb, target = pair(size=size)
+    assert metric(rgb, target).item() == pytest.approx(judge(rgb, target), rel=1e-10)
+    assert metric(rgb.float(), target.float()).item() == pytest.approx(judge(rgb, target), rel=1e-5)
+
+
+@JUDGES
+@pytest.mark.parametrize("lead", [(), (3,), (2, 3)])
+def test_one_figure_a_picture(metric, judge, lead):
+    rgb, target = pair(*lead)
+    figures = metric(rgb, target)
+    assert figures.shape == lead
+    each = [judge(a, b) for a, b in zip(rgb.reshape(-1, 3, 9, 12), target.reshape(-1, 3, 9, 12), strict=True)]
+    assert torch.allclose(figures.flatten(), torch.tensor(each, dtype=torch.float64), rtol=1e-10)
+
+
+@JUDGES
+def test_both_are_clamped(metric, judge):
+    rgb, target = torch.randn(2, 3, 9, 12, dtype=torch.float64)
+    assert metric(rgb, target).item() == pytest.approx(judge(rgb.clamp(0, 1), target.clamp(0, 1)), rel=1e-10)
+
+
+@JUDGES
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_half_is_computed_wide(metric, judge, dtype):
+    rgb, target = (picture.to(dtype) for picture in pair())
+    assert metric(rgb, target).item() == pytest.approx(judge(rgb.double(), target.double()), rel=1e-5)
+
+
+def test_equal_pictures():
+    rgb, _ = pair(2)
+    assert torch.equal(psnr(rgb, rgb), torch.full((2,), float("inf"), dtype=torch.float64))
+    assert torch.allclose(ssim(rgb, rgb), torch.ones(2, dtype=torch.float64))
+
+
+def test_ssim_of_flat_bright_pictures():
+    """Where variances cancel: float32 would lose them."""
+    rgb, target = (0.9 + 1e-3 * picture.float() for picture in pair())
+    assert ssim(rgb, target).item() == pytest.approx(skimage_ssim(rgb.double(), target.double()), rel=1e-5)
+
+
+def test_gradcheck():
+    rgb, target = pair(size=(7, 8))
+    rgb = (0.1 + 0.8 * rgb).requires_grad_()
+    assert gradcheck(lambda x: psnr(x, target), rgb)
+    assert gradcheck(lambda x: ssim(x, target), rgb)
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim])
+@pytest.mark.parametrize(
+    ("error", "rgb", "target"),
+    [
+        (ValueError, torch.rand(3, 8, 8), torch.rand(3, 8, 9)),
+        (ValueError, torch.rand(1, 3, 8, 8), torch.rand(3, 8, 8)),
+        (ValueError, torch.rand(8, 8), torch.rand(8, 8)),
+        (TypeError, torch.ones(3, 8, 8, dtype=torch.uint8), torch.ones(3, 8, 8, dtype=torch.uint8)),
+        (TypeError, torch.rand(3, 8, 8).numpy(), torch.rand(3, 8, 8)),
+    ],
+)
+def test_errors(metric, error, rgb, target):
+    with pytest.raises(error):
+        metric(rgb, target)
+
+
+def test_ssim_needs_a_window():
+    with pytest.raises(ValueError, match="7 x 7"):
+        ssim(torch.rand(3, 6, 9), torch.rand(3, 6, 9))

@@ -1,0 +1,95 @@
+"""Pictures to files and back, panels, flow as colour."""
+
+import numpy as np
+import pytest
+import torch
+from skimage import io
+
+from spikekit import flow_to_rgb, panel, read_picture, write_picture
+
+
+def test_round_trip(tmp_path):
+    rgb = torch.randint(0, 256, (3, 5, 7)) / 255
+    path = tmp_path / "made" / "on the way" / "a.png"
+    write_picture(path, rgb)
+    assert torch.allclose(read_picture(path), rgb, atol=1e-7)
+    assert np.array_equal(io.imread(path), (rgb * 255).round().byte().permute(1, 2, 0).numpy())
+
+
+def test_written_values(tmp_path):
+    values = torch.tensor([[-1.0, 0.0, 0.4 / 255, 0.6 / 255, 1.0, 2.0, float("nan")]])
+    for dtype in (torch.float64, torch.float32, torch.bfloat16):
+        write_picture(tmp_path / "grey.png", values.to(dtype).requires_grad_())
+        assert io.imread(tmp_path / "grey.png").tolist() == [[0, 0, 0, 1, 255, 255, 0]]
+
+
+@pytest.mark.parametrize(
+    ("pixels", "expected"),
+    [
+        (np.full((4, 5), 51, np.uint8), [0.2, 0.2, 0.2]),
+        (np.full((4, 5), 13107, np.uint16), [0.2, 0.2, 0.2]),
+        (np.full((4, 5), 1, np.uint16), [1 / 65535] * 3),
+        (np.full((4, 5, 3), [0, 51, 255], np.uint8), [0, 0.2, 1]),
+        (np.full((4, 5, 4), [0, 51, 255, 255], np.uint8), [0, 0.2, 1]),
+        (np.full((4, 5, 4), [0, 51, 255, 0], np.uint8), [1, 1, 1]),
+    ],
+)
+def test_read(tmp_path, pixels, expected):
+    io.imsave(tmp_path / "a.png", pixels, check_contrast=False)
+    rgb = read_picture(tmp_path / "a.png")
+    assert rgb.shape == (3, 4, 5)
+    assert rgb.dtype == torch.float32
+    assert rgb.is_contiguous()
+    assert torch.allclose(rgb, torch.tensor(expected, dtype=torch.float32).reshape(3, 1, 1).expand(3, 4, 5), atol=1e-7)
+
+
+def test_files_that_are_no_pictures(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"a\.png"):
+        read_picture(tmp_path / "a.png")
+    (tmp_path / "a.png").write_text("no picture")
+    with pytest.raises(ValueError, match=r"a\.png"):
+        read_picture(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("shape", [(4,), (1, 4, 4), (2, 3, 4, 4)])
+def test_write_errors(tmp_path, shape):
+    with pytest.raises(ValueError, match="image"):
+        write_picture(tmp_path / "a.png", torch.zeros(shape))
+
+
+def test_panel():
+    a, b, c = torch.full((3, 2, 3), 0.25), torch.full((4, 2), 0.5), torch.full((3, 1, 5), 0.75)
+    sheet = panel([[a, b], [c]], gap=1)
+    expected = torch.ones(3, 6, 8)
+    expected[:, :2, :3] = 0.25
+    expected[:, :4, 6:8] = 0.5
+    expected[:, 5:, :5] = 0.75
+    assert torch.equal(sheet, expected)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "rgb"),
+    [
+        (0, 0, [1, 1, 1]),
+        (2, 0, [1, 0, 0]),
+        (1, 0, [1, 0.5, 0.5]),
+        (-2, 0, [0, 1, 1]),
+        (0, 2, [0.5, 1, 0]),  # down
+        (0, -2, [0.5, 0, 1]),  # up
+        (8, 0, [1, 0, 0]),  # longer than max_flow
+    ],
+)
+def test_flow_to_rgb(x, y, rgb):
+    flow = torch.tensor([x, y], dtype=torch.float32).reshape(1, 2, 1, 1)
+    assert torch.allclose(flow_to_rgb(flow, 2.0).flatten(), torch.tensor(rgb, dtype=torch.float32), atol=1e-5)
+
+
+def test_flow_to_rgb_scales_to_the_longest():
+    flow = torch.randn(2, 5, 2, 4, 6)
+    colors = flow_to_rgb(flow)
+    assert colors.shape == (2, 5, 3, 4, 6)
+    assert ((colors >= 0) & (colors <= 1)).all()
+    assert torch.allclose(colors, flow_to_rgb(3 * flow), atol=1e-5)
+    assert torch.allclose(colors, flow_to_rgb(flow, flow.norm(dim=2).max().item()), atol=1e-5)
+    with pytest.raises(ValueError, match="flow"):
+        flow_to_rgb(flow[:, :, 0])
