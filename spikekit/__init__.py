@@ -19,6 +19,7 @@ from spikekit.cfa import (
 )
 from spikekit.decoders import SpikeInterval, Tfi, Tfp, spike_interval, tfi, tfp
 from spikekit.demosaic import Demosaic, demosaic
+from spikekit.files import SpikeFileError, iter_spikes, read_spikes, spikes_shape, write_spikes
 from spikekit.metrics import psnr, ssim
 from spikekit.motion import JointFlow, LinearMotion, UpsampleFlow, joint_flow, linear_motion, upsample_flow
 from spikekit.pictures import flow_to_rgb, panel, read_picture, write_picture
@@ -38,6 +39,7 @@ __all__ = [
     "LinearMotion",
     "MergeBayer",
     "Mosaic",
+    "SpikeFileError",
     "SpikeIntegrateFire",
     "SpikeInterval",
     "SplitBayer",
@@ -53,6 +55,7 @@ __all__ = [
     "flow_to_rgb",
     "flow_warp",
     "flow_warp_idw",
+    "iter_spikes",
     "joint_flow",
     "linear_motion",
     "merge_bayer",
@@ -60,8 +63,10 @@ __all__ = [
     "panel",
     "psnr",
     "read_picture",
+    "read_spikes",
     "spike_integrate_fire",
     "spike_interval",
+    "spikes_shape",
     "split_bayer",
     "split_colors",
     "ssim",
@@ -69,4 +74,5 @@ __all__ = [
     "tfp",
     "upsample_flow",
     "write_picture",
+    "write_spikes",
 ]
