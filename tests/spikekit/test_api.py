@@ -1,0 +1,219 @@
+"""What holds for every operator: its name and module, compiling, exporting, autocast, dtypes, and inputs left alone."""
+
+import inspect
+import re
+import subprocess
+import sys
+
+import pytest
+import torch
+from torch import nn
+
+import spikekit as sk
+
+PUBLIC = """
+    PATTERNS BayerMask BinToSensor Demosaic FlowWarp FlowWarpIdw JointFlow LinearMotion MergeBayer Mosaic
+    SpikeFileError SpikeIntegrateFire SpikeInterval SplitBayer SplitColors Tfi Tfp UpsampleFlow
+    bayer_mask bayer_pattern bayer_sites bin_to_sensor demosaic flow_to_rgb flow_warp flow_warp_idw iter_spikes
+    joint_flow linear_motion merge_bayer mosaic panel psnr read_picture read_spikes spike_integrate_fire
+    spike_interval spikes_shape split_bayer split_colors ssim tfi tfp upsample_flow write_picture write_spikes
+""".split()  # noqa: SIM905
+
+SPIKES = (torch.rand(2, 9, 4, 6, generator=torch.Generator().manual_seed(1)) < 0.4).double()
+RGB = torch.rand(2, 3, 4, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+FLOW = 4 * torch.rand(2, 2, 4, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(3)) - 2
+MASK = sk.bayer_mask(4, 6, dtype=torch.float64)[1]
+TIMES = (0.0, 2.0, 5.0)
+
+# function, arguments of the module, tensors it is called with, arguments of the function
+OPERATORS = [
+    (sk.bin_to_sensor, {"pattern": "GRBG", "scale": 2}, (RGB,)),
+    (sk.demosaic, {"pattern": "BGGR"}, (SPIKES,)),
+    (sk.flow_warp, {}, (RGB, FLOW)),
+    (sk.flow_warp_idw, {"neighbors": 3}, (RGB, FLOW, MASK)),
+    (sk.joint_flow, {}, (FLOW[None].repeat(4, 1, 1, 1, 1),)),
+    (sk.linear_motion, {"times": TIMES, "first": -1, "middle": 2, "last": 6, "scale": 2}, (FLOW, 2 * FLOW)),
+    (sk.merge_bayer, {"pattern": "GBRG"}, (SPIKES.repeat(2, 1, 1, 1),)),
+    (sk.mosaic, {"pattern": "BGGR"}, (RGB,)),
+    (sk.spike_integrate_fire, {"threshold": 0.75}, (SPIKES * 0.3125,)),
+    (sk.spike_interval, {}, (SPIKES,)),
+    (sk.split_bayer, {"pattern": "GBRG"}, (SPIKES,)),
+    (sk.split_colors, {"pattern": "GRBG"}, (SPIKES,)),
+    (sk.tfi, {"max_range": 2.0}, (SPIKES,)),
+    (sk.tfp, {"window": 5, "max_range": 2.0}, (SPIKES,)),
+    (sk.upsample_flow, {"scale": 3}, (FLOW,)),
+]
+EVERY = pytest.mark.parametrize(("op", "options", "tensors"), OPERATORS, ids=[op.__name__ for op, *_ in OPERATORS])
+DTYPES = [torch.float64, torch.float32, torch.bfloat16, torch.float16]
+
+
+def camel(name):
+    return re.sub(r"(?:^|_)([a-z])", lambda letter: letter[1].upper(), name)
+
+
+def module_of(op, options):
+    return getattr(sk, camel(op.__name__))(**options)
+
+
+def outputs(result):
+    return result if isinstance(result, tuple) else (result,)
+
+
+def assert_same(got, expected):
+    for one, other in zip(outputs(got), outputs(expected), strict=True):
+        assert one.dtype == other.dtype
+        assert torch.equal(one, other)
+
+
+def test_public_names():
+    assert sorted(sk.__all__) == sorted(PUBLIC)
+    assert all(hasattr(sk, name) for name in sk.__all__)
+
+
+def test_every_module_has_its_function():
+    modules = [
+        name for name in sk.__all__ if inspect.isclass(getattr(sk, name)) and issubclass(getattr(sk, name), nn.Module)
+    ]
+    covered = {camel(op.__name__) for op, *_ in OPERATORS} | {"BayerMask"}
+    assert set(modules) == covered
+    assert all(getattr(sk, name).__doc__ for name in sk.__all__ if name != "PATTERNS")
+
+
+@EVERY
+def test_module_equals_function(op, options, tensors):
+    module = module_of(op, options)
+    assert_same(module(*tensors), op(*tensors, **options))
+    assert not list(module.state_dict())
+    for name, value in options.items():
+        if name not in ("first", "middle", "last"):
+            assert f"{name}={value!r}" in repr(module)
+
+
+def test_sensor_module_takes_a_charge():
+    light, charge = SPIKES * 0.3125, RGB[:, 0] / 2
+    module = sk.SpikeIntegrateFire(0.75)
+    expected = sk.spike_integrate_fire(light, 0.75, charge)
+    assert_same(module(light, charge), expected)
+    torch.compiler.reset()
+    assert_same(torch.compile(module, fullgraph=True, backend="aot_eager")(light, charge), expected)
+    assert_same(torch.export.export(module, (light, charge), strict=False).module()(light, charge), expected)
+
+
+@EVERY
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_dtype_is_kept(op, options, tensors, dtype):
+    narrow = [tensor.to(dtype) for tensor in tensors]
+    result = outputs(op(*narrow, **options))
+    assert result[0].dtype == dtype
+    # the right answer for the numbers that came in, rounded once or so
+    expected = outputs(op(*[tensor.double() for tensor in narrow], **options))[0]
+    eps = max(torch.finfo(dtype).eps, 1e-6)
+    torch.testing.assert_close(result[0].double(), expected, rtol=2 * eps, atol=4 * eps)
+
+
+@EVERY
+def test_inputs_are_left_alone(op, options, tensors):
+    kept = [tensor.clone() for tensor in tensors]
+    for result in outputs(op(*tensors, **options)):
+        if result.data_ptr() not in [tensor.data_ptr() for tensor in tensors]:
+            result.zero_()
+    for tensor, before in zip(tensors, kept, strict=True):
+        assert torch.equal(tensor, before)
+
+
+@EVERY
+def test_non_contiguous_inputs(op, options, tensors):
+    strided = [tensor.mT.contiguous().mT for tensor in tensors]
+    for got, expected in zip(outputs(op(*strided, **options)), outputs(op(*tensors, **options)), strict=True):
+        torch.testing.assert_close(got, expected, rtol=1e-12, atol=1e-12)
+
+
+@EVERY
+def test_autocast(op, options, tensors):
+    tensors = [tensor.float() for tensor in tensors]
+    expected = op(*tensors, **options)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert_same(op(*tensors, **options), expected)
+        half = outputs(op(*[tensor.bfloat16() for tensor in tensors], **options))
+    assert half[0].dtype == torch.bfloat16
+
+
+def run(op, options, tensors):
+    """Outputs, and the gradients of whatever can have one."""
+    leaves = [tensor.clone().requires_grad_() for tensor in tensors]
+    result = outputs(op(*leaves, **options))
+    weighed = sum(
+        (out * torch.arange(1.0, out.numel() + 1).reshape(out.shape)).sum() for out in result if out.requires_grad
+    )
+    if not isinstance(weighed, torch.Tensor):
+        return [*result]
+    return [*result, *torch.autograd.grad(weighed, leaves, allow_unused=True, materialize_grads=True)]
+
+
+@EVERY
+def test_compile(op, options, tensors):
+    torch.compiler.reset()
+    compiled = torch.compile(op, fullgraph=True, backend="aot_eager")
+    for got, expected in zip(run(compiled, options, tensors), run(op, options, tensors), strict=True):
+        torch.testing.assert_close(got, expected, rtol=1e-12, atol=1e-12)
+
+
+@EVERY
+def test_export(op, options, tensors):
+    module = module_of(op, options)
+    exported = torch.export.export(module, tensors, strict=False).module()
+    other = [tensor.flip(-1) for tensor in tensors]
+    other[2:] = tensors[2:]
+    for args in (tensors, other):
+        for got, expected in zip(outputs(exported(*args)), outputs(module(*args)), strict=True):
+            torch.testing.assert_close(got, expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.bool, torch.uint8])
+@pytest.mark.parametrize("op", [sk.spike_interval, sk.tfi, lambda s: sk.tfp(s, 3), sk.split_colors, sk.split_bayer])
+def test_compile_of_bits(op, dtype):
+    torch.compiler.reset()
+    spikes = SPIKES.to(dtype)
+    assert_same(torch.compile(op, fullgraph=True, backend="aot_eager")(spikes), op(spikes))
+
+
+@pytest.mark.parametrize(
+    ("op", "tensors"),
+    [
+        (lambda light: sk.spike_integrate_fire(light)[0], (SPIKES * 0.7,)),
+        (sk.tfi, (SPIKES,)),
+        (sk.spike_interval, (SPIKES > 0,)),
+        (lambda f, w, m: sk.flow_warp_idw(f, w, m), (RGB, FLOW, MASK)),
+    ],
+    ids=["spike_integrate_fire", "tfi", "spike_interval", "flow_warp_idw"],
+)
+def test_custom_operators_with_dynamic_sizes(op, tensors):
+    torch.compiler.reset()
+    compiled = torch.compile(op, fullgraph=True, backend="aot_eager", dynamic=True)
+    for size in (4, 3):
+        cut = [tensor[..., :size].contiguous() for tensor in tensors]
+        torch.testing.assert_close(compiled(*cut), op(*cut), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("op", "arguments"),
+    [
+        (torch.ops.spikekit.integrate_fire, ((SPIKES * 0.7).requires_grad_(), 1.0, torch.zeros(2, 4, 6).double())),
+        (torch.ops.spikekit.tfi, (SPIKES.clone().requires_grad_(), 1.0)),
+        (torch.ops.spikekit.spike_interval, (SPIKES > 0,)),
+        (torch.ops.spikekit.nearest_known, (FLOW.floor().long(), FLOW - FLOW.floor(), MASK, 4)),
+    ],
+    ids=["integrate_fire", "tfi", "spike_interval", "nearest_known"],
+)
+def test_custom_operators_are_registered_correctly(op, arguments):
+    torch.library.opcheck(
+        op.default, arguments, test_utils=("test_schema", "test_autograd_registration", "test_faketensor")
+    )
+
+
+def test_import_is_light():
+    code = "import sys, spikekit; print(*sorted({name.split('.')[0] for name in sys.modules}))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    heavy = {"pytorch_lightning", "lightning", "lightning_modules", "skimage", "matplotlib", "torchmetrics"}
+    assert "spikekit" in done.stdout.split()
+    assert not heavy & set(done.stdout.split())
