@@ -107,8 +107,7 @@ def _sample(
 ) -> Tensor:
     """Sample moved planes (C, h, w) at every one of ``rows`` x ``columns`` of the view: (n, C, rows, columns)."""
     height, width = planes.shape[-2:]
-    whole = bool((rows == rows.round()).all() and (columns == columns.round()).all())
-    if (turn == 1).all() and (shift == 0).all() and whole:
+    if (turn == 1).all() and (shift == 0).all() and all((axis == axis.round()).all() for axis in (rows, columns)):
         # at rest, pixels are copied, so that the ground truth has the picture's own values to the last bit
         i = _inside(rows - corner.imag, height, padding)
         j = _inside(columns - corner.real, width, padding)
@@ -282,7 +281,7 @@ def _touched(
     ends = turn[:, None] * ends + shift[:, None]
 
     def between(axis: Tensor, position: Tensor) -> slice:
-        low, high = torch.searchsorted(axis, torch.stack([position.amin(), position.amax() + 1]))
+        low, high = torch.searchsorted(axis.contiguous(), torch.stack([position.amin(), position.amax() + 1]))
         return slice(int(low), int(high))
 
     return between(rows, ends.imag), between(columns, ends.real)

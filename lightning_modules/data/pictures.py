@@ -77,12 +77,11 @@ def embedded_pictures(held_out: bool = False) -> list[Path]:
     return found
 
 
-def split_pictures(pictures: list[Path], fraction: float, seed: int) -> tuple[list[Path], list[Path]]:
-    """Split pictures at random in two, at least one in each.
+def split_pictures(pictures: list[Path], seed: int) -> tuple[list[Path], list[Path]]:
+    """Hold out one picture in twenty at random, but four where there are eight or more, and half of fewer.
 
     Args:
         pictures: what to split.
-        fraction: the share of the second part.
         seed: the same seed gives the same split.
 
     Returns:
@@ -90,7 +89,7 @@ def split_pictures(pictures: list[Path], fraction: float, seed: int) -> tuple[li
     """
     if len(pictures) == 1:
         return pictures, pictures
-    count = min(max(1, round(fraction * len(pictures))), len(pictures) - 1)
+    count = max(round(len(pictures) / 20), min(4, len(pictures) // 2))
     out = set(np.random.default_rng(seed).permutation(len(pictures))[:count].tolist())
     return (
         [picture for i, picture in enumerate(pictures) if i not in out],

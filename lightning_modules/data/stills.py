@@ -16,10 +16,11 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 
 from lightning_modules.data.pictures import cached_picture, embedded_pictures, folder_pictures, split_pictures
 from lightning_modules.data.textures import outline_mask, texture
+from spikekit import bayer_pattern
+from spikekit.check import check_positive, check_scale
 from spikekit.scene import Layer, Motion, Scene, simulate_spikes
 
 _TEXTURES = 0.4  # share of procedural pictures among embedded ones
-_HELD_OUT = 0.05  # share of a folder that validation keeps, where it has no folder of its own
 _MOST_WORKERS = 8
 
 
@@ -129,11 +130,16 @@ class StillClips(Dataset):
             return texture(side, side, rng)
         if self.augment or turn is None:
             turn = int(rng.integers(len(self.pictures)))
-        picture = _crop(cached_picture(self.pictures[turn % len(self.pictures)]), side, rng)
-        return _augment(picture, rng) if self.augment else picture
+        picture = cached_picture(self.pictures[turn % len(self.pictures)])
+        if self.augment:
+            return _augment(_crop(picture, side, rng, mirror=1.25), rng)
+        return _crop(picture, side, rng, mirror=1.0)
 
 
 def _check(clips: StillClips) -> None:
+    check_scale(clips.scale)
+    check_positive("alpha", clips.alpha)
+    bayer_pattern(clips.pattern)
     low, high = clips.brightness
     for name, good, expected in (
         ("pictures", len(clips.pictures) > 0, "at least one"),
@@ -159,10 +165,14 @@ def _in_disc(rng: np.random.Generator) -> np.ndarray:
     return length * np.array([math.cos(angle), math.sin(angle)])
 
 
-def _crop(picture: Tensor, side: int, rng: np.random.Generator) -> Tensor:
-    """Cut a square at a random place and size; what is too small is enlarged a little and mirrored."""
-    # Shrinking makes grain small and edges sharp. At most half as much again may be mirrored.
-    smallest = max(0.5, side / (1.5 * min(picture.shape[1:])))
+def _crop(picture: Tensor, side: int, rng: np.random.Generator, mirror: float) -> Tensor:
+    """Cut a square at a random place and size; where the picture ends, it is mirrored.
+
+    The square is at most ``mirror`` times as long as the picture, as far as that is to be had without enlarging.
+    """
+    # Shrinking makes grain small and edges sharp. Enlarging blurs: only a picture below half the square's side is.
+    shortest = min(picture.shape[1:])
+    smallest = max(0.5, min(1.0, side / (mirror * shortest)), side / (2 * shortest))
     factor = math.exp(rng.uniform(math.log(smallest), math.log(max(smallest, 1.0))))
     for axis in (1, 2):
         length = min(math.ceil(side / factor), picture.shape[axis])
@@ -216,6 +226,13 @@ class _ClipLoader(DataLoader):
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
         return ({name: torch.from_numpy(value) for name, value in batch.items()} for batch in super().__iter__())
 
+    # Lightning takes a loader with these two for one that can be resumed. It can: training's step says where it stands.
+    def state_dict(self) -> dict[str, object]:
+        return {}
+
+    def load_state_dict(self, state: dict[str, object]) -> None:
+        pass
+
 
 def _one_thread(_: int) -> None:
     torch.set_num_threads(1)
@@ -234,8 +251,8 @@ class StillScenes(pl.LightningDataModule):
     Args:
         root: folder of training pictures, read with all folders in it. Without it, the photographs inside
             scikit-image's wheel and procedural textures: no files are needed.
-        val_root: folder of validation pictures. Without it, one picture in twenty of ``root`` is kept for validation;
-            without both, four held-out photographs of scikit-image.
+        val_root: folder of validation pictures. Without it, one picture in twenty of ``root`` is kept for validation
+            (at least four, if there are as many again); without both, four held-out photographs of scikit-image.
         scale: super-resolution factor.
         patch: side of a training clip in sensor pixels.
         val_patch: side of a validation or test clip in sensor pixels.
@@ -310,6 +327,8 @@ class StillScenes(pl.LightningDataModule):
             FileNotFoundError: a folder is missing or holds no picture.
             ValueError: an argument that makes no sense.
         """
+        if self.batch_size < 1 or self.train_clips < self.batch_size:
+            raise ValueError(f"train_clips: expected at least batch_size = {self.batch_size}, got {self.train_clips}")
         train, val = self._pictures()
         embedded = self.root is None
         options = self.options
@@ -320,7 +339,7 @@ class StillScenes(pl.LightningDataModule):
         if self.root is None:
             train, val = embedded_pictures(), embedded_pictures(held_out=True)
         elif self.val_root is None:
-            return split_pictures(folder_pictures(self.root), _HELD_OUT, self.seed)
+            return split_pictures(folder_pictures(self.root), self.seed)
         else:
             train, val = folder_pictures(self.root), []
         return train, val if self.val_root is None else folder_pictures(self.val_root)
