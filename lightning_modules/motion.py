@@ -11,7 +11,21 @@ from spikekit import split_bayer, tfi, upsample_flow
 from spikekit.check import check_planes
 
 
-class ClassicalFlow(nn.Module):
+class Motion(nn.Module):
+    r"""Base of the estimators.
+
+    Shape:
+        - Input: spikes :math:`(B, N, H, W)`, any real dtype; the times of the first, the middle and the last time
+          point, in spike frames; the Bayer phase
+        - Output: two flows :math:`(B, 2, H, W)` in sensor pixels, middle to first and middle to last
+    """
+
+    def forward(self, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> tuple[Tensor, Tensor]:
+        """Estimate the two flows."""
+        raise NotImplementedError
+
+
+class ClassicalFlow(Motion):
     r"""Iterative Lucas-Kanade (scikit-image) on decoded pictures: no weights, runs on the CPU.
 
     The clip is decoded by TFI at the three times, and each 2 x 2 Bayer cell is averaged to one grey pixel, so that the
@@ -24,9 +38,7 @@ class ClassicalFlow(nn.Module):
         radius: of the Gaussian-weighted window, in Bayer cells.
 
     Shape:
-        - Input: spikes :math:`(B, N, H, W)`, any real dtype; the times of the first, the middle and the last time
-          point; the Bayer phase
-        - Output: two flows :math:`(B, 2, H, W)` in sensor pixels, middle to first and middle to last; no gradient
+        As :class:`Motion`; no gradient.
 
     Example:
         >>> to_first, to_last = ClassicalFlow()(torch.ones(1, 41, 16, 16), (5, 20, 35), "RGGB")
@@ -66,11 +78,11 @@ class ClassicalFlow(nn.Module):
         return f"radius={self.radius}"
 
 
-class ZeroFlow(nn.Module):
+class ZeroFlow(Motion):
     r"""Nothing moves.
 
     Shape:
-        As :class:`ClassicalFlow`.
+        As :class:`Motion`.
 
     Example:
         >>> ZeroFlow()(torch.ones(1, 41, 16, 16), (5, 20, 35), "RGGB")[0].any().item()

@@ -12,7 +12,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from spikekit.check import check_planes
 
 _FARTHEST = 2.0**30  # flow beyond it is cut: positions must fit an integer
-_CHUNK = 1 << 16  # positions searched at a time: what they need stays in the cache
+_CHUNK = 1 << 15  # positions searched at a time: in the cache, and by one thread, without waiting for another
 
 
 def _check_warp(name: str, image: Tensor, flow: Tensor) -> None:

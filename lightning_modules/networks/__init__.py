@@ -2,5 +2,6 @@
 
 from lightning_modules.networks.classical import ClassicalDecoder
 from lightning_modules.networks.cscsr import CSCSR
+from lightning_modules.networks.network import Network
 
-__all__ = ["CSCSR", "ClassicalDecoder"]
+__all__ = ["CSCSR", "ClassicalDecoder", "Network"]

@@ -8,8 +8,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lightning_modules.motion import ClassicalFlow
+from lightning_modules.motion import Motion
 from lightning_modules.networks.classical import ClassicalDecoder
+from lightning_modules.networks.network import Network
 from spikekit import bayer_mask, bayer_pattern, flow_warp_idw, linear_motion, split_colors
 from spikekit.check import check_planes, check_scale
 
@@ -126,7 +127,7 @@ class ColorCorrelation(nn.Module):
             return self.rgb(features.to(self.rgb.weight.dtype))
 
 
-class CSCSR(nn.Module):
+class CSCSR(Network):
     r"""Super-resolution of a colour picture from a Bayer-pattern spike stream.
 
     The middle frame of the clip is reconstructed. Widths and depths are not in the paper; the defaults are size M of
@@ -148,8 +149,8 @@ class CSCSR(nn.Module):
             skip; with it training starts where the classical decoder ends.
         alpha: gain of the camera, what a white pixel receives per clock in thresholds; only the skip divides by it.
         neighbors: known pixels that the temporal pixel search weighs.
-        motion: estimator that is asked where no flow is given; called with spikes, times and pattern. When not
-            given, :class:`lightning_modules.motion.ClassicalFlow`.
+        motion: estimator that is asked where no flow is given; when not given,
+            :class:`lightning_modules.motion.ClassicalFlow`.
 
     Shape:
         - Input: spikes :math:`(B, N, H, W)`, zeros and ones, any real dtype, any H and W of at least 3; optionally
@@ -181,11 +182,17 @@ class CSCSR(nn.Module):
         skip: bool = False,
         alpha: float = 0.4,
         neighbors: int = 4,
-        motion: nn.Module | None = None,
+        motion: Motion | None = None,
     ) -> None:
-        super().__init__()
-        #: what the checkpoint remembers of the constructor, so that it is not loaded into another network unnoticed
-        self.settings = {
+        check_scale(scale)
+        if frames % 2 == 0 or window % 2 == 0 or not 1 <= window < frames or (frames - window) % stride:
+            raise ValueError(
+                "frames, window, stride: expected odd frames and window, and a stride that divides frames - window, "
+                f"got {frames}, {window}, {stride}"
+            )
+        if min(width, representation_width, features, stages, blocks, end_blocks, neighbors) < 1:
+            raise ValueError("widths, stages, blocks and neighbors: expected 1 or more of each")
+        settings = {
             "scale": scale,
             "frames": frames,
             "window": window,
@@ -201,21 +208,10 @@ class CSCSR(nn.Module):
             "alpha": alpha,
             "neighbors": neighbors,
         }
-        check_scale(scale)
-        if frames % 2 == 0 or window % 2 == 0 or not 1 <= window < frames or (frames - window) % stride:
-            raise ValueError(
-                "frames, window, stride: expected odd frames and window, and a stride that divides frames - window, "
-                f"got {frames}, {window}, {stride}"
-            )
-        if min(width, representation_width, features, stages, blocks, end_blocks, neighbors) < 1:
-            raise ValueError("widths, stages, blocks and neighbors: expected 1 or more of each")
-        self.scale = scale
-        self.frames = frames
-        self.pattern = bayer_pattern(pattern)
-        #: centres of the windows, in spike frames
-        self.times = tuple(range(window // 2, frames - window // 2, stride))
+        times = tuple(range(window // 2, frames - window // 2, stride))
+        super().__init__(settings, (times[0], frames // 2, times[-1]), motion)
+        self.times = times  # centres of the windows, in spike frames
         self.neighbors = neighbors
-        self.motion = ClassicalFlow() if motion is None else motion
         self.representation = nn.ModuleList(
             SpikeRepresentation(frames, window, stride, representation_width, features) for _ in range(3)
         )
@@ -226,15 +222,6 @@ class CSCSR(nn.Module):
             nn.init.zeros_(self.reconstruction.rgb.weight)
             nn.init.zeros_(self.reconstruction.rgb.bias)
         self._masks: dict[Any, Tensor] = {}
-
-    @property
-    def flow_times(self) -> tuple[int, int, int]:
-        """Times of the first, the middle and the last time point, which the flows run between."""
-        return self.times[0], self.frames // 2, self.times[-1]
-
-    def estimate_flow(self, spikes: Tensor) -> Tensor:
-        """Flows from the middle to the first and to the last time point, (B, 2, 2, H, W), in sensor pixels."""
-        return torch.stack(self.motion(spikes, self.flow_times, self.pattern), dim=1)
 
     def forward(self, spikes: Tensor, flow: Tensor | None = None) -> Tensor:  # noqa: D102
         check_planes("spikes", spikes, 4, "(B, N, H, W)")

@@ -1,0 +1,117 @@
+"""What a run leaves behind: pictures in TensorBoard, the table of a test, the pictures of a prediction."""
+
+from __future__ import annotations
+
+import csv
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from pytorch_lightning import Callback, LightningModule, Trainer
+from pytorch_lightning.loggers import TensorBoardLogger
+from torch import Tensor
+
+from lightning_modules.networks import ClassicalDecoder
+from spikekit import panel, psnr, ssim, write_picture
+
+
+class ValidationPictures(Callback):
+    """Show the first clips of every validation in TensorBoard: decoded input (TFI), result and truth side by side.
+
+    Args:
+        clips: how many.
+    """
+
+    def __init__(self, clips: int = 4) -> None:
+        self.clips = clips
+        self._rows: list[list[Tensor]] = []
+
+    def on_validation_batch_end(  # noqa: D102
+        self, trainer: Trainer, module: LightningModule, outputs: Tensor, batch: dict[str, Tensor], *_: Any
+    ) -> None:
+        wanted = self.clips - len(self._rows)
+        if wanted > 0:
+            settings = module.network.settings
+            decode = ClassicalDecoder("tfi", settings["scale"], settings["pattern"], settings["alpha"])
+            decoded = decode(batch["spikes"][:wanted]).clamp(0, 1)
+            self._rows += [list(row) for row in zip(decoded, outputs, batch["rgb"][:wanted], strict=False)]
+
+    def on_validation_epoch_end(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
+        if self._rows and isinstance(trainer.logger, TensorBoardLogger) and trainer.is_global_zero:
+            picture = panel(self._rows)
+            trainer.logger.experiment.add_image("val/tfi, result, truth", picture, trainer.global_step)
+        self._rows = []
+
+
+class TestReport(Callback):
+    """Print one table of a test, every method on the same clips, and write ``test.csv`` and ``test.png``.
+
+    PSNR and SSIM as :func:`spikekit.psnr` and :func:`spikekit.ssim`, averaged over clips.
+
+    Args:
+        output: the folder that they are written to.
+        clips: how many clips the picture shows.
+    """
+
+    __test__ = False  # not a test for pytest
+
+    def __init__(self, output: str | Path, clips: int = 6) -> None:
+        self.output = Path(output)
+        self.clips = clips
+
+    def on_test_start(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
+        self._scores: dict[str, list[tuple[float, float]]] = defaultdict(list)
+        self._rows: list[list[Tensor]] = []
+
+    def on_test_batch_end(  # noqa: D102
+        self, trainer: Trainer, module: LightningModule, outputs: dict[str, Tensor], batch: dict[str, Tensor], *_: Any
+    ) -> None:
+        truth = batch["rgb"]
+        for method, rgb in outputs.items():
+            self._scores[method] += zip(psnr(rgb, truth).tolist(), ssim(rgb, truth).tolist(), strict=True)
+        for clip in range(min(len(truth), self.clips - len(self._rows))):
+            self._rows.append([rgb[clip].clamp(0, 1).cpu() for rgb in (*outputs.values(), truth)])
+
+    def on_test_end(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
+        if not trainer.is_global_zero:
+            return
+        self.output.mkdir(parents=True, exist_ok=True)
+        clips = len(next(iter(self._scores.values())))
+        table = [f"{'':24}{'PSNR (dB)':>10}{'SSIM':>10}   mean of {clips} clips"]
+        with open(self.output / "test.csv", "w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(["method", "clip", "psnr", "ssim"])
+            for method, scores in self._scores.items():
+                writer.writerows([method, clip, *map(_rounded, score)] for clip, score in enumerate(scores))
+                mean = torch.tensor(scores, dtype=torch.float64).mean(dim=0).tolist()
+                writer.writerow([method, "mean", *map(_rounded, mean)])
+                table.append(f"{method:24}{mean[0]:10.2f}{mean[1]:10.4f}")
+        write_picture(self.output / "test.png", panel(self._rows))
+        print("\n".join(["", *table, ""]))  # noqa: T201
+        print(f"{self.output / 'test.csv'}, {self.output / 'test.png'} (columns: {', '.join(self._scores)}, truth)")  # noqa: T201
+
+
+def _rounded(value: float) -> str:
+    return f"{value:.4f}"
+
+
+class PredictionPictures(Callback):
+    """Write every predicted picture as PNG, named after the spike frame that it shows.
+
+    Args:
+        output: the folder that they are written to.
+    """
+
+    def __init__(self, output: str | Path) -> None:
+        self.output = Path(output)
+
+    def on_predict_batch_end(  # noqa: D102
+        self, trainer: Trainer, module: LightningModule, outputs: Tensor, batch: dict[str, Tensor], *_: Any
+    ) -> None:
+        for rgb, frame in zip(outputs, batch["frame"].tolist(), strict=True):
+            write_picture(self.output / f"frame_{frame:06d}.png", rgb)
+
+    def on_predict_end(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
+        if trainer.is_global_zero:
+            print(f"{self.output}: {len(list(self.output.glob('frame_*.png')))} pictures")  # noqa: T201

@@ -1,0 +1,133 @@
+"""The ``lightning`` command: LightningCLI with one output folder, and with checkpoints that are found again."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jsonargparse import ArgumentParser
+from pytorch_lightning import Callback, LightningDataModule, Trainer
+from pytorch_lightning.callbacks import LearningRateMonitor, ModelCheckpoint
+from pytorch_lightning.cli import LightningArgumentParser, LightningCLI
+from pytorch_lightning.loggers import TensorBoardLogger
+
+from lightning_modules.callbacks import PredictionPictures, TestReport, ValidationPictures
+from lightning_modules.data import Recording, StillScenes
+from lightning_modules.module import CheckpointMismatchError, SuperResolution
+from lightning_modules.networks import CSCSR
+from spikekit import SpikeFileError
+
+#: classes whose arguments ``--help`` lists, by the option that names them
+CHOICES = (("model.network", CSCSR), ("data", StillScenes), ("data", Recording))
+
+
+class InputError(ValueError):
+    """Something that the user gave and that cannot be used; shown as one line."""
+
+
+class Parser(LightningArgumentParser):
+    """A parser whose help also lists the arguments of the classes that a configuration may name."""
+
+    def format_help(self) -> str:  # noqa: D102
+        text = super().format_help()
+        if any(action.dest == "model.network" for action in self._actions):
+            for option, choice in CHOICES:
+                parser = ArgumentParser(add_help=False, usage=argparse.SUPPRESS)
+                parser.add_class_arguments(choice, option)
+                text += f"\nwith --{option} {choice.__name__}:\n\n{parser.format_help()}"
+        return text
+
+
+class Command(LightningCLI):
+    """The ``lightning`` command."""
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:  # noqa: D102
+        parser.add_argument(
+            "-o",
+            "--output",
+            type=str,
+            default="runs",
+            help="Folder of the run: checkpoints, TensorBoard files, config.yaml, tables and pictures.",
+        )
+        for name in ("scale", "frames", "alpha"):
+            parser.link_arguments(f"model.network.init_args.{name}", f"data.init_args.{name}")
+
+    def before_instantiate_classes(self) -> None:
+        """Turn ``--ckpt_path best`` and ``last`` into files, and keep a run from being written over."""
+        config = self.config[self.subcommand]
+        checkpoints = Path(config.output) / "checkpoints"
+        asked = config.get("ckpt_path")
+        if asked in ("best", "last"):
+            config.ckpt_path = str(checkpoints / f"{asked}.ckpt")
+        if asked and not Path(config.ckpt_path).is_file():
+            raise InputError(f"{config.ckpt_path}: no such checkpoint")
+        if self.subcommand == "fit" and not asked and not config.trainer.fast_dev_run and any(checkpoints.glob("*")):
+            raise InputError(f"{checkpoints}: holds a run already; --ckpt_path last goes on with it, -o goes elsewhere")
+
+    def instantiate_classes(self) -> None:  # noqa: D102
+        try:
+            super().instantiate_classes()
+            self.datamodule.setup()  # here, so that what is wrong with it is known before anything is written
+        except (OSError, ValueError) as error:
+            raise InputError(str(error)) from error
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        """Send everything to one folder, and use bfloat16 on a GPU that has it."""
+        output = Path(self._get(self.config_init, "output"))
+        config = self._get(self.config_init, "trainer")
+        kwargs["default_root_dir"] = output
+        kwargs["callbacks"] = [*(config.get("callbacks") or []), *self._callbacks(output)]
+        if config.get("logger") is None:
+            # the tables and pictures of the other commands are files of their own
+            kwargs["logger"] = TensorBoardLogger(output, name="", version="") if self.subcommand == "fit" else False
+        if config.get("precision") is None:
+            kwargs["precision"] = _precision(config.get("accelerator"))
+        return super().instantiate_trainer(**kwargs)
+
+    def _callbacks(self, output: Path) -> list[Callback]:
+        if self.subcommand == "fit":
+            folder = {"dirpath": output / "checkpoints", "enable_version_counter": False}
+            return [
+                ModelCheckpoint(filename="best", monitor="val/psnr", mode="max", **folder),
+                ModelCheckpoint(filename="last", save_on_train_epoch_end=True, **folder),
+                LearningRateMonitor(),
+                ValidationPictures(),
+            ]
+        if self.subcommand == "test":
+            return [TestReport(output)]
+        return [PredictionPictures(output)] if self.subcommand == "predict" else []
+
+    def before_predict(self) -> None:  # noqa: D102
+        if type(self.datamodule).predict_dataloader is LightningDataModule.predict_dataloader:
+            raise InputError("predict: expected a recording: --data Recording --data.path FILE")
+
+
+def _precision(accelerator: str) -> str:
+    wanted = accelerator in ("auto", "gpu", "cuda") and torch.cuda.is_available() and torch.cuda.is_bf16_supported()
+    return "bf16-mixed" if wanted else "32-true"
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Run the ``lightning`` command.
+
+    Args:
+        args: what was typed after ``lightning``; ``sys.argv`` when not given.
+    """
+    logging.getLogger("pytorch_lightning.utilities.rank_zero").addFilter(lambda line: "litlogger" not in line.msg)
+    try:
+        Command(
+            SuperResolution,
+            LightningDataModule,
+            subclass_mode_data=True,
+            auto_configure_optimizers=False,
+            parser_class=Parser,
+            save_config_kwargs={"overwrite": True},
+            args=None if args is None else list(args),
+        )
+    except (InputError, SpikeFileError, CheckpointMismatchError) as error:
+        sys.exit(f"lightning: {error}")

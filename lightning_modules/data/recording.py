@@ -1,0 +1,92 @@
+"""Recordings in files, cut into clips for ``lightning predict``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+from pytorch_lightning import LightningDataModule
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from spikekit import bayer_sites, read_spikes, spikes_shape
+
+
+class RecordingClips(Dataset[dict[str, Any]]):
+    """Clips around every ``every``-th frame of a recording, read when they are asked for.
+
+    Args:
+        path: a ``.dat`` or ``.npz`` file, see :func:`spikekit.read_spikes`.
+        height: rows; needed for ``.dat``.
+        width: columns; needed for ``.dat``.
+        flip: turn the stored frames upside down, as real cameras need.
+        pattern: Bayer phase after the flip; the clips are cropped by up to one row and column so that they begin with
+            red, which makes every phase RGGB.
+        frames: spike frames N of a clip.
+        every: frames between two clips.
+
+    Raises:
+        spikekit.SpikeFileError: the file cannot be read.
+        ValueError: the recording is shorter than a clip, or an argument is out of range.
+    """
+
+    def __init__(
+        self,
+        path: str,
+        height: int | None = None,
+        width: int | None = None,
+        flip: bool = False,
+        pattern: str = "RGGB",
+        frames: int = 41,
+        every: int = 20,
+    ) -> None:
+        if every < 1:
+            raise ValueError(f"every: expected at least 1 frame, got {every}")
+        total, self.height, self.width = spikes_shape(path, height, width)
+        if total < frames:
+            raise ValueError(f"{path}: expected at least {frames} frames for a clip, got {total}")
+        (_, self.top, self.left), *_ = bayer_sites(pattern)
+        self.path, self.flip, self.frames, self.every = path, flip, frames, every
+        self.clips = (total - frames) // every + 1
+
+    def __len__(self) -> int:  # noqa: D105
+        return self.clips
+
+    def __getitem__(self, index: int) -> dict[str, Any]:  # noqa: D105
+        if not 0 <= index < self.clips:
+            raise IndexError(index)
+        start = index * self.every
+        spikes: Tensor = read_spikes(
+            self.path, self.height, self.width, flip=self.flip, start=start, frames=self.frames
+        )
+        return {"spikes": spikes[:, self.top :, self.left :].contiguous(), "frame": start + self.frames // 2}
+
+
+class Recording(LightningDataModule):
+    """One recording of a colour spike camera, for ``predict``.
+
+    Args:
+        path: a ``.dat`` or ``.npz`` file.
+        height: rows; needed for ``.dat``, which has no header.
+        width: columns; likewise.
+        flip: turn the stored frames upside down, as real cameras need.
+        pattern: Bayer phase after the flip, one of RGGB, BGGR, GRBG, GBRG; for a grey camera leave it as it is.
+        every: frames between two reconstructed pictures; 20 is a millisecond at 20 kHz.
+        frames: spike frames of a clip, as the network was trained.
+    """
+
+    def __init__(
+        self,
+        path: str,
+        height: int | None = None,
+        width: int | None = None,
+        flip: bool = False,
+        pattern: str = "RGGB",
+        every: int = 20,
+        frames: int = 41,
+    ) -> None:
+        super().__init__()
+        self.clips = RecordingClips(path, height, width, flip, pattern, frames, every)
+
+    def predict_dataloader(self) -> DataLoader[dict[str, Any]]:  # noqa: D102
+        return DataLoader(self.clips, batch_size=1)

@@ -1,0 +1,42 @@
+"""What the rest of the house knows of a super-resolution network."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from lightning_modules.motion import ClassicalFlow, Motion
+
+
+class Network(nn.Module):
+    r"""Base of the networks that map a clip of spikes to the colour picture of its middle frame.
+
+    Args:
+        settings: what the constructor was given, as plain values, with at least ``scale``, ``frames``, ``pattern``
+            and ``alpha``; a checkpoint remembers them, because they are not all to be seen in its weights.
+        flow_times: spike frames that the flows run between: the first, the middle and the last time point.
+        motion: estimator that is asked where no flow is given; :class:`lightning_modules.motion.ClassicalFlow` when
+            not given.
+
+    Shape:
+        - Input: spikes :math:`(B, N, H, W)`; optionally flow :math:`(B, 2, 2, H, W)`, from the middle to the first
+          and to the last time point, in sensor pixels
+        - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
+    """
+
+    def __init__(
+        self, settings: dict[str, Any], flow_times: tuple[int, int, int], motion: Motion | None = None
+    ) -> None:
+        super().__init__()
+        self.settings = settings
+        self.scale: int = settings["scale"]
+        self.frames: int = settings["frames"]
+        self.pattern: str = settings["pattern"]
+        self.flow_times = flow_times
+        self.motion = ClassicalFlow() if motion is None else motion
+
+    def estimate_flow(self, spikes: Tensor) -> Tensor:
+        """Flows from the middle to the first and to the last time point, (B, 2, 2, H, W), in sensor pixels."""
+        return torch.stack(self.motion(spikes, self.flow_times, self.pattern), dim=1)
