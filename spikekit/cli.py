@@ -6,6 +6,7 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -31,13 +32,15 @@ USUAL_SIZES = {
     (1000, 1024): "colour spike camera, PCIe stream",
 }
 
-#: Frames that TFI looks at on each side: a pixel darker than one spike in twice as many is taken for that.
+#: Frames that TFI looks at on each side; a pixel that fires more rarely is decoded as if it fired once in all of them.
 TFI_REACH = 200
 
 #: Frames that TFP averages when nothing else is said.
 TFP_WINDOW = 41
 
-#: Rows decoded at a time: the decoders give every frame of the span, of which one is kept.
+_PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+
+# Rows decoded at a time: the decoders give every frame of the span, of which one is kept.
 _BAND = 32
 
 
@@ -74,6 +77,8 @@ def decode(args: argparse.Namespace) -> None:
     _check_size_given(args)
     if args.window is not None and (args.method != "tfp" or args.window % 2 == 0):
         raise UsageError(f"--window: expected an odd number, with --method tfp, got {args.window} with {args.method}")
+    if args.output.is_dir():
+        raise ValueError(f"{args.output}: expected a picture to write, got a folder")
     frames, _, _ = spikes_shape(args.file, args.height, args.width)
     frame = frames // 2 if args.frame is None else args.frame
     if frame >= frames:
@@ -108,17 +113,19 @@ def decode(args: argparse.Namespace) -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return 0, 1 for a file that cannot be used, or 2 for a command line that cannot."""
     try:
-        args = _parser().parse_args(argv)
-        args.run(args)
-        sys.stdout.flush()
-    except SystemExit as done:  # --help
-        return int(done.code or 0)
-    except ValueError as error:
+        with suppress(SystemExit):  # --help
+            args = _parser().parse_args(argv)
+            args.run(args)
+        print(end="", flush=True)
+    except (ValueError, MemoryError) as error:
         print(f"spikekit: {_one_line(error)}", file=sys.stderr)
         return 2 if isinstance(error, UsageError) else 1
-    except BrokenPipeError:
+    except OSError as error:  # nobody reads what is printed, or it finds no room
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it flushes at exit
-        return 141
+        if isinstance(error, BrokenPipeError):
+            return 141
+        print(f"spikekit: standard output: {_one_line(error)}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         return 130
     return 0
@@ -151,7 +158,7 @@ def _parser() -> argparse.ArgumentParser:
         choices=("tfi", "tfp"),
         help=f"by the interval between spikes (reads {TFI_REACH} frames on each side), or by their number in a window",
     )
-    verb.add_argument("-o", "--output", required=True, type=Path, metavar="OUT.png", help="the picture to write")
+    verb.add_argument("-o", "--output", required=True, type=_picture, metavar="OUT.png", help="the picture to write")
     verb.add_argument(
         "--pattern", type=str.upper, choices=PATTERNS, help="Bayer phase after the flip, for colour; grey without it"
     )
@@ -208,6 +215,13 @@ def _positive(text: str) -> float:
     if not 0 < number < float("inf"):
         raise argparse.ArgumentTypeError(f"expected a number above 0, got {text}")
     return number
+
+
+def _picture(text: str) -> Path:
+    path = Path(text)
+    if path.suffix.lower() not in _PICTURE_ENDINGS:  # the picture library would write TIFF, over a recording as well
+        raise argparse.ArgumentTypeError(f"expected a picture that ends in {', '.join(_PICTURE_ENDINGS)}, got {text}")
+    return path
 
 
 def _check_size_given(args: argparse.Namespace) -> None:

@@ -6,7 +6,7 @@ import math
 import secrets
 import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
@@ -129,7 +129,6 @@ def spikes_shape(path: str | Path, height: int | None = None, width: int | None 
         SpikeFileError: as :func:`read_spikes`.
     """
     path = Path(path)
-    suffix = _check_suffix(path)
     with _reading(path):
         if path.is_dir():
             raise SpikeFileError(f"{path}: expected a recording, got a folder")
@@ -138,7 +137,9 @@ def spikes_shape(path: str | Path, height: int | None = None, width: int | None 
         size = path.stat().st_size
     if size == 0:
         raise SpikeFileError(f"{path}: an empty file, 0 bytes")
-    return _dat_shape(path, size, height, width) if suffix == ".dat" else _npz_shape(path, height, width)
+    if _check_suffix(path) == ".dat":
+        return _dat_shape(path, size, height, width)
+    return _npz_shape(path, height, width)
 
 
 def write_spikes(path: str | Path, spikes: Tensor, *, flip: bool = False) -> None:
@@ -180,7 +181,8 @@ def write_spikes(path: str | Path, spikes: Tensor, *, flip: bool = False) -> Non
     except OSError as error:
         raise SpikeFileError(f"{path}: cannot be written ({error.strerror or error})") from error
     finally:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
 def _open(

@@ -1,0 +1,352 @@
+"""The ``spikekit`` command as a user types it."""
+
+import os
+import subprocess
+import sys
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from spikekit import bin_to_sensor, cli, psnr, read_picture, read_spikes, spike_integrate_fire, tfi, tfp, write_spikes
+from spikekit.cli import main
+
+SPIKES = Path(__file__).parents[2].parent / "shared" / "data" / "spikes"
+REDS = SPIKES / "reds_sim_mono_203_250x400.dat"
+UHSR = SPIKES / "uhsr_real_mono_helicopter_250x250.npz"
+needs_data = pytest.mark.skipif(not SPIKES.is_dir(), reason="the shared recordings are not beside the repository")
+
+COMMAND = [sys.executable, "-c", "from spikekit.cli import main; raise SystemExit(main())"]
+
+
+def expose(light, frames):
+    """A still scene of a simulated camera, recorded."""
+    spikes, _ = spike_integrate_fire(light.expand(frames, *light.shape), charge=torch.rand(light.shape))
+    return spikes
+
+
+def run(*words, **kwargs):
+    return subprocess.run([*COMMAND, *map(str, words)], capture_output=True, text=True, timeout=120, **kwargs)
+
+
+@pytest.fixture
+def clip(tmp_path):
+    """A recording of 60 frames of 12 x 20, brighter from left to right and dark at the top left."""
+    light = torch.linspace(0.1, 0.5, 20).repeat(12, 1)
+    light[0, 0] = 0
+    write_spikes(tmp_path / "clip.dat", expose(light, 60))
+    return tmp_path / "clip.dat"
+
+
+@pytest.fixture
+def fails(capsys):
+    """Run a command line that fails: one line on stderr, nothing on stdout."""
+
+    def check(status, *words):
+        assert main([str(word) for word in words]) == status
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert err.startswith("spikekit: ")
+        assert err.endswith("\n")
+        assert err.count("\n") == 1
+        return err
+
+    return check
+
+
+def sized(path, height=12, width=20):
+    return path, "--height", height, "--width", width
+
+
+# --- info -------------------------------------------------------------------------------------------------------------
+
+
+def test_info(clip, capsys):
+    assert main(["info", *map(str, sized(clip))]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    lines = dict(
+        line.split(maxsplit=1) for line in out.replace(" fire ", "_fire ").replace("bits s", "bits_s").splitlines()
+    )
+    assert lines["file"] == str(clip)
+    assert lines["size"] == "12 x 20 (H x W), 1800 bytes"
+    assert lines["frames"] == "60, 3 ms at 20 kHz"
+    assert lines["darkest"] == "0.0000 spikes a frame, at row 0, column 0 as stored"
+    assert lines["brightest"].startswith("0.5000 spikes a frame, at row ")
+    assert lines["brightest"].endswith("column 19 as stored")
+    assert lines["never_fire"] == "1 of 240 pixels, 0.42%"
+    assert lines["always_fire"] == "0 of 240 pixels, 0.00%"
+    assert lines["bits_set"].startswith(f"{read_spikes(clip, 12, 20).sum()} of 14400, ")
+
+
+def test_info_of_an_array(tmp_path, capsys):
+    write_spikes(tmp_path / "a.npz", torch.ones(7, 3, 5))
+    assert main(["info", str(tmp_path / "a.npz")]) == 0
+    out = capsys.readouterr().out
+    assert "3 x 5 (H x W)" in out
+    assert "always fire  15 of 15 pixels, 100.00%" in out
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [
+        (12_500 * 301, "250 x 400 (grey Vidar camera: 301 frames) divides its 3762500 bytes exactly"),
+        (7_813 * 2, "250 x 250 (UHSR: 2 frames) divides its 15626 bytes exactly"),
+        (
+            250_000,
+            "250 x 400 (grey Vidar camera: 20 frames) and 1000 x 1000 (colour spike camera: 2 frames) divide its",
+        ),
+        (30, "none of 250 x 400, 250 x 416, 250 x 250, 1000 x 1000, 1000 x 1024 divides its 30 bytes exactly"),
+    ],
+)
+@pytest.mark.parametrize("given", [(), ("--height", 250), ("--width", 400)])
+def test_headerless_without_its_size(tmp_path, fails, size, expected, given):
+    path = tmp_path / "a.dat"
+    path.touch()
+    os.truncate(path, size)
+    for words in (["info", path], ["decode", path, "--method", "tfi", "-o", tmp_path / "a.png"]):
+        err = fails(2, *words, *given)
+        assert f"{path}: a .dat has no header, give --height and --width" in err
+        assert expected in err
+
+
+# --- decode -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("method", "least"), [("tfi", 20), ("tfp", 30)])
+def test_decode(clip, tmp_path, capsys, method, least):
+    """The scene comes back, at its own brightness with the gain, and with white at its brightest without."""
+    out = tmp_path / "made" / "a.png"
+    words = ["decode", *map(str, sized(clip)), "--method", method, "-o", str(out)]
+    light = torch.linspace(0.1, 0.5, 20).repeat(3, 12, 1)
+    assert main([*words, "--alpha", "0.5"]) == 0
+    assert capsys.readouterr().out.endswith("divided by alpha 0.5\n")
+    assert psnr(read_picture(out)[:, 1:], light[:, 1:] / 0.5) > least
+    assert main(words) == 0
+    report = capsys.readouterr().out
+    assert report.startswith(f"{out}: frame 30 of 60 by {method} from frames {0 if method == 'tfi' else 10} .. ")
+    assert report.endswith("so that the 99.9th percentile of the spike rate is white\n")
+    assert 1.9 < float(report.split("multiplied by ")[1].split(",")[0]) <= 2
+    assert psnr(read_picture(out)[:, 1:], light[:, 1:] / 0.5) > least
+
+
+@pytest.mark.parametrize(("method", "words"), [("tfi", []), ("tfp", []), ("tfp", ["--window", "5"])])
+@pytest.mark.parametrize("frame", [0, 3, 250, 498, 499])
+def test_decode_reads_what_it_needs(tmp_path, method, words, frame):
+    """The picture of a frame is that of the whole recording, for pixels that fire within the span."""
+    spikes = expose(torch.rand(40, 9) * 0.5 + 0.05, 500)
+    write_spikes(tmp_path / "a.npz", spikes)
+    out = tmp_path / "a.png"
+    assert (
+        main(
+            [
+                "decode",
+                str(tmp_path / "a.npz"),
+                "--method",
+                method,
+                "-o",
+                str(out),
+                "--alpha",
+                "1",
+                *words,
+                "--frame",
+                str(frame),
+            ]
+        )
+        == 0
+    )
+    whole = tfi(spikes) if method == "tfi" else tfp(spikes, 5 if words else 41)
+    assert torch.equal((read_picture(out)[0] * 255).round(), (whole[frame] * 255).round())
+
+
+def test_decode_reads_only_what_it_needs(tmp_path, monkeypatch):
+    read = []
+    monkeypatch.setattr(
+        cli, "read_spikes", lambda *_, start, frames, **__: read.append((start, frames)) or torch.ones(frames, 4, 4)
+    )
+    with open(tmp_path / "a.dat", "wb") as file:
+        file.truncate(2 * 1_000_000)
+    words = ["decode", str(tmp_path / "a.dat"), "--height", "4", "--width", "4", "-o", str(tmp_path / "a.png")]
+    assert main([*words, "--method", "tfp"]) == 0
+    assert main([*words, "--method", "tfp", "--window", "1", "--frame", "7"]) == 0
+    assert main([*words, "--method", "tfi", "--frame", "999999"]) == 0
+    assert read == [(499_980, 41), (7, 1), (999_799, 201)]
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG", "bggr"])
+def test_decode_colour(tmp_path, pattern):
+    """A coloured wall, stored upside down, comes back in its colour: the phase counts after the flip."""
+    rgb = torch.tensor([0.9, 0.5, 0.2])[:, None, None].expand(3, 10, 14)
+    raw = bin_to_sensor(rgb, pattern.upper(), scale=1)
+    write_spikes(tmp_path / "a.dat", expose(0.4 * raw, 200), flip=True)
+    out = tmp_path / "a.png"
+    words = ["decode", *map(str, sized(tmp_path / "a.dat", 10, 14)), "--flip", "--method", "tfp", "--window", "199"]
+    assert main([*words, "--alpha", "0.4", "--pattern", pattern, "-o", str(out)]) == 0
+    assert (read_picture(out) - rgb).abs().max() < 0.06
+
+
+def test_decode_flip(tmp_path):
+    spikes = torch.zeros(5, 6, 4)
+    spikes[:, 0] = 1
+    write_spikes(tmp_path / "a.npz", spikes, flip=True)
+    for flip, row in (([], 5), (["--flip"], 0)):
+        assert main(["decode", str(tmp_path / "a.npz"), "--method", "tfp", "-o", str(tmp_path / "a.png"), *flip]) == 0
+        assert (read_picture(tmp_path / "a.png")[0].sum(-1) > 0).nonzero().tolist() == [[row]]
+
+
+def test_decode_darkness(tmp_path, capsys):
+    write_spikes(tmp_path / "a.npz", torch.zeros(5, 6, 4))
+    assert main(["decode", str(tmp_path / "a.npz"), "--method", "tfp", "-o", str(tmp_path / "a.png")]) == 0
+    assert "multiplied by 1," in capsys.readouterr().out
+    assert read_picture(tmp_path / "a.png").max() == 0
+
+
+# --- command lines and files that cannot be used ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "required: VERB (see spikekit --help)"),
+        (["look"], "invalid choice: 'look'"),
+        (["info"], "required: FILE (see spikekit info --help)"),
+        (["info", "a.dat", "--height", "0"], "--height: expected a whole number, 1 or more, got 0"),
+        (["info", "a.dat", "--width", "wide"], "--width: expected a whole number, 1 or more, got wide"),
+        (["info", "a.dat", "--flip"], "unrecognized arguments: --flip"),
+        (["decode", "a.dat"], "required: --method, -o/--output (see spikekit decode --help)"),
+        (["decode", "a.dat", "-o", "a.png", "--method", "mean"], "--method: invalid choice: 'mean'"),
+        (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--pattern", "RGB"], "--pattern: invalid choice: 'RGB'"),
+        (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--alpha", "0"], "--alpha: expected a number above 0"),
+        (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--alpha", "nan"], "--alpha: expected a number above 0"),
+        (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--frame", "-1"], "--frame: expected a whole number, 0"),
+        (
+            ["decode", "a.dat", "-o", "a.png", "--method", "tfp", "--window", "4"],
+            "odd number, with --method tfp, got 4",
+        ),
+        (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--window", "5"], "with --method tfp, got 5 with tfi"),
+        (
+            ["decode", "a.dat", "-o", "a.dat", "--method", "tfi"],
+            "ends in .png, .jpg, .jpeg, .tif, .tiff, .bmp, got a.dat",
+        ),
+    ],
+)
+def test_wrong_command_lines(fails, words, message):
+    assert message in fails(2, *words)
+
+
+def test_frame_that_is_not_there(clip, tmp_path, fails):
+    words = ("--method", "tfi", "-o", tmp_path / "a.png", "--frame", 60)
+    assert f"--frame: expected 0 .. 59, as {clip} has 60 frames, got 60" in fails(2, "decode", *sized(clip), *words)
+
+
+def test_wrong_files(clip, tmp_path, fails):
+    (tmp_path / "clip.raw").write_bytes(b"raw")
+    np.savez(tmp_path / "a.npz", spk=np.zeros((3, 12, 20)))
+    for path, message in [
+        (sized(tmp_path / "none.dat"), "none.dat: no such file"),
+        ((tmp_path / "none.dat",), "none.dat: no such file"),
+        ((tmp_path,), "got a folder"),
+        ((tmp_path / "clip.raw",), "clip.raw: expected a recording that ends in .dat or .npz, got .raw"),
+        (sized(clip, 7, 7), "1800 bytes at 7 bytes a frame make 257 whole frames and 1 bytes left over"),
+        (sized(tmp_path / "a.npz", 20, 12), "holds frames of 12 x 20, got height 20 and width 12"),
+    ]:
+        assert message in fails(1, "info", *path)
+        assert message in fails(1, "decode", *path, "--method", "tfi", "-o", tmp_path / "a.png")
+    assert not (tmp_path / "a.png").exists()
+
+
+def test_too_small_for_colour(tmp_path, fails):
+    write_spikes(tmp_path / "a.npz", torch.ones(3, 2, 2))
+    words = ("--method", "tfp", "-o", tmp_path / "a.png", "--pattern", "RGGB")
+    assert "at least 3 x 3, got (2, 2)" in fails(1, "decode", tmp_path / "a.npz", *words)
+
+
+def test_where_nothing_can_be_written(clip, tmp_path, fails):
+    (tmp_path / "folder.png").mkdir()
+    for out, message in [(tmp_path / "folder.png", "got a folder"), (clip / "a.png", "cannot be written")]:
+        assert f"{out}: " in (err := fails(1, "decode", *sized(clip), "--method", "tfp", "-o", out))
+        assert message in err
+
+
+@pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt(), 130), (MemoryError("no room"), 1)])
+def test_stopped(clip, monkeypatch, capsys, error, status):
+    def stop(*_):
+        raise error
+
+    monkeypatch.setattr(cli, "iter_spikes", stop)
+    assert main(["info", *map(str, sized(clip))]) == status
+    assert capsys.readouterr() == ("", "spikekit: no room\n" if status == 1 else "")
+
+
+# --- as a process -----------------------------------------------------------------------------------------------------
+
+
+def test_installed_command():
+    (script,) = entry_points(group="console_scripts", name="spikekit")
+    assert script.load() is main
+
+
+@pytest.mark.parametrize("words", [["--help"], ["info", "--help"], ["decode", "--help"]])
+def test_help(words, capsys):
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("usage: spikekit")
+    assert ("example:\n  spikekit " in out) == (len(words) == 2)
+
+
+def test_process(clip, tmp_path):
+    done = run("decode", *sized(clip), "--method", "tfi", "-o", "made/here/a.png", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert read_picture(tmp_path / "made" / "here" / "a.png").shape == (3, 12, 20)
+    done = run("info", "none.npz", cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", "spikekit: none.npz: no such file\n")
+
+
+@pytest.mark.parametrize("help_", [True, False])
+def test_closed_pipe(clip, help_):
+    reader, writer = os.pipe()
+    os.close(reader)
+    words = ["--help"] if help_ else ["info", *map(str, sized(clip))]
+    done = subprocess.run([*COMMAND, *words], stdout=writer, stderr=subprocess.PIPE, timeout=120)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (0 if help_ else 141, b"")  # argparse itself lets the help go
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
+def test_full_disk(clip):
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [*COMMAND, "info", *map(str, sized(clip))], stdout=full, stderr=subprocess.PIPE, text=True
+        )
+    assert (done.returncode, done.stderr) == (1, "spikekit: standard output: No space left on device\n")
+
+
+# --- the field's own --------------------------------------------------------------------------------------------------
+
+
+@needs_data
+def test_info_of_the_fields_own(capsys):
+    assert main(["info", str(REDS), "--height", "250", "--width", "400"]) == 0
+    out = capsys.readouterr().out
+    assert "frames       301, 15.05 ms at 20 kHz" in out
+    assert "bits set     6497164 of 30100000, 21.59%" in out
+    assert main(["info", str(UHSR)]) == 0
+    out = capsys.readouterr().out
+    assert "250 x 250 (H x W)" in out
+    assert "never fire   2 of 62500 pixels, 0.00%" in out
+
+
+@needs_data
+@pytest.mark.parametrize("method", ["tfi", "tfp"])
+def test_decode_of_the_fields_own(tmp_path, method):
+    out = tmp_path / "a.png"
+    assert main(["decode", *map(str, sized(REDS, 250, 400)), "--flip", "--method", method, "-o", str(out)]) == 0
+    picture = read_picture(out)
+    assert picture.shape == (3, 250, 400)
+    assert picture[:, :40, :200].mean() > 0.6 > 0.2 > picture[:, 60:90, :180].mean()  # awning over roof: upright
+    assert main(["decode", str(UHSR), "--method", method, "-o", str(out)]) == 0
+    picture = read_picture(out)
+    assert picture.shape == (3, 250, 250)
+    assert picture[:, 40:60, 60:200].mean() > 0.4 > picture[:, 200:, :].mean()  # a screen in a dark room
