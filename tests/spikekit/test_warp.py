@@ -193,7 +193,7 @@ def test_idw_remembers_masks_but_not_too_well():
     """The tables of a mask are kept between calls; a mask that changes, or another number, must not get old ones."""
     features, flow = torch.randn(1, 1, 6, 8, dtype=torch.float64), flows(6, 8)[4:5]
     mask = (torch.rand(6, 8) < 0.3).double()
-    for neighbors in (4, 4, 2, 4):
+    for neighbors in (2, 4, 4, 3):
         torch.testing.assert_close(
             flow_warp_idw(features, flow, mask, neighbors=neighbors), idw_brute(features, flow, mask, neighbors)
         )
