@@ -45,7 +45,7 @@ def check_scale(scale: int) -> None:
     Raises:
         ValueError: anything else.
     """
-    if isinstance(scale, bool) or int(scale) != scale or scale < 1:
+    if isinstance(scale, bool) or not isinstance(scale, int) or scale < 1:
         raise ValueError(f"scale: expected a whole number >= 1, got {scale!r}")
 
 

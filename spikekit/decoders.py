@@ -72,7 +72,9 @@ def _(value: Tensor, fired: Tensor) -> Tensor:
 @torch.library.custom_op("spikekit::tfi", mutates_args=())
 def _tfi(spikes: Tensor, max_range: float) -> Tensor:
     interval = _spike_interval(spikes != 0)
-    return (max_range / interval.to(torch.promote_types(spikes.dtype, torch.float32))).to(spikes.dtype)
+    wide = torch.promote_types(spikes.dtype, torch.float32)
+    # a tensor over a tensor: torch divides a number by a tensor through the inverse, and 255 / 5 is not 51 then
+    return (torch.full_like(interval, max_range, dtype=wide) / interval).to(spikes.dtype)
 
 
 @_tfi.register_fake
@@ -248,11 +250,11 @@ def tfp(spikes: Tensor, window: int, max_range: float = 1.0) -> Tensor:
     n = torch.arange(frames, device=spikes.device)
     begin, end = (n - half).clamp(min=0), (n + half + 1).clamp(max=frames)
     inside = counts.index_select(-3, end) - counts.index_select(-3, begin)
-    return (inside.to(wide) * (max_range / (end - begin).to(wide))[:, None, None]).to(dtype)
+    return (inside.to(wide) * max_range / (end - begin)[:, None, None]).to(dtype)
 
 
 def _check_window(window: int) -> None:
-    if isinstance(window, bool) or int(window) != window or window < 1 or window % 2 == 0:
+    if isinstance(window, bool) or not isinstance(window, int) or window < 1 or window % 2 == 0:
         raise ValueError(f"window: expected an odd number of frames, 1 or more, got {window!r}")
 
 

@@ -239,4 +239,4 @@ class LinearMotion(nn.Module):
         )
 
     def extra_repr(self) -> str:  # noqa: D102
-        return f"times={self.times}, scale={self.scale}"
+        return f"times={self.times}, first={self.first}, middle={self.middle}, last={self.last}, scale={self.scale}"

@@ -15,11 +15,13 @@ from spikekit.check import check_planes, check_positive
 def _integrate_fire(light: Tensor, threshold: float, charge: Tensor) -> tuple[Tensor, Tensor]:
     spikes = torch.empty_like(light)
     charge = charge.clone()
+    theta = charge.new_tensor(threshold)  # a tensor: CUDA would divide by a number through its inverse
     for light_t, spike_t in zip(light.unbind(-3), spikes.unbind(-3), strict=True):
         charge += light_t
-        spike_t.copy_(charge >= threshold)
-        # exact, unlike charge - floor(charge / threshold) * threshold, which can end below 0
-        charge.remainder_(threshold)
+        whole = torch.floor(charge / theta)
+        spike_t.copy_(whole > 0)
+        charge -= whole * theta
+        charge.clamp_(min=0)  # the quotient may have been rounded up to a whole number
     return spikes, charge
 
 

@@ -226,7 +226,7 @@ def flow_warp_idw(features: Tensor, flow: Tensor, mask: Tensor, *, neighbors: in
     if not isinstance(mask, Tensor) or mask.shape != features.shape[-2:]:
         got = tuple(mask.shape) if isinstance(mask, Tensor) else type(mask).__name__
         raise ValueError(f"mask: expected {(height, width)} for features {tuple(features.shape)}, got {got}")
-    if isinstance(neighbors, bool) or int(neighbors) != neighbors or neighbors < 1:
+    if isinstance(neighbors, bool) or not isinstance(neighbors, int) or neighbors < 1:
         raise ValueError(f"neighbors: expected a whole number >= 1, got {neighbors!r}")
     dtype = torch.promote_types(torch.promote_types(features.dtype, flow.dtype), torch.float32)
     flow = flow.reshape(-1, 2, height, width).to(dtype).clamp(-_FARTHEST, _FARTHEST)

@@ -225,8 +225,9 @@ class CSCSR(Network):
 
     def forward(self, spikes: Tensor, flow: Tensor | None = None) -> Tensor:  # noqa: D102
         check_planes("spikes", spikes, 4, "(B, N, H, W)")
-        if spikes.ndim != 4 or spikes.shape[1] != self.frames:
-            raise ValueError(f"spikes: expected (B, {self.frames}, H, W), got {tuple(spikes.shape)}")
+        if spikes.ndim != 4 or spikes.shape[1] != self.frames or min(spikes.shape[-2:]) < 3:
+            expected = f"(B, {self.frames}, H, W) of at least 3 x 3 pixels"
+            raise ValueError(f"spikes: expected {expected}, got {tuple(spikes.shape)}")
         batch, _, height, width = spikes.shape
         spikes = spikes.to(self.reconstruction.rgb.weight.dtype)
         flow = self.estimate_flow(spikes) if flow is None else flow

@@ -12,15 +12,16 @@ DTYPES = [torch.float64, torch.float32, torch.bfloat16, torch.float16]
 
 
 def loop(light, threshold, charge):
-    """Integrate and fire in the dtype of ``charge``; fmod is exact."""
+    """Integrate and fire in the dtype of ``charge``, as the contract says it."""
     threshold = charge.dtype.type(threshold)
     spikes, charge = np.zeros_like(light), charge.copy()
     for where in np.ndindex(charge.shape):
         for t in range(light.shape[-3]):
             here = (*where[:-2], t, *where[-2:])
             u = charge[where] + light[here].astype(charge.dtype)
-            spikes[here] = u >= threshold
-            charge[where] = np.fmod(u, threshold)
+            whole = np.floor(u / threshold)
+            spikes[here] = whole > 0
+            charge[where] = max(u - whole * threshold, 0)
     return spikes, charge
 
 

@@ -1,0 +1,200 @@
+"""The ``lightning`` command, as its users type it."""
+
+import csv
+import subprocess
+import sys
+
+import pytest
+import torch
+import yaml
+
+from lightning_modules.cli import main
+from lightning_modules.networks import CSCSR
+from spikekit import read_picture, write_spikes
+
+TINY = """
+model:
+  network:
+    init_args: {width: 4, representation_width: 4, features: 1, stages: 1, blocks: 1, end_blocks: 1}
+data:
+  init_args: {patch: 8, val_patch: 12, train_clips: 8, val_clips: 3, batch_size: 2, workers: 0}
+trainer:
+  max_steps: 6
+  check_val_every_n_epoch: 1
+  enable_progress_bar: false
+"""
+
+
+@pytest.fixture(scope="module")
+def overlay(tmp_path_factory):
+    path = tmp_path_factory.mktemp("overlay") / "tiny.yaml"
+    path.write_text(TINY)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def _argv(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["lightning"])
+
+
+@pytest.fixture(scope="module")
+def trained(overlay, tmp_path_factory):
+    from pathlib import Path
+
+    output = tmp_path_factory.mktemp("run")
+    x4 = Path(__file__).parents[2] / "configs" / "x4.yaml"
+    done = run("fit", "-c", x4, "-c", overlay, "-o", output)
+    assert done.returncode == 0, done.stderr
+    return output
+
+
+def run(*args):
+    command = [sys.executable, "-m", "lightning_modules", *map(str, args)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+def weights(output, name="last"):
+    return torch.load(output / "checkpoints" / f"{name}.ckpt", weights_only=True)
+
+
+@pytest.mark.slow
+def test_fit_leaves_checkpoints_and_pictures(trained):
+    assert weights(trained)["global_step"] == 6
+    assert weights(trained, "best")["network"]["scale"] == 4
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(trained)).Reload()
+    assert {"train/loss", "val/psnr", "val/ssim"} <= set(events.Tags()["scalars"])
+    assert events.Tags()["images"] == ["val/tfi, result, truth"]
+    assert yaml.safe_load((trained / "config.yaml").read_text())["model"]["network"]["init_args"]["width"] == 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stop", [3, 4])  # in the middle of an epoch of four steps, and at its end
+def test_resumed_run_equals_an_unbroken_one(trained, overlay, configs, tmp_path, stop):
+    args = ["fit", "-c", configs / "x4.yaml", "-c", overlay, "-o", tmp_path]
+    main([*map(str, args), "--trainer.max_steps", str(stop)])
+    assert weights(tmp_path)["global_step"] == stop
+    main([*map(str, args), "--ckpt_path", "last"])
+    resumed, unbroken = weights(tmp_path), weights(trained)
+    assert resumed["global_step"] == unbroken["global_step"] == 6
+    for name, value in unbroken["state_dict"].items():
+        assert resumed["state_dict"][name].equal(value), name
+    before = weights(tmp_path, "best")["state_dict"]
+    assert any(not before[name].equal(value) for name, value in unbroken["state_dict"].items())
+
+
+@pytest.mark.slow
+def test_test_prints_a_table_and_writes_it(trained, overlay, configs, capsys):
+    args = ["test", "-c", configs / "x4.yaml", "-c", overlay, "-o", trained, "--ckpt_path", "best"]
+    main([*map(str, args)])
+    printed = capsys.readouterr().out
+    methods = ["TFI", "TFP", "CSCSR", "CSCSR, true flow"]
+    assert all(f"\n{method} " in printed for method in methods)
+    rows = list(csv.DictReader((trained / "test.csv").open()))
+    assert [row["clip"] for row in rows] == ["0", "1", "2", "mean"] * 4
+    for method in methods:
+        *clips, mean = [float(row["psnr"]) for row in rows if row["method"] == method]
+        assert mean == pytest.approx(sum(clips) / 3, abs=1e-4)
+        assert f"{mean:.2f}" in printed
+    assert read_picture(trained / "test.png").shape == (3, 3 * 48 + 2 * 4, 5 * 48 + 4 * 4)
+
+
+@pytest.mark.slow
+def test_predict_writes_a_picture_per_clip(trained, overlay, configs, tmp_path):
+    write_spikes(tmp_path / "clip.dat", torch.rand(62, 10, 13) < 0.3)
+    done = run(
+        *("predict", "-c", configs / "x4.yaml", "-c", overlay, "--ckpt_path", trained / "checkpoints/last.ckpt"),
+        *("--data", "Recording", "--data.path", tmp_path / "clip.dat", "--data.height", 10, "--data.width", 13),
+        *("-o", tmp_path / "out"),
+    )
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["frame_000020.png", "frame_000040.png"]
+    assert read_picture(tmp_path / "out" / "frame_000040.png").shape == (3, 40, 52)
+
+
+@pytest.mark.slow
+def test_a_checkpoint_of_another_scale_is_refused(trained, overlay, configs, tmp_path):
+    done = run(
+        *("validate", "-c", configs / "x2.yaml", "-c", overlay, "-o", tmp_path),
+        *("--ckpt_path", trained / "checkpoints/last.ckpt"),
+    )
+    assert done.returncode == 1
+    assert done.stderr.endswith("lightning: the checkpoint was trained with scale=4; this run asks for scale=2\n")
+
+
+@pytest.mark.slow
+def test_a_finished_run_is_not_written_over(trained, overlay, configs):
+    before = weights(trained)["state_dict"]
+    with pytest.raises(SystemExit, match="holds a run already"):
+        main(["fit", "-c", str(configs / "x4.yaml"), "-c", str(overlay), "-o", str(trained)])
+    assert all(weights(trained)["state_dict"][name].equal(value) for name, value in before.items())
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["test", "--ckpt_path", "best"], "checkpoints/best.ckpt: no such checkpoint"),
+        (["fit", "--data.root", "nowhere"], "nowhere"),
+        (["fit", "--data.motion", "-1"], "motion: expected 0 or more, got -1"),
+        (["fit", "--model.network.frames", "40"], "frames, window, stride: expected odd frames"),
+        (["fit", "--data.pattern", "BGGR"], "pattern"),
+        (["predict"], "--data Recording --data.path FILE"),
+        (["predict", "--data", "Recording", "--data.path", "nowhere.dat"], "nowhere.dat: no such file"),
+    ],
+)
+def test_errors_are_one_line(args, message, configs, tmp_path, overlay):
+    with pytest.raises(SystemExit) as exit:
+        main([args[0], "-c", str(configs / "x4.yaml"), *args[1:], "-o", str(tmp_path / "run")])
+    assert message in str(exit.value)
+    assert str(exit.value).startswith("lightning: ")
+    assert "\n" not in str(exit.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_help_explains_every_option(configs, capsys):
+    with pytest.raises(SystemExit):
+        main(["fit", "-c", str(configs / "x4.yaml"), "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    for option, words in (
+        ("--model.network.width", "channels of refinement and reconstruction"),
+        ("--model.network.stride", "spike frames between two time points"),
+        ("--data.brightness", "darkest and brightest exposure"),
+        ("--data.height", "rows; needed for"),
+        ("--model.tile", "side of the tiles"),
+        ("--output", "Folder of the run"),
+        ("--trainer.max_steps", "Stop training after this number of steps"),
+    ):
+        assert option in text
+        assert words in text
+
+
+def test_the_scales_differ_in_the_scale_alone(configs):
+    x2, x3, x4 = (yaml.safe_load((configs / f"x{scale}.yaml").read_text()) for scale in (2, 3, 4))
+    for scale, config in ((2, x2), (3, x3), (4, x4)):
+        assert config.pop("output") == f"runs/x{scale}"
+        assert config["model"]["network"]["init_args"].pop("scale") == scale
+    assert x2 == x3 == x4
+
+
+def test_the_paper_is_the_default(configs, capsys):
+    with pytest.raises(SystemExit):
+        main(["fit", "-c", str(configs / "x4.yaml"), "--print_config"])
+    config = yaml.safe_load(capsys.readouterr().out)
+    network, data = config["model"]["network"]["init_args"], config["data"]["init_args"]
+    assert [network[name] for name in ("scale", "frames", "window", "stride", "pattern")] == [4, 41, 11, 3, "RGGB"]
+    assert [data[name] for name in ("patch", "batch_size", "pattern", "alpha")] == [96, 4, "RGGB", 0.4]
+    assert config["model"]["optimizer"]["class_path"] == "torch.optim.Adam"
+    assert config["model"]["optimizer"]["init_args"]["lr"] == 1e-4
+    assert config["model"]["lr_scheduler"]["init_args"]["step_size"] == 7500
+    assert config["model"]["lr_scheduler"]["init_args"]["gamma"] == 0.8
+
+
+@pytest.mark.parametrize("overlay", ["quick", "size/s", "size/m", "size/l"])
+@pytest.mark.parametrize("scale", [2, 3, 4])
+def test_overlays_build(overlay, scale, configs):
+    base, over = (
+        yaml.safe_load((configs / f"{name}.yaml").read_text())["model"]["network"]["init_args"]
+        for name in (f"x{scale}", overlay)
+    )
+    assert CSCSR(**{**base, **over}).scale == scale

@@ -1,0 +1,131 @@
+import pytest
+import torch
+import yaml
+
+from lightning_modules.networks import CSCSR, ClassicalDecoder
+from lightning_modules.tiles import forward_in_tiles
+from spikekit import bayer_mask, linear_motion, mosaic, psnr, spike_integrate_fire
+
+TINY = {"width": 4, "representation_width": 4, "features": 2, "stages": 2, "blocks": 1, "end_blocks": 1}
+
+
+def clip(batch=1, height=12, width=16, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    spikes = (torch.rand(batch, 41, height, width, generator=generator) < 0.3).to(torch.uint8)
+    return spikes, torch.randn(batch, 2, 2, height, width, generator=generator)
+
+
+# What the reference notes count for the three sizes, and what the paper's settings make of them.
+@pytest.mark.parametrize(("size", "parameters"), [("s", 165_801), ("m", 726_447), ("l", 2_832_251)])
+@pytest.mark.parametrize("scale", [2, 3, 4])
+def test_parameters_of_the_sizes(size, parameters, scale, configs):
+    settings = yaml.safe_load((configs / f"size/{size}.yaml").read_text())["model"]["network"]["init_args"]
+    network = CSCSR(scale, **settings)
+    assert sum(p.numel() for p in network.parameters()) == parameters
+
+
+@pytest.mark.parametrize("scale", [1, 2, 3, 4])
+@pytest.mark.parametrize("size", [(12, 16), (9, 7), (3, 4)])
+def test_any_size_and_scale(scale, size):
+    spikes, flow = clip(2, *size)
+    rgb = CSCSR(scale, **TINY)(spikes, flow)
+    assert rgb.shape == (2, 3, scale * size[0], scale * size[1])
+    assert rgb.isfinite().all()
+
+
+def test_time_points_are_those_of_the_paper():
+    network = CSCSR(**TINY)
+    assert network.times == (5, 8, 11, 14, 17, 20, 23, 26, 29, 32, 35)
+    assert network.flow_times == (5, 20, 35)
+
+
+def test_every_parameter_learns():
+    spikes, flow = clip()
+    network = CSCSR(2, **TINY)
+    network(spikes, flow).square().mean().backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in network.parameters())
+
+
+def test_search_undoes_motion_of_whole_bayer_periods():
+    """Features that move by one Bayer cell from time point to time point look the same at every time point."""
+    network = CSCSR(3, **TINY)
+    times = len(network.times)
+    still = torch.rand(1, 1, 2, 24, 60, generator=torch.Generator().manual_seed(0))
+    moving = torch.cat([still.roll(2 * (t - times // 2), dims=-1) for t in range(times)], dim=1)
+    flow = torch.zeros(1, 2, 24, 60)
+    flow[:, 0] = 2 * (times // 2)  # to the right, in sensor pixels, from the middle to the last time point
+    offsets = linear_motion(-flow, flow, network.times, scale=3)
+    for mask in bayer_mask(24, 60, scale=3):
+        pixels = network._search(moving, offsets, mask)[..., 36:-36]
+        torch.testing.assert_close(pixels, pixels[:, times // 2 :][:, :1].expand_as(pixels), rtol=0, atol=1e-5)
+        wrong = network._search(moving, -offsets, mask)[..., 36:-36]
+        assert (wrong - wrong[:, times // 2 :][:, :1]).abs().max() > 0.1
+
+
+def test_result_moves_with_the_scene_by_whole_bayer_periods():
+    network = CSCSR(2, **TINY).double()
+    spikes, _ = clip(1, 48, 48)
+    still = torch.zeros(1, 2, 2, 48, 48, dtype=torch.float64)
+    moved = network(spikes.roll((2, 4), dims=(-2, -1)), still).roll((-4, -8), dims=(-2, -1))
+    torch.testing.assert_close(moved[..., 32:-32, 32:-32], network(spikes, still)[..., 32:-32, 32:-32])
+
+
+def test_skip_starts_at_the_classical_picture():
+    spikes, flow = clip()
+    torch.testing.assert_close(
+        CSCSR(4, **TINY, skip=True)(spikes, flow), ClassicalDecoder("tfp", 4)(spikes.float()), rtol=0, atol=0
+    )
+
+
+def test_bfloat16_keeps_the_picture_in_float32():
+    spikes, flow = clip(1, 16, 16)
+    network = CSCSR(2, **TINY)
+    with torch.no_grad():
+        exact = network(spikes, flow)
+        with torch.autocast("cpu", torch.bfloat16):
+            half = network(spikes, flow)
+    assert half.dtype == torch.float32
+    assert (half - exact).abs().max() < 0.02
+
+
+def test_tiles_change_nothing():
+    network = CSCSR(2, **TINY, skip=True)
+    with torch.no_grad():
+        network.reconstruction.rgb.weight.normal_(std=0.1)
+    spikes, flow = clip(1, 70, 58)
+    network.estimate_flow = lambda _: flow
+    torch.testing.assert_close(forward_in_tiles(network, spikes, 32), network(spikes, flow), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("method", ["tfi", "tfp"])
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
+def test_classical_decoder_finds_the_colour_of_a_plain_scene(method, pattern):
+    rgb = torch.tensor([1.0, 0.5, 0.25]).reshape(1, 3, 1, 1)
+    light = 0.5 * mosaic(rgb.expand(1, 3, 12, 12), pattern).expand(41, 1, 12, 12).movedim(0, 1)
+    spikes, _ = spike_integrate_fire(light)
+    decoded = ClassicalDecoder(method, 2, pattern, alpha=0.5)(spikes)
+    assert psnr(decoded, rgb.expand_as(decoded)).item() > 30
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"frames": 40}, "odd frames"),
+        ({"stride": 7}, "divides frames - window"),
+        ({"scale": 0}, "scale"),
+        ({"pattern": "RGB"}, "pattern"),
+        ({"width": 0}, "1 or more"),
+    ],
+)
+def test_wrong_arguments(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        CSCSR(**{**TINY, **arguments})
+
+
+def test_wrong_input():
+    spikes, flow = clip()
+    network = CSCSR(2, **TINY)
+    with pytest.raises(ValueError, match=r"expected \(B, 41, H, W\) of at least 3 x 3 pixels, got \(1, 21, 12, 16\)"):
+        network(spikes[:, :21], flow)
+    with pytest.raises(ValueError, match="flow: expected"):
+        network(spikes, flow[..., :8])
