@@ -23,6 +23,7 @@ from spikekit.files import SpikeFileError, iter_spikes, read_spikes, spikes_shap
 from spikekit.metrics import psnr, ssim
 from spikekit.motion import JointFlow, LinearMotion, UpsampleFlow, joint_flow, linear_motion, upsample_flow
 from spikekit.pictures import flow_to_rgb, panel, read_picture, write_picture
+from spikekit.scene import Layer, Motion, Scene, simulate_spikes
 from spikekit.sensor import SpikeIntegrateFire, spike_integrate_fire
 from spikekit.warp import FlowWarp, FlowWarpIdw, flow_warp, flow_warp_idw
 
@@ -36,9 +37,12 @@ __all__ = [
     "FlowWarp",
     "FlowWarpIdw",
     "JointFlow",
+    "Layer",
     "LinearMotion",
     "MergeBayer",
     "Mosaic",
+    "Motion",
+    "Scene",
     "SpikeFileError",
     "SpikeIntegrateFire",
     "SpikeInterval",
@@ -64,6 +68,7 @@ __all__ = [
     "psnr",
     "read_picture",
     "read_spikes",
+    "simulate_spikes",
     "spike_integrate_fire",
     "spike_interval",
     "spikes_shape",

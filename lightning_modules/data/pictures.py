@@ -19,7 +19,6 @@ _TRAIN = [
     "ihc.png",
     "retina.jpg",
     "hubble_deep_field.jpg",
-    "color.png",
     "brick.png",
     "grass.png",
     "camera.png",

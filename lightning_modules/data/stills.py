@@ -20,7 +20,7 @@ from spikekit import bayer_pattern
 from spikekit.check import check_positive, check_scale
 from spikekit.scene import Layer, Motion, Scene, simulate_spikes
 
-_TEXTURES = 0.4  # share of procedural pictures among embedded ones
+_TEXTURES = 0.3  # share of procedural pictures among embedded ones
 _MOST_WORKERS = 8
 
 

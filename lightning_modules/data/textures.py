@@ -65,9 +65,14 @@ def texture(height: int, width: int, rng: np.random.Generator) -> Tensor:
     return torch.from_numpy(draw(height, width, rng).clip(0, 1).astype("float32"))
 
 
+def _colour(rng: np.random.Generator) -> np.ndarray:
+    """A random colour, (3, 1, 1): most are muted, as in photographs, some glare."""
+    return (rng.uniform(0, 1) + rng.exponential(0.15) * rng.standard_normal((3, 1, 1))).clip(0, 1)
+
+
 def _ramp(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Colour values in [0, 1] from one random colour to another."""
-    first, second = rng.uniform(0, 1, (2, 3, 1, 1))
+    first, second = _colour(rng), _colour(rng)
     return first + (second - first) * values
 
 
@@ -79,8 +84,8 @@ def _noise(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
     gain[0, 0] = 0
     field = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((3, height, width), "float32")) * gain, (height, width))
     field /= field.std() + 1e-6
-    common = rng.uniform(0, 1)
-    field = common * field[:1] * rng.choice([-1.0, 1.0], (3, 1, 1), p=[0.1, 0.9]) + (1 - common) * field
+    own = rng.uniform(0, 1) ** 2
+    field = (1 - own) * field[:1] * rng.choice([-1.0, 1.0], (3, 1, 1), p=[0.05, 0.95]) + own * field
     return rng.uniform(0.3, 0.7, (3, 1, 1)) + rng.uniform(0.1, 0.4) * field
 
 
@@ -121,7 +126,7 @@ def _patches(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
             continue
         size = int(np.exp(rng.uniform(np.log(6), np.log(max(7.0, 0.6 * side)))))
         mask = outline_mask(size, rng).numpy()
-        paint = rng.uniform(0, 1, (3, 1, 1))
+        paint = _colour(rng)
         if size >= 16 and rng.uniform() < 0.3:
             paint = [_gratings, _checkers, _noise][rng.integers(3)](size, size, rng)
         top, left = rng.integers(-size // 2, height - size // 2), rng.integers(-size // 2, width - size // 2)
@@ -138,7 +143,7 @@ def _patches(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
 def _print(picture: np.ndarray, rng: np.random.Generator) -> None:
     """Paint a line of letter-like strokes."""
     height, width = picture.shape[1:]
-    letter, ink = int(rng.integers(5, 25)), rng.uniform(0, 1, (3, 1, 1))
+    letter, ink = int(rng.integers(5, 25)), _colour(rng)
     top, left = rng.integers(0, height), rng.integers(-width // 4, width)
     stroke = max(1, letter // 6)
     for start in range(left, min(left + letter * int(rng.integers(3, 30)), width), letter):
