@@ -16,7 +16,8 @@ PUBLIC = """
     Motion Scene SpikeFileError SpikeIntegrateFire SpikeInterval SplitBayer SplitColors Tfi Tfp UpsampleFlow
     bayer_mask bayer_pattern bayer_sites bin_to_sensor demosaic flow_to_rgb flow_warp flow_warp_idw iter_spikes
     joint_flow linear_motion merge_bayer mosaic panel psnr read_picture read_spikes simulate_spikes
-    spike_integrate_fire spike_interval spikes_shape split_bayer split_colors ssim tfi tfp upsample_flow write_picture write_spikes
+    spike_integrate_fire spike_interval spikes_shape split_bayer split_colors ssim tfi tfp upsample_flow write_picture
+    write_spikes
 """.split()  # noqa: SIM905
 
 SPIKES = (torch.rand(2, 9, 4, 6, generator=torch.Generator().manual_seed(1)) < 0.4).double()
