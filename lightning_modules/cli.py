@@ -19,7 +19,7 @@ from pytorch_lightning.loggers import TensorBoardLogger
 from lightning_modules.callbacks import PredictionPictures, TestReport, ValidationPictures
 from lightning_modules.data import Recording, StillScenes
 from lightning_modules.module import CheckpointMismatchError, SuperResolution
-from lightning_modules.networks import CSCSR
+from lightning_modules.networks import CSCSR, Network
 from spikekit import SpikeFileError
 
 #: classes whose arguments ``--help`` lists, by the option that names them
@@ -56,6 +56,12 @@ class Command(LightningCLI):
         )
         for name in ("scale", "frames", "alpha"):
             parser.link_arguments(f"model.network.init_args.{name}", f"data.init_args.{name}")
+        frames_and_window = "model.network.init_args.frames", "model.network.init_args.window"
+        parser.link_arguments(
+            frames_and_window,
+            "data.init_args.flow_times",
+            lambda frames, window: (window // 2, frames - 1 - window // 2),
+        )
 
     def before_instantiate_classes(self) -> None:
         """Turn ``--ckpt_path best`` and ``last`` into files, and keep a run from being written over."""
@@ -73,6 +79,7 @@ class Command(LightningCLI):
         try:
             super().instantiate_classes()
             self.datamodule.setup()  # here, so that what is wrong with it is known before anything is written
+            _check_agreement(self.model.network, self.datamodule)
         except (OSError, ValueError) as error:
             raise InputError(str(error)) from error
 
@@ -105,6 +112,14 @@ class Command(LightningCLI):
     def before_predict(self) -> None:  # noqa: D102
         if type(self.datamodule).predict_dataloader is LightningDataModule.predict_dataloader:
             raise InputError("predict: expected a recording: --data Recording --data.path FILE")
+
+
+def _check_agreement(network: Network, data: LightningDataModule) -> None:
+    """Scale, frames and alpha of the data follow the network; a recording has a Bayer phase of its own."""
+    if isinstance(data, StillScenes) and data.options["pattern"] != network.pattern:
+        raise ValueError(
+            f"data.pattern: expected {network.pattern}, as the network has it, got {data.options['pattern']}"
+        )
 
 
 def _precision(accelerator: str) -> str:

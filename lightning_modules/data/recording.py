@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-
 from pytorch_lightning import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
@@ -49,10 +48,10 @@ class RecordingClips(Dataset[dict[str, Any]]):
         self.path, self.flip, self.frames, self.every = path, flip, frames, every
         self.clips = (total - frames) // every + 1
 
-    def __len__(self) -> int:  # noqa: D105
+    def __len__(self) -> int:
         return self.clips
 
-    def __getitem__(self, index: int) -> dict[str, Any]:  # noqa: D105
+    def __getitem__(self, index: int) -> dict[str, Any]:
         if not 0 <= index < self.clips:
             raise IndexError(index)
         start = index * self.every
@@ -86,7 +85,24 @@ class Recording(LightningDataModule):
         frames: int = 41,
     ) -> None:
         super().__init__()
-        self.clips = RecordingClips(path, height, width, flip, pattern, frames, every)
+        self.path = path
+        self.how = {
+            "height": height,
+            "width": width,
+            "flip": flip,
+            "pattern": pattern,
+            "frames": frames,
+            "every": every,
+        }
+
+    def setup(self, stage: str | None = None) -> None:
+        """Open the recording.
+
+        Raises:
+            spikekit.SpikeFileError: the file cannot be read.
+            ValueError: the recording is shorter than a clip, or an argument is out of range.
+        """
+        self.clips = RecordingClips(self.path, **self.how)
 
     def predict_dataloader(self) -> DataLoader[dict[str, Any]]:  # noqa: D102
         return DataLoader(self.clips, batch_size=1)

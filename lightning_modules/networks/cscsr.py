@@ -218,10 +218,20 @@ class CSCSR(Network):
         self.refinement = nn.ModuleList(FeatureRefinement(len(self.times), features, width) for _ in range(3))
         self.reconstruction = ColorCorrelation(width, stages, blocks, end_blocks)
         self.base = ClassicalDecoder("tfp", scale, pattern, alpha, window=frames) if skip else None
-        if skip:
-            nn.init.zeros_(self.reconstruction.rgb.weight)
-            nn.init.zeros_(self.reconstruction.rgb.bias)
+        self._initialize()
         self._masks: dict[Any, Tensor] = {}
+
+    def _initialize(self) -> None:
+        """Keep the size of signals from the spikes to the picture; torch's default would lose them on the way."""
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+                nn.init.zeros_(module.bias)
+        for module in self.modules():
+            if isinstance(module, ResBlock):
+                module.body[-1].weight.data *= 0.1
+        if self.base is not None:
+            nn.init.zeros_(self.reconstruction.rgb.weight)
 
     def forward(self, spikes: Tensor, flow: Tensor | None = None) -> Tensor:  # noqa: D102
         check_planes("spikes", spikes, 4, "(B, N, H, W)")

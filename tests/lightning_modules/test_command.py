@@ -21,6 +21,7 @@ data:
 trainer:
   max_steps: 6
   check_val_every_n_epoch: 1
+  log_every_n_steps: 2
   enable_progress_bar: false
 """
 
@@ -183,7 +184,8 @@ def test_the_paper_is_the_default(configs, capsys):
     config = yaml.safe_load(capsys.readouterr().out)
     network, data = config["model"]["network"]["init_args"], config["data"]["init_args"]
     assert [network[name] for name in ("scale", "frames", "window", "stride", "pattern")] == [4, 41, 11, 3, "RGGB"]
-    assert [data[name] for name in ("patch", "batch_size", "pattern", "alpha")] == [96, 4, "RGGB", 0.4]
+    assert network["alpha"] == 0.4
+    assert [data[name] for name in ("patch", "batch_size", "pattern")] == [96, 4, "RGGB"]
     assert config["model"]["optimizer"]["class_path"] == "torch.optim.Adam"
     assert config["model"]["optimizer"]["init_args"]["lr"] == 1e-4
     assert config["model"]["lr_scheduler"]["init_args"]["step_size"] == 7500
