@@ -112,7 +112,11 @@ class ColorCorrelation(nn.Module):
             nn.ModuleList(nn.Sequential(*(ResBlock(width) for _ in range(blocks))) for _ in range(3))
             for _ in range(stages)
         )
-        self.fuse = nn.ModuleList(ConvBlock((3 if stage == 0 else 4) * width, width) for stage in range(stages))
+        # leaky, unlike ConvBlock: everything passes through here, and must not die
+        self.fuse = nn.ModuleList(
+            nn.Sequential(conv((3 if stage == 0 else 4) * width, width), nn.LeakyReLU(0.1, inplace=True))
+            for stage in range(stages)
+        )
         self.end = nn.Sequential(*(ResBlock(width) for _ in range(end_blocks)))
         self.rgb = conv(width, 3)
 
@@ -222,10 +226,16 @@ class CSCSR(Network):
         self._masks: dict[Any, Tensor] = {}
 
     def _initialize(self) -> None:
-        """Keep the size of signals from the spikes to the picture; torch's default would lose them on the way."""
+        """Start nearly pixel by pixel: orthogonal centre taps, small ones around (Xiao et al., ICML 2018).
+
+        A dozen random 3 x 3 filters in a row would blur what the network is to sharpen: training then rests for
+        hundreds of steps on a plateau, or dies on it.
+        """
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+                module.weight.data *= 0.2
+                module.weight.data[:, :, 1, 1] += nn.init.orthogonal_(torch.empty(module.weight.shape[:2]), gain=1.2)
                 nn.init.zeros_(module.bias)
         for module in self.modules():
             if isinstance(module, ResBlock):
