@@ -31,8 +31,8 @@ class ClassicalFlow(Motion):
     The clip is decoded by TFI at the three times, and each 2 x 2 Bayer cell is averaged to one grey pixel, so that the
     noise of the four colours is averaged *before* motion is estimated; averaging four flows afterwards, as eq. (7)
     does with a learned estimator, was less accurate here and four times the work. TFI needs no window, which would
-    reach over the ends of the clip and shift the time that it stands for. Of scikit-image's two estimators this one bears
-    the noise better than TV-L1; kornia has no dense flow estimator without weights.
+    reach over the ends of the clip and shift the time that it stands for. Of scikit-image's two estimators this one
+    bears the noise better than TV-L1; kornia has no dense flow estimator without weights.
 
     Args:
         radius: of the Gaussian-weighted window, in Bayer cells.

@@ -119,7 +119,7 @@ def _tables(mask: Tensor, neighbors: int) -> _Tables:
         if len(columns):
             axes = (np.array(rows), height), (columns, width)
             lookup = [
-                torch.from_numpy(_nearest_on_axis(*axis, neighbors)).to(mask.device, torch.int32) for axis in axes
+                torch.from_numpy(_nearest_on_axis(*axis, neighbors).T.astype(np.int32)).to(mask.device) for axis in axes
             ]
             tables.append((lookup[0], lookup[1]))
     if not tables:
@@ -131,12 +131,13 @@ def _tables(mask: Tensor, neighbors: int) -> _Tables:
 
 def _on_axis(table: Tensor, cell: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
     """Nearest positions on one axis, and their squared distance less that of a common reference: both (k, n)."""
-    top = table.shape[0] - 1
+    top = table.shape[1] - 1
     half = (2 * cell + torch.ceil(2 * part).nan_to_num(0).long()).clamp(0, top)
-    position = table[half].T
+    position = table.index_select(1, half)
     reference = cell.clamp(0, top // 2)
+    step = (position - reference.int()).to(part.dtype)
     # (p - q)^2 - (r - q)^2 without squaring what is far away; q = cell + part
-    return position, (reference - position) * (2 * part - (reference - cell) - (position - cell))
+    return position, step * (step + 2 * ((reference - cell).to(part.dtype) - part))
 
 
 @torch.library.custom_op("spikekit::nearest_known", mutates_args=())
@@ -240,8 +241,9 @@ def flow_warp_idw(features: Tensor, flow: Tensor, mask: Tensor, *, neighbors: in
     nearest = _nearest_known(cell, part.detach(), mask, neighbors)
     exists = nearest >= 0
     nearest = nearest.clamp(min=0)
-    dx = (nearest % width - cell[:, :1]).to(dtype) - part[:, :1]
-    dy = (nearest // width - cell[:, 1:]).to(dtype) - part[:, 1:]
+    row = nearest // width
+    dx = (nearest - row * width - cell[:, :1]).to(dtype) - part[:, :1]
+    dy = (row - cell[:, 1:]).to(dtype) - part[:, 1:]
     square = dx * dx + dy * dy
     hit = square == 0
     distance = torch.where(hit, 1, square).sqrt() * ~hit
