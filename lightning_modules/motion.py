@@ -11,7 +11,7 @@ from spikekit import split_bayer, tfi, upsample_flow
 from spikekit.check import check_planes
 
 
-class Motion(nn.Module):
+class MotionEstimator(nn.Module):
     r"""Base of the estimators.
 
     Shape:
@@ -25,7 +25,7 @@ class Motion(nn.Module):
         raise NotImplementedError
 
 
-class ClassicalFlow(Motion):
+class ClassicalFlow(MotionEstimator):
     r"""Iterative Lucas-Kanade (scikit-image) on decoded pictures: no weights, runs on the CPU.
 
     The clip is decoded by TFI at the three times, and each 2 x 2 Bayer cell is averaged to one grey pixel, so that the
@@ -38,7 +38,7 @@ class ClassicalFlow(Motion):
         radius: of the Gaussian-weighted window, in Bayer cells.
 
     Shape:
-        As :class:`Motion`; no gradient.
+        As :class:`MotionEstimator`; no gradient.
 
     Example:
         >>> to_first, to_last = ClassicalFlow()(torch.ones(1, 41, 16, 16), (5, 20, 35), "RGGB")
@@ -78,11 +78,11 @@ class ClassicalFlow(Motion):
         return f"radius={self.radius}"
 
 
-class ZeroFlow(Motion):
+class ZeroFlow(MotionEstimator):
     r"""Nothing moves.
 
     Shape:
-        As :class:`Motion`.
+        As :class:`MotionEstimator`.
 
     Example:
         >>> ZeroFlow()(torch.ones(1, 41, 16, 16), (5, 20, 35), "RGGB")[0].any().item()

@@ -53,7 +53,7 @@ def info(args: argparse.Namespace) -> None:
     _check_size_given(args)
     frames, height, width = spikes_shape(args.file, args.height, args.width)
     counts = torch.zeros(height, width, dtype=torch.int64)
-    for frame in iter_spikes(args.file, args.height, args.width):
+    for frame in iter_spikes(args.file, args.height, args.width, flip=args.flip):
         counts += frame
 
     pixels, spikes = counts.numel(), int(counts.sum())
@@ -151,7 +151,6 @@ def _parser() -> argparse.ArgumentParser:
         "decode water.dat --height 1000 --width 1000 --flip --pattern BGGR --method tfi -o water.png",
     )
     _add_recording(verb)
-    verb.add_argument("--flip", action="store_true", help="the frames are stored upside down, as real cameras do")
     verb.add_argument(
         "--method",
         required=True,
@@ -192,6 +191,7 @@ def _add_recording(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("file", type=Path, metavar="FILE", help="a recording, .dat (8 pixels a byte, no header) or .npz")
     verb.add_argument("--height", type=_whole(1), metavar="H", help="rows of a frame; a .dat needs it")
     verb.add_argument("--width", type=_whole(1), metavar="W", help="columns of a frame; a .dat needs it")
+    verb.add_argument("--flip", action="store_true", help="the frames are stored upside down, as real cameras do")
 
 
 def _whole(least: int) -> Any:
@@ -244,7 +244,7 @@ def _check_size_given(args: argparse.Namespace) -> None:
 
 def _at(rates: Tensor, index: Tensor) -> str:
     row, column = divmod(int(index), rates.shape[-1])
-    return f"{rates.flatten()[index]:.4f} spikes a frame, at row {row}, column {column} as stored"
+    return f"{rates.flatten()[index]:.4f} spikes a frame, at row {row}, column {column}"
 
 
 def _one_line(error: BaseException) -> str:

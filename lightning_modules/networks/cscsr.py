@@ -6,12 +6,12 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
+from kornia.filters import filter2d_separable
 from torch import Tensor, nn
 
-from lightning_modules.motion import Motion
-from lightning_modules.networks.classical import ClassicalDecoder
+from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks.network import Network
-from spikekit import bayer_mask, bayer_pattern, flow_warp_idw, linear_motion, split_colors
+from spikekit import bayer_mask, bayer_pattern, demosaic, flow_warp_idw, linear_motion, split_colors, tfp
 from spikekit.check import check_planes, check_scale
 
 
@@ -149,8 +149,8 @@ class CSCSR(Network):
         stages: fusions of the colours.
         blocks: residual blocks of every colour before every fusion.
         end_blocks: residual blocks after the last fusion.
-        skip: learn what to add to the enlarged TFP picture instead of the picture itself. The paper has no such
-            skip; with it training starts where the classical decoder ends.
+        skip: learn what to add to a smooth, enlarged TFP picture instead of the picture itself. The paper has no
+            such skip; with it training starts where the classical decoder ends.
         alpha: gain of the camera, what a white pixel receives per clock in thresholds; only the skip divides by it.
         neighbors: known pixels that the temporal pixel search weighs.
         motion: estimator that is asked where no flow is given; when not given,
@@ -186,7 +186,7 @@ class CSCSR(Network):
         skip: bool = False,
         alpha: float = 0.4,
         neighbors: int = 4,
-        motion: Motion | None = None,
+        motion: MotionEstimator | None = None,
     ) -> None:
         check_scale(scale)
         if frames % 2 == 0 or window % 2 == 0 or not 1 <= window < frames or (frames - window) % stride:
@@ -221,7 +221,8 @@ class CSCSR(Network):
         )
         self.refinement = nn.ModuleList(FeatureRefinement(len(self.times), features, width) for _ in range(3))
         self.reconstruction = ColorCorrelation(width, stages, blocks, end_blocks)
-        self.base = ClassicalDecoder("tfp", scale, pattern, alpha, window=frames) if skip else None
+        self.skip = skip
+        self.alpha = alpha
         self._initialize()
         self._masks: dict[Any, Tensor] = {}
 
@@ -240,7 +241,7 @@ class CSCSR(Network):
         for module in self.modules():
             if isinstance(module, ResBlock):
                 module.body[-1].weight.data *= 0.1
-        if self.base is not None:
+        if self.skip:
             nn.init.zeros_(self.reconstruction.rgb.weight)
 
     def forward(self, spikes: Tensor, flow: Tensor | None = None) -> Tensor:  # noqa: D102
@@ -268,7 +269,7 @@ class CSCSR(Network):
             )
         ]
         rgb = self.reconstruction(colors)
-        return rgb if self.base is None else rgb + self.base(spikes)
+        return rgb + self._base(spikes) if self.skip else rgb
 
     def _search(self, features: Tensor, offsets: Tensor, mask: Tensor) -> Tensor:
         """Temporal pixel search (section 4.3, Fig. 5 b): (B, T, C, H, W) to (B, T, C, s H, s W)."""
@@ -276,6 +277,16 @@ class CSCSR(Network):
             fine = F.interpolate(features.flatten(0, 1), scale_factor=self.scale, mode="bilinear", align_corners=False)
             features = fine.unflatten(0, features.shape[:2])
         return flow_warp_idw(features, offsets, mask, neighbors=self.neighbors)
+
+    def _base(self, spikes: Tensor) -> Tensor:
+        """TFP of the whole clip, demosaiced, smoothed, enlarged."""
+        raw = tfp(spikes, self.frames)[:, self.frames // 2] / self.alpha
+        # zero at the Nyquist frequency, where demosaicing leaves a zipper that training would have to undo first
+        binomial = raw.new_tensor([[0.25, 0.5, 0.25]])
+        smooth = filter2d_separable(demosaic(raw, self.pattern), binomial, binomial)
+        if self.scale == 1:
+            return smooth
+        return F.interpolate(smooth, scale_factor=self.scale, mode="bicubic", align_corners=False)
 
     def _mask(self, height: int, width: int, device: torch.device) -> tuple[Tensor, ...]:
         key = height, width, device

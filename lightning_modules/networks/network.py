@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lightning_modules.motion import ClassicalFlow, Motion
+from lightning_modules.motion import ClassicalFlow, MotionEstimator
 
 
 class Network(nn.Module):
@@ -27,7 +27,7 @@ class Network(nn.Module):
     """
 
     def __init__(
-        self, settings: dict[str, Any], flow_times: tuple[int, int, int], motion: Motion | None = None
+        self, settings: dict[str, Any], flow_times: tuple[int, int, int], motion: MotionEstimator | None = None
     ) -> None:
         super().__init__()
         self.settings = settings

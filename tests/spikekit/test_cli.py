@@ -73,9 +73,9 @@ def test_info(clip, capsys):
     assert lines["file"] == str(clip)
     assert lines["size"] == "12 x 20 (H x W), 1800 bytes"
     assert lines["frames"] == "60, 3 ms at 20 kHz"
-    assert lines["darkest"] == "0.0000 spikes a frame, at row 0, column 0 as stored"
+    assert lines["darkest"] == "0.0000 spikes a frame, at row 0, column 0"
     assert lines["brightest"].startswith("0.5000 spikes a frame, at row ")
-    assert lines["brightest"].endswith("column 19 as stored")
+    assert lines["brightest"].endswith("column 19")
     assert lines["never_fire"] == "1 of 240 pixels, 0.42%"
     assert lines["always_fire"] == "0 of 240 pixels, 0.00%"
     assert lines["bits_set"].startswith(f"{read_spikes(clip, 12, 20).sum()} of 14400, ")
