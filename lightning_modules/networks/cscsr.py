@@ -273,10 +273,13 @@ class CSCSR(Network):
 
     def _search(self, features: Tensor, offsets: Tensor, mask: Tensor) -> Tensor:
         """Temporal pixel search (section 4.3, Fig. 5 b): (B, T, C, H, W) to (B, T, C, s H, s W)."""
-        if self.scale > 1:
-            fine = F.interpolate(features.flatten(0, 1), scale_factor=self.scale, mode="bilinear", align_corners=False)
-            features = fine.unflatten(0, features.shape[:2])
-        return flow_warp_idw(features, offsets, mask, neighbors=self.neighbors)
+        # one time point after the other: what the search needs on the way is many times its result
+        pixels = []
+        for feature, offset in zip(features.unbind(1), offsets.unbind(1), strict=True):
+            if self.scale > 1:
+                feature = F.interpolate(feature, scale_factor=self.scale, mode="bilinear", align_corners=False)
+            pixels.append(flow_warp_idw(feature, offset, mask, neighbors=self.neighbors))
+        return torch.stack(pixels, dim=1)
 
     def _base(self, spikes: Tensor) -> Tensor:
         """TFP of the whole clip, demosaiced, smoothed, enlarged."""
