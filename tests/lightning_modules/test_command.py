@@ -110,7 +110,7 @@ def test_predict_writes_a_picture_per_clip(trained, overlay, configs, tmp_path):
         *("-o", tmp_path / "out"),
     )
     assert done.returncode == 0, done.stderr
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["frame_000020.png", "frame_000040.png"]
+    assert sorted(path.name for path in (tmp_path / "out").glob("*.png")) == ["frame_000020.png", "frame_000040.png"]
     assert read_picture(tmp_path / "out" / "frame_000040.png").shape == (3, 40, 52)
 
 

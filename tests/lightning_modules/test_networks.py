@@ -89,7 +89,8 @@ def test_bfloat16_keeps_the_picture_in_float32():
         with torch.autocast("cpu", torch.bfloat16):
             half = network(spikes, flow)
     assert half.dtype == torch.float32
-    assert (half - exact).abs().max() < 0.02
+    assert not half.bfloat16().float().equal(half)
+    assert (half - exact).abs().max() < 0.05 * exact.abs().max()
 
 
 def test_tiles_change_nothing():
