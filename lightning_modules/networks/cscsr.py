@@ -14,6 +14,8 @@ from lightning_modules.networks.network import Network
 from spikekit import bayer_mask, bayer_pattern, demosaic, flow_warp_idw, linear_motion, split_colors, tfp
 from spikekit.check import check_planes, check_scale
 
+_SEARCHED = 1 << 19  # positions that are searched in one go
+
 
 def conv(inputs: int, outputs: int) -> nn.Conv2d:
     """3 x 3 convolution that keeps the size."""
@@ -273,13 +275,14 @@ class CSCSR(Network):
 
     def _search(self, features: Tensor, offsets: Tensor, mask: Tensor) -> Tensor:
         """Temporal pixel search (section 4.3, Fig. 5 b): (B, T, C, H, W) to (B, T, C, s H, s W)."""
-        # one time point after the other: what the search needs on the way is many times its result
+        # a few time points after the others: what the search needs on the way is many times its result
+        few = max(1, _SEARCHED // (offsets.shape[-2] * offsets.shape[-1]))
         pixels = []
-        for feature, offset in zip(features.unbind(1), offsets.unbind(1), strict=True):
+        for part, offset in zip(features.flatten(0, 1).split(few), offsets.flatten(0, 1).split(few), strict=True):
             if self.scale > 1:
-                feature = F.interpolate(feature, scale_factor=self.scale, mode="bilinear", align_corners=False)
-            pixels.append(flow_warp_idw(feature, offset, mask, neighbors=self.neighbors))
-        return torch.stack(pixels, dim=1)
+                part = F.interpolate(part, scale_factor=self.scale, mode="bilinear", align_corners=False)
+            pixels.append(flow_warp_idw(part, offset, mask, neighbors=self.neighbors))
+        return torch.cat(pixels).unflatten(0, features.shape[:2])
 
     def _base(self, spikes: Tensor) -> Tensor:
         """TFP of the whole clip, demosaiced, smoothed, enlarged."""
