@@ -2,6 +2,7 @@ import pytest
 import torch
 import yaml
 
+from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks import CSCSR, ClassicalDecoder
 from lightning_modules.tiles import forward_in_tiles
 from spikekit import bayer_mask, linear_motion, mosaic, psnr, spike_integrate_fire
@@ -60,6 +61,27 @@ def test_search_undoes_motion_of_whole_bayer_periods():
         torch.testing.assert_close(pixels, pixels[:, times // 2 :][:, :1].expand_as(pixels), rtol=0, atol=1e-5)
         wrong = network._search(moving, -offsets, mask)[..., 36:-36]
         assert (wrong - wrong[:, times // 2 :][:, :1]).abs().max() > 0.1
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_flows_reach_their_time_points(given):
+    class Estimator(MotionEstimator):
+        def forward(self, spikes, times, pattern):
+            assert (times, pattern) == ((5, 20, 35), "RGGB")
+            still = torch.zeros(len(spikes), 2, *spikes.shape[-2:])
+            return still - 1, still + 2
+
+    network = CSCSR(3, **TINY, motion=Estimator())
+    seen = []
+    search = network._search
+    network._search = lambda features, offsets, mask: seen.append(offsets) or search(features, offsets, mask)
+    spikes, flow = clip()
+    flow[:, 0], flow[:, 1] = -1, 2
+    network(spikes, flow) if given else network(spikes)
+    assert len(seen) == 3
+    for offsets in seen:
+        expected = torch.tensor([3 * (-1 * (20 - t) if t < 20 else 2 * (t - 20)) / 15 for t in network.times])
+        torch.testing.assert_close(offsets, expected.reshape(1, 11, 1, 1, 1).expand_as(offsets))
 
 
 def test_result_moves_with_the_scene_by_whole_bayer_periods():
