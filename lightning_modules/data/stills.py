@@ -239,7 +239,7 @@ def _one_thread(_: int) -> None:
 
 
 def _default_workers() -> int:
-    # One core stays with training; beyond eight workers no single GPU was found waiting. A lone core makes its clips
+    # One core stays with training; the cap of eight is a guess that no GPU has tested. A lone core makes its clips
     # between the steps: a process beside it would only take turns with it.
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(0, min(_MOST_WORKERS, cores - 1))

@@ -19,7 +19,7 @@ class ClassicalDecoder(nn.Module):
         scale: super-resolution factor.
         pattern: Bayer phase.
         alpha: gain of the camera, what a white pixel receives per clock in thresholds; the result is divided by it.
-        window: frames that TFP averages, odd; the whole clip of 41 frames is what suits alpha 0.4 best on Vid4.
+        window: frames that TFP averages, odd.
 
     Shape:
         - Input: spikes :math:`(B, N, H, W)`, any real dtype

@@ -1,6 +1,7 @@
 import pytest
 import torch
 import yaml
+from torch.utils.flop_counter import FlopCounterMode
 
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks import CSCSR, ClassicalDecoder
@@ -16,13 +17,18 @@ def clip(batch=1, height=12, width=16, seed=0):
     return spikes, torch.randn(batch, 2, 2, height, width, generator=generator)
 
 
-# What the reference notes count for the three sizes, and what the paper's settings make of them.
-@pytest.mark.parametrize(("size", "parameters"), [("s", 165_801), ("m", 726_447), ("l", 2_832_251)])
-@pytest.mark.parametrize("scale", [2, 3, 4])
-def test_parameters_of_the_sizes(size, parameters, scale, configs):
+# The figures of README.md and configs/size.
+@pytest.mark.parametrize(
+    ("size", "parameters", "mmac"), [("s", 165_801, 1.9), ("m", 726_447, 9.3), ("l", 2_832_251, 43)]
+)
+def test_parameters_and_work_of_the_sizes(size, parameters, mmac, configs):
     settings = yaml.safe_load((configs / f"size/{size}.yaml").read_text())["model"]["network"]["init_args"]
-    network = CSCSR(scale, **settings)
-    assert sum(p.numel() for p in network.parameters()) == parameters
+    for scale in (2, 3, 4):
+        network = CSCSR(scale, **settings)
+        assert sum(p.numel() for p in network.parameters()) == parameters
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        network(torch.zeros(1, 41, 8, 8), torch.zeros(1, 2, 2, 8, 8))
+    assert counter.get_total_flops() / 2 / 64 / 1e6 == pytest.approx(mmac, rel=0.02)
 
 
 @pytest.mark.parametrize("scale", [1, 2, 3, 4])
