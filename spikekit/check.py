@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import operator
+
 import torch
 from torch import Tensor
 
@@ -29,6 +31,17 @@ def check_planes(name: str, value: Tensor, ndim: int, shape: str, *, floating: b
         raise TypeError(f"{name}: expected {kind} tensor, got {value.dtype}")
 
 
+def check_dtype(dtype: torch.dtype | None, *others: torch.dtype) -> None:
+    """Raise unless the type asked for is None, floating, or one of ``others``.
+
+    Raises:
+        TypeError: another type, or no type.
+    """
+    known = dtype is None or isinstance(dtype, torch.dtype)
+    if not known or not (dtype is None or dtype.is_floating_point or dtype in others):
+        raise TypeError(f"dtype: expected a floating-point type{''.join(f' or {o}' for o in others)}, got {dtype!r}")
+
+
 def check_positive(name: str, value: float) -> None:
     """Raise unless ``value`` is a finite number above zero.
 
@@ -39,14 +52,26 @@ def check_positive(name: str, value: float) -> None:
         raise ValueError(f"{name}: expected a finite number above 0, got {value}")
 
 
+def check_whole(name: str, value: int) -> int:
+    """Return ``value`` as an int; raise unless it is a whole number, 1 or more.
+
+    Raises:
+        ValueError: anything else, True and False among it.
+    """
+    if not isinstance(value, int) and hasattr(value, "__index__"):  # NumPy's
+        value = operator.index(value)
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ValueError(f"{name}: expected a whole number >= 1, got {value!r}")
+    return value
+
+
 def check_scale(scale: int) -> None:
     """Raise unless ``scale`` is a whole number, 1 or more.
 
     Raises:
         ValueError: anything else.
     """
-    if isinstance(scale, bool) or not isinstance(scale, int) or scale < 1:
-        raise ValueError(f"scale: expected a whole number >= 1, got {scale!r}")
+    check_whole("scale", scale)
 
 
 def default_float(value: Tensor) -> torch.dtype:

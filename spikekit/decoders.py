@@ -7,13 +7,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from spikekit.check import check_planes, check_positive, default_float
+from spikekit.check import check_dtype, check_planes, check_positive, check_whole, default_float
+from spikekit.kernels import batch_first, register
 
 
 # The loops over time are custom operators: torch.compile would unroll them.
 @torch.library.custom_op("spikekit::spike_interval", mutates_args=())
-def _spike_interval(fired: Tensor) -> Tensor:
-    frames = fired.shape[-3]
+def _spike_interval(spikes: Tensor) -> Tensor:
+    fired, frames = spikes != 0, spikes.shape[-3]
     interval = torch.empty_like(fired, dtype=_interval_dtype(frames))
     planes = list(zip(fired.unbind(-3), interval.unbind(-3), strict=True))
 
@@ -38,60 +39,128 @@ def _spike_interval(fired: Tensor) -> Tensor:
 
 
 @_spike_interval.register_fake
-def _(fired: Tensor) -> Tensor:
-    return torch.empty_like(fired, dtype=_interval_dtype(fired.shape[-3]))
+def _(spikes: Tensor) -> Tensor:
+    return torch.empty_like(spikes, dtype=_interval_dtype(spikes.shape[-3]))
 
 
 def _interval_dtype(frames: int) -> torch.dtype:
     return torch.int16 if frames < 32767 else torch.int32
 
 
-@torch.library.custom_op("spikekit::sum_intervals", mutates_args=())
-def _sum_intervals(value: Tensor, fired: Tensor) -> Tensor:
-    """Sum ``value`` over every interval (last spike before n, first spike at or after n], and spread the sum on it."""
-    total = torch.empty_like(value)
-    planes = list(zip(value.unbind(-3), fired.unbind(-3), total.unbind(-3), strict=True))
-    running = torch.zeros_like(planes[0][0], dtype=torch.promote_types(value.dtype, torch.float32))
-    sums = []
-    for value_n, fired_n, _ in planes:
-        running = running + value_n
-        sums.append(running)
-        running = running.masked_fill(fired_n, 0)
-    spread = sums[-1]
-    for running, (_, fired_n, total_n) in zip(reversed(sums), reversed(planes), strict=True):
-        spread = torch.where(fired_n, running, spread)
-        total_n.copy_(spread)
-    return total
-
-
-@_sum_intervals.register_fake
-def _(value: Tensor, fired: Tensor) -> Tensor:
-    return torch.empty_like(value)
-
-
 @torch.library.custom_op("spikekit::tfi", mutates_args=())
-def _tfi(spikes: Tensor, max_range: float) -> Tensor:
-    interval = _spike_interval(spikes != 0)
-    wide = torch.promote_types(spikes.dtype, torch.float32)
+def _tfi(spikes: Tensor, max_range: float, dtype: torch.dtype) -> Tensor:
+    wide = torch.promote_types(dtype, torch.float32)
+    interval = torch.ops.spikekit.spike_interval(spikes)
     # a tensor over a tensor: torch divides a number by a tensor through the inverse, and 255 / 5 is not 51 then
-    return (torch.full_like(interval, max_range, dtype=wide) / interval).to(spikes.dtype)
+    return _to(torch.full_like(interval, max_range, dtype=wide) / interval, dtype)
 
 
 @_tfi.register_fake
-def _(spikes: Tensor, max_range: float) -> Tensor:
+def _(spikes: Tensor, max_range: float, dtype: torch.dtype) -> Tensor:
+    return torch.empty_like(spikes, dtype=dtype)
+
+
+def _to(value: Tensor, dtype: torch.dtype) -> Tensor:
+    """Cast; to uint8 by rounding to the nearest whole number, and cutting what is beyond."""
+    return value.round().clamp(0, 255).to(dtype) if dtype is torch.uint8 else value.to(dtype)
+
+
+@torch.library.custom_op("spikekit::tfi_grad", mutates_args=())
+def _tfi_grad(grad: Tensor, spikes: Tensor, rate: Tensor) -> Tensor:
+    """Sum the gradient over (last spike before n, first spike at or after n], spread it there, weigh it by the rate."""
+    result = torch.empty_like(spikes)
+    planes = list(zip(grad.unbind(-3), (spikes != 0).unbind(-3), rate.unbind(-3), result.unbind(-3), strict=True))
+    running = torch.zeros_like(planes[0][0], dtype=torch.promote_types(spikes.dtype, torch.float32))
+    sums = []
+    for grad_n, fired_n, _, _ in planes:
+        running = running + grad_n
+        sums.append(running)
+        running = running.masked_fill(fired_n, 0)
+    spread = sums[-1]
+    for running, (_, fired_n, rate_n, result_n) in zip(reversed(sums), reversed(planes), strict=True):
+        spread = torch.where(fired_n, running, spread)
+        result_n.copy_(spread * rate_n)
+    return result
+
+
+@_tfi_grad.register_fake
+def _(grad: Tensor, spikes: Tensor, rate: Tensor) -> Tensor:
     return torch.empty_like(spikes)
 
 
-def _save_tfi(ctx: Any, inputs: tuple[Tensor, float], output: Tensor) -> None:
+def _save_tfi(ctx: Any, inputs: tuple[Tensor, float, torch.dtype], output: Tensor) -> None:
     ctx.save_for_backward(inputs[0], output)
 
 
-def _tfi_backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+def _tfi_backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
     spikes, rate = ctx.saved_tensors
-    return _sum_intervals(grad, spikes != 0) * rate, None
+    return _tfi_grad(grad, spikes, rate), None, None
+
+
+@torch.library.custom_op("spikekit::tfp", mutates_args=())
+def _tfp(spikes: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Tensor:
+    wide = torch.promote_types(torch.promote_types(dtype, torch.float32), spikes.dtype)
+    total = _inside(spikes, window, wide if spikes.is_floating_point() else torch.int32)
+    return _to(total.to(wide) * max_range / _window_sizes(spikes, window), dtype)
+
+
+@_tfp.register_fake
+def _(spikes: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Tensor:
+    return torch.empty_like(spikes, dtype=dtype)
+
+
+@torch.library.custom_op("spikekit::tfp_grad", mutates_args=())
+def _tfp_grad(grad: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Tensor:
+    """The adjoint of TFP: every frame shares its gradient among the frames of its window."""
+    wide = torch.promote_types(torch.promote_types(dtype, torch.float32), grad.dtype)
+    share = grad.to(wide) * max_range / _window_sizes(grad, window)
+    return _inside(share, window, wide).to(dtype)
+
+
+@_tfp_grad.register_fake
+def _(grad: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Tensor:
+    return torch.empty_like(grad, dtype=dtype)
+
+
+def _ends(values: Tensor, window: int) -> tuple[Tensor, Tensor]:
+    """First frame of the window around every frame, and the first after it."""
+    n, half = torch.arange(values.shape[-3], device=values.device), window // 2
+    return (n - half).clamp(min=0), (n + half + 1).clamp(max=values.shape[-3])
+
+
+def _window_sizes(values: Tensor, window: int) -> Tensor:
+    begin, end = _ends(values, window)
+    return (end - begin)[:, None, None]
+
+
+def _inside(values: Tensor, window: int, dtype: torch.dtype) -> Tensor:
+    begin, end = _ends(values, window)
+    sums = torch.cumsum(values, dim=-3, dtype=dtype)
+    sums = torch.cat([torch.zeros_like(sums[..., :1, :, :]), sums], dim=-3)
+    return sums.index_select(-3, end) - sums.index_select(-3, begin)
+
+
+def _save_dtype(ctx: Any, inputs: tuple[Tensor, int, float, torch.dtype], output: Tensor) -> None:
+    values, ctx.window, ctx.max_range, _ = inputs
+    ctx.dtype = values.dtype
+
+
+def _adjoint(op: Any) -> Any:
+    return lambda ctx, grad: (op(grad, ctx.window, ctx.max_range, ctx.dtype), None, None, None)
 
 
 _tfi.register_autograd(_tfi_backward, setup_context=_save_tfi)
+_tfp.register_autograd(_adjoint(_tfp_grad), setup_context=_save_dtype)
+_tfp_grad.register_autograd(_adjoint(_tfp), setup_context=_save_dtype)
+for _name, _op in {
+    "spike_interval": _spike_interval,
+    "tfi": _tfi,
+    "tfi_grad": _tfi_grad,
+    "tfp": _tfp,
+    "tfp_grad": _tfp_grad,
+}.items():
+    register(_op, _name)
+    batch_first(_op)
 
 
 def spike_interval(spikes: Tensor) -> Tensor:
@@ -125,7 +194,7 @@ def spike_interval(spikes: Tensor) -> Tensor:
         Dong et al., CVPR 2024, eq. (4); Zhu et al., ICME 2019.
     """
     check_planes("spikes", spikes, 3, "(*, T, H, W)")
-    interval = _spike_interval(spikes != 0)
+    interval = _spike_interval(spikes)
     return interval.to(spikes.dtype) if spikes.is_floating_point() else interval
 
 
@@ -145,7 +214,7 @@ class SpikeInterval(nn.Module):
         return spike_interval(spikes)
 
 
-def tfi(spikes: Tensor, max_range: float = 1.0) -> Tensor:
+def tfi(spikes: Tensor, max_range: float = 1.0, *, dtype: torch.dtype | None = None) -> Tensor:
     r"""Texture from interval: light as the inverse of the spike interval, at every frame.
 
     .. math:: R_n = \delta / \Psi_n
@@ -161,13 +230,14 @@ def tfi(spikes: Tensor, max_range: float = 1.0) -> Tensor:
     Args:
         spikes: :math:`(*, T, H, W)`, zeros and ones, any real dtype.
         max_range: :math:`\delta`, the value of a pixel that fires at every clock.
+        dtype: that of the result; that of ``spikes`` where it is floating, else torch's default type. ``torch.uint8``
+            makes pictures: rounded to the nearest whole number, cut to 0 .. 255, without a gradient.
 
     Returns:
-        Raw intensities :math:`(*, T, H, W)`, in the dtype of ``spikes`` where that is floating, else in torch's
-        default type.
+        Raw intensities :math:`(*, T, H, W)`.
 
     Raises:
-        TypeError: ``spikes`` is not a tensor of real numbers.
+        TypeError: ``spikes`` is not a tensor of real numbers, ``dtype`` neither floating nor uint8.
         ValueError: fewer than three dimensions, an empty clip, ``max_range`` not above 0.
 
     Example:
@@ -180,7 +250,8 @@ def tfi(spikes: Tensor, max_range: float = 1.0) -> Tensor:
     """
     check_planes("spikes", spikes, 3, "(*, T, H, W)")
     check_positive("max_range", max_range)
-    return _tfi(spikes.to(default_float(spikes)), float(max_range))
+    check_dtype(dtype, torch.uint8)
+    return _tfi(spikes, float(max_range), dtype or default_float(spikes))
 
 
 class Tfi(nn.Module):
@@ -195,19 +266,21 @@ class Tfi(nn.Module):
         255.0
     """
 
-    def __init__(self, max_range: float = 1.0) -> None:
+    def __init__(self, max_range: float = 1.0, *, dtype: torch.dtype | None = None) -> None:
         super().__init__()
         check_positive("max_range", max_range)
+        check_dtype(dtype, torch.uint8)
         self.max_range = max_range
+        self.dtype = dtype
 
     def forward(self, spikes: Tensor) -> Tensor:  # noqa: D102
-        return tfi(spikes, self.max_range)
+        return tfi(spikes, self.max_range, dtype=self.dtype)
 
     def extra_repr(self) -> str:  # noqa: D102
-        return f"max_range={self.max_range}"
+        return f"max_range={self.max_range}" + (f", dtype={self.dtype}" if self.dtype else "")
 
 
-def tfp(spikes: Tensor, window: int, max_range: float = 1.0) -> Tensor:
+def tfp(spikes: Tensor, window: int, max_range: float = 1.0, *, dtype: torch.dtype | None = None) -> Tensor:
     r"""Texture from playback: light as the mean number of spikes in a window around every frame.
 
     .. math:: R_n = \frac{\delta}{w} \sum_{|i - n| \le (w - 1) / 2} S_i
@@ -221,13 +294,14 @@ def tfp(spikes: Tensor, window: int, max_range: float = 1.0) -> Tensor:
         spikes: :math:`(*, T, H, W)`, zeros and ones, any real dtype.
         window: number of frames, odd.
         max_range: :math:`\delta`, the value of a pixel that fires at every clock.
+        dtype: that of the result; that of ``spikes`` where it is floating, else torch's default type. ``torch.uint8``
+            makes pictures: rounded to the nearest whole number, cut to 0 .. 255, without a gradient.
 
     Returns:
-        Raw intensities :math:`(*, T, H, W)`, in the dtype of ``spikes`` where that is floating, else in torch's
-        default type.
+        Raw intensities :math:`(*, T, H, W)`.
 
     Raises:
-        TypeError: ``spikes`` is not a tensor of real numbers.
+        TypeError: ``spikes`` is not a tensor of real numbers, ``dtype`` neither floating nor uint8.
         ValueError: fewer than three dimensions, an empty clip, an even window or one below 1, ``max_range`` not
             above 0.
 
@@ -240,22 +314,16 @@ def tfp(spikes: Tensor, window: int, max_range: float = 1.0) -> Tensor:
         Dong et al., CVPR 2024, eq. (6); Zhu et al., ICME 2019.
     """
     check_planes("spikes", spikes, 3, "(*, T, H, W)")
-    _check_window(window)
+    window = _check_window(window)
     check_positive("max_range", max_range)
-    dtype = default_float(spikes)
-    wide = torch.promote_types(dtype, torch.float32)
-    frames, half = spikes.shape[-3], window // 2
-    counts = torch.cumsum(spikes, dim=-3, dtype=wide if spikes.is_floating_point() else torch.int32)
-    counts = torch.cat([torch.zeros_like(counts[..., :1, :, :]), counts], dim=-3)
-    n = torch.arange(frames, device=spikes.device)
-    begin, end = (n - half).clamp(min=0), (n + half + 1).clamp(max=frames)
-    inside = counts.index_select(-3, end) - counts.index_select(-3, begin)
-    return (inside.to(wide) * max_range / (end - begin)[:, None, None]).to(dtype)
+    check_dtype(dtype, torch.uint8)
+    return _tfp(spikes, window, float(max_range), dtype or default_float(spikes))
 
 
-def _check_window(window: int) -> None:
-    if isinstance(window, bool) or not isinstance(window, int) or window < 1 or window % 2 == 0:
-        raise ValueError(f"window: expected an odd number of frames, 1 or more, got {window!r}")
+def _check_window(window: int) -> int:
+    if check_whole("window", window) % 2 == 0:
+        raise ValueError(f"window: expected an odd number of frames, got {window}")
+    return check_whole("window", window)
 
 
 class Tfp(nn.Module):
@@ -270,15 +338,17 @@ class Tfp(nn.Module):
         1.0
     """
 
-    def __init__(self, window: int, max_range: float = 1.0) -> None:
+    def __init__(self, window: int, max_range: float = 1.0, *, dtype: torch.dtype | None = None) -> None:
         super().__init__()
         _check_window(window)
         check_positive("max_range", max_range)
+        check_dtype(dtype, torch.uint8)
         self.window = window
         self.max_range = max_range
+        self.dtype = dtype
 
     def forward(self, spikes: Tensor) -> Tensor:  # noqa: D102
-        return tfp(spikes, self.window, self.max_range)
+        return tfp(spikes, self.window, self.max_range, dtype=self.dtype)
 
     def extra_repr(self) -> str:  # noqa: D102
-        return f"window={self.window}, max_range={self.max_range}"
+        return f"window={self.window}, max_range={self.max_range}" + (f", dtype={self.dtype}" if self.dtype else "")

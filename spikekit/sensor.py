@@ -7,44 +7,74 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from spikekit.check import check_planes, check_positive
+from spikekit.check import check_dtype, check_planes, check_positive
+from spikekit.kernels import batch_first, register
 
 
 # A custom operator, because torch.compile would unroll the loop over time and because the gradient does not need it.
 @torch.library.custom_op("spikekit::integrate_fire", mutates_args=())
-def _integrate_fire(light: Tensor, threshold: float, charge: Tensor) -> tuple[Tensor, Tensor]:
-    spikes = torch.empty_like(light)
-    charge = charge.clone()
+def _integrate_fire(light: Tensor, threshold: float, charge: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    spikes = torch.empty_like(light, dtype=dtype)
     theta = charge.new_tensor(threshold)  # a tensor: CUDA would divide by a number through its inverse
     for light_t, spike_t in zip(light.unbind(-3), spikes.unbind(-3), strict=True):
-        charge += light_t
-        whole = torch.floor(charge / theta)
-        spike_t.copy_(whole > 0)
-        charge -= whole * theta
-        charge.clamp_(min=0)  # the quotient may have been rounded up to a whole number
+        full = charge + light_t
+        fired = full >= theta
+        spike_t.copy_(fired)
+        rest = torch.where(fired, full - theta, full)
+        # More than one threshold: the surplus is lost, and so is a remainder that rounding has pushed out of range.
+        remainder = full - torch.floor(full / theta) * theta
+        remainder = torch.where((remainder >= 0) & (remainder < theta), remainder, 0)
+        charge = torch.where(rest >= theta, remainder, rest)
     return spikes, charge
 
 
 @_integrate_fire.register_fake
-def _(light: Tensor, threshold: float, charge: Tensor) -> tuple[Tensor, Tensor]:
-    return torch.empty_like(light), torch.empty_like(charge)
+def _(light: Tensor, threshold: float, charge: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    return torch.empty_like(light, dtype=dtype), torch.empty_like(charge)
 
 
-def _save_light(ctx: Any, inputs: tuple[Tensor, float, Tensor], output: Any) -> None:
-    light, ctx.threshold, _ = inputs
+@torch.library.custom_op("spikekit::integrate_fire_grad", mutates_args=())
+def _integrate_fire_grad(grad: Tensor, light: Tensor, threshold: float) -> Tensor:
+    wide = torch.promote_types(light.dtype, torch.float32)
+    light, theta = light.to(wide), light.new_tensor(threshold, dtype=wide)
+    return torch.where((light >= 0) & (light <= theta), grad.to(wide) / theta, 0).to(grad.dtype)
+
+
+@_integrate_fire_grad.register_fake
+def _(grad: Tensor, light: Tensor, threshold: float) -> Tensor:
+    return torch.empty_like(grad)
+
+
+def _save_light(ctx: Any, inputs: tuple[Tensor, float, Tensor, torch.dtype], output: Any) -> None:
+    light, ctx.threshold, *_ = inputs
     ctx.save_for_backward(light)
 
 
-def _straight_through(ctx: Any, grad_spikes: Tensor, _: Tensor) -> tuple[Tensor, None, None]:
+def _straight_through(ctx: Any, grad_spikes: Tensor, _: Tensor) -> tuple[Tensor, None, None, None]:
     (light,) = ctx.saved_tensors
-    linear = (light >= 0) & (light <= ctx.threshold)
-    return torch.where(linear, grad_spikes / ctx.threshold, 0), None, None
+    return _integrate_fire_grad(grad_spikes, light, ctx.threshold), None, None, None
+
+
+def _save_light_again(ctx: Any, inputs: tuple[Tensor, Tensor, float], output: Tensor) -> None:
+    _, light, ctx.threshold = inputs
+    ctx.save_for_backward(light)
+
+
+def _straight_through_again(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+    (light,) = ctx.saved_tensors
+    return _integrate_fire_grad(grad, light, ctx.threshold), None, None
 
 
 _integrate_fire.register_autograd(_straight_through, setup_context=_save_light)
+_integrate_fire_grad.register_autograd(_straight_through_again, setup_context=_save_light_again)
+for _name, _op in {"integrate_fire": _integrate_fire, "integrate_fire_grad": _integrate_fire_grad}.items():
+    register(_op, _name)
+    batch_first(_op)
 
 
-def spike_integrate_fire(light: Tensor, threshold: float = 1.0, charge: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def spike_integrate_fire(
+    light: Tensor, threshold: float = 1.0, charge: Tensor | None = None, *, dtype: torch.dtype | None = None
+) -> tuple[Tensor, Tensor]:
     r"""Integrate light at every pixel and fire a spike whenever the charge reaches the threshold.
 
     .. math::
@@ -52,10 +82,15 @@ def spike_integrate_fire(light: Tensor, threshold: float = 1.0, charge: Tensor |
         S_t = [k_t > 0], \quad c_t = u_t - k_t \theta
 
     Convention:
-        Time is axis -3. Light is the charge that arrives per clock, in the unit of the threshold, and is not negative.
-        A pixel fires at :math:`u \ge \theta` and is reset by subtraction. The read-out is one bit: surplus whole
-        thresholds within one clock are lost, not remembered. The charge goes in and comes out, so that a recording
-        cut into chunks equals one run, bit for bit. It is held in float32 or wider, whatever the dtype of the light.
+        Time is axis -3. Light is the charge that arrives per clock, in the unit of the threshold. A pixel fires at
+        :math:`u \ge \theta` and is reset by subtraction. The read-out is one bit: surplus whole thresholds within one
+        clock are lost, not remembered. The charge goes in and comes out, so that a recording cut into chunks equals
+        one run, bit for bit. It is held in float32 or wider, whatever the dtype of the light, and stays below the
+        threshold: a remainder that rounding puts outside [0, threshold) counts as 0.
+
+        Light below 0, which interpolation and noise make, is a debt: the charge goes below 0, k is 0 there, and later
+        light pays first. After infinite light the pixel fires and is empty. Light that is NaN or minus infinity
+        silences its pixel, and the charge shows it from then on.
 
         The gradient is straight-through in the linear range,
         :math:`\partial S_t / \partial I_t = 1 / \theta` where :math:`0 \le I_t \le \theta`, else 0, which makes the
@@ -64,13 +99,15 @@ def spike_integrate_fire(light: Tensor, threshold: float = 1.0, charge: Tensor |
     Args:
         light: charge per sensor clock, :math:`(*, T, H, W)`, floating, >= 0.
         threshold: charge of one spike.
-        charge: charge at the start, broadcastable to :math:`(*, H, W)`, in [0, threshold); zero when not given.
+        charge: charge at the start, broadcastable to :math:`(*, H, W)`, below the threshold; zero when not given.
+        dtype: that of the spikes; that of ``light`` when not given. ``torch.uint8`` and ``torch.bool`` take a byte a
+            spike, without a gradient.
 
     Returns:
-        The spikes, zeros and ones in the shape and dtype of ``light``, and the charge left, :math:`(*, H, W)`.
+        The spikes, zeros and ones in the shape of ``light``, and the charge left, :math:`(*, H, W)`.
 
     Raises:
-        TypeError: ``light`` or ``charge`` is not a floating-point tensor.
+        TypeError: ``light`` or ``charge`` is not a floating-point tensor, ``dtype`` neither floating nor of a byte.
         ValueError: fewer than three dimensions, a charge that does not fit, a threshold that is not above 0.
 
     Example:
@@ -87,17 +124,18 @@ def spike_integrate_fire(light: Tensor, threshold: float = 1.0, charge: Tensor |
     """
     check_planes("light", light, 3, "(*, T, H, W)", floating=True)
     check_positive("threshold", threshold)
+    check_dtype(dtype, torch.uint8, torch.bool)
     planes = light.shape[:-3] + light.shape[-2:]
-    dtype = torch.promote_types(light.dtype, torch.float32)
+    wide = torch.promote_types(light.dtype, torch.float32)
     if charge is None:
-        charge = light.new_zeros(planes, dtype=dtype)
+        charge = light.new_zeros(planes, dtype=wide)
     else:
         check_planes("charge", charge, 2, "(*, H, W)", floating=True)
         try:
-            charge = charge.detach().to(torch.promote_types(dtype, charge.dtype)).expand(planes)
+            charge = charge.detach().to(torch.promote_types(wide, charge.dtype)).expand(planes)
         except RuntimeError:
             raise ValueError(f"charge: expected {tuple(planes)}, got {tuple(charge.shape)}") from None
-    spikes, charge = _integrate_fire(light, float(threshold), charge)
+    spikes, charge = _integrate_fire(light, float(threshold), charge, dtype or light.dtype)
     return spikes, charge.detach()
 
 
@@ -114,13 +152,15 @@ class SpikeIntegrateFire(nn.Module):
         (torch.Size([41, 8, 8]), torch.Size([8, 8]))
     """
 
-    def __init__(self, threshold: float = 1.0) -> None:
+    def __init__(self, threshold: float = 1.0, *, dtype: torch.dtype | None = None) -> None:
         super().__init__()
         check_positive("threshold", threshold)
+        check_dtype(dtype, torch.uint8, torch.bool)
         self.threshold = threshold
+        self.dtype = dtype
 
     def forward(self, light: Tensor, charge: Tensor | None = None) -> tuple[Tensor, Tensor]:  # noqa: D102
-        return spike_integrate_fire(light, self.threshold, charge)
+        return spike_integrate_fire(light, self.threshold, charge, dtype=self.dtype)
 
     def extra_repr(self) -> str:  # noqa: D102
-        return f"threshold={self.threshold}"
+        return f"threshold={self.threshold}" + (f", dtype={self.dtype}" if self.dtype else "")

@@ -1,0 +1,42 @@
+"""Faster ways to run the heavy operators, one file a kind of machine; the plain torch path is with the operator."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+from torch import Tensor
+
+from spikekit.kernels import cpu
+
+
+def register(op: Any, name: str) -> None:
+    """Run a custom operator by the function ``name`` of :mod:`spikekit.kernels.cpu` and :mod:`spikekit.kernels.gpu`.
+
+    The latter is Triton: imported when first needed, and left out where Triton is not installed. Where a file has no
+    such function, the operator's own torch path runs.
+    """
+    if hasattr(cpu, name):
+        op.register_kernel("cpu")(getattr(cpu, name))
+    if find_spec("triton") is not None:
+
+        def on_gpu(*args: Any) -> Tensor | tuple[Tensor, ...]:
+            return getattr(import_module("spikekit.kernels.gpu"), name)(*args)
+
+        op.register_kernel("cuda")(on_gpu)
+
+
+def batch_first(op: Any) -> None:
+    """Let ``torch.func.vmap`` give its axis to a custom operator as one more leading dimension of every tensor."""
+
+    def rule(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Any, Any]:
+        def with_axis(value: Any, dim: int | None) -> Any:
+            if not isinstance(value, Tensor):
+                return value
+            return value.expand(info.batch_size, *value.shape) if dim is None else value.movedim(dim, 0)
+
+        result = op(*map(with_axis, args, in_dims))
+        return result, (0,) * len(result) if isinstance(result, tuple) else 0
+
+    op.register_vmap(rule)

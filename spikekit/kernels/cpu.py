@@ -1,0 +1,278 @@
+"""The sensor and the decoders on the CPU: NumPy, one plane of one tile at a time, so that what is reused stays cached.
+
+Every function takes the arguments of the custom operator of the same name and gives what its torch path gives. Tiles
+are some 32 k pixels; a loop over time runs within a tile. Outputs are allocated by NumPy, which asks for huge pages.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+_TILE = 1 << 15  # pixels
+
+_Slices = tuple[slice, slice]
+
+
+@cache
+def _numpy_dtype(dtype: torch.dtype) -> np.dtype:
+    """Return the NumPy type, or float32 for the halves, which are widened tile by tile."""
+    if dtype in (torch.bfloat16, torch.float16):
+        return np.dtype(np.float32)
+    return torch.empty(0, dtype=dtype).numpy().dtype
+
+
+def _empty(shape: torch.Size, dtype: torch.dtype) -> Tensor:
+    if dtype is torch.bfloat16:
+        return torch.from_numpy(np.empty(shape, np.int16)).view(dtype)
+    return torch.from_numpy(np.empty(shape, torch.empty(0, dtype=dtype).numpy().dtype))
+
+
+def _flat(stream: Tensor) -> Tensor:
+    """(*, T, H, W) as (B, T, P); a view where strides allow it."""
+    lead, (frames, height, width) = stream.shape[:-3], stream.shape[-3:]
+    return stream.detach().reshape(math.prod(lead), frames, height * width)
+
+
+def _tiles(batch: int, pixels: int) -> Iterator[_Slices]:
+    several = max(_TILE // pixels, 1)
+    for b in range(0, batch, several):
+        for p in range(0, pixels, _TILE):
+            yield slice(b, b + several), slice(p, p + _TILE)
+
+
+def _read(flat: Tensor, tile: _Slices) -> np.ndarray:
+    """Return a tile as (T, b, p): a view, or a float32 copy of halves."""
+    part = flat[tile[0], :, tile[1]].movedim(1, 0)
+    return (part.float() if part.dtype in (torch.bfloat16, torch.float16) else part).numpy()
+
+
+class _Output:
+    """An output that is filled tile by tile, through a float32 buffer where it is half precision."""
+
+    def __init__(self, shape: torch.Size, dtype: torch.dtype) -> None:
+        self.tensor = _empty(shape, dtype)
+        self._flat = _flat(self.tensor)
+        self._through_buffer = dtype in (torch.bfloat16, torch.float16)
+
+    def tiles(self) -> Iterator[tuple[_Slices, np.ndarray]]:
+        """Yield where a tile lies, and the (T, b, p) to write it to."""
+        batch, _, pixels = self._flat.shape
+        for tile in _tiles(batch, pixels):
+            part = self._flat[tile[0], :, tile[1]].movedim(1, 0)
+            if self._through_buffer:
+                buffer = np.empty(part.shape, np.float32)
+                yield tile, buffer
+                part.copy_(torch.from_numpy(buffer))
+            else:
+                yield tile, part.numpy()
+
+
+def integrate_fire(light: Tensor, threshold: float, charge: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Two passes over memory: light in, spikes out."""
+    spikes = _Output(light.shape, dtype)
+    left = torch.from_numpy(charge.detach().numpy().copy())
+    lights, charges = _flat(light), _flat(left.unsqueeze(-3))[:, 0].numpy()
+    theta = charges.dtype.type(threshold)
+    for tile, spikes_tile in spikes.tiles():
+        charges[tile] = _integrate_tile(_read(lights, tile), theta, charges[tile], spikes_tile)
+    return spikes.tensor, left
+
+
+def _integrate_tile(light: np.ndarray, theta: np.floating, charge: np.ndarray, spikes: np.ndarray) -> np.ndarray:
+    charge = charge.copy()
+    full, rest = np.empty_like(charge), np.empty_like(charge)
+    bits = np.dtype(f"u{charge.itemsize}")
+    fired = np.empty(charge.shape, bool)
+    with np.errstate(invalid="ignore", over="ignore"):
+        for light_t, spikes_t in zip(light, spikes, strict=True):
+            np.add(charge, light_t, out=full)
+            np.greater_equal(full, theta, out=fired)
+            np.copyto(spikes_t, fired)
+            np.subtract(full, theta, out=rest)
+            # The smaller of the two as unsigned integers: `rest` where it is not negative, else `full`.
+            np.minimum(full.view(bits), rest.view(bits), out=charge.view(bits))
+            if not charge.max() < theta:  # NaN comes this way as well
+                over = charge >= theta
+                several = full[over]
+                remainder = several - np.floor(several / theta) * theta
+                charge[over] = np.where((remainder >= 0) & (remainder < theta), remainder, 0)
+    return charge
+
+
+def integrate_fire_grad(grad: Tensor, light: Tensor, threshold: float) -> Tensor:
+    """Three passes over memory: gradient and light in, gradient out."""
+    result = _Output(grad.shape, grad.dtype)
+    grads, lights = _flat(grad), _flat(light)
+    theta = _numpy_dtype(grad.dtype).type(threshold)
+    for tile, out in result.tiles():
+        planes = zip(_read(grads, tile), _read(lights, tile), out, strict=True)
+        linear, beyond = np.empty(out.shape[1:], bool), np.empty(out.shape[1:], bool)
+        mask = np.empty(out.shape[1:], f"i{out.itemsize}")
+        for grad_t, light_t, out_t in planes:
+            np.greater_equal(light_t, 0, out=linear)
+            np.less_equal(light_t, theta, out=beyond)
+            np.logical_and(linear, beyond, out=linear)
+            np.negative(linear.view(np.int8), out=mask)  # all bits or none: 0 times infinity is not 0
+            np.divide(grad_t, theta, out=out_t)
+            np.bitwise_and(out_t.view(mask.dtype), mask, out=out_t.view(mask.dtype))
+    return result.tensor
+
+
+def spike_interval(spikes: Tensor) -> Tensor:
+    """Read the spikes once, write the intervals twice."""
+    interval = _Output(spikes.shape, torch.int16 if spikes.shape[-3] < 32767 else torch.int32)
+    flat = _flat(spikes)
+    for tile, out in interval.tiles():
+        _interval_tile(_read(flat, tile), out)
+    return interval.tensor
+
+
+def _interval_tile(spikes: np.ndarray, interval: np.ndarray) -> None:
+    frames, *plane = spikes.shape
+    one = interval.dtype.type(1)
+    silent, factor, step = np.empty(plane, bool), np.empty(plane, interval.dtype), np.empty(plane, interval.dtype)
+
+    # Backwards: the distance to the next spike, or to T where there is none.
+    ahead = np.zeros(plane, interval.dtype)
+    for spikes_n, ahead_n in zip(spikes[::-1], interval[::-1], strict=True):
+        np.equal(spikes_n, 0, out=silent)
+        np.copyto(factor, silent)
+        np.add(ahead, one, out=step)
+        np.multiply(step, factor, out=ahead_n)
+        ahead = ahead_n
+
+    # The first interval stretches back as far as the first complete one was long, but not less than to -1.
+    first = interval[0].astype(np.int64)
+    after = np.minimum(first + 1, frames - 1)
+    second = after + np.take_along_axis(interval, after[None], axis=0)[0]
+    complete = (first < frames - 1) & (second < frames)
+    behind = np.where(complete, np.maximum(second - 2 * first, 1), 1).astype(interval.dtype)
+
+    # Forwards: plus the distance to the last spike before.
+    for interval_n in interval:
+        np.not_equal(interval_n, 0, out=silent)
+        np.copyto(factor, silent)
+        np.add(interval_n, behind, out=interval_n)
+        np.multiply(behind, factor, out=behind)
+        np.add(behind, one, out=behind)
+
+    # After the last spike, likewise: not less than the last complete interval.
+    last = frames - behind  # -1 of a pixel that never fired
+    complete = np.take_along_axis(interval, last.astype(np.int64).clip(0)[None], axis=0)[0]
+    missing = np.where(last > first, np.maximum(complete - behind, 0), 0).astype(interval.dtype)
+    for n in range(int(last[missing > 0].min(initial=frames)) + 1, frames):
+        np.less(last, n, out=silent)
+        np.copyto(factor, silent)
+        np.multiply(factor, missing, out=factor)
+        np.add(interval[n], factor, out=interval[n])
+
+
+def tfi(spikes: Tensor, max_range: float, dtype: torch.dtype) -> Tensor:
+    """Read the spikes once and write the light once; the intervals of a tile lie between."""
+    light = _Output(spikes.shape, dtype)
+    flat = _flat(spikes)
+    counter = np.int16 if spikes.shape[-3] < 32767 else np.int32
+    white = (np.float64 if dtype is torch.float64 else np.float32)(max_range)
+    for tile, out in light.tiles():
+        interval = np.empty(out.shape, counter)
+        _interval_tile(_read(flat, tile), interval)
+        rate = np.empty(out.shape[1:], white.dtype)
+        for interval_n, out_n in zip(interval, out, strict=True):
+            np.divide(white, interval_n, out=rate, dtype=rate.dtype)
+            _store(rate, out_n)
+    return light.tensor
+
+
+def _store(value: np.ndarray, out: np.ndarray) -> None:
+    """Write a plane of floats, rounded to the nearest whole number and cut to the range where ``out`` is uint8."""
+    if out.dtype == np.uint8:
+        np.rint(value, out=value)
+        np.clip(value, 0, 255, out=value)
+    np.copyto(out, value, casting="unsafe")
+
+
+def tfi_grad(grad: Tensor, spikes: Tensor, rate: Tensor) -> Tensor:
+    """Sum the gradient over every interval, spread the sum on it, and weigh it by the rate."""
+    result = _Output(spikes.shape, spikes.dtype)
+    grads, fired, rates = _flat(grad), _flat(spikes), _flat(rate)
+    for tile, out in result.tiles():
+        spikes_tile = _read(fired, tile)
+        plane = out.shape[1:]
+        chosen, running, sums = np.empty(plane, bool), np.zeros(plane, out.dtype), np.empty(out.shape, out.dtype)
+        bits = np.dtype(f"i{out.itemsize}")
+        mask, change = np.empty(plane, bits), np.empty(plane, bits)
+        for grad_n, spikes_n, sums_n in zip(_read(grads, tile), spikes_tile, sums, strict=True):
+            np.add(running, grad_n, out=sums_n)
+            np.equal(spikes_n, 0, out=chosen)
+            np.negative(chosen.view(np.int8), out=mask)
+            np.bitwise_and(sums_n.view(bits), mask, out=running.view(bits))
+        spread = sums[-1].copy()
+        for rate_n, spikes_n, sums_n, out_n in zip(
+            _read(rates, tile)[::-1], spikes_tile[::-1], sums[::-1], out[::-1], strict=True
+        ):
+            np.not_equal(spikes_n, 0, out=chosen)
+            np.negative(chosen.view(np.int8), out=mask)
+            np.bitwise_xor(spread.view(bits), sums_n.view(bits), out=change)
+            np.bitwise_and(change, mask, out=change)
+            np.bitwise_xor(spread.view(bits), change, out=spread.view(bits))
+            np.multiply(spread, rate_n, out=out_n)
+    return result.tensor
+
+
+def tfp(spikes: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Tensor:
+    """Read the spikes twice, as they enter and leave the window, and write the light once, whatever the window."""
+    light = _Output(spikes.shape, dtype)
+    flat = _flat(spikes)
+    wide = np.dtype(np.float64 if torch.float64 in (spikes.dtype, dtype) else np.float32)
+    if spikes.is_floating_point():
+        counter = np.dtype(np.float64)  # where they are no bits, a sum that runs must not forget the small ones
+    elif spikes.dtype in (torch.bool, torch.uint8):
+        counter = np.min_scalar_type(window if spikes.dtype is torch.bool else 255 * window)
+    else:
+        counter = np.dtype(np.int64)
+    for tile, out in light.tiles():
+        inside = _running_sums(_read(flat, tile), window, counter)
+        mean = np.empty(out.shape[1:], wide)
+        for (total, size), out_n in zip(inside, out, strict=True):
+            np.copyto(mean, total, casting="same_kind")
+            if max_range != 1:
+                np.multiply(mean, wide.type(max_range), out=mean)
+            np.divide(mean, wide.type(size), out=mean)
+            _store(mean, out_n)
+    return light.tensor
+
+
+def _running_sums(values: np.ndarray, window: int, counter: np.dtype) -> Iterator[tuple[np.ndarray, int]]:
+    """Yield, for every frame, the sum over the frames of its window that exist, and their number."""
+    frames, half = len(values), window // 2
+    if values.dtype == bool:
+        values = values.view(np.uint8)
+    total = np.zeros(values.shape[1:], counter)
+    for value in values[:half]:
+        np.add(total, value, out=total, casting="unsafe")
+    for n in range(frames):
+        if n + half < frames:
+            np.add(total, values[n + half], out=total, casting="unsafe")
+        if n > half:
+            np.subtract(total, values[n - half - 1], out=total, casting="unsafe")
+        yield total, min(n + half, frames - 1) - max(n - half, 0) + 1
+
+
+def tfp_grad(grad: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Tensor:
+    """The same running sum over the gradient, each frame of it divided by the size of its window."""
+    result = _Output(grad.shape, dtype)
+    flat = _flat(grad)
+    frames, half = grad.shape[-3], window // 2
+    n = np.arange(frames)
+    size = np.minimum(n + half, frames - 1) - np.maximum(n - half, 0) + 1
+    for tile, out in result.tiles():
+        share = _read(flat, tile) * (max_range / size[:, None, None])
+        for (total, _), out_n in zip(_running_sums(share, window, np.dtype(np.float64)), out, strict=True):
+            np.copyto(out_n, total, casting="same_kind")
+    return result.tensor
