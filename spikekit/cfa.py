@@ -44,6 +44,15 @@ def bayer_sites(pattern: str | CFA) -> tuple[tuple[int, int, int], ...]:
 
     G1 is the green pixel of the upper row, G2 that of the lower row.
 
+    Args:
+        pattern: Bayer phase, see :func:`bayer_pattern`.
+
+    Returns:
+        Four triples, in the order R, G1, G2, B.
+
+    Raises:
+        ValueError: the pattern is unknown.
+
     Example:
         >>> bayer_sites("BGGR")
         ((0, 1, 1), (1, 0, 1), (1, 1, 0), (2, 0, 0))
@@ -64,9 +73,13 @@ def bayer_mask(
 ) -> Tensor:
     r"""Which pixels of a Bayer sensor are known, colour by colour, optionally after upsampling.
 
+    .. math:: M_C(x, y) = [\text{the sensor's pixel } (\lfloor x / s \rfloor, \lfloor y / s \rfloor)
+        \text{ sees the colour } C]
+
     Convention:
         Planes are R, G, B. One known sensor pixel becomes a block of ``scale`` x ``scale`` known pixels. The three
-        planes add up to one everywhere. Odd sizes are legal: the last row or column is simply cut.
+        planes add up to one everywhere. The pattern begins at the top left, pixel (0, 0), whatever the size; with an
+        odd size the last cell is cut. A constant: there is no gradient.
 
     Args:
         height: rows of the sensor.
@@ -134,8 +147,12 @@ class BayerMask(nn.Module):
 def mosaic(rgb: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
     r"""Keep, at every pixel, the one colour that a Bayer sensor sees there.
 
+    .. math:: R(x, y) = I_{C(x, y)}(x, y)
+
     Convention:
-        As :func:`kornia.color.rgb_to_raw`, without the channel axis that it keeps.
+        C(x, y) is the colour of :func:`bayer_mask`. Values are copied, in any real dtype, as by
+        :func:`kornia.color.rgb_to_raw`, whose channel axis is dropped. The two colours that are not seen do not matter,
+        NaN included, and their gradient is 0; that of the seen one is passed on.
 
     Args:
         rgb: colour image :math:`(*, 3, H, W)`; odd sizes are legal.
@@ -151,6 +168,9 @@ def mosaic(rgb: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
     Example:
         >>> mosaic(torch.tensor([1.0, 2.0, 3.0]).reshape(3, 1, 1).expand(3, 2, 2)).tolist()
         [[1.0, 2.0], [2.0, 3.0]]
+
+    Reference:
+        Bayer, Color imaging array, US patent 3,971,065, 1976.
     """
     return bin_to_sensor(rgb, pattern, scale=1)
 
@@ -185,7 +205,8 @@ def bin_to_sensor(rgb: Tensor, pattern: str | CFA = "RGGB", *, scale: int) -> Te
 
     Convention:
         The sensor pixel (x, y) covers the block that starts at (s x, s y), and averages the block's pixels of its own
-        colour only. The sum runs in float32 or wider.
+        colour C(x, y) only. The sum runs in float32 or wider. The gradient of a picture pixel is :math:`1 / s^2` of
+        its sensor pixel's in that colour, and 0 in the other two.
 
     Args:
         rgb: colour image :math:`(*, 3, H, W)`, H and W multiples of ``scale``.
@@ -196,8 +217,8 @@ def bin_to_sensor(rgb: Tensor, pattern: str | CFA = "RGGB", *, scale: int) -> Te
         The mosaic :math:`(*, H / s, W / s)`, in the dtype of ``rgb`` (integer pictures need ``scale=1``).
 
     Raises:
-        TypeError: ``rgb`` is not a tensor of real numbers.
-        ValueError: no three channels, a size that ``scale`` does not divide, an unknown pattern.
+        TypeError: ``rgb`` is not a tensor of real numbers, or not a floating-point one where ``scale`` is above 1.
+        ValueError: no three channels, a size that ``scale`` does not divide, a scale below 1, an unknown pattern.
 
     Example:
         >>> bin_to_sensor(torch.arange(48.0).reshape(3, 4, 4), scale=2).tolist()
@@ -250,9 +271,12 @@ class BinToSensor(nn.Module):
 def split_colors(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
     r"""Split a mosaic, or a stream of mosaics, into three full-size ones that hold one colour each and 0 elsewhere.
 
+    .. math:: S^C = M_C \, S, \quad C \in \{R, G, B\}
+
     Convention:
-        The colour is the **first** axis of the result, so that ``red, green, blue = split_colors(spikes)`` leaves
-        time at -3. Their sum is the input.
+        M is the mask of :func:`bayer_mask`. The colour is the **first** axis of the result, so that
+        ``red, green, blue = split_colors(spikes)`` leaves time at -3. Their sum is the input. The gradient of a pixel
+        is that of its own colour's plane.
 
     Args:
         raw: mosaic or spike stream :math:`(*, H, W)`, any dtype.
@@ -305,11 +329,13 @@ class SplitColors(nn.Module):
 def split_bayer(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
     r"""Split a mosaic, or a stream of mosaics, into its four half-size sub-streams R, G1, G2, B.
 
+    .. math:: S^k(x, y) = S(2 x + \text{column}_k, 2 y + \text{row}_k)
+
     Convention:
         The sub-stream is the **first** axis of the result, so that ``r, g1, g2, b = split_bayer(spikes)`` leaves time
-        at -3. G1 is the green of the row that the cell begins with, G2 that of the row below. Pixel (x, y) of a
-        sub-stream lies at (2 x + column, 2 y + row) of the sensor, see :func:`bayer_sites`. :func:`merge_bayer` is
-        the inverse.
+        at -3. Rows and columns are those of :func:`bayer_sites`: G1 is the green of the row that the cell begins
+        with, G2 that of the row below. Every pixel goes to one place, and its gradient comes from there.
+        :func:`merge_bayer` is the inverse.
 
     Args:
         raw: mosaic or spike stream :math:`(*, H, W)`, any dtype, H and W even.
@@ -320,7 +346,7 @@ def split_bayer(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
 
     Raises:
         TypeError: ``raw`` is not a tensor of real numbers.
-        ValueError: H or W is odd, or the pattern is unknown.
+        ValueError: fewer than two dimensions, H or W is odd, or the pattern is unknown.
 
     Example:
         >>> r, g1, g2, b = split_bayer(torch.tensor([[1, 2], [3, 4]]), "GBRG")
@@ -362,6 +388,12 @@ class SplitBayer(nn.Module):
 def merge_bayer(planes: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
     r"""Put the four sub-streams R, G1, G2, B back into one mosaic; the inverse of :func:`split_bayer`.
 
+    .. math:: S(2 x + \text{column}_k, 2 y + \text{row}_k) = S^k(x, y)
+
+    Convention:
+        The sub-stream is the **first** axis of the input, in the order and at the places of :func:`bayer_sites`.
+        Every pixel goes to one place, and its gradient comes from there.
+
     Args:
         planes: :math:`(4, *, H, W)`, any dtype.
         pattern: Bayer phase, see :func:`bayer_pattern`.
@@ -371,7 +403,7 @@ def merge_bayer(planes: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
 
     Raises:
         TypeError: ``planes`` is not a tensor of real numbers.
-        ValueError: the first axis is not of length 4, or the pattern is unknown.
+        ValueError: fewer than three dimensions, a first axis that is not of length 4, or an unknown pattern.
 
     Example:
         >>> raw = torch.rand(5, 4, 6)
@@ -388,7 +420,7 @@ def merge_bayer(planes: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
 
 
 class MergeBayer(nn.Module):
-    r"""See :func:`merge_bayer`.
+    r"""See the Convention block on :func:`merge_bayer`.
 
     Shape:
         - Input: :math:`(4, *, H, W)`

@@ -20,10 +20,19 @@ _DIAGONAL = [[0, 0, -1.5, 0, 0], [0, 2, 0, 2, 0], [-1.5, 0, 6, 0, -1.5], [0, 2, 
 def demosaic(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
     r"""Fill in the two missing colours of every pixel with Malvar, He and Cutler's 5 x 5 linear filters.
 
+    Green at a red pixel, for one, is the mean of the green neighbours and half of what red differs from its own
+    neighbours by:
+
+    .. math::
+        \hat g(x, y) = \frac{1}{4} \sum_{|a| + |b| = 1} g(x + a, y + b)
+        + \frac{1}{2} \Bigl(r(x, y) - \frac{1}{4} \sum_{|a| + |b| = 1} r(x + 2 a, y + 2 b)\Bigr)
+
+    Red and blue are found in the same way, with a gain of 5/8 at green pixels and of 3/4 at each other's.
+
     Convention:
-        Known values are kept. Linear in the mosaic, so it is differentiable and may leave the range of its input by a
-        little; nothing is clamped. Borders are mirrored without repeating the outermost pixel, which keeps the Bayer
-        phase. Computed in float32 or wider.
+        Known values are kept. Linear in the mosaic, and differentiable as such. Nothing is clamped: of a mosaic in
+        [0, 1] the result is in [-3/4, 7/4]. Borders are mirrored without repeating the outermost pixel, which keeps
+        the Bayer phase. Computed in float32 or wider.
 
     Args:
         raw: mosaic :math:`(*, H, W)`, floating, H and W at least 3; odd sizes are legal.
@@ -33,8 +42,8 @@ def demosaic(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
         The picture :math:`(*, 3, H, W)`, in the dtype of ``raw``.
 
     Raises:
-        TypeError: not a floating-point tensor.
-        ValueError: smaller than 3 x 3, or an unknown pattern.
+        TypeError: ``raw`` is not a floating-point tensor.
+        ValueError: fewer than two dimensions, smaller than 3 x 3, or an unknown pattern.
 
     Example:
         >>> demosaic(torch.full((4, 6), 0.25)).unique().tolist()

@@ -21,9 +21,12 @@ def _pair(rgb: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 def psnr(rgb: Tensor, target: Tensor) -> Tensor:
     r"""Peak signal-to-noise ratio of every picture, in dB.
 
+    .. math:: -10 \log_{10} \frac{1}{3 H W} \sum_{C, x, y} (a - b)^2
+
     Convention:
         Both are clamped to [0, 1] and not rounded; one mean square error over all colours and pixels of a picture;
-        no border crop. Average the result over pictures: averaging errors first gives another number.
+        no border crop. Average the result over pictures: averaging errors first gives another number. Computed in
+        float32 or wider. The gradient is 0 where a value was clamped, and NaN where the two pictures are equal.
 
     Args:
         rgb: :math:`(*, 3, H, W)`, [0, 1].
@@ -33,8 +36,8 @@ def psnr(rgb: Tensor, target: Tensor) -> Tensor:
         dB, of shape :math:`(*)`; infinite where the two are equal.
 
     Raises:
-        TypeError: not floating-point tensors.
-        ValueError: sizes that differ.
+        TypeError: ``rgb`` or ``target`` is not a floating-point tensor.
+        ValueError: fewer than three dimensions, or sizes that differ.
 
     Example:
         >>> round(psnr(torch.full((3, 8, 8), 0.5), torch.full((3, 8, 8), 0.6)).item(), 3)
@@ -47,20 +50,25 @@ def psnr(rgb: Tensor, target: Tensor) -> Tensor:
 def ssim(rgb: Tensor, target: Tensor) -> Tensor:
     r"""Structural similarity of every picture.
 
+    .. math::
+        \frac{(2 \mu_a \mu_b + 0.01^2) (2 \sigma_{ab} + 0.03^2)}
+        {(\mu_a^2 + \mu_b^2 + 0.01^2) (\sigma_a^2 + \sigma_b^2 + 0.03^2)}
+
     Convention:
         As ``skimage.metrics.structural_similarity`` with its defaults and ``channel_axis``: 7 x 7 uniform window,
-        sample covariance, only windows that lie inside, mean over pixels and colours. Both are clamped to [0, 1].
+        sample covariance, only windows that lie inside, mean over pixels and colours. Both are clamped to [0, 1],
+        and a value that was clamped has gradient 0. Computed in float64.
 
     Args:
         rgb: :math:`(*, 3, H, W)`, [0, 1], H and W at least 7.
         target: the truth, of the same size.
 
     Returns:
-        The similarity, of shape :math:`(*)`.
+        The similarity, of shape :math:`(*)`, float32 or wider.
 
     Raises:
-        TypeError: not floating-point tensors.
-        ValueError: sizes that differ, or below 7 x 7.
+        TypeError: ``rgb`` or ``target`` is not a floating-point tensor.
+        ValueError: fewer than three dimensions, sizes that differ, or below 7 x 7.
 
     Example:
         >>> picture = torch.rand(2, 3, 16, 16)
@@ -68,7 +76,8 @@ def ssim(rgb: Tensor, target: Tensor) -> Tensor:
         [1.0, 1.0]
 
     Reference:
-        Wang et al., Image quality assessment, IEEE TIP 2004.
+        Wang, Bovik, Sheikh and Simoncelli, Image quality assessment: from error visibility to structural similarity,
+        IEEE Transactions on Image Processing, 2004.
     """
     rgb, target = _pair(rgb, target)
     if rgb.shape[-2] < 7 or rgb.shape[-1] < 7:

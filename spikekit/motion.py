@@ -20,12 +20,13 @@ def _check_flow(name: str, flow: Tensor) -> None:
 def joint_flow(flows: Tensor | Sequence[Tensor]) -> Tensor:
     r"""Average the flows that were estimated from the sub-streams R, G1, G2, B.
 
-    .. math:: w = \frac{1}{4} \sum_C w^C
+    .. math:: w = \frac{1}{4} \sum_{C \in \{R, G_1, G_2, B\}} w^C
 
     Convention:
-        The colours are the **first** axis, as :func:`spikekit.split_bayer` leaves them; the result stays at the
-        resolution of the flows that came. The four phases of a Bayer cell average to the centre of the cell, which is
-        where :func:`upsample_flow` expects them.
+        The colours are the **first** axis, as :func:`spikekit.split_bayer` leaves them; any number of flows is
+        averaged alike. The result stays at the resolution, and in the pixels, of the flows that came. The four phases
+        of a Bayer cell average to the centre of the cell, which is where :func:`upsample_flow` expects them. Linear:
+        every flow gets its share of the gradient.
 
     Args:
         flows: (C, \*, 2, H, W), or a sequence of C flows (\*, 2, H, W); any C of at least one.
@@ -77,9 +78,13 @@ class JointFlow(nn.Module):
 def upsample_flow(flow: Tensor, scale: int) -> Tensor:
     r"""Bring flow to a finer grid: bilinear in space, and ``scale`` times as many pixels long.
 
+    .. math:: w'(x, y) = s \, w \Bigl(\frac{x + 1/2}{s} - \frac{1}{2}, \frac{y + 1/2}{s} - \frac{1}{2}\Bigr)
+
     Convention:
         A coarse pixel is the block of ``scale`` x ``scale`` fine ones that begins at (scale x, scale y)
-        (``align_corners=False``), as in :func:`spikekit.bayer_mask` and :func:`spikekit.bin_to_sensor`.
+        (``align_corners=False``), as in :func:`spikekit.bayer_mask` and :func:`spikekit.bin_to_sensor`. Beyond the
+        outermost coarse centres the flow is that of the nearest. Linear in the flow, and differentiable as such.
+        Scale 1 returns the flow that came.
 
     Args:
         flow: :math:`(*, 2, H, W)`, floating.
@@ -89,8 +94,8 @@ def upsample_flow(flow: Tensor, scale: int) -> Tensor:
         :math:`(*, 2, scale \cdot H, scale \cdot W)`, in the dtype of ``flow``.
 
     Raises:
-        TypeError: not a floating-point tensor.
-        ValueError: no two channels, or a scale below 1.
+        TypeError: ``flow`` is not a floating-point tensor.
+        ValueError: no two channels, or a scale that is not a whole number, 1 or more.
 
     Example:
         >>> upsample_flow(torch.ones(1, 2, 2, 2), 4).unique().item()
@@ -149,7 +154,8 @@ def linear_motion(
 
     Convention:
         i, j, k are the times of the first, the middle and the last frame that the flows were estimated between; the
-        offset at j is zero. With ``scale`` the flow is brought to the finer grid first, see :func:`upsample_flow`.
+        offset at j is zero, and times before i or after k are extrapolated. With ``scale`` the flow is brought to the
+        finer grid first, see :func:`upsample_flow`. Linear in both flows, and differentiable as such.
         Backward sampling: the pixel (x, y) of the middle frame is found at (x, y) + offset at time t, as
         :func:`spikekit.flow_warp` and :func:`spikekit.flow_warp_idw` read it.
 
@@ -167,7 +173,8 @@ def linear_motion(
 
     Raises:
         TypeError: the flows are not floating-point tensors.
-        ValueError: the flows differ in size, no times, or not first < middle < last.
+        ValueError: the flows differ in size or have no two channels, no times, not first < middle < last, or a scale
+            below 1.
 
     Example:
         >>> to_first, to_last = torch.full((1, 2, 1, 1), -2.0), torch.full((1, 2, 1, 1), 4.0)

@@ -29,6 +29,13 @@ def read_picture(path: str | Path) -> Tensor:
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: the file is not a picture that can be read; the message names it.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_picture(f"{folder}/grey.png", torch.full((4, 6), 0.2))
+        ...     read_picture(f"{folder}/grey.png").shape
+        torch.Size([3, 4, 6])
     """
     from skimage import color, io, util
 
@@ -52,10 +59,18 @@ def write_picture(path: str | Path, image: Tensor) -> None:
 
     Args:
         path: where to; the ending names the format, PNG for lossless.
-        image: (3, H, W) or (H, W), floating, [0, 1]; clamped, and rounded to 8 bits.
+        image: (3, H, W) or (H, W), floating, [0, 1]; clamped, and rounded to 8 bits; NaN is black.
 
     Raises:
-        ValueError: the image has another shape.
+        TypeError: ``image`` is not a floating-point tensor.
+        ValueError: ``image`` has another shape.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_picture(f"{folder}/new/red.png", torch.tensor([1.2, 0.0, -0.1]).reshape(3, 1, 1))
+        ...     read_picture(f"{folder}/new/red.png").flatten().tolist()
+        [1.0, 0.0, 0.0]
     """
     from skimage import io
 
@@ -79,7 +94,10 @@ def panel(rows: Sequence[Sequence[Tensor]], gap: int = 4) -> Tensor:
         gap: white pixels between two pictures.
 
     Returns:
-        One picture (3, H, W); every picture stands at the top left of its cell.
+        One picture (3, H, W), float32, on the CPU; every picture stands at the top left of its cell.
+
+    Raises:
+        ValueError: no rows, or no picture in any of them.
 
     Example:
         >>> panel([[torch.zeros(3, 4, 4), torch.zeros(4, 4)], [torch.zeros(3, 2, 4)]], gap=1).shape
@@ -101,20 +119,24 @@ def panel(rows: Sequence[Sequence[Tensor]], gap: int = 4) -> Tensor:
 
 
 def flow_to_rgb(flow: Tensor, max_flow: float | None = None) -> Tensor:
-    """Show flow as colour: the direction is the hue, the length is the saturation, white stands still.
+    r"""Show flow as colour: the direction is the hue, the length is the saturation, white stands still.
+
+    .. math:: \text{hue} = \operatorname{atan2}(v, u), \quad \text{saturation} = \min(1, \sqrt{u^2 + v^2} / l)
 
     Convention:
         Flow in pixels, order (x, y), x right, y down. Red points right, and the hue turns clockwise on the screen.
+        Made for the eye: the gradient at zero flow is NaN.
 
     Args:
-        flow: (*, 2, H, W), floating.
-        max_flow: the length that is fully saturated; the longest of the tensor when not given.
+        flow: :math:`(*, 2, H, W)`, floating.
+        max_flow: l, the length that is fully saturated, above 0; the longest of the tensor when not given.
 
     Returns:
-        ``rgb`` of shape (*, 3, H, W), [0, 1].
+        ``rgb`` of shape :math:`(*, 3, H, W)`, [0, 1].
 
     Raises:
-        ValueError: the flow has no two channels.
+        TypeError: ``flow`` is not a floating-point tensor.
+        ValueError: ``flow`` has no two channels.
 
     Example:
         >>> flow_to_rgb(torch.zeros(2, 1, 1)).flatten().tolist()

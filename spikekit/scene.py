@@ -37,6 +37,10 @@ class Motion:
 
     Raises:
         ValueError: a zoom that is not above 0.
+
+    Example:
+        >>> Motion(velocity=(0.25, 0.0), rotation=0.01, center=(16.0, 16.0)).zoom
+        1.0
     """
 
     velocity: tuple[float, float] = (0.0, 0.0)
@@ -68,6 +72,9 @@ class Layer:
     Raises:
         TypeError: not a float32 or float64 picture.
         ValueError: sizes that do not fit.
+
+    Example:
+        >>> coin = Layer(torch.rand(3, 9, 9), Motion(velocity=(1.0, 0.0)), position=(4, 4), mask=torch.ones(9, 9))
     """
 
     picture: Tensor
@@ -290,13 +297,16 @@ def _touched(
 def simulate_spikes(light: Tensor, *, photons: float | None = None, generator: torch.Generator | None = None) -> Tensor:
     r"""Let the camera look at light: photon noise, if wanted, a random charge to begin with, and spikes.
 
+    .. math:: I'_t \sim \operatorname{Poisson}(p I_t) / p, \quad c_0 \sim U[0, 1)
+
     Convention:
-        The threshold is 1. The charge of every pixel begins uniform in [0, 1), because the camera has been running
-        before. The same generator state gives the same charge with and without noise.
+        Time is axis -3, the threshold is 1, and the spikes are those of :func:`spikekit.spike_integrate_fire`. The
+        charge of every pixel begins uniform in [0, 1), because the camera has been running before. The same generator
+        state gives the same charge with and without noise. No gradient.
 
     Args:
         light: charge per clock, :math:`(*, T, H, W)`, floating, >= 0, on the generator's device.
-        photons: how many photons make one threshold; Poisson noise of that strength. ``None``: no noise.
+        photons: p, how many photons make one threshold; Poisson noise of that strength. ``None``: no noise.
         generator: where chance comes from; torch's default one when not given.
 
     Returns:
@@ -305,11 +315,15 @@ def simulate_spikes(light: Tensor, *, photons: float | None = None, generator: t
     Raises:
         TypeError: ``light`` is not a floating-point tensor.
         ValueError: fewer than three dimensions, or ``photons`` is not above 0.
+        RuntimeError: negative or NaN light, with ``photons``.
 
     Example:
         >>> spikes = simulate_spikes(torch.full((40, 8, 8), 0.25), generator=torch.Generator().manual_seed(0))
         >>> spikes.dtype, spikes.sum(0).unique().tolist()
         (torch.uint8, [10])
+
+    Reference:
+        Dong et al., CVPR 2024, section 5.1.
     """
     check_planes("light", light, 3, "(*, T, H, W)", floating=True)
     size = light.shape[:-3] + light.shape[-2:]
