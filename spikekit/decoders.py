@@ -88,13 +88,38 @@ def _(grad: Tensor, spikes: Tensor, rate: Tensor) -> Tensor:
     return torch.empty_like(spikes)
 
 
-def _save_tfi(ctx: Any, inputs: tuple[Tensor, float, torch.dtype], output: Tensor) -> None:
-    ctx.save_for_backward(inputs[0], output)
+class _Tfi(torch.autograd.Function):
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(spikes: Tensor, max_range: float, dtype: torch.dtype) -> Tensor:
+        return _tfi(spikes, max_range, dtype)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Tensor) -> None:
+        ctx.save_for_backward(inputs[0], output)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        return _SumOnIntervals.apply(grad, *ctx.saved_tensors), None, None
 
 
-def _tfi_backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-    spikes, rate = ctx.saved_tensors
-    return _tfi_grad(grad, spikes, rate), None, None
+class _SumOnIntervals(torch.autograd.Function):
+    """The gradient of TFI, which is linear in the one that comes, and its own adjoint."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(grad: Tensor, spikes: Tensor, rate: Tensor) -> Tensor:
+        return _tfi_grad(grad, spikes, rate)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Tensor) -> None:
+        ctx.save_for_backward(*inputs[1:])
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        return _SumOnIntervals.apply(grad, *ctx.saved_tensors), None, None
 
 
 @torch.library.custom_op("spikekit::tfp", mutates_args=())
@@ -140,18 +165,25 @@ def _inside(values: Tensor, window: int, dtype: torch.dtype) -> Tensor:
     return sums.index_select(-3, end) - sums.index_select(-3, begin)
 
 
-def _save_dtype(ctx: Any, inputs: tuple[Tensor, int, float, torch.dtype], output: Tensor) -> None:
-    values, ctx.window, ctx.max_range, _ = inputs
-    ctx.dtype = values.dtype
+class _Tfp(torch.autograd.Function):
+    """TFP or its adjoint: each is the gradient of the other."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(values: Tensor, window: int, max_range: float, dtype: torch.dtype, adjoint: bool) -> Tensor:
+        return (_tfp_grad if adjoint else _tfp)(values, window, max_range, dtype)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Tensor) -> None:
+        values, *ctx.options, _, ctx.adjoint = inputs
+        ctx.dtype = values.dtype
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None]:
+        return _Tfp.apply(grad, *ctx.options, ctx.dtype, not ctx.adjoint), None, None, None, None
 
 
-def _adjoint(op: Any) -> Any:
-    return lambda ctx, grad: (op(grad, ctx.window, ctx.max_range, ctx.dtype), None, None, None)
-
-
-_tfi.register_autograd(_tfi_backward, setup_context=_save_tfi)
-_tfp.register_autograd(_adjoint(_tfp_grad), setup_context=_save_dtype)
-_tfp_grad.register_autograd(_adjoint(_tfp), setup_context=_save_dtype)
 for _name, _op in {
     "spike_interval": _spike_interval,
     "tfi": _tfi,
@@ -251,7 +283,7 @@ def tfi(spikes: Tensor, max_range: float = 1.0, *, dtype: torch.dtype | None = N
     check_planes("spikes", spikes, 3, "(*, T, H, W)")
     check_positive("max_range", max_range)
     check_dtype(dtype, torch.uint8)
-    return _tfi(spikes, float(max_range), dtype or default_float(spikes))
+    return _Tfi.apply(spikes, float(max_range), dtype or default_float(spikes))
 
 
 class Tfi(nn.Module):
@@ -317,7 +349,7 @@ def tfp(spikes: Tensor, window: int, max_range: float = 1.0, *, dtype: torch.dty
     window = _check_window(window)
     check_positive("max_range", max_range)
     check_dtype(dtype, torch.uint8)
-    return _tfp(spikes, window, float(max_range), dtype or default_float(spikes))
+    return _Tfp.apply(spikes, window, float(max_range), dtype or default_float(spikes), False)
 
 
 def _check_window(window: int) -> int:

@@ -45,28 +45,43 @@ def _(grad: Tensor, light: Tensor, threshold: float) -> Tensor:
     return torch.empty_like(grad)
 
 
-def _save_light(ctx: Any, inputs: tuple[Tensor, float, Tensor, torch.dtype], output: Any) -> None:
-    light, ctx.threshold, *_ = inputs
-    ctx.save_for_backward(light)
+class _StraightThrough(torch.autograd.Function):
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(light: Tensor, threshold: float, charge: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        return _integrate_fire(light, threshold, charge, dtype)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        light, ctx.threshold, *_ = inputs
+        ctx.save_for_backward(light)
+        ctx.mark_non_differentiable(output[1])
+
+    @staticmethod
+    def backward(ctx: Any, grad_spikes: Tensor, _: Tensor) -> tuple[Tensor, None, None, None]:
+        return _Linear.apply(grad_spikes, *ctx.saved_tensors, ctx.threshold), None, None, None
 
 
-def _straight_through(ctx: Any, grad_spikes: Tensor, _: Tensor) -> tuple[Tensor, None, None, None]:
-    (light,) = ctx.saved_tensors
-    return _integrate_fire_grad(grad_spikes, light, ctx.threshold), None, None, None
+class _Linear(torch.autograd.Function):
+    """The gradient, which is linear in the one that comes: differentiated again, the same once more."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(grad: Tensor, light: Tensor, threshold: float) -> Tensor:
+        return _integrate_fire_grad(grad, light, threshold)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        _, light, ctx.threshold = inputs
+        ctx.save_for_backward(light)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        return _Linear.apply(grad, *ctx.saved_tensors, ctx.threshold), None, None
 
 
-def _save_light_again(ctx: Any, inputs: tuple[Tensor, Tensor, float], output: Tensor) -> None:
-    _, light, ctx.threshold = inputs
-    ctx.save_for_backward(light)
-
-
-def _straight_through_again(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-    (light,) = ctx.saved_tensors
-    return _integrate_fire_grad(grad, light, ctx.threshold), None, None
-
-
-_integrate_fire.register_autograd(_straight_through, setup_context=_save_light)
-_integrate_fire_grad.register_autograd(_straight_through_again, setup_context=_save_light_again)
 for _name, _op in {"integrate_fire": _integrate_fire, "integrate_fire_grad": _integrate_fire_grad}.items():
     register(_op, _name)
     batch_first(_op)
@@ -135,8 +150,7 @@ def spike_integrate_fire(
             charge = charge.detach().to(torch.promote_types(wide, charge.dtype)).expand(planes)
         except RuntimeError:
             raise ValueError(f"charge: expected {tuple(planes)}, got {tuple(charge.shape)}") from None
-    spikes, charge = _integrate_fire(light, float(threshold), charge, dtype or light.dtype)
-    return spikes, charge.detach()
+    return _StraightThrough.apply(light, float(threshold), charge, dtype or light.dtype)
 
 
 class SpikeIntegrateFire(nn.Module):

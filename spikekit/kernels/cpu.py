@@ -1,7 +1,7 @@
 """The sensor and the decoders on the CPU: NumPy, one plane of one tile at a time, so that what is reused stays cached.
 
 Every function takes the arguments of the custom operator of the same name and gives what its torch path gives. Tiles
-are some 32 k pixels; a loop over time runs within a tile. Outputs are allocated by NumPy, which asks for huge pages.
+are some 64 k pixels; a loop over time runs within a tile. Outputs are allocated by NumPy, which asks for huge pages.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-_TILE = 1 << 15  # pixels
+_TILE = 1 << 16  # pixels
 
 _Slices = tuple[slice, slice]
 
@@ -47,8 +47,10 @@ def _tiles(batch: int, pixels: int) -> Iterator[_Slices]:
 
 
 def _read(flat: Tensor, tile: _Slices) -> np.ndarray:
-    """Return a tile as (T, b, p): a view, or a float32 copy of halves."""
+    """Return a tile as (T, b, p): a view, or a float32 copy of halves; bool as uint8."""
     part = flat[tile[0], :, tile[1]].movedim(1, 0)
+    if part.dtype is torch.bool:
+        part = part.view(torch.uint8)
     return (part.float() if part.dtype in (torch.bfloat16, torch.float16) else part).numpy()
 
 
@@ -251,8 +253,6 @@ def tfp(spikes: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Te
 def _running_sums(values: np.ndarray, window: int, counter: np.dtype) -> Iterator[tuple[np.ndarray, int]]:
     """Yield, for every frame, the sum over the frames of its window that exist, and their number."""
     frames, half = len(values), window // 2
-    if values.dtype == bool:
-        values = values.view(np.uint8)
     total = np.zeros(values.shape[1:], counter)
     for value in values[:half]:
         np.add(total, value, out=total, casting="unsafe")

@@ -45,6 +45,18 @@ OPERATORS = [
     (sk.upsample_flow, {"scale": 3}, (FLOW,)),
 ]
 EVERY = pytest.mark.parametrize(("op", "options", "tensors"), OPERATORS, ids=[op.__name__ for op, *_ in OPERATORS])
+
+
+def warp_green(features, flow):
+    return sk.flow_warp_idw(features, flow, MASK)
+
+
+# tensors that all begin with the same free dimension
+LEADING = [
+    (warp_green, {}, tensors[:2]) if op is sk.flow_warp_idw else (op, options, tensors)
+    for op, options, tensors in OPERATORS
+    if op not in (sk.joint_flow, sk.merge_bayer)
+]
 DTYPES = [torch.float64, torch.float32, torch.bfloat16, torch.float16]
 
 
@@ -170,6 +182,27 @@ def test_export(op, options, tensors):
             torch.testing.assert_close(got, expected, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize(("op", "options", "tensors"), LEADING, ids=[op.__name__ for op, *_ in LEADING])
+def test_func_transforms(op, options, tensors):
+    """torch.func.vmap is one more leading dimension, and torch.func.grad is what backward gives."""
+
+    def first(*args):
+        return outputs(op(*args, **options))[0]
+
+    expected = torch.stack([first(*[t[i] for t in tensors]) for i in range(2)])
+    for dim in (0, 1):
+        got = torch.func.vmap(first, in_dims=dim)(*[tensor.movedim(0, dim) for tensor in tensors])
+        torch.testing.assert_close(got, expected, rtol=1e-12, atol=1e-12)
+    if not expected.is_floating_point() or op is sk.spike_interval:
+        return
+    weight = torch.arange(1.0, expected[0].numel() + 1).reshape(expected[0].shape)
+    grads = torch.func.vmap(torch.func.grad(lambda *args: (first(*args) * weight).sum(), tuple(range(len(tensors)))))
+    leaves = [tensor.clone().requires_grad_() for tensor in tensors]
+    wanted = torch.autograd.grad(sum((first(*[t[i] for t in leaves]) * weight).sum() for i in range(2)), leaves)
+    for got, want in zip(grads(*tensors), wanted, strict=True):
+        torch.testing.assert_close(got, want, rtol=1e-12, atol=1e-12)
+
+
 @pytest.mark.parametrize("dtype", [torch.bool, torch.uint8])
 @pytest.mark.parametrize("op", [sk.spike_interval, sk.tfi, lambda s: sk.tfp(s, 3), sk.split_colors, sk.split_bayer])
 def test_compile_of_bits(op, dtype):
@@ -199,12 +232,16 @@ def test_custom_operators_with_dynamic_sizes(op, tensors):
 @pytest.mark.parametrize(
     ("op", "arguments"),
     [
-        (torch.ops.spikekit.integrate_fire, ((SPIKES * 0.7).requires_grad_(), 1.0, torch.zeros(2, 4, 6).double())),
-        (torch.ops.spikekit.tfi, (SPIKES.clone().requires_grad_(), 1.0)),
+        (torch.ops.spikekit.integrate_fire, ((SPIKES * 0.7).requires_grad_(), 1.0, RGB[:, 0], torch.float64)),
+        (torch.ops.spikekit.integrate_fire_grad, (SPIKES.clone().requires_grad_(), SPIKES * 0.7, 1.0)),
+        (torch.ops.spikekit.tfi, (SPIKES.clone().requires_grad_(), 1.0, torch.float64)),
+        (torch.ops.spikekit.tfi_grad, (SPIKES, SPIKES, SPIKES)),
+        (torch.ops.spikekit.tfp, (SPIKES.clone().requires_grad_(), 3, 1.0, torch.float64)),
+        (torch.ops.spikekit.tfp_grad, (SPIKES.clone().requires_grad_(), 3, 1.0, torch.float64)),
         (torch.ops.spikekit.spike_interval, (SPIKES > 0,)),
         (torch.ops.spikekit.nearest_known, (FLOW.floor().long(), FLOW - FLOW.floor(), MASK, 4)),
     ],
-    ids=["integrate_fire", "tfi", "spike_interval", "nearest_known"],
+    ids=lambda value: str(value).rpartition(".")[2] if "spikekit" in str(value) else "",
 )
 def test_custom_operators_are_registered_correctly(op, arguments):
     torch.library.opcheck(

@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch.autograd import gradcheck
+from torch.autograd import gradcheck, gradgradcheck
 
 from spikekit import spike_interval, tfi, tfp
 
@@ -176,6 +176,48 @@ def test_tfp_counts_uint8_past_255():
     for dtype in (torch.uint8, torch.bool):
         assert torch.allclose(tfp(torch.ones(600, 1, 1, dtype=dtype), 601), torch.ones(1))
     assert (tfp(torch.ones(5000, 1, 1, dtype=torch.float16), 3) == 1).all()
+
+
+@pytest.mark.parametrize("op", [tfi, lambda s, m, dtype: tfp(s, 5, m, dtype=dtype)])
+def test_dtype_of_the_result(op):
+    spikes = torch.from_numpy(streams(41))
+    exact = op(spikes.double(), 255.0, dtype=None)
+    for came in (torch.bool, torch.uint8, torch.float32):
+        for dtype in DTYPES:
+            got = op(spikes.to(came), 255.0, dtype=dtype)
+            assert got.dtype == dtype
+            torch.testing.assert_close(got.double(), exact, rtol=max(torch.finfo(dtype).eps, 1e-7), atol=0)
+        picture = op(spikes.to(came).requires_grad_(came.is_floating_point), 255.0, dtype=torch.uint8)
+        assert not picture.requires_grad
+        assert torch.equal(picture, exact.float().round().to(torch.uint8))  # to the nearest, not down
+    assert op(spikes, 1000.0, dtype=torch.uint8).max() == 255
+    for dtype in (torch.int16, torch.bool, "uint8"):
+        with pytest.raises(TypeError, match="dtype"):
+            op(spikes, 1.0, dtype=dtype)
+
+
+def test_second_gradients():
+    """TFP is linear; the gradient of TFI is linear in the one that comes, and its own adjoint."""
+    spikes = torch.from_numpy(streams(17)).double().requires_grad_()
+    assert gradgradcheck(lambda s: tfp(s, 5, 2.0), torch.rand(6, 1, 2, dtype=torch.float64, requires_grad=True))
+    weight, other = torch.randn(2, *spikes.shape, dtype=torch.float64)
+    weight.requires_grad_()
+    (grad,) = torch.autograd.grad((tfi(spikes) * weight).sum(), spikes, create_graph=True)
+    (again,) = torch.autograd.grad((grad * other).sum(), weight)
+    (expected,) = torch.autograd.grad((tfi(spikes) * other).sum(), spikes)
+    assert torch.allclose(again, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_tfp_forgets_what_has_left_the_window():
+    """A large number must not leave its rounding error behind."""
+    spikes = torch.zeros(60, 1, 1)
+    spikes[5], spikes[20:] = 1e8, 0.1
+    assert torch.allclose(tfp(spikes, 5)[30:], torch.tensor(0.1), rtol=1e-6)
+
+
+def test_window_of_numpy():
+    spikes = torch.from_numpy(streams(9))
+    assert torch.equal(tfp(spikes, np.int64(3)), tfp(spikes, 3))
 
 
 def test_tfp_is_linear():

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spikekit import spike_integrate_fire
+from spikekit import SpikeIntegrateFire, spike_integrate_fire
 
 DTYPES = [torch.float64, torch.float32, torch.bfloat16, torch.float16]
 
@@ -85,6 +85,68 @@ def test_charge_is_conserved(light, start, threshold, dtype):
     assert threshold * spikes.double().sum() + charge.double().sum() == start.double().sum() + light.sum()
     assert (charge >= 0).all()
     assert (charge < threshold).all()
+
+
+@given(light=st.lists(st.integers(-200, 127), min_size=1, max_size=41), dtype=st.sampled_from(DTYPES))
+def test_light_below_zero_is_a_debt(light, dtype):
+    """Nothing is made of it and nothing forgotten: the pixel fires when the sum reaches the next threshold."""
+    sums, fired = np.cumsum(light), []
+    for t in range(len(light)):
+        fired.append(int(sums[t] - 128 * sum(fired) >= 128))
+    light = torch.tensor(light, dtype=torch.float64).reshape(-1, 1, 1) / 128
+    spikes, charge = spike_integrate_fire(light.to(dtype))
+    assert spikes.flatten().tolist() == fired
+    assert charge.item() == sums[-1] / 128 - sum(fired)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_light_that_is_no_number(dtype):
+    nan, inf = float("nan"), float("inf")
+    light = torch.full((6, 1, 4), 0.5, dtype=dtype)
+    light[2, 0] = torch.tensor([0.5, nan, inf, -inf])
+    light.requires_grad_()
+    spikes, charge = spike_integrate_fire(light)
+    assert spikes[:, 0].T.tolist() == [[0, 1, 0, 1, 0, 1], [0, 1, 0, 0, 0, 0], [0, 1, 1, 0, 1, 0], [0, 1, 0, 0, 0, 0]]
+    assert charge[0].isnan().tolist() == [False, True, False, False]
+    assert charge[0, [0, 2, 3]].tolist() == [0, 0.5, -inf]
+    (grad,) = torch.autograd.grad(spikes.sum(), light)
+    expected = torch.ones_like(light)
+    expected[2, 0, 1:] = 0
+    assert torch.equal(grad, expected)
+    again, charge = spike_integrate_fire(light.detach()[3:], charge=torch.zeros(1, 4))  # a new charge cures the pixel
+    assert again[:, 0].T.tolist() == [[0, 1, 0]] * 4
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("threshold", [1e-6, 0.1, 3.0, 1e6])
+def test_charge_stays_in_range_under_blinding_light(dtype, threshold):
+    """Where rounding leaves nothing of the remainder, the dark that follows must not fire."""
+    light = torch.rand(20, 5, 8, dtype=dtype) * threshold * torch.logspace(0, 20, 40, dtype=dtype).reshape(5, 8)
+    spikes, charge = spike_integrate_fire(light, threshold)
+    assert ((charge >= 0) & (charge < torch.tensor(threshold, dtype=dtype))).all()
+    spikes, _ = spike_integrate_fire(torch.zeros_like(light), threshold, charge)
+    assert not spikes.any()
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.bool, torch.float16, torch.float64])
+def test_dtype_of_the_spikes(dtype):
+    light = torch.rand(2, 9, 3, 4, requires_grad=True)
+    expected, charge = spike_integrate_fire(light)
+    spikes, left = spike_integrate_fire(light, dtype=dtype)
+    assert spikes.dtype == dtype
+    assert torch.equal(spikes, expected.to(dtype))
+    assert torch.equal(left, charge)
+    assert spikes.requires_grad == dtype.is_floating_point
+
+
+def test_second_gradient():
+    """The gradient is linear in the one that comes: its own gradient is the same window of light again."""
+    light = (torch.rand(3, 2, 2, dtype=torch.float64) * 3 - 1).requires_grad_()
+    weight = torch.randn(3, 2, 2, dtype=torch.float64, requires_grad=True)
+    spikes, _ = spike_integrate_fire(light, 0.5)
+    (grad,) = torch.autograd.grad((spikes * weight).sum(), light, create_graph=True)
+    (again,) = torch.autograd.grad(grad.sum(), weight)
+    assert torch.equal(again, 2.0 * ((light >= 0) & (light <= 0.5)))
 
 
 @given(data=st.data(), threshold=st.sampled_from([0.3, 1.0, 7.0]), dtype=st.sampled_from(DTYPES))
@@ -198,3 +260,13 @@ def test_charge_broadcasts():
 def test_errors(error, arguments):
     with pytest.raises(error):
         spike_integrate_fire(*arguments)
+
+
+@pytest.mark.parametrize("dtype", [torch.int16, torch.complex64, float])
+def test_wrong_dtype(dtype):
+    for call in (
+        lambda: spike_integrate_fire(torch.ones(3, 2, 2), dtype=dtype),
+        lambda: SpikeIntegrateFire(dtype=dtype),
+    ):
+        with pytest.raises(TypeError, match="dtype"):
+            call()
