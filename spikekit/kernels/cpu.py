@@ -232,47 +232,54 @@ def tfp(spikes: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Te
     light = _Output(spikes.shape, dtype)
     flat = _flat(spikes)
     wide = np.dtype(np.float64 if torch.float64 in (spikes.dtype, dtype) else np.float32)
-    if spikes.is_floating_point():
-        counter = np.dtype(np.float64)  # where they are no bits, a sum that runs must not forget the small ones
-    elif spikes.dtype in (torch.bool, torch.uint8):
-        counter = np.min_scalar_type(window if spikes.dtype is torch.bool else 255 * window)
-    else:
-        counter = np.dtype(np.int64)
+    sizes = _window_sizes(spikes.shape[-3], window).astype(wide)
     for tile, out in light.tiles():
-        inside = _running_sums(_read(flat, tile), window, counter)
-        mean = np.empty(out.shape[1:], wide)
-        for (total, size), out_n in zip(inside, out, strict=True):
+        values, mean = _read(flat, tile), np.empty(out.shape[1:], wide)
+        for total, size, out_n in zip(_running_sums(values, window), sizes, out, strict=True):
             np.copyto(mean, total, casting="same_kind")
             if max_range != 1:
                 np.multiply(mean, wide.type(max_range), out=mean)
-            np.divide(mean, wide.type(size), out=mean)
+            np.divide(mean, size, out=mean)
             _store(mean, out_n)
     return light.tensor
 
 
-def _running_sums(values: np.ndarray, window: int, counter: np.dtype) -> Iterator[tuple[np.ndarray, int]]:
-    """Yield, for every frame, the sum over the frames of its window that exist, and their number."""
-    frames, half = len(values), window // 2
-    total = np.zeros(values.shape[1:], counter)
-    for value in values[:half]:
-        np.add(total, value, out=total, casting="unsafe")
-    for n in range(frames):
-        if n + half < frames:
-            np.add(total, values[n + half], out=total, casting="unsafe")
-        if n > half:
-            np.subtract(total, values[n - half - 1], out=total, casting="unsafe")
-        yield total, min(n + half, frames - 1) - max(n - half, 0) + 1
-
-
 def tfp_grad(grad: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Tensor:
-    """The same running sum over the gradient, each frame of it divided by the size of its window."""
+    """The same running sum over the gradient, each frame of it shared among the frames of its window."""
     result = _Output(grad.shape, dtype)
     flat = _flat(grad)
-    frames, half = grad.shape[-3], window // 2
-    n = np.arange(frames)
-    size = np.minimum(n + half, frames - 1) - np.maximum(n - half, 0) + 1
+    weights = max_range / _window_sizes(grad.shape[-3], window)
     for tile, out in result.tiles():
-        share = _read(flat, tile) * (max_range / size[:, None, None])
-        for (total, _), out_n in zip(_running_sums(share, window, np.dtype(np.float64)), out, strict=True):
+        for total, out_n in zip(_running_sums(_read(flat, tile), window, weights), out, strict=True):
             np.copyto(out_n, total, casting="same_kind")
     return result.tensor
+
+
+def _window_sizes(frames: int, window: int) -> np.ndarray:
+    """How many frames of the window around every frame exist."""
+    n, half = np.arange(frames), window // 2
+    return np.minimum(n + half, frames - 1) - np.maximum(n - half, 0) + 1
+
+
+def _running_sums(values: np.ndarray, window: int, weights: np.ndarray | None = None) -> Iterator[np.ndarray]:
+    """Yield, for every frame, the weighed sum over the frames of its window; the array is the same every time."""
+    frames, half = len(values), window // 2
+    if values.dtype.kind == "f":
+        counter = np.dtype(np.float64)  # or a large number that has left the window would leave its rounding behind
+    elif values.dtype == np.uint8:
+        counter = np.min_scalar_type(window * int(values.max(initial=0)))
+    else:
+        counter = np.dtype(np.int64)
+    total, weighed = np.zeros(values.shape[1:], counter), np.empty(values.shape[1:], counter)
+
+    def weigh(n: int) -> np.ndarray:
+        return values[n] if weights is None else np.multiply(values[n], weights[n], out=weighed)
+
+    for n in range(min(half, frames)):
+        np.add(total, weigh(n), out=total, casting="same_kind")
+    for n in range(frames):
+        if n + half < frames:
+            np.add(total, weigh(n + half), out=total, casting="same_kind")
+        if n > half:
+            np.subtract(total, weigh(n - half - 1), out=total, casting="same_kind")
+        yield total
