@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from spikekit.check import check_planes
+from spikekit.gather import Gather
 
 _FARTHEST = 2.0**30  # flow beyond it is cut: positions must fit an integer
 _CHUNK = 1 << 15  # positions searched at a time: in the cache, and by one thread, without waiting for another
@@ -254,10 +255,7 @@ def flow_warp_idw(features: Tensor, flow: Tensor, mask: Tensor, *, neighbors: in
     share = weight / weight.sum(dim=1, keepdim=True)
 
     values = features.reshape(-1, features.shape[-3], height * width)
-    result = 0
-    for index, share_i in zip(nearest.flatten(2).split(1, dim=1), share.flatten(2).split(1, dim=1), strict=True):
-        result = result + values.gather(-1, index.expand(values.shape)) * share_i
-    return result.to(features.dtype).reshape(features.shape)
+    return Gather.apply(values, nearest.flatten(2), share.flatten(2)).reshape(features.shape)
 
 
 class FlowWarpIdw(nn.Module):

@@ -1,0 +1,181 @@
+"""Weighted sums of gathered pixels: three bilinear operators, each the derivative of the other two.
+
+    gather   out[b, c, q] = sum_k weight[b, k, q] values[b, c, index[b, k, q]]
+    scatter  out[b, c, p] = sum of weight[b, k, q] grad[b, c, q] over all k, q with index[b, k, q] = p
+    dot      out[b, k, q] = sum_c values[b, c, index[b, k, q]] grad[b, c, q]
+
+With them a warp can be differentiated as often as one likes. Sums run in float32 or wider. Where the channels of
+``values`` (of ``grad``, for scatter) lie side by side in memory, those of the result do too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from spikekit.kernels import cpu_warp, register
+from spikekit.kernels.layout import empty_like_layout, is_channels_last
+
+
+_FEW = 8  # channels: of fewer planes, a CPU gathers one after the other faster than rows of all
+
+
+def _wide(*tensors: Tensor) -> torch.dtype:
+    dtype = torch.float32
+    for tensor in tensors:
+        dtype = torch.promote_types(dtype, tensor.dtype)
+    return dtype
+
+
+def _gather(values: Tensor, index: Tensor, weight: Tensor) -> Tensor:
+    """(B, C, P), (B, K, Q) and (B, K, Q) to (B, C, Q), in the dtype of ``values``."""
+    total = values.new_zeros(*values.shape[:2], index.shape[2], dtype=_wide(values, weight))
+    for index_k, weight_k in zip(index.split(1, dim=1), weight.split(1, dim=1), strict=True):
+        total += values.gather(2, index_k.expand(-1, values.shape[1], -1)) * weight_k
+    return empty_like_layout(values, index.shape[2]).copy_(total)
+
+
+def _scatter(grad: Tensor, index: Tensor, weight: Tensor, size: int) -> Tensor:
+    """(B, C, Q), (B, K, Q) and (B, K, Q) to (B, C, size), in the dtype of ``grad``."""
+    dtype = _wide(grad, weight)
+    total = grad.new_zeros(*grad.shape[:2], size, dtype=dtype)
+    for index_k, weight_k in zip(index.split(1, dim=1), weight.split(1, dim=1), strict=True):
+        total.scatter_add_(2, index_k.expand(-1, grad.shape[1], -1), (grad * weight_k).to(dtype))
+    return empty_like_layout(grad, size).copy_(total)
+
+
+def _dot(values: Tensor, grad: Tensor, index: Tensor) -> Tensor:
+    """(B, C, P), (B, C, Q) and (B, K, Q) to (B, K, Q), in float32 or wider."""
+    dtype = _wide(values, grad)
+    result = values.new_empty(index.shape, dtype=dtype)
+    for k, index_k in enumerate(index.split(1, dim=1)):
+        gathered = values.gather(2, index_k.expand(-1, values.shape[1], -1))
+        result[:, k] = (gathered.to(dtype) * grad).sum(dim=1)
+    return result
+
+
+def fold_into_batch(op: Any, count: int) -> None:
+    """Let ``torch.func.vmap`` give its axis to the first ``count`` arguments of an operator as a larger batch."""
+
+    def rule(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Any, Any]:
+        if any(dim is not None for dim in in_dims[count:]):
+            raise ValueError(f"{op._name}: expected only the first {count} arguments to be mapped over")
+
+        def folded(value: Tensor, dim: int | None) -> Tensor:
+            return (value.expand(info.batch_size, *value.shape) if dim is None else value.movedim(dim, 0)).flatten(0, 1)
+
+        result = op(*map(folded, args[:count], in_dims), *args[count:])
+        results = result if isinstance(result, tuple) else (result,)
+        unfolded = tuple(value.unflatten(0, (info.batch_size, -1)) for value in results)
+        return (unfolded, (0,) * len(unfolded)) if isinstance(result, tuple) else (unfolded[0], 0)
+
+    op.register_vmap(rule)
+
+
+def _operator(plain: Callable[..., Tensor], name: str) -> Any:
+    op = torch.library.custom_op(f"spikekit::{name}", plain, mutates_args=())
+    register(op, name)
+    rows = getattr(cpu_warp, name)
+
+    @op.register_kernel("cpu")
+    def _(first: Tensor, *others: Any) -> Tensor:
+        return (rows if is_channels_last(first) or first.shape[1] >= _FEW else plain)(first, *others)
+
+    fold_into_batch(op, 3)
+    return op
+
+
+weighted_gather = _operator(_gather, "weighted_gather")
+weighted_scatter = _operator(_scatter, "weighted_scatter")
+weighted_dot = _operator(_dot, "weighted_dot")
+
+
+@weighted_gather.register_fake
+def _(values: Tensor, index: Tensor, weight: Tensor) -> Tensor:
+    return empty_like_layout(values, index.shape[2])
+
+
+@weighted_scatter.register_fake
+def _(grad: Tensor, index: Tensor, weight: Tensor, size: int) -> Tensor:
+    return empty_like_layout(grad, size)
+
+
+@weighted_dot.register_fake
+def _(values: Tensor, grad: Tensor, index: Tensor) -> Tensor:
+    return values.new_empty(index.shape, dtype=_wide(values, grad))
+
+
+class Gather(torch.autograd.Function):
+    """:func:`weighted_gather` with derivatives in values and weight."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(values: Tensor, index: Tensor, weight: Tensor) -> Tensor:  # noqa: D102
+        return weighted_gather(values, index, weight)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, Tensor], output: Tensor) -> None:  # noqa: D102
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None, Tensor | None]:  # noqa: D102
+        values, index, weight = ctx.saved_tensors
+        of_values, _, of_weight = ctx.needs_input_grad
+        return (
+            Scatter.apply(grad, index, weight, values.shape[2]) if of_values else None,
+            None,
+            Dot.apply(values, grad, index).to(weight.dtype) if of_weight else None,
+        )
+
+
+class Scatter(torch.autograd.Function):
+    """:func:`weighted_scatter` with derivatives in grad and weight."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(grad: Tensor, index: Tensor, weight: Tensor, size: int) -> Tensor:  # noqa: D102
+        return weighted_scatter(grad, index, weight, size)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, Tensor, int], output: Tensor) -> None:  # noqa: D102
+        ctx.save_for_backward(*inputs[:3])
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None, Tensor | None, None]:  # noqa: D102
+        other, index, weight = ctx.saved_tensors
+        of_other, _, of_weight, _ = ctx.needs_input_grad
+        return (
+            Gather.apply(grad, index, weight) if of_other else None,
+            None,
+            Dot.apply(grad, other, index).to(weight.dtype) if of_weight else None,
+            None,
+        )
+
+
+class Dot(torch.autograd.Function):
+    """:func:`weighted_dot` with derivatives in values and grad."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(values: Tensor, grad: Tensor, index: Tensor) -> Tensor:  # noqa: D102
+        return weighted_dot(values, grad, index)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, Tensor], output: Tensor) -> None:  # noqa: D102
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:  # noqa: D102
+        values, other, index = ctx.saved_tensors
+        of_values, of_other, _ = ctx.needs_input_grad
+        return (
+            Scatter.apply(other, index, grad, values.shape[2]).to(values.dtype) if of_values else None,
+            Gather.apply(values, index, grad).to(other.dtype) if of_other else None,
+            None,
+        )

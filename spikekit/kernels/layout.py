@@ -1,0 +1,21 @@
+"""Where in memory the result of a gather lies: as its input does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from torch import Tensor
+
+
+def is_channels_last(values: Tensor) -> bool:
+    """Whether the channels of (B, C, P) lie side by side in memory."""
+    return values.stride(1) == 1 and values.stride(2) > 1
+
+
+def empty_like_layout(values: Tensor, size: int, empty: Callable[[tuple[int, ...]], Tensor] | None = None) -> Tensor:
+    """Return an empty (B, C, size) in the dtype of ``values``, channels last where ``values`` are, else contiguous."""
+    empty = empty or values.new_empty
+    batch, channels, _ = values.shape
+    if is_channels_last(values):
+        return empty((batch, size, channels)).transpose(1, 2)
+    return empty((batch, channels, size))
