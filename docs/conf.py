@@ -1,12 +1,12 @@
 """How Sphinx builds these pages: ``sphinx-build -W -b html docs docs/_build``."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 from docutils import nodes
-from docutils.parsers.rst import directives
 from docutils.statemachine import StringList
 from sphinx.util.docutils import SphinxDirective
 
@@ -43,17 +43,18 @@ plot_html_show_source_link = True
 
 
 class Run(SphinxDirective):
-    """``.. run:: info --help`` shows what the ``spikekit`` command prints; ``:table:`` reads it as a Markdown table."""
+    """``.. run:: info --help`` shows what the ``spikekit`` command prints, with ``--markdown`` as tables."""
 
     required_arguments = 1
     final_argument_whitespace = True
-    option_spec = {"table": directives.flag}
 
     def run(self):
+        """Return the nodes."""
+        self.env.note_reread()  # what it prints can change without a change of the page
         printed = _spikekit(self.arguments[0])
-        if "table" not in self.options:
+        if "--markdown" not in self.arguments[0]:
             return [nodes.literal_block(printed, f"$ spikekit {self.arguments[0]}\n{printed}", language="console")]
-        rst = StringList(_list_tables(printed), source=self.get_source_info()[0])
+        rst = StringList(list(_restructured(printed)), source=self.get_source_info()[0])
         node = nodes.Element()
         self.state.nested_parse(rst, self.content_offset, node)
         return node.children
@@ -68,22 +69,26 @@ def _spikekit(arguments):
     return done.stdout
 
 
-def _list_tables(markdown):
-    """Markdown's tables as reStructuredText; the lines around them are left as they are."""
+def _restructured(markdown):
+    """Markdown's headings, tables and code as lines of reStructuredText."""
     header = True
     for line in markdown.splitlines():
         if not line.startswith("|"):
             header = True
-            yield line
+            yield f".. rubric:: {_inline(line.lstrip('# '))}" if line.startswith("#") else _inline(line)
             continue
-        cells = [cell.strip() for cell in line.strip("|").split("|")]
         if header:
             yield from ("", ".. list-table::", "   :header-rows: 1", "")
-        if set(line) <= set("|-: "):
-            continue
-        for i, cell in enumerate(cells):
-            yield f"   {'* -' if i == 0 else '  -'} {cell}"
         header = False
+        if not set(line) <= set("|-: "):
+            for i, cell in enumerate(line.strip("|").split("|")):
+                yield f"   {'  -' if i else '* -'} {_inline(cell.strip())}"
+
+
+def _inline(text):
+    """Keep what is between backticks as code, and let nothing else mean anything."""
+    parts = text.split("`")
+    return "".join(f"``{part}``" if i % 2 else re.sub(r"([*_|\\])", r"\\\1", part) for i, part in enumerate(parts))
 
 
 def setup(app):

@@ -12,7 +12,7 @@ to_last = torch.tensor([3.0, 4.0]).reshape(2, 1, 1)
 offset = sk.linear_motion(to_first, to_last, times)[:, :, 0, 0]  # (11, 2)
 
 figure, (path, course) = plt.subplots(1, 2, figsize=(7.2, 3), layout="constrained")
-for flow, name, side in ((to_first, "flow_to_first", "right"), (to_last, "flow_to_last", "left")):
+for flow, name in ((to_first, "flow_to_first"), (to_last, "flow_to_last")):
     u, v = flow.flatten().tolist()
     path.annotate("", (u, v), (0, 0), arrowprops={"arrowstyle": "->", "color": "0.6", "lw": 2})
     path.text(u, v + 0.5, name, ha="center", va="top", color="0.4")
