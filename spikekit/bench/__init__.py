@@ -1,0 +1,264 @@
+"""The benchmark: every operator beside what one would otherwise run, in one process, in turn.
+
+Ratios hold on any machine that is not too different; absolute figures hold on the one that printed them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+import platform
+import re
+import statistics
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from spikekit.bench import pictures, streams
+from spikekit.bench.case import SEED, SIZES, Case, Other, Setup
+from spikekit.bench.measure import Ratio, Run, Timer, floor_run, interleave, peak_memory, ratio, timer_of
+
+CASES = {**streams.CASES, **pictures.CASES}
+
+#: Seconds of one case after which no further round is begun.
+CASE_SECONDS = 2.5
+
+COLUMNS = (
+    "operator", "case", "beside", "other / ours", "rounds", "Mpixel/s", "ours / floor", "MiB ours", "MiB other", "equal"
+)  # fmt: skip
+
+_LEGEND = """\
+other / ours  time of what stands under "beside" over that of spikekit: median of the rounds (least .. most)
+Mpixel/s      million pixels of a frame that spikekit makes a second (all channels of a pixel count as one)
+ours / floor  time of spikekit over that of a kernel that only reads the input once and writes the result once, in
+              memory that is already there
+MiB           by how much a call raises the memory in use, its result included
+equal         share of the values that are equal, where the two should be"""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table: our code beside one other, or alone where ``other`` is empty.
+
+    Attributes:
+        operator: its public name.
+        case: what goes in and what comes out.
+        other: what it is measured beside.
+        ratio: time of the other over ours; None where the other could not be run.
+        rounds: how many timings the ratio is the median of.
+        speed: million pixels a second, ours.
+        floor: our time over that of the memory-bandwidth floor.
+        memory: peak MiB above the inputs, ours and the other's.
+        equal: share of the compared values that are equal; None where nothing should be.
+        note: how the other differs, or why it was not run.
+    """
+
+    operator: str
+    case: str
+    other: str = ""
+    ratio: Ratio | None = None
+    rounds: int = 0
+    speed: float | None = None
+    floor: float | None = None
+    memory: tuple[float | None, float | None] = (None, None)
+    equal: float | None = None
+    note: str = ""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the benchmark to a parser."""
+    parser.add_argument(
+        "operators", nargs="*", metavar="OPERATOR", help=f"what to measure, all if not given: {', '.join(CASES)}"
+    )
+    parser.add_argument("--size", choices=SIZES, default="full", help="small shows that everything runs; default full")
+    parser.add_argument("--rounds", type=_rounds, default=7, metavar="N", help="timings of each, in turn; default 7")
+    parser.add_argument(
+        "--threads", type=_rounds, default=1, metavar="N", help="threads of torch; 1 counts CPU time, more wall time"
+    )
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="default cpu")
+    parser.add_argument("--markdown", action="store_true", help="a Markdown table")
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="write there what is otherwise printed")
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure every operator beside what one would otherwise run, and print the table."""
+    unknown = [name for name in args.operators if name not in CASES]
+    if unknown:
+        raise ValueError(f"operators: expected some of {', '.join(CASES)}, got {', '.join(unknown)}")
+    try:
+        device = torch.empty(0, device=args.device).device
+    except (RuntimeError, AssertionError) as error:
+        raise ValueError(f"--device: {args.device} cannot be used here ({str(error).splitlines()[0]})") from error
+    timer, unit = timer_of(device, args.threads)
+    with _threads(args.threads):
+        table = list(rows(args.operators or list(CASES), args.size, device, args.rounds, timer))
+        text = "\n\n".join(
+            [_header(device, unit, args.size), _table(table, args.markdown), _notes(table, args.markdown)]
+        )
+    if args.output is None:
+        sys.stdout.write(f"{text}\n")
+        return
+    try:
+        args.output.write_text(f"{text}\n", encoding="utf-8")
+    except OSError as error:
+        raise ValueError(f"{args.output}: cannot be written ({error.strerror or error})") from error
+
+
+def rows(operators: Sequence[str], size: str, device: torch.device, rounds: int, timer: Timer) -> Iterator[Row]:
+    """Measure all cases of some operators."""
+    with tempfile.TemporaryDirectory() as folder, _frozen():
+        setup = Setup(SIZES[size], device, Path(folder))
+        for operator in operators:
+            try:
+                for case in CASES[operator](setup):
+                    yield from compare(case, operator, device, rounds, timer)
+            except Exception as error:  # the other operators are worth their lines
+                yield Row(operator, "", note=_reason(error))
+
+
+def compare(case: Case, operator: str, device: torch.device, rounds: int, timer: Timer) -> Iterator[Row]:
+    """Measure one case beside everything that can be run; what cannot gets a row that says why."""
+    result = case.run()
+    runs: dict[str, Run] = {}
+    equal: dict[str, float | None] = {}
+    failed: dict[str, str] = {}
+    for other in case.others:
+        try:
+            run = other.prepare()
+            equal[other.name] = _equal(other, result, run())
+            runs[other.name] = run
+        except Exception as error:
+            failed[other.name] = _reason(error)
+    del result
+    gc.collect()
+    memory = {name: peak_memory(run, device) for name, run in runs.items()}
+    ours = peak_memory(case.run, device)
+    floor = floor_run(case.read, case.written, device)
+    times = interleave({"": case.run, **runs, "floor": floor}, rounds, timer, CASE_SECONDS)
+
+    to_floor = ratio(times[""], times["floor"]).median
+    speed = case.pixels / max(statistics.median(times[""]), 1e-9) / 1e6
+    row = Row(operator, case.name, rounds=len(times[""]), speed=speed, floor=to_floor, memory=(ours, None))
+    if not case.others:
+        yield row
+    for other in case.others:
+        if other.name in failed:
+            yield Row(operator, case.name, other.name, note=failed[other.name])
+            continue
+        yield Row(
+            **{
+                **vars(row),
+                "other": other.name,
+                "ratio": ratio(times[other.name], times[""]),
+                "memory": (ours, memory[other.name]),
+                "equal": equal[other.name],
+                "note": other.note,
+            }
+        )
+
+
+def _equal(other: Other, ours: object, theirs: object) -> float | None:
+    """Share of the values that are equal."""
+    if other.pair is None:
+        return None
+    a, b = (value.detach().double() for value in other.pair(ours, theirs))
+    if a.shape != b.shape:
+        raise ValueError(f"gives {tuple(b.shape)}, not {tuple(a.shape)}")
+    return torch.isclose(a, b, rtol=other.tolerance, atol=other.tolerance).double().mean().item()
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, ImportError):
+        return f"not installed ({error.name or error})" if isinstance(error, ModuleNotFoundError) else f"fails: {error}"
+    return f"fails: {type(error).__name__}: {' '.join(str(error).split())[:120]}"
+
+
+def _header(device: torch.device, unit: str, size: str) -> str:
+    # what a result costs depends on whether the heap keeps its pages
+    heap = [f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith("MALLOC_")]
+    lines = [
+        f"machine  {_cpu_name()}, {os.cpu_count()} cores, {torch.get_num_threads()} threads used",
+        f"torch    {torch.__version__}, Python {platform.python_version()}, {platform.system()}"
+        + "".join(f", {setting}" for setting in heap),
+        f"time     {unit}; size {size}, seed {SEED}",
+    ]
+    if device.type == "cuda":
+        lines.insert(1, f"device   {torch.cuda.get_device_name(device)}")
+    return "\n".join(lines)
+
+
+def _cpu_name() -> str:
+    with suppress(OSError, AttributeError):
+        return re.search(r"^model name\s*:\s*(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)[1]  # type: ignore[index]
+    return platform.processor() or platform.machine()
+
+
+def _table(rows: Sequence[Row], markdown: bool) -> str:
+    lines, previous = [COLUMNS], None
+    for row in rows:
+        cells = (row.operator, row.case, *_cells(row))
+        shown = (row.operator, row.case, row.speed, row.floor)
+        if not markdown and shown == previous:  # what the line above says already
+            cells = ("", "", *cells[2:5], "", "", "", *cells[8:])
+        lines.append(cells)
+        previous = shown
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    text = [[cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines]
+    if markdown:
+        text.insert(1, ["-" * width for width in widths])
+        return "\n".join(f"| {' | '.join(line)} |" for line in text)
+    return "\n".join("  ".join(line).rstrip() for line in text)
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    if row.ratio is None and row.speed is None:
+        return row.other, row.note, *[""] * 6
+    equal = "" if row.equal is None else f"{100 * row.equal:.4g} %"
+    return (
+        row.other,
+        "" if row.ratio is None else f"{row.ratio.median:.3g} ({row.ratio.least:.3g} .. {row.ratio.most:.3g})",
+        str(row.rounds),
+        f"{row.speed:.4g}",
+        f"{row.floor:.3g}",
+        *("" if mib is None else f"{mib:.1f}" for mib in row.memory),
+        "; ".join(filter(None, [equal, row.note])),
+    )
+
+
+def _notes(rows: Sequence[Row], markdown: bool) -> str:
+    missing = sorted({f"{row.other}: {row.note}" for row in rows if row.ratio is None and row.other})
+    text = "\n".join([_LEGEND, *missing])
+    return f"```\n{text}\n```" if markdown else text
+
+
+@contextmanager
+def _frozen() -> Iterator[None]:
+    """Keep what is there already out of the garbage collector's way: it is much, and would be searched every time."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+
+
+@contextmanager
+def _threads(number: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(number)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _rounds(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number, 1 or more, got {text}")
+    return int(text)
