@@ -1,4 +1,4 @@
-"""The docs: a page for every operator, a docstring that says all it should, figures that draw, a build that is clean."""
+"""The docs: every operator has a page and a docstring that says all it should, figures draw, the build is clean."""
 
 import builtins
 import inspect
