@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
+import secrets
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
@@ -15,9 +17,9 @@ import torch
 from torch import Tensor
 
 from spikekit.cfa import PATTERNS
-from spikekit.decoders import tfi, tfp
 from spikekit.demosaic import demosaic
-from spikekit.files import iter_spikes, read_spikes, spikes_shape
+from spikekit.files import iter_spikes, spikes_shape
+from spikekit.keyframe import search
 from spikekit.pictures import write_picture
 
 #: Clocks a second of the cameras.
@@ -38,10 +40,16 @@ TFI_REACH = 200
 #: Frames that TFP averages when nothing else is said.
 TFP_WINDOW = 41
 
+# Gives the frame of a number, its pixels unpacked.
+_Plane = Callable[[int], np.ndarray]
+
+# Stands for the number of the frame in the name of a picture.
+_NUMBER = "{frame}"
+
 _PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 
-# Rows decoded at a time: the decoders give every frame of the span, of which one is kept.
-_BAND = 32
+# Pixels that are counted at a time.
+_BLOCK = 1 << 24
 
 
 class UsageError(ValueError):
@@ -52,10 +60,7 @@ def info(args: argparse.Namespace) -> None:
     """Print what a recording holds, in one pass over its frames."""
     _check_size_given(args)
     frames, height, width = spikes_shape(args.file, args.height, args.width)
-    counts = torch.zeros(height, width, dtype=torch.int64)
-    for frame in iter_spikes(args.file, args.height, args.width, flip=args.flip):
-        counts += frame
-
+    counts = _counts(args, height, width, 0, frames)
     pixels, spikes = counts.numel(), int(counts.sum())
     rates = counts.double() / frames
     dead, full = int((counts == 0).sum()), int((counts == frames).sum())
@@ -73,41 +78,50 @@ def info(args: argparse.Namespace) -> None:
 
 
 def decode(args: argparse.Namespace) -> None:
-    """Write the picture of one frame, reading only as much around it as the method needs."""
+    """Write the picture of one frame, or of many, reading only as much around each as the method needs."""
     _check_size_given(args)
     if args.window is not None and (args.method != "tfp" or args.window % 2 == 0):
         raise UsageError(f"--window: expected an odd number, with --method tfp, got {args.window} with {args.method}")
     if args.output.is_dir():
         raise ValueError(f"{args.output}: expected a picture to write, got a folder")
-    frames, _, _ = spikes_shape(args.file, args.height, args.width)
-    frame = frames // 2 if args.frame is None else args.frame
-    if frame >= frames:
-        raise UsageError(f"--frame: expected 0 .. {frames - 1}, as {args.file} has {frames} frames, got {frame}")
+    frames, height, width = spikes_shape(args.file, args.height, args.width)
+    chosen = _chosen(args, frames)
+    if len(chosen) > 1 and _NUMBER not in str(args.output):
+        raise UsageError(f"--output: expected {_NUMBER} in the name of {len(chosen)} pictures, got {args.output}")
 
-    window = args.window or TFP_WINDOW
-    reach = window // 2 if args.method == "tfp" else TFI_REACH
-    first, last = max(frame - reach, 0), min(frame + reach, frames - 1)
-    spikes = read_spikes(args.file, args.height, args.width, flip=args.flip, start=first, frames=last - first + 1)
-    raws, rates = [], []
-    for band in spikes.split(_BAND, dim=-2):
-        decoded = tfp(band, window) if args.method == "tfp" else tfi(band)
-        raws.append(decoded[frame - first].clone())  # a view would keep the whole span
-        rates.append(band.numpy().mean(axis=0, dtype=np.float32))
-    raw, rate = torch.cat(raws), np.concatenate(rates)
-
+    reach = (args.window or TFP_WINDOW) // 2 if args.method == "tfp" else TFI_REACH
+    key = chosen[len(chosen) // 2]
+    first, last = _span(key, reach, frames)
     if args.alpha is None:
         # Of the rate, not of the picture: TFI makes 1 or 1/2 of a bright pixel, and its percentile is one of the two.
-        white = float(np.quantile(rate, 0.999)) or float(rate.max()) or 1.0
-        scaling = f"multiplied by {1 / white:.4g}, so that the 99.9th percentile of the spike rate is white"
+        rate = _counts(args, height, width, first, last - first + 1) / (last - first + 1)
+        white = float(np.quantile(rate.float(), 0.999)) or float(rate.max()) or 1.0
+        around = "" if len(chosen) == 1 else f" around frame {key}"
+        scaling = f"multiplied by {1 / white:.4g}, so that the 99.9th percentile of the spike rate{around} is white"
     else:
         white = args.alpha
         scaling = f"divided by alpha {white:g}"
-    picture = raw / white if args.pattern is None else demosaic(raw / white, args.pattern)
+
+    show = len(chosen) > 1 and sys.stderr.isatty()
     try:
-        write_picture(args.output, picture)
-    except Exception as error:  # what a picture library raises depends on the ending
-        raise ValueError(f"{args.output}: cannot be written ({_one_line(error)})") from error
-    print(f"{args.output}: frame {frame} of {frames} by {args.method} from frames {first} .. {last}, {scaling}")
+        for done, (n, plane) in enumerate(_windows(args, (frames, height, width), chosen, reach)):
+            if show:
+                print(f"\r{done} of {len(chosen)} pictures", end="", file=sys.stderr, flush=True)
+            raw = _decode_frame(args.method, plane, n, *_span(n, reach, frames)) / white
+            picture = raw if args.pattern is None else demosaic(raw, args.pattern)
+            _write(Path(str(args.output).replace(_NUMBER, f"{n:0{len(str(frames - 1))}}")), picture)
+    finally:
+        if show:
+            print("\r\033[K", end="", file=sys.stderr, flush=True)
+    if len(chosen) == 1:
+        made = f"frame {key} of {frames} by {args.method} from frames {first} .. {last}"
+    else:
+        every = f", every {chosen.step}th" if chosen.step > 1 else ""
+        made = (
+            f"{len(chosen)} pictures of frames {chosen[0]} .. {chosen[-1]}{every} of {frames} by {args.method} "
+            f"from up to {reach} frames on each side"
+        )
+    print(f"{args.output}: {made}, {scaling}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -147,7 +161,7 @@ def _parser() -> argparse.ArgumentParser:
         verbs,
         decode,
         "decode",
-        "the picture of one frame",
+        "the picture of one frame, or of many",
         "decode water.dat --height 1000 --width 1000 --flip --pattern BGGR --method tfi -o water.png",
     )
     _add_recording(verb)
@@ -155,22 +169,41 @@ def _parser() -> argparse.ArgumentParser:
         "--method",
         required=True,
         choices=("tfi", "tfp"),
-        help=f"by the interval between spikes (reads {TFI_REACH} frames on each side), or by their number in a window",
+        help="by the interval between the two spikes around the frame, or by the number of spikes in a window around "
+        f"it; tfi looks up to {TFI_REACH} frames to each side, and a pixel with no spike there is taken to have fired "
+        "just outside",
     )
-    verb.add_argument("-o", "--output", required=True, type=_picture, metavar="OUT.png", help="the picture to write")
+    verb.add_argument(
+        "-o",
+        "--output",
+        required=True,
+        type=_picture,
+        metavar="OUT.png",
+        help=f"the picture to write; {_NUMBER} in it becomes the number of the frame, with leading zeros",
+    )
     verb.add_argument(
         "--pattern", type=str.upper, choices=PATTERNS, help="Bayer phase after the flip, for colour; grey without it"
     )
-    verb.add_argument("--frame", type=_whole(0), metavar="N", help="which frame, from 0; the middle one if not given")
     verb.add_argument(
-        "--window", type=_whole(1), metavar="W", help=f"frames that tfp averages, odd; {TFP_WINDOW} if not given"
+        "--frame",
+        type=_frames,
+        metavar="N|A:B[:STEP]",
+        help="which frame, from 0, or which frames, from A to B - 1, as in Python; the middle one if not given",
+    )
+    verb.add_argument(
+        "--window",
+        type=_whole(1),
+        metavar="W",
+        help=f"frames that tfp averages, odd, the frame in their middle, fewer at the ends of the recording; "
+        f"{TFP_WINDOW} if not given",
     )
     verb.add_argument(
         "--alpha",
         type=_positive,
         metavar="A",
         help="gain of a simulated recording (a white pixel fires A times a frame), to divide by; "
-        "if not given, the picture is scaled until the 99.9th percentile of the spike rate is white",
+        "if not given, the picture is scaled until the 99.9th percentile of the spike rate in the frames it is made "
+        "from is white, and many pictures all as the one in their middle",
     )
     return parser
 
@@ -207,6 +240,12 @@ def _whole(least: int) -> Any:
     return whole
 
 
+def _frames(text: str) -> str:
+    if not re.fullmatch(r"\d+|\d*:\d*(:0*[1-9]\d*)?", text, re.ASCII):
+        raise argparse.ArgumentTypeError(f"expected a whole number, 0 or more, or A:B or A:B:STEP, got {text}")
+    return text
+
+
 def _positive(text: str) -> float:
     try:
         number = float(text)
@@ -240,6 +279,76 @@ def _check_size_given(args: argparse.Namespace) -> None:
         f"{path}: a .dat has no header, give --height and --width; of the usual sizes (H x W), "
         f"{sizes} divide{'' if len(fits) > 1 else 's'} its {size} bytes exactly"
     )
+
+
+def _chosen(args: argparse.Namespace, frames: int) -> range:
+    """Return the frames to decode."""
+    text = str(frames // 2) if args.frame is None else args.frame
+    if ":" in text:
+        begin, end, step = (text + ":").split(":")[:3]
+        chosen = range(int(begin or 0), int(end or frames), int(step or 1))
+    else:
+        chosen = range(int(text), int(text) + 1)
+    if not chosen or chosen.stop > frames:
+        raise UsageError(f"--frame: expected 0 .. {frames - 1}, as {args.file} has {frames} frames, got {text}")
+    return chosen
+
+
+def _span(frame: int, reach: int, frames: int) -> tuple[int, int]:
+    """Return the first and the last frame that the picture of one is made from."""
+    return max(frame - reach, 0), min(frame + reach, frames - 1)
+
+
+def _windows(
+    args: argparse.Namespace, shape: tuple[int, int, int], chosen: range, reach: int
+) -> Iterator[tuple[int, _Plane]]:
+    """Read forwards; yield every chosen frame and what unpacks it and its neighbours."""
+    frames, height, width = shape
+    held = np.empty((min(2 * reach + 1, frames), height, -(-width // 8)), np.uint8)  # frame n at n modulo the length
+
+    def plane(n: int) -> np.ndarray:
+        return np.unpackbits(held[n % len(held)], axis=-1, count=width, bitorder="little")
+
+    stream, stop = None, 0
+    for n in chosen:
+        first, last = _span(n, reach, frames)
+        if stream is None or (stop < first and args.file.suffix.lower() == ".dat"):  # an .npz has no short cut
+            stream = iter_spikes(args.file, height, width, flip=args.flip, start=first, packed=True)
+            stop = first
+        for k in range(stop, last + 1):
+            held[k % len(held)] = next(stream).numpy()
+        stop = last + 1
+        yield n, plane
+
+
+def _decode_frame(method: str, plane: _Plane, frame: int, first: int, last: int) -> Tensor:
+    """Decode one frame from those between the first and the last."""
+    if method == "tfi":
+        return torch.from_numpy(search(plane, frame, range(first, last + 1))).float().reciprocal()
+    total = sum(map(plane, range(first, last + 1)), start=np.float32(0))
+    return torch.from_numpy(total / np.float32(last + 1 - first))
+
+
+def _counts(args: argparse.Namespace, height: int, width: int, start: int, frames: int) -> Tensor:
+    """Count the spikes of every pixel in some frames."""
+    counts = torch.zeros(height, width, dtype=torch.int64)
+    chunk = min(max(_BLOCK // (height * width), 1), 255)  # whose sum fits into a byte
+    for part in iter_spikes(args.file, height, width, flip=args.flip, start=start, frames=frames, chunk=chunk):
+        counts += torch.from_numpy(part.numpy().sum(axis=0, dtype=np.uint8))
+    return counts
+
+
+def _write(path: Path, picture: Tensor) -> None:
+    """Write a picture under a name of its own first, so that a full disk leaves no half picture."""
+    part = path.with_name(f".{secrets.token_hex(4)}.{path.name}")  # the ending names the format
+    try:
+        write_picture(part, picture)
+        part.replace(path)
+    except Exception as error:  # what a picture library raises depends on the ending
+        raise ValueError(f"{path}: cannot be written ({_one_line(error)})") from error
+    finally:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
 def _at(rates: Tensor, index: Tensor) -> str:

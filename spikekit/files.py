@@ -146,7 +146,8 @@ def spikes_shape(path: str | Path, height: int | None = None, width: int | None 
         TypeError: as :func:`read_spikes`.
     """
     path = Path(path)
-    height, width = _whole("height", height), _whole("width", width)
+    height = None if height is None else _whole("height", height)
+    width = None if width is None else _whole("width", width)
     with reading(path):
         if path.is_dir():
             raise SpikeFileError(f"{path}: expected a recording, got a folder")
@@ -268,9 +269,8 @@ def _open(
     """Check everything but the frames themselves; return them, ``chunk`` at a time or all at once."""
     path = Path(path)
     total, height, width = spikes_shape(path, height, width)
-    start, frames = _whole("start", start), _whole("frames", frames)
-    if frames is None:
-        frames = total - start
+    start = _whole("start", start)
+    frames = total - start if frames is None else _whole("frames", frames)
     if start < 0 or frames < 1 or start + frames > total:
         raise SpikeFileError(f"{path}: expected frames within 0 .. {total - 1}, got {frames} from frame {start} on")
     read = dat_blocks if path.suffix.lower() == ".dat" else npz_blocks
@@ -284,9 +284,9 @@ def _check_suffix(path: Path) -> str:
     return suffix
 
 
-def _whole(name: str, value: int | None) -> int | None:
-    """Return what stands for a whole number as an int, and None as it is."""
+def _whole(name: str, value: int) -> int:
+    """Return as an int what can stand for one."""
     try:
-        return None if value is None else operator.index(value)
+        return operator.index(value)
     except TypeError:
         raise TypeError(f"{name}: expected a whole number, got {value!r}") from None

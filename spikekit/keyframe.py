@@ -39,8 +39,8 @@ def _(spikes: Tensor, frame: int) -> Tensor:
     frames = spikes.shape[-3]
     planes = spikes.detach().movedim(-3, 0)
     if spikes.dtype in (torch.uint8, torch.bool):
-        return torch.from_numpy(search(planes.view(torch.uint8).numpy().__getitem__, frame, frames))
-    return torch.from_numpy(search(lambda n: (planes[n] != 0).view(torch.uint8).numpy(), frame, frames))
+        return torch.from_numpy(search(planes.view(torch.uint8).numpy().__getitem__, frame, range(frames)))
+    return torch.from_numpy(search(lambda n: (planes[n] != 0).view(torch.uint8).numpy(), frame, range(frames)))
 
 
 @_spike_interval_at.register_fake
@@ -56,26 +56,26 @@ def _interval_dtype(frames: int) -> torch.dtype:
     return torch.int16 if frames < 32767 else torch.int32
 
 
-def search(plane: Callable[[int], np.ndarray], frame: int, frames: int) -> np.ndarray:
-    """Find the intervals at one frame of a stream whose frames are made when they are needed.
+def search(plane: Callable[[int], np.ndarray], frame: int, clip: range) -> np.ndarray:
+    """Find the intervals at one frame of a clip whose frames are made when they are needed.
 
     Args:
         plane: gives the frame of a number: an array of any shape, uint8, anything but 0 is a spike.
         frame: where to find the intervals.
-        frames: length of the stream.
+        clip: the numbers of the clip's frames, consecutive.
 
     Returns:
-        The intervals as in :func:`spikekit.spike_interval`.
+        The intervals as :func:`spikekit.spike_interval` gives them for the clip.
     """
     size = plane(frame).shape
-    onwards, backwards = range(frame, frames), range(frame - 1, -1, -1)
-    after, none_after = _silence(map(plane, onwards), size, frames)
-    before, none_before = _silence(map(plane, backwards), size, frames)
+    onwards, backwards = range(frame, clip.stop), range(frame - 1, clip.start - 1, -1)
+    after, none_after = _silence(map(plane, onwards), size, len(clip))
+    before, none_before = _silence(map(plane, backwards), size, len(clip))
     interval = after + before + 1
     # where one of the two spikes is missing, the nearest complete interval lies on the other side
     for order, alone in ((onwards, none_before & ~none_after), (backwards, none_after & ~none_before)):
         if alone.any():
-            np.maximum(interval, _first_interval(map(plane, order), alone, frames), out=interval)
+            np.maximum(interval, _first_interval(map(plane, order), alone, len(clip)), out=interval)
     return interval
 
 

@@ -10,7 +10,18 @@ import numpy as np
 import pytest
 import torch
 
-from spikekit import bin_to_sensor, cli, psnr, read_picture, read_spikes, spike_integrate_fire, tfi, tfp, write_spikes
+from spikekit import (
+    bin_to_sensor,
+    cli,
+    iter_spikes,
+    psnr,
+    read_picture,
+    read_spikes,
+    spike_integrate_fire,
+    tfi,
+    tfp,
+    write_spikes,
+)
 from spikekit.cli import main
 
 SPIKES = Path(__file__).parents[2].parent / "shared" / "data" / "spikes"
@@ -79,6 +90,20 @@ def test_info(clip, capsys):
     assert lines["never_fire"] == "1 of 240 pixels, 0.42%"
     assert lines["always_fire"] == "0 of 240 pixels, 0.00%"
     assert lines["bits_set"].startswith(f"{read_spikes(clip, 12, 20).sum()} of 14400, ")
+
+
+@pytest.mark.parametrize("frames", [255, 256, 700])
+def test_info_of_many_frames(tmp_path, capsys, monkeypatch, frames):
+    """Sums of bytes do not run over, whatever is counted at a time."""
+    spikes = torch.ones(frames, 2, 4)
+    spikes[1, 0, 0] = 0
+    write_spikes(tmp_path / "a.npz", spikes)
+    for block in (1, 800, 1 << 24):
+        monkeypatch.setattr(cli, "_BLOCK", block)
+        assert main(["info", str(tmp_path / "a.npz")]) == 0
+        out = capsys.readouterr().out
+        assert f"bits set     {8 * frames - 1} of {8 * frames}," in out
+        assert "always fire  7 of 8 pixels" in out
 
 
 def test_info_of_an_array(tmp_path, capsys):
@@ -161,18 +186,117 @@ def test_decode_reads_what_it_needs(tmp_path, method, words, frame):
     assert torch.equal((read_picture(out)[0] * 255).round(), (whole[frame] * 255).round())
 
 
-def test_decode_reads_only_what_it_needs(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--method", "tfp"], [(499_980, 41)]),
+        (["--method", "tfp", "--window", "1", "--frame", "7"], [(7, 1)]),
+        (["--method", "tfi", "--frame", "999999"], [(999_799, 201)]),
+        (["--method", "tfp", "--frame", "100:140:10"], [(80, 71)]),
+        (["--method", "tfp", "--window", "5", "--frame", "100:140:20"], [(98, 5), (118, 5)]),
+    ],
+)
+def test_decode_reads_only_what_it_needs(tmp_path, monkeypatch, words, expected):
+    """Each frame once, and none between two pictures."""
     read = []
-    monkeypatch.setattr(
-        cli, "read_spikes", lambda *_, start, frames, **__: read.append((start, frames)) or torch.ones(frames, 4, 4)
-    )
+
+    def count(*_, start, **__):
+        read.append([start, 0])
+        for frame in iter_spikes(*_, start=start, **__):
+            read[-1][1] += 1
+            yield frame
+
+    monkeypatch.setattr(cli, "iter_spikes", count)
     with open(tmp_path / "a.dat", "wb") as file:
         file.truncate(2 * 1_000_000)
-    words = ["decode", str(tmp_path / "a.dat"), "--height", "4", "--width", "4", "-o", str(tmp_path / "a.png")]
-    assert main([*words, "--method", "tfp"]) == 0
-    assert main([*words, "--method", "tfp", "--window", "1", "--frame", "7"]) == 0
-    assert main([*words, "--method", "tfi", "--frame", "999999"]) == 0
-    assert read == [(499_980, 41), (7, 1), (999_799, 201)]
+    line = ["decode", str(tmp_path / "a.dat"), "--height", "4", "--width", "4", "-o", str(tmp_path / "{frame}.png")]
+    assert main([*line, *words, "--alpha", "1"]) == 0
+    assert [tuple(part) for part in read] == expected
+
+
+@pytest.mark.parametrize("name", ["a.dat", "a.npz"])
+@pytest.mark.parametrize("method", ["tfi", "tfp"])
+@pytest.mark.parametrize("frames", ["0:500:83", "240:260:7", ":3", "498:", "17:18"])
+def test_decode_many(tmp_path, capsys, name, method, frames):
+    """Pictures of many frames are the pictures of each, under their numbers."""
+    spikes = expose(torch.rand(12, 9) * 0.5 + 0.05, 500)
+    write_spikes(tmp_path / name, spikes)
+    line = ["decode", *map(str, sized(tmp_path / name, 12, 9)), "--method", method]
+    assert main([*line, "--frame", frames, "-o", str(tmp_path / "out" / "a{frame}.png"), "--alpha", "0.6"]) == 0
+    chosen = range(500)[slice(*[int(part) if part else None for part in frames.split(":")])]
+    report, err = capsys.readouterr()
+    assert err == ""
+    if len(chosen) > 1:
+        assert f"{len(chosen)} pictures of frames {chosen[0]} .. {chosen[-1]}" in report
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [f"a{n:03}.png" for n in chosen]
+    whole = tfi(spikes) if method == "tfi" else tfp(spikes, 41)
+    for n in chosen:
+        expected = (whole[n] / 0.6).clamp(0, 1)
+        assert torch.equal((read_picture(tmp_path / "out" / f"a{n:03}.png")[0] * 255).round(), (expected * 255).round())
+
+
+def test_decode_many_at_one_scale(tmp_path, capsys):
+    """A light that goes on stays darker than white before: pictures can be compared."""
+    spikes = torch.cat([expose(torch.full((6, 8), level), 100) for level in (0.1, 0.4)])
+    write_spikes(tmp_path / "a.npz", spikes)
+    line = ["decode", str(tmp_path / "a.npz"), "--method", "tfp", "--window", "21", "-o", str(tmp_path / "{frame}.png")]
+    assert main([*line, "--frame", "50:200:50"]) == 0
+    assert "3 pictures of frames 50 .. 150, every 50th of 200 by tfp from up to 10 frames on each side" in (
+        report := capsys.readouterr().out
+    )
+    assert "99.9th percentile of the spike rate around frame 100 is white" in report
+    dark, _, bright = (read_picture(tmp_path / f"{n:03}.png").mean() for n in (50, 100, 150))
+    assert dark < bright / 2
+
+
+def test_decode_many_until_the_disk_is_full(clip, tmp_path, monkeypatch, fails):
+    """The pictures already made stay, and the one that failed leaves nothing."""
+    write, out = cli.write_picture, tmp_path / "out"
+
+    def full(path, picture):
+        write(path, picture)
+        if len(list(out.iterdir())) == 3:
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(cli, "write_picture", full)
+    words = ("--method", "tfp", "--frame", "10:20", "-o", out / "{frame}.png")
+    assert f"{out / '12.png'}: cannot be written (No space left on device)" in fails(1, "decode", *sized(clip), *words)
+    assert sorted(path.name for path in out.iterdir()) == ["10.png", "11.png"]
+    assert read_picture(out / "11.png").shape == (3, 12, 20)
+
+
+def test_progress_on_a_terminal(clip, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    line = ["decode", *map(str, sized(clip)), "--method", "tfp", "-o", str(tmp_path / "{frame}.png"), "--frame"]
+    assert main([*line, "5:8"]) == 0
+    assert capsys.readouterr().err == "\r0 of 3 pictures\r1 of 3 pictures\r2 of 3 pictures\r\033[K"
+    assert main([*line, "5"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+BOUNDED = """
+import resource, sys
+from spikekit.cli import main
+
+def run(frames):
+    line = ["decode", sys.argv[1], "--height", "100", "--width", "160", "--method", "tfi", "-o", sys.argv[2]]
+    assert main([*line, "--frame", frames]) == 0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+before = run("0:1000:250")
+print(run("0::250") - before)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="kilobytes of ru_maxrss are Linux's")
+def test_decode_many_in_bounded_memory(tmp_path):
+    """20,000 frames, 320 MB as bytes, take no more than 40 MB beyond what 1000 take."""
+    chunk = (torch.rand(200, 100, 160) < 0.2).byte()
+    write_spikes(tmp_path / "a.dat", (chunk for _ in range(100)))
+    words = [tmp_path / "a.dat", tmp_path / "{frame}.png"]
+    done = subprocess.run([sys.executable, "-c", BOUNDED, *words], capture_output=True, text=True, check=True)
+    assert int(done.stdout.splitlines()[-1]) < 40_000
+    assert len(list(tmp_path.glob("*.png"))) == 80
 
 
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG", "bggr"])
@@ -220,6 +344,8 @@ def test_decode_darkness(tmp_path, capsys):
         (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--alpha", "0"], "--alpha: expected a number above 0"),
         (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--alpha", "nan"], "--alpha: expected a number above 0"),
         (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--frame", "-1"], "--frame: expected a whole number, 0"),
+        (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--frame", "1:2:0"], "or A:B or A:B:STEP, got 1:2:0"),
+        (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--frame", "1:-2"], "or A:B or A:B:STEP, got 1:-2"),
         (
             ["decode", "a.dat", "-o", "a.png", "--method", "tfp", "--window", "4"],
             "odd number, with --method tfp, got 4",
@@ -235,9 +361,17 @@ def test_wrong_command_lines(fails, words, message):
     assert message in fails(2, *words)
 
 
-def test_frame_that_is_not_there(clip, tmp_path, fails):
-    words = ("--method", "tfi", "-o", tmp_path / "a.png", "--frame", 60)
-    assert f"--frame: expected 0 .. 59, as {clip} has 60 frames, got 60" in fails(2, "decode", *sized(clip), *words)
+@pytest.mark.parametrize("frames", ["60", "60:", "5:5", "9:3", "0:61", "70:80:2"])
+def test_frames_that_are_not_there(clip, tmp_path, fails, frames):
+    words = ("--method", "tfi", "-o", tmp_path / "{frame}.png", "--frame", frames)
+    message = f"--frame: expected 0 .. 59, as {clip} has 60 frames, got {frames}\n"
+    assert message in fails(2, "decode", *sized(clip), *words)
+
+
+def test_many_pictures_under_one_name(clip, tmp_path, fails):
+    words = ("--method", "tfi", "-o", tmp_path / "a.png", "--frame", "0:3")
+    message = f"--output: expected {{frame}} in the name of 3 pictures, got {tmp_path / 'a.png'}"
+    assert message in fails(2, "decode", *sized(clip), *words)
 
 
 def test_wrong_files(clip, tmp_path, fails):

@@ -1,5 +1,7 @@
 """Recordings: bits, rows, flips, parts of files, and every way in which a file can be wrong."""
 
+import subprocess
+import sys
 import tracemalloc
 import zipfile
 from pathlib import Path
@@ -8,7 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from spikekit import SpikeFileError, iter_spikes, read_spikes, spikes_shape, write_spikes
+from spikekit import SpikeFileError, files, iter_spikes, read_spikes, spikes_shape, write_spikes
+from spikekit.packing import pack_spikes
 
 SPIKES = Path(__file__).parents[2].parent / "shared" / "data" / "spikes"
 REDS = SPIKES / "reds_sim_mono_203_250x400.dat"
@@ -138,6 +141,80 @@ def test_frame_by_frame_in_bounded_memory(tmp_path, name):
     assert peak < 25 * 40_000
 
 
+@pytest.mark.parametrize("name", ["a.dat", "a.npz"])
+@pytest.mark.parametrize("width", [5, 8, 16])
+@pytest.mark.parametrize("flip", [False, True])
+@pytest.mark.parametrize("packed", [False, True])
+def test_chunks_equal_the_whole(tmp_path, name, width, flip, packed):
+    spikes = random_spikes(11, 3, width)
+    write_spikes(tmp_path / name, spikes, flip=flip)
+    options = {"flip": flip, "packed": packed}
+    whole = pack_spikes(spikes) if packed else spikes
+    assert read_spikes(tmp_path / name, 3, width, **options).equal(whole)
+    assert read_spikes(tmp_path / name, 3, width, **options, start=4, frames=3).equal(whole[4:7])
+    assert torch.stack(list(iter_spikes(tmp_path / name, 3, width, **options))).equal(whole)
+    for chunk in (1, 4, 11, 100, np.int64(3)):
+        chunks = list(iter_spikes(tmp_path / name, 3, width, **options, chunk=chunk))
+        assert torch.cat(chunks).equal(whole)
+        assert [len(part) for part in chunks[:-1]] == [chunk] * (len(chunks) - 1)
+        chunks = list(iter_spikes(tmp_path / name, 3, width, **options, chunk=chunk, start=2, frames=7))
+        assert torch.cat(chunks).equal(whole[2:9])
+    for tensor in (read_spikes(tmp_path / name, 3, width, **options), chunks[0]):
+        assert tensor.is_contiguous()
+        tensor.zero_()  # its own memory, and writable
+
+
+@pytest.mark.parametrize("name", ["a.dat", "a.npz"])
+@pytest.mark.parametrize("cuts", [[11], [1] * 11, [4, 4, 3], [10, 1]])
+@pytest.mark.parametrize("flip", [False, True])
+def test_written_in_chunks(tmp_path, name, cuts, flip):
+    """The same bytes as written at once, in chunks of several types, or frame by frame."""
+    spikes = random_spikes(11, 3, 5)
+    write_spikes(tmp_path / "whole" / name, spikes, flip=flip)
+    dtypes = [torch.bool, torch.float32, torch.uint8, torch.bfloat16] * 3
+    chunks = (part.to(dtype) for part, dtype in zip(spikes.split(cuts), dtypes, strict=False))
+    write_spikes(tmp_path / "chunks" / name, chunks, flip=flip)
+    write_spikes(tmp_path / "frames" / name, list(spikes), flip=flip)
+    for folder in ("whole", "chunks", "frames"):
+        assert read_spikes(tmp_path / folder / name, 3, 5, flip=flip).equal(spikes)
+        assert [file.name for file in (tmp_path / folder).iterdir()] == [name]
+    if name == "a.dat":
+        assert len({(tmp_path / folder / name).read_bytes() for folder in ("whole", "chunks", "frames")}) == 1
+
+
+def test_from_one_format_to_the_other(tmp_path):
+    spikes = random_spikes(30, 4, 9)
+    write_spikes(tmp_path / "a.dat", spikes)
+    write_spikes(tmp_path / "a.npz", iter_spikes(tmp_path / "a.dat", 4, 9, chunk=7))
+    write_spikes(tmp_path / "b.dat", iter_spikes(tmp_path / "a.npz"))
+    assert (tmp_path / "b.dat").read_bytes() == (tmp_path / "a.dat").read_bytes()
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert np.array_equal(arrays["spk"], spikes.numpy())
+
+
+@pytest.mark.parametrize("name", ["a.dat", "a.npz"])
+def test_large_tensors_are_written_block_by_block(tmp_path, name, monkeypatch):
+    monkeypatch.setattr(files, "_BLOCK", 100)
+    spikes = random_spikes(40, 5, 7).float()
+    write_spikes(tmp_path / name, spikes)
+    assert read_spikes(tmp_path / name, 5, 7).equal(spikes.byte())
+    spikes[33, 2, 2] = 3
+    with pytest.raises(ValueError, match=r"values from 0\.0 to 3\.0 in frame 33"):
+        write_spikes(tmp_path / name, spikes)
+
+
+@pytest.mark.parametrize("name", ["a.dat", "a.npz"])
+def test_chunks_in_bounded_memory(tmp_path, name):
+    """8 MB go through in chunks of 400 kB, written and read."""
+    tracemalloc.start()
+    write_spikes(tmp_path / name, (torch.ones(10, 100, 400, dtype=torch.uint8) for _ in range(20)))
+    count = sum(int(part[:, 0, 0].sum()) for part in iter_spikes(tmp_path / name, 100, 400, chunk=10))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert count == 200
+    assert peak < 1_600_000
+
+
 # --- arrays of .npz ---------------------------------------------------------------------------------------------------
 
 
@@ -255,6 +332,28 @@ def test_wrong_sizes(clip, read, size, message):
         read(clip, *size)
 
 
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda clip: read_spikes(clip, 3.0, 5), TypeError, r"height: expected a whole number, got 3\.0"),
+        (lambda clip: spikes_shape(clip, 3, "5"), TypeError, "width: expected a whole number, got '5'"),
+        (lambda clip: read_spikes(clip, 3, 5, start=1.0), TypeError, r"start: expected a whole number, got 1\.0"),
+        (lambda clip: read_spikes(clip, 3, 5, start=None), TypeError, "start: expected a whole number, got None"),
+        (lambda clip: iter_spikes(clip, 3, 5, frames=1.5), TypeError, r"frames: expected a whole number, got 1\.5"),
+        (lambda clip: iter_spikes(clip, 3, 5, chunk=0), ValueError, "chunk: expected a whole number >= 1, got 0"),
+        (lambda clip: iter_spikes(clip, 3, 5, chunk=2.0), ValueError, r"chunk: expected a whole number >= 1, got 2\.0"),
+    ],
+)
+def test_numbers_that_are_not_whole(clip, call, error, message):
+    with pytest.raises(error, match=message):
+        call(clip)
+
+
+def test_numpy_numbers(clip):
+    whole = read_spikes(clip, 3, 5)
+    assert read_spikes(clip, np.int32(3), np.uint8(5), start=np.int64(1), frames=torch.tensor(2)).equal(whole[1:3])
+
+
 def test_truncated(clip):
     clip.write_bytes(clip.read_bytes()[:-1])
     with pytest.raises(SpikeFileError, match="9 bytes at 2 bytes a frame make 4 whole frames and 1 bytes left over"):
@@ -266,6 +365,13 @@ def test_truncated_while_it_is_read(clip):
     clip.write_bytes(b"")
     with pytest.raises(SpikeFileError, match=r"clip\.dat: truncated while it was read, at frame 0"):
         next(frames)
+
+
+def test_truncated_within_a_chunk(clip):
+    chunks = iter_spikes(clip, 3, 5, chunk=4)
+    clip.write_bytes(clip.read_bytes()[:5])
+    with pytest.raises(SpikeFileError, match=r"clip\.dat: truncated while it was read, at frame 2"):
+        next(chunks)
 
 
 @pytest.mark.parametrize("size", [(3, 6), (4, 5), (0, 5), (4, None), (None, 6)])
@@ -323,6 +429,60 @@ def test_failed_write_keeps_the_old_file(tmp_path, name):
         write_spikes(tmp_path / name, torch.tensor([0, 1, 2]).expand(4, 5, 3).permute(2, 0, 1))
     assert [file.name for file in tmp_path.iterdir()] == [name]
     assert read_spikes(tmp_path / name, 4, 5).equal(spikes)
+
+
+@pytest.mark.parametrize("name", ["a.dat", "a.npz"])
+@pytest.mark.parametrize(
+    ("chunks", "error", "message"),
+    [
+        ([], ValueError, "at least one chunk"),
+        (5, TypeError, r"spikes: expected a tensor of shape \(T, H, W\), or chunks of it, got int"),
+        ([torch.ones(2, 3, 5), torch.ones(2, 5, 3)], ValueError, r"frames of 3 x 5 as before, got \(2, 5, 3\)"),
+        ([torch.ones(2, 3, 5), torch.ones(0, 3, 5)], ValueError, r"got \(0, 3, 5\)"),
+        ([torch.ones(1, 2, 3, 5)], ValueError, r"expected \(T, H, W\), got \(1, 2, 3, 5\)"),
+        ([torch.ones(2, 3, 5), [1, 0]], TypeError, "expected a tensor of shape"),
+        ([torch.ones(2, 3, 5), torch.full((3, 5), 2)], ValueError, "values from 2 to 2 in frame 2"),
+    ],
+)
+def test_chunks_that_cannot_be_written(tmp_path, name, chunks, error, message):
+    with pytest.raises(error, match=message):
+        write_spikes(tmp_path / name, chunks)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["a.dat", "a.npz"])
+def test_chunks_that_fail_leave_the_old_file(tmp_path, name):
+    """What the chunks raise comes out as it is."""
+    spikes = random_spikes(3, 4, 5)
+    write_spikes(tmp_path / name, spikes)
+
+    def chunks():
+        yield spikes
+        raise FileNotFoundError("picture_7.png")
+
+    with pytest.raises(FileNotFoundError, match="picture_7"):
+        write_spikes(tmp_path / name, chunks())
+    assert [file.name for file in tmp_path.iterdir()] == [name]
+    assert read_spikes(tmp_path / name, 4, 5).equal(spikes)
+
+
+@pytest.mark.parametrize("name", ["a.dat", "a.npz"])
+@pytest.mark.skipif(sys.platform == "win32", reason="no limits on file sizes")
+def test_full_disk(tmp_path, name):
+    """A file that may not grow, like a full disk, is one line, and nothing is left behind."""
+    code = (
+        "import resource, signal, sys, torch\n"
+        "from spikekit import SpikeFileError, write_spikes\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))\n"
+        "try:\n"
+        "    write_spikes(sys.argv[1], (torch.rand(10, 100, 100) < 0.5 for _ in range(20)))\n"
+        "except SpikeFileError as error:\n"
+        "    print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, tmp_path / name], capture_output=True, text=True, check=True)
+    assert done.stdout == f"{tmp_path / name}: cannot be written (File too large)\n"
+    assert not list(tmp_path.iterdir())
 
 
 def test_where_nothing_can_be_written(tmp_path):
