@@ -19,7 +19,6 @@ from torch import Tensor
 from spikekit.kernels import cpu_warp, register
 from spikekit.kernels.layout import empty_like_layout, is_channels_last
 
-
 _FEW = 8  # channels: of fewer planes, a CPU gathers one after the other faster than rows of all
 
 

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from spikekit.kernels.layout import empty_like_layout, is_channels_last
 
-_PIECE = 1 << 18  # numbers that are worked on at a time
+_PIECE = 1 << 18  # numbers that are gathered at a time
+_TILE = 1 << 13  # positions that are searched at a time
 
 
 def _empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
@@ -120,3 +121,103 @@ def weighted_dot(values: Tensor, grad: Tensor, index: Tensor) -> Tensor:
             gathered = rows.numpy().take(_bags(index_b, place, piece), axis=0)
             out_b[:, piece] = np.einsum("qkc,qc->kq", gathered, _rows(grad_b[:, piece], dtype).numpy())
     return out
+
+
+_Position = tuple[np.ndarray, np.ndarray]  # whole and fractional part of a coordinate
+_Pixels = tuple[np.ndarray, np.ndarray]  # squared distance, less that of a common reference, and where
+_Ranked = list[_Pixels]
+
+
+def nearest_four(flow: Tensor, products: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """Four nearest pixels of one or two products of rows and columns, in closed form, and their weights.
+
+    The four of a product are one of five Young diagrams over the order of the rows and that of the columns; three
+    comparisons tell which. The first four of two sorted lists are the smaller ones of pairs, one list taken backwards.
+    """
+    count, _, height, width = flow.shape
+    plane = height * width
+    row_tables, column_tables = ([table.numpy() for table in tables] for tables in zip(*products, strict=True))
+    index, weight = _empty((count, 4, plane), torch.int64), _empty((count, 4, plane), flow.dtype)
+    moved = flow.detach().flatten(2).numpy()
+    for images in _slices(count, max(_TILE // plane, 1)):
+        for piece in _slices(plane, _TILE):
+            pixel = np.arange(plane)[piece]
+            x, columns = _on_axis(moved[images, 0, piece], pixel % width, column_tables)
+            y, rows = _on_axis(moved[images, 1, piece], pixel // width, row_tables)
+            nearest = [_four_of_product(*pair, width) for pair in zip(rows, columns, strict=True)]
+            four = _four_of_both(*nearest) if len(nearest) == 2 else nearest[0]
+            shares = _weigh(four, width, x, y, moved.dtype)
+            for k, ((_, flat), share) in enumerate(zip(four, shares, strict=True)):
+                index.numpy()[images, k, piece], weight.numpy()[images, k, piece] = flat, share
+    return index, weight
+
+
+def _slices(length: int, size: int) -> Iterator[slice]:
+    return (slice(begin, begin + size) for begin in range(0, length, size))
+
+
+def _on_axis(flow: np.ndarray, pixel: np.ndarray, tables: list[np.ndarray]) -> tuple[_Position, list[_Ranked]]:
+    """Return where a coordinate is, and what is nearest to it in every table."""
+    flow = flow.astype(np.float64)  # so that what is nearer does not depend on rounding
+    whole = np.rint(flow)
+    part = flow - whole
+    cell = whole + pixel
+    half = np.clip(2 * cell + np.ceil(2 * part), 0, tables[0].shape[1] - 1).astype(np.intp)
+    reference = (half >> 1).astype(np.float64)
+    twice = 2 * ((reference - cell) - part)
+    ranked = []
+    for table in tables:
+        steps = [positions.take(half) for positions in table - np.arange(table.shape[1]) // 2.0]
+        # (p - q)^2 - (r - q)^2 without squaring what is far away
+        ranked.append([(step * (step + twice), step + reference) for step in steps])
+    return (cell, part), ranked
+
+
+def _before(one: np.ndarray, other: np.ndarray, lower: np.ndarray) -> np.ndarray:
+    return (one < other) | ((one == other) & lower)
+
+
+def _four_of_product(rows: _Ranked, columns: _Ranked, width: int) -> _Ranked:
+    (b0, y0), (b1, y1), (b2, y2), (b3, y3) = rows
+    (a0, x0), (a1, x1), (a2, x2), (a3, x3) = columns
+    y0, y1, y2, y3 = (y * width for y in (y0, y1, y2, y3))
+    second, row_4 = a1 + b0, a0 + b3
+    swap = _before(row_4, second, y3 < y0)
+    ranked = [(a0 + b0, y0 + x0), (np.where(swap, row_4, second), np.where(swap, y3 + x0, y0 + x1))]
+    column_4, row_2 = a3 + b0, a0 + b1
+    swap = _before(row_2, column_4, y1 < y0)
+    ranked.append((np.where(swap, row_2, column_4), np.where(swap, y1 + x0, y0 + x3)))
+    column_3, corner, row_3 = a2 + b0, a1 + b1, a0 + b2
+    swap = _before(corner, column_3, y1 < y0)
+    distance, flat = np.where(swap, corner, column_3), np.where(swap, y1 + x1, y0 + x2)
+    swap = _before(row_3, distance, y2 + x0 < flat)
+    return [*ranked, (np.where(swap, row_3, distance), np.where(swap, y2 + x0, flat))]
+
+
+def _in_order(one: _Pixels, other: _Pixels) -> tuple[_Pixels, _Pixels]:
+    swap = _before(other[0], one[0], other[1] < one[1])
+    return (
+        (np.minimum(one[0], other[0]), np.where(swap, other[1], one[1])),
+        (np.maximum(one[0], other[0]), np.where(swap, one[1], other[1])),
+    )
+
+
+def _four_of_both(*products: _Ranked) -> _Ranked:
+    for ranked in products:  # the first is in its place already
+        for i, j in (1, 2), (2, 3), (1, 2):
+            ranked[i], ranked[j] = _in_order(ranked[i], ranked[j])
+    ranked = [_in_order(*pair)[0] for pair in zip(products[0], reversed(products[1]), strict=True)]
+    ranked[0], ranked[3] = _in_order(ranked[0], ranked[3])
+    return ranked
+
+
+def _weigh(four: _Ranked, width: int, x: _Position, y: _Position, dtype: np.dtype) -> list[np.ndarray]:
+    """Weights by inverse distance, relative to the nearest, so that nothing overflows; on a pixel it has them all."""
+    distance = []
+    for _, flat in four:
+        row = np.floor(flat / width)
+        dx, dy = ((flat - row * width - x[0]) - x[1]).astype(dtype), ((row - y[0]) - y[1]).astype(dtype)
+        distance.append(np.sqrt(dx * dx + dy * dy))
+    others = [distance[0] / d for d in distance[1:]]
+    share = 1 / (1 + others[0] + others[1] + others[2])
+    return [share, *(other * share for other in others)]

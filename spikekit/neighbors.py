@@ -1,0 +1,340 @@
+"""The known pixels nearest to where flow points to, and their weights by inverse distance.
+
+Everything that warps with the same flow and mask can share them::
+
+    index, weight = idw_neighbors(flow, mask)
+    warped = Gather.apply(features.flatten(2), index, weight).reshape(features.shape)
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
+
+from spikekit.gather import fold_into_batch
+from spikekit.kernels import cpu_warp
+
+_FARTHEST = 2.0**30  # flow beyond it is cut: positions must fit an integer
+_CHUNK = 1 << 15  # positions searched at a time: in the cache, and by one thread, without waiting for another
+
+# The tables of the rows and of the columns of a product, (k, 2 H) and (k, 2 W), see _nearest_on_axis.
+Product = tuple[Tensor, Tensor]
+
+
+def finite(flow: Tensor) -> Tensor:
+    """Count NaN as 0 and cut what is too far; the gradient is 0 there."""
+    return flow.nan_to_num(0.0).clamp(-_FARTHEST, _FARTHEST)
+
+
+def _nearest_on_axis(known: np.ndarray, length: int, neighbors: int) -> np.ndarray:
+    """Positions of the nearest known indices, nearest first, for every interval ((h - 1) / 2, h / 2].
+
+    Between two half-integers the order of whole numbers by distance does not change; at h / 2 itself two may be
+    equally far, and the lower one wins. So the order at q depends on ceil(2 q) alone, and beyond the axis it does not
+    change any more: 2 * length rows are enough for every q.
+    """
+    h = np.arange(2 * length)
+    # known positions that can be among the nearest: as many to the left of h / 2 as to the right
+    start = np.searchsorted(known, h / 2)[:, None] + np.arange(-neighbors, neighbors)
+    outside = (start < 0) | (start >= len(known))
+    position = known[start.clip(0, len(known) - 1)]
+    distance = np.where(outside, np.inf, np.abs(2 * position - h[:, None]))
+    order = np.argsort(distance, axis=1, kind="stable")[:, : min(neighbors, len(known))]
+    return np.take_along_axis(position, order, axis=1)
+
+
+# What was seen of a mask, as (bits, height, width, device). By identity: a WeakKeyDictionary would compare with ==.
+_Key = tuple[bytes, int, int, str]
+_key_of_mask = WeakTensorKeyDictionary()
+
+
+def _key(mask: Tensor) -> _Key:
+    """Return what to look up the tables of a mask by; the mask is read only where it is new or has changed."""
+    # inference tensors do not count their changes, so nothing is kept for them
+    version = None if mask.is_inference() else mask._version
+    kept, key = _key_of_mask.get(mask, (None, None))
+    if version is None or version != kept:
+        key = (mask.detach() != 0).cpu().numpy().tobytes(), *mask.shape, str(mask.device)
+        if version is not None:
+            _key_of_mask[mask] = version, key
+    return key
+
+
+@lru_cache(maxsize=32)
+def _products(key: _Key, neighbors: int) -> list[Product]:
+    """Write a mask as products of known rows and known columns, and return the tables of each.
+
+    Rows with the same known columns belong together, so that every mask is a union of such products: one for red and
+    for blue of a Bayer filter, two for green.
+    """
+    bits, height, width, device = key
+    rows_of_pattern: dict[bytes, list[int]] = {}
+    for row in range(height):
+        rows_of_pattern.setdefault(bits[row * width : (row + 1) * width], []).append(row)
+    products = []
+    for pattern, rows in rows_of_pattern.items():
+        columns = np.flatnonzero(np.frombuffer(pattern, dtype=bool))
+        if len(columns):
+            axes = (np.array(rows), height), (columns, width)
+            tables = [torch.from_numpy(_nearest_on_axis(*axis, neighbors).T.astype(np.int32)) for axis in axes]
+            products.append((tables[0].to(device), tables[1].to(device)))
+    if not products:
+        raise ValueError("mask: expected at least one known pixel, got none")
+    return products
+
+
+def products_of(mask: Tensor, neighbors: int) -> list[Product]:
+    """Return the tables of a mask, kept between calls."""
+    return _products(_key(mask), neighbors)
+
+
+def _on_axis(table: Tensor, cell: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
+    """Nearest positions on one axis, and their squared distance less that of a common reference: both (k, n)."""
+    top = table.shape[1] - 1
+    half = (2 * cell + torch.ceil(2 * part).long()).clamp(0, top)
+    position = table.index_select(1, half)
+    reference = cell.clamp(0, top // 2)
+    step = (position - reference).to(part.dtype)
+    # (p - q)^2 - (r - q)^2 without squaring what is far away; q = cell + part
+    return position, step * (step + 2 * ((reference - cell).to(part.dtype) - part))
+
+
+def _search(products: list[Product], neighbors: int, width: int, cell: Tensor, part: Tensor) -> Tensor:
+    """Flat indices (neighbors, n) of the known pixels nearest to cell + part, (2, n): the nearest again where none is.
+
+    Nearest first, exact, row-major order among equals.
+    """
+    best: list[tuple[Tensor, Tensor]] = []
+    for rows, columns in products:
+        row, row_distance = _on_axis(rows, cell[1], part[1])
+        column, column_distance = _on_axis(columns, cell[0], part[0])
+        for i in range(len(row)):
+            for j in range(min(len(column), neighbors // (i + 1))):
+                before = (i + 1) * (j + 1) - 1  # so many pixels of this product are at least as near
+                _insert(best, row_distance[i] + column_distance[j], row[i] * width + column[j], before, neighbors)
+    best += best[:1] * (neighbors - len(best))
+    return torch.stack([index for _, index in best]).long()
+
+
+def _insert(best: list[tuple[Tensor, Tensor]], distance: Tensor, index: Tensor, before: int, most: int) -> None:
+    """Keep the smallest (distance, index), in order; the new one cannot be among the first ``before``."""
+    for slot in range(before, len(best)):
+        other, other_index = best[slot]
+        closer = (distance < other) | ((distance == other) & (index < other_index))
+        best[slot] = torch.where(closer, distance, other), torch.where(closer, index, other_index)
+        if slot + 1 < most:
+            distance, index = torch.where(closer, other, distance), torch.where(closer, other_index, index)
+    if len(best) < most:
+        best.append((distance, index))
+
+
+class _Axis:
+    """Positions on one axis, quantised, in classes: the period's inside, every pixel its own near the borders."""
+
+    def __init__(self, length: int, period: int, margin: int, steps: int, device: str) -> None:
+        inner = length - 2 * margin
+        pixel = np.arange(length)
+        self.pixel = pixel  # one of every class
+        self.place = pixel  # the class of every pixel
+        if inner > period:
+            self.pixel = np.delete(pixel, np.s_[margin + period : length - margin])
+            self.place = np.where(pixel < margin, pixel, margin + (pixel - margin) % period)
+            self.place[length - margin :] = margin + period + np.arange(margin)
+        self.place = torch.from_numpy(self.place).to(device)
+        self.steps = steps
+        self.half = (steps + 1) // 2  # quantised positions on either side of a pixel
+
+    def __len__(self) -> int:
+        return len(self.pixel) * (2 * self.half + 1)
+
+    def positions(self) -> tuple[Tensor, Tensor]:
+        """Pixel and offset of every quantised position."""
+        pixel = torch.from_numpy(self.pixel).repeat_interleave(2 * self.half + 1)
+        offset = torch.arange(-self.half, self.half + 1, dtype=torch.float64).repeat(len(self.pixel)) / self.steps
+        return pixel, offset
+
+    def find(self, cell: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the quantised position nearest to cell + part, and its pixel."""
+        pixel = cell.clamp(0, len(self.place) - 1)
+        offset = ((cell - pixel) + part).clamp(-0.5, 0.5) * self.steps
+        return self.place[pixel] * (2 * self.half + 1) + self.half + offset.round().long(), pixel
+
+
+def _period(known: np.ndarray) -> int:
+    """Return the smallest shift along the first axis that maps a mask on itself, 0 if it does not repeat in full."""
+    if len(known) == 1:
+        return 1
+    return next((shift for shift in range(1, len(known) // 2 + 1) if (known[shift:] == known[:-shift]).all()), 0)
+
+
+def _margin(known: np.ndarray, period: tuple[int, int], neighbors: int) -> int:
+    """Return how far from a pixel of the picture its nearest known pixels can be."""
+    height, width = known.shape
+    density = np.count_nonzero(known[: period[0], : period[1]])
+    for reach in range(1, max(height, width) + 1):
+        # a square of this side, with the pixel in its corner, lies inside the picture or spans it
+        cells = (min(reach, height) // period[0]) * (min(reach, width) // period[1])
+        if cells * density >= neighbors:
+            return int(np.ceil(reach * 2**0.5)) + 1
+    return max(height, width)
+
+
+class _Table:
+    """The nearest known pixels of all quantised positions of a periodic mask."""
+
+    def __init__(self, key: _Key, neighbors: int, steps: int) -> None:
+        bits, height, self.width, device = key
+        known = np.frombuffer(bits, dtype=bool).reshape(height, self.width)
+        period = _period(known), _period(known.T)
+        if not all(period):
+            raise ValueError(
+                f"mask: expected a pattern that repeats along rows and columns for steps={steps}, got one that does not; "
+                "its table would be larger than the picture is worth"
+            )
+        margin = _margin(known, period, neighbors)
+        self.rows = _Axis(height, period[0], margin, steps, device)
+        self.columns = _Axis(self.width, period[1], margin, steps, device)
+        products = _products((bits, height, self.width, "cpu"), neighbors)
+        self.shift = torch.empty(neighbors, len(self.rows) * len(self.columns), dtype=torch.int32)
+        (y, y_offset), (x, x_offset) = self.rows.positions(), self.columns.positions()
+        for i in range(len(self.rows)):
+            cell, part = torch.stack([x, y[i].expand_as(x)]), torch.stack([x_offset, y_offset[i].expand_as(x)])
+            nearest = _search(products, neighbors, self.width, cell, part)
+            self.shift[:, i * len(x) : (i + 1) * len(x)] = nearest - (y[i] * self.width + x)
+        self.shift = self.shift.to(device)
+
+    def find(self, cell: Tensor, part: Tensor) -> Tensor:
+        """Flat indices (neighbors, n) for cell + part, (2, n)."""
+        column, x = self.columns.find(cell[0], part[0])
+        row, y = self.rows.find(cell[1], part[1])
+        return self.shift.index_select(1, row * len(self.columns) + column) + (y * self.width + x)
+
+
+_table = lru_cache(maxsize=8)(_Table)
+
+
+def _weigh(index: Tensor, width: int, cell: Tensor, part: Tensor) -> Tensor:
+    """Weights by inverse distance, of sum 1, that pixels (neighbors, n) have at cell + part, (2, n)."""
+    row = index // width
+    dx = (index - row * width - cell[0]).to(part.dtype) - part[0]
+    dy = (row - cell[1]).to(part.dtype) - part[1]
+    distance = (dx * dx + dy * dy).sqrt()
+    # 1 / d, relative to the nearest: no overflow next to a known pixel, and nothing for the others on it
+    weight = torch.where(index[1:] == index[0], 0, distance[0] / distance[1:])
+    weight = torch.cat([torch.ones_like(distance[:1]), weight])
+    return weight / weight.sum(dim=0)
+
+
+def _nearest_known(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
+    """Flat indices of the ``neighbors`` known pixels nearest to where flow points to, and their weights.
+
+    Args:
+        flow: (N, 2, H, W), float32 or float64, finite and less than 2^30.
+        mask: (H, W).
+        neighbors: how many known pixels to weigh, K.
+        steps: positions per pixel and axis of a table that is asked instead of the exact search; 0: no table.
+
+    Returns:
+        Index, int64, and weight, in the dtype of ``flow``: both (N, K, H W), the nearest first. Where fewer pixels
+        are known, the nearest is repeated with weight 0.
+    """
+    count, _, height, width = flow.shape
+    if steps:
+        find = _table(_key(mask), neighbors, steps).find
+    else:
+        find = partial(_search, products_of(mask, neighbors), neighbors, width)
+    # double, so that what is nearer does not depend on rounding
+    double = torch.float32 if flow.device.type == "mps" else torch.float64
+    plane = height * width
+    flat = flow.movedim(1, 0).reshape(2, -1)
+    index = flow.new_empty(neighbors, count * plane, dtype=torch.int64)
+    weight = flow.new_empty(neighbors, count * plane)
+    size = _CHUNK if flow.device.type == "cpu" else 128 * _CHUNK  # elsewhere a launch costs more than the cache saves
+    for begin in range(0, count * plane, size):
+        moved = flat[:, begin : begin + size].to(double)
+        whole = moved.round()
+        pixel = torch.arange(begin, begin + moved.shape[1], device=flow.device) % plane
+        cell, part = torch.stack([pixel % width, pixel // width]) + whole.long(), moved - whole
+        chunk = slice(begin, begin + size)
+        index[:, chunk] = find(cell, part)
+        weight[:, chunk] = _weigh(index[:, chunk], width, cell, part)
+    shape = neighbors, count, plane
+    return index.reshape(shape).movedim(0, 1).contiguous(), weight.reshape(shape).movedim(0, 1).contiguous()
+
+
+nearest_known = torch.library.custom_op("spikekit::nearest_known", _nearest_known, mutates_args=())
+
+
+@nearest_known.register_fake
+def _(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
+    shape = flow.shape[0], neighbors, flow.shape[2] * flow.shape[3]
+    return flow.new_empty(shape, dtype=torch.int64), flow.new_empty(shape)
+
+
+@nearest_known.register_kernel("cpu")
+def _(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
+    if not steps and neighbors == 4:
+        products = products_of(mask, neighbors)
+        if len(products) <= 2 and all(len(table) == 4 for product in products for table in product):
+            return cpu_warp.nearest_four(flow, products)
+    return _nearest_known(flow, mask, neighbors, steps)
+
+
+fold_into_batch(nearest_known, 1)
+
+
+class _NearestKnown(torch.autograd.Function):
+    """:func:`nearest_known` with the derivative of the weights in the flow."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
+        return nearest_known(flow, mask, neighbors, steps)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, int, int], output: tuple[Tensor, Tensor]) -> None:
+        index, weight = output
+        ctx.mark_non_differentiable(index)
+        ctx.save_for_backward(inputs[0], index, weight)
+
+    @staticmethod
+    def backward(ctx: Any, _: Tensor, grad: Tensor) -> tuple[Tensor, None, None, None]:
+        flow, index, weight = ctx.saved_tensors
+        _, _, height, width = flow.shape
+        whole = flow.detach().round()
+        part = (flow - whole).flatten(2)
+        pixel = torch.arange(height * width, device=flow.device)
+        row = index // width
+        cell_x, cell_y = (whole.long().flatten(2) + torch.stack([pixel % width, pixel // width])).split(1, dim=1)
+        dx = (index - row * width - cell_x).to(flow.dtype) - part[:, :1]
+        dy = (row - cell_y).to(flow.dtype) - part[:, 1:]
+        square = dx * dx + dy * dy
+        # sum over i of w_i (g_i - mean g) (p_i - q) / d_i^2; for the nearest, whose d may be tiny, without cancellation
+        first, others = weight.split([1, weight.shape[1] - 1], dim=1)
+        near = first * (others * (grad[:, :1] - grad[:, 1:])).sum(dim=1, keepdim=True)
+        far = others * (grad[:, 1:] - (weight * grad).sum(dim=1, keepdim=True))
+        factor = torch.cat([near, far], dim=1) / torch.where(square < torch.finfo(flow.dtype).tiny, 1, square)
+        return torch.stack([(factor * dx).sum(dim=1), (factor * dy).sum(dim=1)], dim=1).reshape(flow.shape), *[None] * 3
+
+
+def idw_neighbors(flow: Tensor, mask: Tensor, neighbors: int = 4, steps: int | None = None) -> tuple[Tensor, Tensor]:
+    """Known pixels nearest to where flow points to, and their weights by inverse distance.
+
+    Args:
+        flow: (N, 2, H, W), floating.
+        mask: (H, W); a pixel is known where it is not 0.
+        neighbors: how many known pixels to weigh, K.
+        steps: positions per pixel and axis of the table to look them up in; None: exact.
+
+    Returns:
+        Flat indices, int64, and weights, in the dtype of ``flow`` but float32 at least: both (N, K, H W). The weights
+        are differentiable in the flow. Where fewer pixels are known, the nearest is repeated with weight 0.
+    """
+    flow = finite(flow.to(torch.promote_types(flow.dtype, torch.float32)))
+    return _NearestKnown.apply(flow, mask, neighbors, steps or 0)
