@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from kornia.color import CFA
 from torch import Tensor, nn
 
-from spikekit.check import check_planes, check_scale
+from spikekit.check import check_planes, check_scale, check_whole
 
 #: Bayer phases by name, read along the rows of the top-left 2 x 2 cell.
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
@@ -105,8 +105,7 @@ def bayer_mask(
         Dong et al., Super-Resolution Reconstruction from Bayer-Pattern Spike Streams, CVPR 2024, Fig. 5 (b).
     """
     check_scale(scale)
-    if height < 1 or width < 1:
-        raise ValueError(f"height, width: expected at least 1, got {height}, {width}")
+    height, width = check_whole("height", height), check_whole("width", width)
     rows = torch.arange(scale * height, device=device) // scale % 2
     columns = torch.arange(scale * width, device=device) // scale % 2
     planes: list[Tensor | None] = [None, None, None]
@@ -232,7 +231,8 @@ def bin_to_sensor(rgb: Tensor, pattern: str | CFA = "RGGB", *, scale: int) -> Te
     check_planes("rgb", rgb, 3, "(*, 3, H, W)", floating=scale > 1)
     channels, height, width = rgb.shape[-3:]
     if channels != 3 or height % scale or width % scale:
-        raise ValueError(f"rgb: expected (*, 3, H, W) with H and W multiples of {scale}, got {tuple(rgb.shape)}")
+        multiples = f" with H and W multiples of {scale}" if scale > 1 else ""
+        raise ValueError(f"rgb: expected (*, 3, H, W){multiples}, got {tuple(rgb.shape)}")
     rows, columns = height // scale, width // scale
     planes = rgb.unbind(-3)
     if scale > 1:
@@ -299,8 +299,8 @@ def split_colors(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
     """
     check_planes("raw", raw, 2, "(*, H, W)")
     height, width = raw.shape[-2:]
-    mask = bayer_mask(height, width, pattern, device=raw.device, dtype=raw.dtype)
-    return raw * mask.reshape(3, *[1] * (raw.ndim - 2), height, width)
+    mask = bayer_mask(height, width, pattern, device=raw.device, dtype=torch.bool)
+    return torch.where(mask.reshape(3, *[1] * (raw.ndim - 2), height, width), raw, raw.new_zeros(()))
 
 
 class SplitColors(nn.Module):
@@ -410,8 +410,8 @@ def merge_bayer(planes: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
         >>> bool((merge_bayer(split_bayer(raw, "GRBG"), "GRBG") == raw).all())
         True
     """
-    check_planes("planes", planes, 3, "(4, *, H, W)")
-    if planes.shape[0] != 4:
+    check_planes("planes", planes, 2, "(4, *, H, W)")
+    if planes.ndim < 3 or planes.shape[0] != 4:
         raise ValueError(f"planes: expected (4, *, H, W), got {tuple(planes.shape)}")
     cell = [planes[0]] * 4
     for plane, (_, row, column) in zip(planes, bayer_sites(pattern), strict=True):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -46,6 +46,8 @@ def joint_flow(flows: Tensor | Sequence[Tensor]) -> Tensor:
         Dong et al., CVPR 2024, eq. (7).
     """
     if not isinstance(flows, Tensor):
+        if not isinstance(flows, Iterable):
+            raise TypeError(f"flows: expected a tensor (C, *, 2, H, W) or a sequence of flows, got {flows!r}")
         flows = list(flows)
         if not flows:
             raise ValueError("flows: expected at least one flow, got none")
@@ -54,8 +56,9 @@ def joint_flow(flows: Tensor | Sequence[Tensor]) -> Tensor:
         if len({flow.shape for flow in flows}) > 1:
             raise ValueError(f"flows: expected one size, got {[tuple(flow.shape) for flow in flows]}")
         flows = torch.stack(flows)
-    check_planes("flows", flows, 4, "(C, *, 2, H, W)", floating=True)
     _check_flow("flows", flows)
+    if flows.ndim < 4 or flows.shape[0] == 0:
+        raise ValueError(f"flows: expected (C, *, 2, H, W) with at least one flow, got {tuple(flows.shape)}")
     return flows.mean(dim=0)
 
 
@@ -103,11 +106,15 @@ def upsample_flow(flow: Tensor, scale: int) -> Tensor:
     """
     _check_flow("flow", flow)
     check_scale(scale)
-    if scale == 1:
-        return flow
-    planes = flow.reshape(-1, *flow.shape[-3:])
-    fine = F.interpolate(planes, scale_factor=scale, mode="bilinear", align_corners=False)
-    return (fine * scale).reshape(*flow.shape[:-2], *fine.shape[-2:])
+    return flow if scale == 1 else _upsample(flow, scale).to(flow.dtype)
+
+
+def _upsample(flow: Tensor, scale: int) -> Tensor:
+    """In float32 or wider, so that halves are rounded once, at the end of everything."""
+    planes = flow.reshape(-1, *flow.shape[-3:]).to(torch.promote_types(flow.dtype, torch.float32))
+    if scale > 1:
+        planes = scale * F.interpolate(planes, scale_factor=scale, mode="bilinear", align_corners=False)
+    return planes.reshape(*flow.shape[:-2], *planes.shape[-2:])
 
 
 class UpsampleFlow(nn.Module):
@@ -199,12 +206,13 @@ def linear_motion(
     middle = (first + last) / 2 if middle is None else middle
     if not first < middle < last:
         raise ValueError(f"first, middle, last: expected rising times, got {first}, {middle}, {last}")
-    to_first, to_last = upsample_flow(flow_to_first, scale), upsample_flow(flow_to_last, scale)
+    check_scale(scale)
+    to_first, to_last = _upsample(flow_to_first, scale), _upsample(flow_to_last, scale)
     offsets = [
         to_first * ((t - middle) / (first - middle)) if t < middle else to_last * ((t - middle) / (last - middle))
         for t in times
     ]
-    return torch.stack(offsets, dim=-4)
+    return torch.stack(offsets, dim=-4).to(torch.promote_types(flow_to_first.dtype, flow_to_last.dtype))
 
 
 class LinearMotion(nn.Module):

@@ -11,7 +11,7 @@ import torch
 from kornia.color import hsv_to_rgb
 from torch import Tensor
 
-from spikekit.check import check_planes
+from spikekit.check import check_planes, check_positive
 
 
 def read_picture(path: str | Path) -> Tensor:
@@ -97,12 +97,14 @@ def panel(rows: Sequence[Sequence[Tensor]], gap: int = 4) -> Tensor:
         One picture (3, H, W), float32, on the CPU; every picture stands at the top left of its cell.
 
     Raises:
-        ValueError: no rows, or no picture in any of them.
+        ValueError: no rows, or a row without a picture.
 
     Example:
         >>> panel([[torch.zeros(3, 4, 4), torch.zeros(4, 4)], [torch.zeros(3, 2, 4)]], gap=1).shape
         torch.Size([3, 7, 9])
     """
+    if not rows or not all(rows):
+        raise ValueError("rows: expected at least one row, and a picture in each, got none")
     heights = [max(picture.shape[-2] for picture in row) for row in rows]
     columns = range(max(len(row) for row in rows))
     widths = [max(row[i].shape[-1] for row in rows if i < len(row)) for i in columns]
@@ -136,7 +138,7 @@ def flow_to_rgb(flow: Tensor, max_flow: float | None = None) -> Tensor:
 
     Raises:
         TypeError: ``flow`` is not a floating-point tensor.
-        ValueError: ``flow`` has no two channels.
+        ValueError: ``flow`` has no two channels, or ``max_flow`` is not above 0.
 
     Example:
         >>> flow_to_rgb(torch.zeros(2, 1, 1)).flatten().tolist()
@@ -147,6 +149,8 @@ def flow_to_rgb(flow: Tensor, max_flow: float | None = None) -> Tensor:
         raise ValueError(f"flow: expected (*, 2, H, W), got {tuple(flow.shape)}")
     x, y = flow.unbind(-3)
     length = torch.hypot(x, y)
+    if max_flow is not None:
+        check_positive("max_flow", max_flow)
     longest = length.amax().clamp(min=1e-6) if max_flow is None else max_flow
     hue = torch.atan2(y, x).remainder(2 * math.pi)
     return hsv_to_rgb(torch.stack([hue, (length / longest).clamp(max=1), torch.ones_like(length)], dim=-3))

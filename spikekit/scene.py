@@ -88,8 +88,10 @@ class Layer:
             raise ValueError(f"picture: expected (3, h, w), got {tuple(self.picture.shape)}")
         if self.picture.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"picture: expected float32 or float64, got {self.picture.dtype}")
-        if self.mask is not None and self.mask.shape != self.picture.shape[1:]:
-            raise ValueError(f"mask: expected {tuple(self.picture.shape[1:])}, got {tuple(self.mask.shape)}")
+        size = tuple(self.picture.shape[1:])
+        if self.mask is not None and getattr(self.mask, "shape", None) != size:
+            got = tuple(self.mask.shape) if isinstance(self.mask, Tensor) else type(self.mask).__name__
+            raise ValueError(f"mask: expected {size}, got {got}")
 
     def _planes(self) -> tuple[Tensor, complex]:
         """What is sampled, and where its pixel (0, 0) is: an object gets its mask as fourth plane, and an empty rim."""

@@ -164,3 +164,22 @@ def test_gradients(op):
 def test_errors(error, call):
     with pytest.raises(error):
         call()
+
+
+def test_split_colors_keeps_a_bad_pixel_to_its_colour():
+    raw = torch.ones(2, 2)
+    raw[0, 0] = float("nan")
+    red, green, blue = sk.split_colors(raw)
+    assert red.isnan().tolist() == [[True, False], [False, False]]
+    assert green.tolist() == [[0, 1], [1, 0]]
+    assert blue.tolist() == [[0, 0], [0, 1]]
+
+
+@pytest.mark.parametrize("size", [(1.5, 2), (2, 0), (True, 2), ("2", 2)])
+def test_wrong_size_of_a_mask(size):
+    with pytest.raises(ValueError, match="expected a whole number"):
+        sk.bayer_mask(*size)
+
+
+def test_merge_of_an_empty_batch():
+    assert sk.merge_bayer(torch.zeros(4, 0, 3, 5)).shape == (0, 6, 10)

@@ -121,3 +121,23 @@ FLOW = torch.zeros(1, 2, 3, 3)
 def test_errors(error, call):
     with pytest.raises(error):
         call()
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_halves_are_rounded_once(dtype):
+    flow = torch.randn(2, 2, 5, 7).to(dtype)
+    assert torch.equal(upsample_flow(flow, 3), upsample_flow(flow.float(), 3).to(dtype))
+    times = [0.0, 2.0, 5.0]
+    for scale in (1, 3):
+        assert torch.equal(
+            linear_motion(flow, -flow, times, scale=scale),
+            linear_motion(flow.float(), -flow.float(), times, scale=scale).to(dtype),
+        )
+
+
+def test_joint_flow_of_an_empty_batch_and_of_no_flow():
+    assert joint_flow(torch.zeros(4, 0, 2, 3, 5)).shape == (0, 2, 3, 5)
+    with pytest.raises(ValueError, match="flows"):
+        joint_flow(torch.zeros(0, 2, 3, 5))
+    with pytest.raises(TypeError, match="flows"):
+        joint_flow(3)

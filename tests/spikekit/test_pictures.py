@@ -93,3 +93,15 @@ def test_flow_to_rgb_scales_to_the_longest():
     assert torch.allclose(colors, flow_to_rgb(flow, flow.norm(dim=2).max().item()), atol=1e-5)
     with pytest.raises(ValueError, match="flow"):
         flow_to_rgb(flow[:, :, 0])
+
+
+@pytest.mark.parametrize("rows", [[], [[]], [[torch.zeros(2, 2)], []]])
+def test_panel_of_nothing(rows):
+    with pytest.raises(ValueError, match="rows"):
+        panel(rows)
+
+
+@pytest.mark.parametrize("longest", [0, -1.0, float("nan")])
+def test_wrong_max_flow(longest):
+    with pytest.raises(ValueError, match="max_flow"):
+        flow_to_rgb(torch.ones(2, 1, 1), longest)
