@@ -15,7 +15,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -29,9 +29,10 @@ CASES = {**streams.CASES, **pictures.CASES}
 #: Seconds of one case after which no further round is begun.
 CASE_SECONDS = 2.5
 
-COLUMNS = (
+COLUMNS = [
     "operator", "case", "beside", "other / ours", "rounds", "Mpixel/s", "ours / floor", "MiB ours", "MiB other", "equal"
-)  # fmt: skip
+]  # fmt: skip
+_OURS = {"operator", "case", "rounds", "Mpixel/s", "ours / floor", "MiB ours"}
 
 _LEGEND = """\
 other / ours  time of what stands under "beside" over that of spikekit: median of the rounds (least .. most)
@@ -49,7 +50,7 @@ class Row:
     Attributes:
         operator: its public name.
         case: what goes in and what comes out.
-        other: what it is measured beside.
+        other: what it is measured beside, empty where there is nothing.
         ratio: time of the other over ours; None where the other could not be run.
         rounds: how many timings the ratio is the median of.
         speed: million pixels a second, ours.
@@ -97,10 +98,11 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError(f"--device: {args.device} cannot be used here ({str(error).splitlines()[0]})") from error
     timer, unit = timer_of(device, args.threads)
     with _threads(args.threads):
-        table = list(rows(args.operators or list(CASES), args.size, device, args.rounds, timer))
-        text = "\n\n".join(
-            [_header(device, unit, args.size), _table(table, args.markdown), _notes(table, args.markdown)]
-        )
+        measured = list(rows(args.operators or list(CASES), args.size, device, args.rounds, timer))
+        header = _header(device, unit, args.size)
+    text = "\n\n".join(
+        [_fenced(header, args.markdown), _table(measured, args.markdown), _fenced(_LEGEND, args.markdown)]
+    )
     if args.output is None:
         sys.stdout.write(f"{text}\n")
         return
@@ -137,30 +139,32 @@ def compare(case: Case, operator: str, device: torch.device, rounds: int, timer:
             failed[other.name] = _reason(error)
     del result
     gc.collect()
-    memory = {name: peak_memory(run, device) for name, run in runs.items()}
-    ours = peak_memory(case.run, device)
     floor = floor_run(case.read, case.written, device)
     times = interleave({"": case.run, **runs, "floor": floor}, rounds, timer, CASE_SECONDS)
+    memory = {name: peak_memory(run, device) for name, run in {"": case.run, **runs}.items()}
 
-    to_floor = ratio(times[""], times["floor"]).median
-    speed = case.pixels / max(statistics.median(times[""]), 1e-9) / 1e6
-    row = Row(operator, case.name, rounds=len(times[""]), speed=speed, floor=to_floor, memory=(ours, None))
+    row = Row(
+        operator,
+        case.name,
+        rounds=len(times[""]),
+        speed=case.pixels / max(statistics.median(times[""]), 1e-9) / 1e6,
+        floor=ratio(times[""], times["floor"]).median,
+        memory=(memory[""], None),
+    )
     if not case.others:
         yield row
     for other in case.others:
         if other.name in failed:
-            yield Row(operator, case.name, other.name, note=failed[other.name])
-            continue
-        yield Row(
-            **{
-                **vars(row),
-                "other": other.name,
-                "ratio": ratio(times[other.name], times[""]),
-                "memory": (ours, memory[other.name]),
-                "equal": equal[other.name],
-                "note": other.note,
-            }
-        )
+            yield replace(row, other=other.name, note=failed[other.name])
+        else:
+            yield replace(
+                row,
+                other=other.name,
+                ratio=ratio(times[other.name], times[""]),
+                memory=(memory[""], memory[other.name]),
+                equal=equal[other.name],
+                note=other.note,
+            )
 
 
 def _equal(other: Other, ours: object, theirs: object) -> float | None:
@@ -199,15 +203,18 @@ def _cpu_name() -> str:
     return platform.processor() or platform.machine()
 
 
+def _fenced(text: str, markdown: bool) -> str:
+    return f"```text\n{text}\n```" if markdown else text
+
+
 def _table(rows: Sequence[Row], markdown: bool) -> str:
-    lines, previous = [COLUMNS], None
+    lines, case = [COLUMNS], None
     for row in rows:
-        cells = (row.operator, row.case, *_cells(row))
-        shown = (row.operator, row.case, row.speed, row.floor)
-        if not markdown and shown == previous:  # what the line above says already
-            cells = ("", "", *cells[2:5], "", "", "", *cells[8:])
+        cells = _cells(row)
+        if case == (row.operator, row.case) and not markdown:  # the line above says what is ours
+            cells = ["" if column in _OURS else cell for column, cell in zip(COLUMNS, cells, strict=True)]
         lines.append(cells)
-        previous = shown
+        case = row.operator, row.case
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     text = [[cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines]
     if markdown:
@@ -216,25 +223,21 @@ def _table(rows: Sequence[Row], markdown: bool) -> str:
     return "\n".join("  ".join(line).rstrip() for line in text)
 
 
-def _cells(row: Row) -> tuple[str, ...]:
-    if row.ratio is None and row.speed is None:
-        return row.other, row.note, *[""] * 6
-    equal = "" if row.equal is None else f"{100 * row.equal:.4g} %"
-    return (
+def _cells(row: Row) -> list[str]:
+    def number(value: float | None, form: str) -> str:
+        return "" if value is None else format(value, form)
+
+    return [
+        row.operator,
+        row.case,
         row.other,
         "" if row.ratio is None else f"{row.ratio.median:.3g} ({row.ratio.least:.3g} .. {row.ratio.most:.3g})",
-        str(row.rounds),
-        f"{row.speed:.4g}",
-        f"{row.floor:.3g}",
-        *("" if mib is None else f"{mib:.1f}" for mib in row.memory),
-        "; ".join(filter(None, [equal, row.note])),
-    )
-
-
-def _notes(rows: Sequence[Row], markdown: bool) -> str:
-    missing = sorted({f"{row.other}: {row.note}" for row in rows if row.ratio is None and row.other})
-    text = "\n".join([_LEGEND, *missing])
-    return f"```\n{text}\n```" if markdown else text
+        str(row.rounds or ""),
+        number(row.speed, ".4g"),
+        number(row.floor, ".3g"),
+        *(number(mib, ".1f") for mib in row.memory),
+        "; ".join(filter(None, ["" if row.equal is None else f"{100 * row.equal:.4g} %", row.note])),
+    ]
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -62,10 +63,21 @@ def _flow_warp_idw(setup: Setup) -> Iterator[Case]:
             others,
         )
 
+    def table(colour: str, mask: Tensor) -> Case:
+        exact = partial(_warp, flow_warp_idw, features, flow, None, mask=mask)
+        return replace(
+            case(colour, mask, "NCHW", backward=False),
+            name=f"{colour}, {sizes(features)} NCHW, forward, steps = 16",
+            run=partial(exact, steps=16),
+            others=[Other("without steps", lambda: exact, _values, 1 / 16, "an approximation: within 1/16, on noise")],
+        )
+
     for layout in _LAYOUTS:
         for backward in (False, True):
             yield case("R", red, layout, backward)
             yield case("G", green, layout, backward)
+    yield table("R", red)
+    yield table("G", green)
 
 
 _LAYOUTS = {"NCHW": torch.contiguous_format, "channels-last": torch.channels_last}
