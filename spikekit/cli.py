@@ -91,37 +91,26 @@ def decode(args: argparse.Namespace) -> None:
 
     reach = (args.window or TFP_WINDOW) // 2 if args.method == "tfp" else TFI_REACH
     key = chosen[len(chosen) // 2]
-    first, last = _span(key, reach, frames)
-    if args.alpha is None:
-        # Of the rate, not of the picture: TFI makes 1 or 1/2 of a bright pixel, and its percentile is one of the two.
-        rate = _counts(args, height, width, first, last - first + 1) / (last - first + 1)
-        white = float(np.quantile(rate.float(), 0.999)) or float(rate.max()) or 1.0
-        around = "" if len(chosen) == 1 else f" around frame {key}"
-        scaling = f"multiplied by {1 / white:.4g}, so that the 99.9th percentile of the spike rate{around} is white"
-    else:
-        white = args.alpha
-        scaling = f"divided by alpha {white:g}"
-
+    white, scaling = _white(args, (frames, height, width), key, reach)
     show = len(chosen) > 1 and sys.stderr.isatty()
     try:
         for done, (n, plane) in enumerate(_windows(args, (frames, height, width), chosen, reach)):
             if show:
                 print(f"\r{done} of {len(chosen)} pictures", end="", file=sys.stderr, flush=True)
             raw = _decode_frame(args.method, plane, n, *_span(n, reach, frames)) / white
-            picture = raw if args.pattern is None else demosaic(raw, args.pattern)
-            _write(Path(str(args.output).replace(_NUMBER, f"{n:0{len(str(frames - 1))}}")), picture)
+            path = Path(str(args.output).replace(_NUMBER, f"{n:0{len(str(frames - 1))}}"))
+            _write(path, raw if args.pattern is None else demosaic(raw, args.pattern))
     finally:
         if show:
             print("\r\033[K", end="", file=sys.stderr, flush=True)
     if len(chosen) == 1:
-        made = f"frame {key} of {frames} by {args.method} from frames {first} .. {last}"
+        first, last = _span(key, reach, frames)
+        print(f"{path}: frame {key} of {frames} by {args.method} from frames {first} .. {last}, {scaling}")
     else:
-        every = f", every {chosen.step}th" if chosen.step > 1 else ""
-        made = (
-            f"{len(chosen)} pictures of frames {chosen[0]} .. {chosen[-1]}{every} of {frames} by {args.method} "
-            f"from up to {reach} frames on each side"
+        print(
+            f"{args.output}: {len(chosen)} pictures of frames {chosen[0]} .. {chosen[-1]} of {frames}, {chosen.step} "
+            f"apart, by {args.method} from up to {reach} frames on each side, all {scaling}"
         )
-    print(f"{args.output}: {made}, {scaling}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -292,6 +281,18 @@ def _chosen(args: argparse.Namespace, frames: int) -> range:
     if not chosen or chosen.stop > frames:
         raise UsageError(f"--frame: expected 0 .. {frames - 1}, as {args.file} has {frames} frames, got {text}")
     return chosen
+
+
+def _white(args: argparse.Namespace, shape: tuple[int, int, int], key: int, reach: int) -> tuple[float, str]:
+    """Return what becomes white, and a sentence that says so."""
+    if args.alpha is not None:
+        return args.alpha, f"divided by alpha {args.alpha:g}"
+    first, last = _span(key, reach, shape[0])
+    # Of the rate, not of the picture: TFI makes 1 or 1/2 of a bright pixel, and its percentile is one of the two.
+    rate = _counts(args, *shape[1:], first, last - first + 1).numpy() / (last - first + 1)
+    white = float(np.quantile(rate, 0.999)) or float(rate.max()) or 1.0
+    scale = f"multiplied by {1 / white:.4g}"
+    return white, f"{scale}, so that the 99.9th percentile of the spike rate around frame {key} is white"
 
 
 def _span(frame: int, reach: int, frames: int) -> tuple[int, int]:

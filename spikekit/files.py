@@ -274,7 +274,7 @@ def _open(
     if start < 0 or frames < 1 or start + frames > total:
         raise SpikeFileError(f"{path}: expected frames within 0 .. {total - 1}, got {frames} from frame {start} on")
     read = dat_blocks if path.suffix.lower() == ".dat" else npz_blocks
-    return read(Wanted(path, height, width, start, frames, min(chunk or frames, frames), flip, packed))
+    return read(Wanted(path, height, width, start, frames, chunk or frames, flip, packed))
 
 
 def _check_suffix(path: Path) -> str:

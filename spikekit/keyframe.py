@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from spikekit.check import check_dtype, check_planes, check_positive, default_float
-from spikekit.kernels import batch_first
 
 
 @torch.library.custom_op("spikekit::spike_interval_at", mutates_args=())
@@ -47,9 +46,6 @@ def _(spikes: Tensor, frame: int) -> Tensor:
 def _(spikes: Tensor, frame: int) -> Tensor:
     size = spikes.shape[:-3] + spikes.shape[-2:]
     return spikes.new_empty(size, dtype=_interval_dtype(spikes.shape[-3]))
-
-
-batch_first(_spike_interval_at)
 
 
 def _interval_dtype(frames: int) -> torch.dtype:

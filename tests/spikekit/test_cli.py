@@ -152,7 +152,7 @@ def test_decode(clip, tmp_path, capsys, method, least):
     assert main(words) == 0
     report = capsys.readouterr().out
     assert report.startswith(f"{out}: frame 30 of 60 by {method} from frames {0 if method == 'tfi' else 10} .. ")
-    assert report.endswith("so that the 99.9th percentile of the spike rate is white\n")
+    assert report.endswith("so that the 99.9th percentile of the spike rate around frame 30 is white\n")
     assert 1.9 < float(report.split("multiplied by ")[1].split(",")[0]) <= 2
     assert psnr(read_picture(out)[:, 1:], light[:, 1:] / 0.5) > least
 
@@ -194,6 +194,7 @@ def test_decode_reads_what_it_needs(tmp_path, method, words, frame):
         (["--method", "tfi", "--frame", "999999"], [(999_799, 201)]),
         (["--method", "tfp", "--frame", "100:140:10"], [(80, 71)]),
         (["--method", "tfp", "--window", "5", "--frame", "100:140:20"], [(98, 5), (118, 5)]),
+        (["--method", "tfp", "--window", "5", "--frame", "100:140:5"], [(98, 40)]),
     ],
 )
 def test_decode_reads_only_what_it_needs(tmp_path, monkeypatch, words, expected):
@@ -227,7 +228,9 @@ def test_decode_many(tmp_path, capsys, name, method, frames):
     report, err = capsys.readouterr()
     assert err == ""
     if len(chosen) > 1:
-        assert f"{len(chosen)} pictures of frames {chosen[0]} .. {chosen[-1]}" in report
+        assert f"{len(chosen)} pictures of frames {chosen[0]} .. {chosen[-1]} of 500" in report
+    else:
+        assert report.startswith(f"{tmp_path / 'out' / f'a{chosen[0]:03}.png'}: frame {chosen[0]} of 500")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [f"a{n:03}.png" for n in chosen]
     whole = tfi(spikes) if method == "tfi" else tfp(spikes, 41)
     for n in chosen:
@@ -241,9 +244,8 @@ def test_decode_many_at_one_scale(tmp_path, capsys):
     write_spikes(tmp_path / "a.npz", spikes)
     line = ["decode", str(tmp_path / "a.npz"), "--method", "tfp", "--window", "21", "-o", str(tmp_path / "{frame}.png")]
     assert main([*line, "--frame", "50:200:50"]) == 0
-    assert "3 pictures of frames 50 .. 150, every 50th of 200 by tfp from up to 10 frames on each side" in (
-        report := capsys.readouterr().out
-    )
+    report = capsys.readouterr().out
+    assert "3 pictures of frames 50 .. 150 of 200, 50 apart, by tfp from up to 10 frames on each side" in report
     assert "99.9th percentile of the spike rate around frame 100 is white" in report
     dark, _, bright = (read_picture(tmp_path / f"{n:03}.png").mean() for n in (50, 100, 150))
     assert dark < bright / 2
