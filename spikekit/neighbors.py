@@ -18,6 +18,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from spikekit.gather import fold_into_batch
 from spikekit.kernels import cpu_warp
+from spikekit.position_table import PositionTable
 
 _FARTHEST = 2.0**30  # flow beyond it is cut: positions must fit an integer
 _CHUNK = 1 << 15  # positions searched at a time: in the cache, and by one thread, without waiting for another
@@ -133,89 +134,12 @@ def _insert(best: list[tuple[Tensor, Tensor]], distance: Tensor, index: Tensor, 
         best.append((distance, index))
 
 
-class _Axis:
-    """Positions on one axis, quantised, in classes: the period's inside, every pixel its own near the borders."""
-
-    def __init__(self, length: int, period: int, margin: int, steps: int, device: str) -> None:
-        inner = length - 2 * margin
-        pixel = np.arange(length)
-        self.pixel = pixel  # one of every class
-        self.place = pixel  # the class of every pixel
-        if inner > period:
-            self.pixel = np.delete(pixel, np.s_[margin + period : length - margin])
-            self.place = np.where(pixel < margin, pixel, margin + (pixel - margin) % period)
-            self.place[length - margin :] = margin + period + np.arange(margin)
-        self.place = torch.from_numpy(self.place).to(device)
-        self.steps = steps
-        self.half = (steps + 1) // 2  # quantised positions on either side of a pixel
-
-    def __len__(self) -> int:
-        return len(self.pixel) * (2 * self.half + 1)
-
-    def positions(self) -> tuple[Tensor, Tensor]:
-        """Pixel and offset of every quantised position."""
-        pixel = torch.from_numpy(self.pixel).repeat_interleave(2 * self.half + 1)
-        offset = torch.arange(-self.half, self.half + 1, dtype=torch.float64).repeat(len(self.pixel)) / self.steps
-        return pixel, offset
-
-    def find(self, cell: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the quantised position nearest to cell + part, and its pixel."""
-        pixel = cell.clamp(0, len(self.place) - 1)
-        offset = ((cell - pixel) + part).clamp(-0.5, 0.5) * self.steps
-        return self.place[pixel] * (2 * self.half + 1) + self.half + offset.round().long(), pixel
-
-
-def _period(known: np.ndarray) -> int:
-    """Return the smallest shift along the first axis that maps a mask on itself, 0 if it does not repeat in full."""
-    if len(known) == 1:
-        return 1
-    return next((shift for shift in range(1, len(known) // 2 + 1) if (known[shift:] == known[:-shift]).all()), 0)
-
-
-def _margin(known: np.ndarray, period: tuple[int, int], neighbors: int) -> int:
-    """Return how far from a pixel of the picture its nearest known pixels can be."""
-    height, width = known.shape
-    density = np.count_nonzero(known[: period[0], : period[1]])
-    for reach in range(1, max(height, width) + 1):
-        # a square of this side, with the pixel in its corner, lies inside the picture or spans it
-        cells = (min(reach, height) // period[0]) * (min(reach, width) // period[1])
-        if cells * density >= neighbors:
-            return int(np.ceil(reach * 2**0.5)) + 1
-    return max(height, width)
-
-
-class _Table:
-    """The nearest known pixels of all quantised positions of a periodic mask."""
-
-    def __init__(self, key: _Key, neighbors: int, steps: int) -> None:
-        bits, height, self.width, device = key
-        known = np.frombuffer(bits, dtype=bool).reshape(height, self.width)
-        period = _period(known), _period(known.T)
-        if not all(period):
-            raise ValueError(
-                f"mask: expected a pattern that repeats along rows and columns for steps={steps}, got one that does not; "
-                "its table would be larger than the picture is worth"
-            )
-        margin = _margin(known, period, neighbors)
-        self.rows = _Axis(height, period[0], margin, steps, device)
-        self.columns = _Axis(self.width, period[1], margin, steps, device)
-        products = _products((bits, height, self.width, "cpu"), neighbors)
-        self.shift = torch.empty(neighbors, len(self.rows) * len(self.columns), dtype=torch.int32)
-        (y, y_offset), (x, x_offset) = self.rows.positions(), self.columns.positions()
-        for i in range(len(self.rows)):
-            cell, part = torch.stack([x, y[i].expand_as(x)]), torch.stack([x_offset, y_offset[i].expand_as(x)])
-            nearest = _search(products, neighbors, self.width, cell, part)
-            self.shift[:, i * len(x) : (i + 1) * len(x)] = nearest - (y[i] * self.width + x)
-        self.shift = self.shift.to(device)
-
-    def find(self, cell: Tensor, part: Tensor) -> Tensor:
-        """Flat indices (neighbors, n) for cell + part, (2, n)."""
-        column, x = self.columns.find(cell[0], part[0])
-        row, y = self.rows.find(cell[1], part[1])
-        return self.shift.index_select(1, row * len(self.columns) + column) + (y * self.width + x)
-
-
-_table = lru_cache(maxsize=8)(_Table)
+@lru_cache(maxsize=8)
+def _table(key: _Key, neighbors: int, steps: int) -> PositionTable:
+    bits, height, width, device = key
+    known = np.frombuffer(bits, dtype=bool).reshape(height, width)
+    search = partial(_search, _products((bits, height, width, "cpu"), neighbors), neighbors, width)
+    return PositionTable(known, neighbors, steps, search, device)
 
 
 def _weigh(index: Tensor, width: int, cell: Tensor, part: Tensor) -> Tensor:
@@ -278,7 +202,9 @@ def _(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, T
 
 @nearest_known.register_kernel("cpu")
 def _(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
-    if not steps and neighbors == 4:
+    if steps:
+        return cpu_warp.nearest_in_table(flow, _table(_key(mask), neighbors, steps))
+    if neighbors == 4:
         products = products_of(mask, neighbors)
         if len(products) <= 2 and all(len(table) == 4 for product in products for table in product):
             return cpu_warp.nearest_four(flow, products)

@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from spikekit.kernels.layout import empty_like_layout, is_channels_last
+from spikekit.position_table import PositionTable, TableAxis
 
 _PIECE = 1 << 18  # numbers that are gathered at a time
 _TILE = 1 << 13  # positions that are searched at a time
@@ -49,8 +50,7 @@ def _rows(planes: Tensor, dtype: torch.dtype) -> Tensor:
         return rows
     result = _empty(tuple(rows.shape), dtype)
     for piece in _pieces(*rows.shape):
-        # two steps, each of which torch does quickly
-        result[piece].copy_(planes[:, piece].contiguous().t().contiguous())
+        result[piece].copy_(planes[:, piece].contiguous().t())  # torch transposes quickly what is contiguous
     return result
 
 
@@ -92,21 +92,21 @@ def weighted_scatter(grad: Tensor, index: Tensor, weight: Tensor, size: int) -> 
     """Sorted by pixel, what arrives at one is a bag: a gather again."""
     out, dtype = _empty_like_layout(grad, size).zero_(), _wide(grad, weight)
     for planes, index_b, weight_b, out_b in zip(grad.detach(), index.numpy(), weight.detach(), out, strict=True):
-        order = np.argsort(index_b.ravel().astype(np.int32), kind="stable")
-        pixel = index_b.ravel()[order]
-        first = np.flatnonzero(np.diff(pixel, prepend=-1))
+        pixel, order = torch.from_numpy(index_b.ravel().astype(np.int32)).sort(stable=True)
+        first = np.flatnonzero(np.diff(pixel.numpy(), prepend=-1))
+        pixel = pixel.numpy()[first]
         sums = F.embedding_bag(
-            torch.from_numpy(order % index_b.shape[1]),
+            order % index_b.shape[1],
             _rows(planes, dtype),
             torch.from_numpy(first),
             mode="sum",
-            per_sample_weights=weight_b.to(dtype).ravel()[torch.from_numpy(order)],
+            per_sample_weights=torch.from_numpy(weight_b.to(dtype).numpy().ravel().take(order.numpy())),
         ).to(out.dtype)
         if is_channels_last(out):
-            _array(out_b.t())[pixel[first]] = _array(sums)
+            _array(out_b.t())[pixel] = _array(sums)
             continue
         for out_c, sums_c in zip(_array(out_b), _array(sums.t().contiguous()), strict=True):
-            out_c[pixel[first]] = sums_c
+            out_c[pixel] = sums_c
     return out
 
 
@@ -114,17 +114,17 @@ def weighted_dot(values: Tensor, grad: Tensor, index: Tensor) -> Tensor:
     """Products of rows, a piece at a time."""
     dtype = _wide(values, grad)
     out = _empty(tuple(index.shape), dtype)
-    width = values.shape[1] * index.shape[1]
     for planes, grad_b, index_b, out_b in zip(values.detach(), grad.detach(), index.numpy(), out.numpy(), strict=True):
         rows, place = _used_rows(planes, index_b, dtype)
-        for piece in _pieces(index.shape[2], width):
-            gathered = rows.numpy().take(_bags(index_b, place, piece), axis=0)
-            out_b[:, piece] = np.einsum("qkc,qc->kq", gathered, _rows(grad_b[:, piece], dtype).numpy())
+        for piece in _pieces(*grad_b.t().shape):
+            other = _rows(grad_b[:, piece], dtype).numpy()
+            for index_k, out_k in zip(index_b[:, piece], out_b[:, piece], strict=True):
+                gathered = rows.numpy().take(index_k if place is None else place.take(index_k), axis=0)
+                np.einsum("qc,qc->q", gathered, other, out=out_k)
     return out
 
 
-_Position = tuple[np.ndarray, np.ndarray]  # whole and fractional part of a coordinate
-_Pixels = tuple[np.ndarray, np.ndarray]  # squared distance, less that of a common reference, and where
+_Pixels = tuple[np.ndarray, np.ndarray]  # squared distance and flat index, both less those of a common reference
 _Ranked = list[_Pixels]
 
 
@@ -136,88 +136,146 @@ def nearest_four(flow: Tensor, products: list[tuple[Tensor, Tensor]]) -> tuple[T
     """
     count, _, height, width = flow.shape
     plane = height * width
-    row_tables, column_tables = ([table.numpy() for table in tables] for tables in zip(*products, strict=True))
+    steps = [tuple(_steps(table.numpy()) for table in product) for product in products]
     index, weight = _empty((count, 4, plane), torch.int64), _empty((count, 4, plane), flow.dtype)
     moved = flow.detach().flatten(2).numpy()
+    pixel_x, pixel_y = np.tile(np.arange(1.0 * width), height), np.repeat(np.arange(1.0 * height), width)
     for images in _slices(count, max(_TILE // plane, 1)):
         for piece in _slices(plane, _TILE):
-            pixel = np.arange(plane)[piece]
-            x, columns = _on_axis(moved[images, 0, piece], pixel % width, column_tables)
-            y, rows = _on_axis(moved[images, 1, piece], pixel // width, row_tables)
-            nearest = [_four_of_product(*pair, width) for pair in zip(rows, columns, strict=True)]
-            four = _four_of_both(*nearest) if len(nearest) == 2 else nearest[0]
-            shares = _weigh(four, width, x, y, moved.dtype)
-            for k, ((_, flat), share) in enumerate(zip(four, shares, strict=True)):
-                index.numpy()[images, k, piece], weight.numpy()[images, k, piece] = flat, share
+            x = _Axis(moved[images, 0, piece], pixel_x[piece], width)
+            y = _Axis(moved[images, 1, piece], pixel_y[piece], height)
+            four, nearest = _nearest_four(x, y, steps, width)
+            zero, reference = x.away * x.away + y.away * y.away, y.reference * width + x.reference
+            squares = [nearest, *(square + zero for square, _ in four[1:])]
+            first, *others = [np.sqrt(square.astype(moved.dtype)) for square in squares]
+            flats = [flat + reference for _, flat in four]
+            _store(index[images, :, piece], weight[images, :, piece], flats, [first / other for other in others])
     return index, weight
+
+
+def nearest_in_table(flow: Tensor, table: PositionTable) -> tuple[Tensor, Tensor]:
+    """Nearest pixels of rounded positions, from a table, and the weights that they have at the exact ones."""
+    count, _, height, width = flow.shape
+    plane, neighbors = height * width, len(table.shift)
+    index, weight = _empty((count, neighbors, plane), torch.int64), _empty((count, neighbors, plane), flow.dtype)
+    moved, shift = flow.detach().flatten(2).numpy(), table.shift.numpy()
+    pixel_x, pixel_y = np.tile(np.arange(1.0 * width), height), np.repeat(np.arange(1.0 * height), width)
+    for images in _slices(count, max(_TILE // plane, 1)):
+        for piece in _slices(plane, _TILE):
+            column, x, x_cell, x_part = _on_table(moved[images, 0, piece], pixel_x[piece], table.columns)
+            row, y, y_cell, y_part = _on_table(moved[images, 1, piece], pixel_y[piece], table.rows)
+            place, pixel = (row * table.columns_length + column).astype(np.intp), y * width + x
+            flats, distances = [], []
+            for shift_k in shift:
+                flat = shift_k.take(place) + pixel
+                row = np.floor(flat / width)
+                dx, dy = (flat - row * width - x_cell) - x_part, (row - y_cell) - y_part
+                flats.append(flat)
+                distances.append(np.sqrt((dx * dx + dy * dy).astype(moved.dtype)))
+            ratios = [
+                np.divide(distances[0], distance, out=np.zeros_like(distance), where=flat != flats[0])
+                for flat, distance in zip(flats[1:], distances[1:], strict=True)
+            ]
+            _store(index[images, :, piece], weight[images, :, piece], flats, ratios)
+    return index, weight
+
+
+def _on_table(flow: np.ndarray, pixel: np.ndarray, axis: TableAxis) -> tuple[np.ndarray, ...]:
+    """Return where a coordinate is in the table, the pixel that it is looked up from, and its two parts."""
+    flow = flow.astype(np.float64)
+    whole = np.rint(flow)
+    part = flow - whole
+    cell = whole + pixel
+    inside = np.maximum(np.minimum(cell, axis.length - 1.0), 0.0)
+    offset = np.maximum(np.minimum((cell - inside) + part, 0.5), -0.5) * axis.steps
+    return axis.place.numpy().take(inside.astype(np.intp)) + np.rint(offset), inside, cell, part
 
 
 def _slices(length: int, size: int) -> Iterator[slice]:
     return (slice(begin, begin + size) for begin in range(0, length, size))
 
 
-def _on_axis(flow: np.ndarray, pixel: np.ndarray, tables: list[np.ndarray]) -> tuple[_Position, list[_Ranked]]:
-    """Return where a coordinate is, and what is nearest to it in every table."""
-    flow = flow.astype(np.float64)  # so that what is nearer does not depend on rounding
-    whole = np.rint(flow)
-    part = flow - whole
-    cell = whole + pixel
-    half = np.clip(2 * cell + np.ceil(2 * part), 0, tables[0].shape[1] - 1).astype(np.intp)
-    reference = (half >> 1).astype(np.float64)
-    twice = 2 * ((reference - cell) - part)
-    ranked = []
-    for table in tables:
-        steps = [positions.take(half) for positions in table - np.arange(table.shape[1]) // 2.0]
+def _steps(table: np.ndarray) -> np.ndarray:
+    """Return positions relative to the reference of their half of a pixel."""
+    return table - np.arange(table.shape[1]) // 2.0
+
+
+class _Axis:
+    """Where a coordinate is: in which half of a pixel, the reference, and how far from it."""
+
+    def __init__(self, flow: np.ndarray, pixel: np.ndarray, length: int) -> None:
+        flow = flow.astype(np.float64)  # so that what is nearer does not depend on rounding
+        whole = np.rint(flow)
+        part = flow - whole
+        cell = whole + pixel
+        half = np.ceil(part + part) + (cell + cell)
+        self.half = np.maximum(np.minimum(half, 2.0 * length - 1), 0.0).astype(np.intp)
+        self.reference = (self.half >> 1).astype(np.float64)
+        self.away = (self.reference - cell) - part
+
+    def ranked(self, steps: np.ndarray) -> _Ranked:
+        taken = [step.take(self.half) for step in steps]
         # (p - q)^2 - (r - q)^2 without squaring what is far away
-        ranked.append([(step * (step + twice), step + reference) for step in steps])
-    return (cell, part), ranked
+        twice = self.away + self.away
+        return [(step * (step + twice), step) for step in taken]
 
 
-def _before(one: np.ndarray, other: np.ndarray, lower: np.ndarray) -> np.ndarray:
-    return (one < other) | ((one == other) & lower)
+def _nearest_four(x: _Axis, y: _Axis, steps: list[tuple[np.ndarray, ...]], width: int) -> tuple[_Ranked, np.ndarray]:
+    """Return the four, and the squared distance of the first, which a difference would leave inexact."""
+    lists, squares = [], []
+    for row_steps, column_steps in steps:
+        rows, columns = y.ranked(row_steps), x.ranked(column_steps)
+        squares.append((rows[0][1] + y.away) ** 2 + (columns[0][1] + x.away) ** 2)
+        lists.append(_four_of_product([(square, step * width) for square, step in rows], columns))
+    four = lists[0] if len(lists) == 1 else _four_of_both(*lists)
+    return four, np.minimum(squares[0], squares[-1])
 
 
-def _four_of_product(rows: _Ranked, columns: _Ranked, width: int) -> _Ranked:
-    (b0, y0), (b1, y1), (b2, y2), (b3, y3) = rows
-    (a0, x0), (a1, x1), (a2, x2), (a3, x3) = columns
-    y0, y1, y2, y3 = (y * width for y in (y0, y1, y2, y3))
-    second, row_4 = a1 + b0, a0 + b3
-    swap = _before(row_4, second, y3 < y0)
-    ranked = [(a0 + b0, y0 + x0), (np.where(swap, row_4, second), np.where(swap, y3 + x0, y0 + x1))]
-    column_4, row_2 = a3 + b0, a0 + b1
-    swap = _before(row_2, column_4, y1 < y0)
-    ranked.append((np.where(swap, row_2, column_4), np.where(swap, y1 + x0, y0 + x3)))
-    column_3, corner, row_3 = a2 + b0, a1 + b1, a0 + b2
-    swap = _before(corner, column_3, y1 < y0)
-    distance, flat = np.where(swap, corner, column_3), np.where(swap, y1 + x1, y0 + x2)
-    swap = _before(row_3, distance, y2 + x0 < flat)
-    return [*ranked, (np.where(swap, row_3, distance), np.where(swap, y2 + x0, flat))]
+def _nearer(one: _Pixels, other: _Pixels, earlier: np.ndarray) -> _Pixels:
+    """Choose ``one`` where it is nearer, or as near and ``earlier`` in row-major order."""
+    choice = (one[0] < other[0]) | ((one[0] == other[0]) & earlier)
+    return np.minimum(one[0], other[0]), np.where(choice, one[1], other[1])
+
+
+def _four_of_product(rows: _Ranked, columns: _Ranked) -> _Ranked:
+    def at(i: int, j: int) -> _Pixels:
+        return rows[i][0] + columns[j][0], rows[i][1] + columns[j][1]
+
+    def above(i: int, j: int) -> np.ndarray:
+        return rows[i][1] < rows[j][1]
+
+    corner, column = _nearer(at(1, 1), at(0, 2), above(1, 0)), at(2, 0)
+    return [
+        at(0, 0),
+        _nearer(at(3, 0), at(0, 1), above(3, 0)),
+        _nearer(at(1, 0), at(0, 3), above(1, 0)),
+        _nearer(column, corner, column[1] < corner[1]),
+    ]
 
 
 def _in_order(one: _Pixels, other: _Pixels) -> tuple[_Pixels, _Pixels]:
-    swap = _before(other[0], one[0], other[1] < one[1])
+    choice = (one[0] < other[0]) | ((one[0] == other[0]) & (one[1] < other[1]))
     return (
-        (np.minimum(one[0], other[0]), np.where(swap, other[1], one[1])),
-        (np.maximum(one[0], other[0]), np.where(swap, one[1], other[1])),
+        (np.minimum(one[0], other[0]), np.where(choice, one[1], other[1])),
+        (np.maximum(one[0], other[0]), np.where(choice, other[1], one[1])),
     )
 
 
-def _four_of_both(*products: _Ranked) -> _Ranked:
-    for ranked in products:  # the first is in its place already
+def _four_of_both(first: _Ranked, second: _Ranked) -> _Ranked:
+    for ranked in (first, second):  # the nearest is in its place already
         for i, j in (1, 2), (2, 3), (1, 2):
             ranked[i], ranked[j] = _in_order(ranked[i], ranked[j])
-    ranked = [_in_order(*pair)[0] for pair in zip(products[0], reversed(products[1]), strict=True)]
-    ranked[0], ranked[3] = _in_order(ranked[0], ranked[3])
-    return ranked
+    four = [_nearer(one, other, one[1] < other[1]) for one, other in zip(first, reversed(second), strict=True)]
+    four[0], four[3] = _in_order(four[0], four[3])
+    return four
 
 
-def _weigh(four: _Ranked, width: int, x: _Position, y: _Position, dtype: np.dtype) -> list[np.ndarray]:
-    """Weights by inverse distance, relative to the nearest, so that nothing overflows; on a pixel it has them all."""
-    distance = []
-    for _, flat in four:
-        row = np.floor(flat / width)
-        dx, dy = ((flat - row * width - x[0]) - x[1]).astype(dtype), ((row - y[0]) - y[1]).astype(dtype)
-        distance.append(np.sqrt(dx * dx + dy * dy))
-    others = [distance[0] / d for d in distance[1:]]
-    share = 1 / (1 + others[0] + others[1] + others[2])
-    return [share, *(other * share for other in others)]
+def _store(index: Tensor, weight: Tensor, flats: list[np.ndarray], ratios: list[np.ndarray]) -> None:
+    """Write (n, K, p) of what is nearest, and weights of sum 1 from 1 / d, relative to the nearest: d_1 / d_k.
+
+    So nothing overflows next to a pixel, and on it the others have none.
+    """
+    share = 1 / (1 + sum(ratios))
+    for k, flat in enumerate(flats):
+        index.numpy()[:, k] = flat
+        weight.numpy()[:, k] = share if k == 0 else ratios[k - 1] * share

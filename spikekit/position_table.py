@@ -1,0 +1,115 @@
+"""A table of the nearest known pixels for positions that are rounded to fractions of a pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+_CHUNK = 1 << 15  # positions that are searched at a time
+
+
+class TableAxis:
+    """Rounded positions on one axis, in classes: a pixel near a border is its own, the others share the period's.
+
+    Args:
+        length: pixels.
+        period: after how many of them the mask repeats.
+        margin: how near to a border a pixel is its own class.
+        steps: positions per pixel.
+        device: of the mask.
+    """
+
+    def __init__(self, length: int, period: int, margin: int, steps: int, device: str) -> None:
+        self.length = length
+        self.steps = steps
+        self.half = (steps + 1) // 2  # rounded positions on either side of a pixel
+        pixel = np.arange(length)
+        place = pixel
+        if length > 2 * margin + period:
+            inner = np.s_[margin : length - margin]
+            place = np.where(pixel < margin, pixel, pixel - (length - 2 * margin - period))
+            place[inner] = margin + (pixel[inner] - margin) % period
+        _, self.first = np.unique(place, return_index=True)  # a pixel of every class
+        # where the class of a pixel begins, plus half: a rounded offset is added to it
+        self.place = torch.from_numpy(place * (2 * self.half + 1) + self.half).to(device)
+
+    def positions(self) -> tuple[Tensor, Tensor]:
+        """Pixel and offset of everything the table holds."""
+        offset = torch.arange(-self.half, self.half + 1, dtype=torch.float64) / self.steps
+        pixel = torch.from_numpy(self.first).repeat_interleave(len(offset))
+        return pixel, offset.repeat(len(self.first))
+
+    def find(self, cell: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
+        """Return where cell + part is in the table, and the pixel that it is looked up from."""
+        pixel = cell.clamp(0, self.length - 1)
+        offset = ((cell - pixel) + part).clamp(-0.5, 0.5) * self.steps
+        return self.place[pixel] + offset.round().long(), pixel
+
+
+class PositionTable:
+    """The nearest known pixels of all rounded positions of a mask with a period.
+
+    Args:
+        known: the mask, bool.
+        neighbors: how many pixels are kept for a position.
+        steps: positions per pixel and axis.
+        search: finds flat indices (neighbors, n) for pixels (2, n), (x, y), and offsets (2, n), on the CPU.
+        device: of the mask.
+
+    Raises:
+        ValueError: the mask has no period.
+    """
+
+    def __init__(
+        self,
+        known: np.ndarray,
+        neighbors: int,
+        steps: int,
+        search: Callable[[Tensor, Tensor], Tensor],
+        device: str,
+    ) -> None:
+        height, self.width = known.shape
+        period = _period(known), _period(known.T)
+        if not all(period):
+            raise ValueError(
+                f"mask: expected a pattern that repeats along rows and columns for steps={steps}, got one that does "
+                "not: its table would be larger than the picture is worth"
+            )
+        margin = _margin(known, period, neighbors)
+        self.rows = TableAxis(height, period[0], margin, steps, device)
+        self.columns = TableAxis(self.width, period[1], margin, steps, device)
+        (y, y_offset), (x, x_offset) = self.rows.positions(), self.columns.positions()
+        self.columns_length = len(x)
+        cell = torch.stack([x.repeat(len(y)), y.repeat_interleave(len(x))])
+        part = torch.stack([x_offset.repeat(len(y)), y_offset.repeat_interleave(len(x))])
+        parts = zip(cell.split(_CHUNK, dim=1), part.split(_CHUNK, dim=1), strict=True)
+        nearest = torch.cat([search(*pair).int() for pair in parts], dim=1)
+        self.shift = (nearest - (cell[1] * self.width + cell[0])).int().to(device)  # from the pixel to its neighbours
+
+    def find(self, cell: Tensor, part: Tensor) -> Tensor:
+        """Flat indices (neighbors, n) for cell + part, (2, n)."""
+        column, x = self.columns.find(cell[0], part[0])
+        row, y = self.rows.find(cell[1], part[1])
+        return self.shift.index_select(1, row * self.columns_length + column) + (y * self.width + x)
+
+
+def _period(known: np.ndarray) -> int:
+    """Return the smallest shift along the first axis that maps a mask on itself, 0 if it does not repeat in full."""
+    if len(known) == 1:
+        return 1
+    return next((shift for shift in range(1, len(known) // 2 + 1) if (known[shift:] == known[:-shift]).all()), 0)
+
+
+def _margin(known: np.ndarray, period: tuple[int, int], neighbors: int) -> int:
+    """Return how far from a pixel of the picture its nearest known pixels can be."""
+    height, width = known.shape
+    density = np.count_nonzero(known[: period[0], : period[1]])
+    for reach in range(1, max(height, width) + 1):
+        # a square of this side, with the pixel in its corner, lies inside the picture or spans it
+        cells = (min(reach, height) // period[0]) * (min(reach, width) // period[1])
+        if cells * density >= neighbors:
+            return int(np.ceil(reach * 2**0.5)) + 1
+    return max(height, width)
