@@ -1,0 +1,118 @@
+"""What the operators do at the extremes of physics and floating point: ``spikekit extremes`` prints the table.
+
+Every row is an operator at an extreme in one dtype on one device: the worst error against a brute-force reference
+(:mod:`spikekit.extremes.reference`), the bound that is asserted and where it comes from, and whether values and
+gradients are finite, or which other outcome is the documented one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import nullcontext
+from itertools import groupby
+
+import torch
+
+from spikekit.extremes import autograd, light, sizes, spikes, warp
+from spikekit.extremes.table import BITS, FLOATS, Case, Row, short
+
+__all__ = ["CASES", "Case", "Row", "add_arguments", "devices", "markdown", "rows", "run", "text"]
+
+CASES: list[Case] = [*light.CASES, *spikes.CASES, *warp.CASES, *sizes.CASES, *autograd.CASES]
+_DTYPES = [short(dtype) for dtype in (*FLOATS, *BITS)]
+
+
+def devices() -> list[str]:
+    """Return ``"cpu"``, and ``"cuda"`` where there is one."""
+    return ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+
+
+def operators() -> list[str]:
+    """Return the names of the operators in the table, in its order."""
+    return list(dict.fromkeys(case.operator for case in CASES))
+
+
+def rows(on: Iterable[str] | None = None, operator: str | None = None) -> Iterator[Row]:
+    """Yield the rows as they are measured, one device and one operator after the other.
+
+    Args:
+        on: the devices; all there are when not given.
+        operator: only this one.
+    """
+    for device in devices() if on is None else on:
+        for name in operators() if operator is None else [operator]:
+            for case in CASES:
+                if case.operator == name:
+                    yield from (case.row(dtype, device) for dtype in case.dtypes)
+
+
+def _lines(table: Iterable[Row]) -> Iterator[tuple[str, list[str]]]:
+    """Yield a title and a heading for each operator and device, then a line for each extreme, its dtypes abreast."""
+    for (operator, device), of_operator in groupby(table, key=lambda row: (row.operator, row.device)):
+        used = {short(dtype) for case in CASES if case.operator == operator for dtype in case.dtypes}
+        dtypes = [dtype for dtype in _DTYPES if dtype in used]
+        yield f"{operator} on {device}", ["extreme", *dtypes, "values", "gradients", "largest error allowed"]
+        for extreme, group in groupby(of_operator, key=lambda row: row.extreme):
+            line = list(group)
+            errors = {row.dtype: f"{row.error:.2g}{'' if row.passed else ' FAILS'}" for row in line}
+            outcomes = ["/".join(dict.fromkeys(getattr(row, name) for row in line)) for name in ("values", "gradients")]
+            yield "", [extreme, *(errors.get(dtype, "") for dtype in dtypes), *outcomes, line[0].bound]
+
+
+def text(table: Iterable[Row]) -> Iterator[str]:
+    """Yield the table as aligned lines, each as soon as its rows are there."""
+    first = max(len(case.extreme) for case in CASES)
+    for title, (extreme, *cells, bound) in _lines(table):
+        if title:
+            yield f"\n{title}"
+        yield f"  {extreme:{first}}  {'  '.join(f'{cell:9}' for cell in cells)}  {bound}"
+
+
+def markdown(table: Iterable[Row]) -> Iterator[str]:
+    """Yield the table as Markdown, a heading for each operator."""
+    for title, cells in _lines(table):
+        if title:
+            yield f"\n## {title}\n"
+        yield f"| {' | '.join(cells)} |"
+        if title:
+            yield "|" + " --- |" * len(cells)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``spikekit extremes``."""
+    parser.add_argument("--operator", choices=operators(), metavar="NAME", help="only the rows of this one")
+    parser.add_argument("--device", choices=devices(), help="only on this one; on all there are if not given")
+    parser.add_argument("--markdown", action="store_true", help="as Markdown")
+    parser.add_argument("-o", "--output", metavar="FILE", help="where to write the table; printed if not given")
+
+
+def run(args: argparse.Namespace) -> None:
+    """Print the table of extremes.
+
+    Raises:
+        ValueError: an error is larger than its bound, or an outcome is not the documented one.
+    """
+    measured: list[Row] = []
+
+    def noted(table: Iterable[Row]) -> Iterator[Row]:
+        for row in table:
+            measured.append(row)
+            yield row
+
+    table = noted(rows([args.device] if args.device else None, args.operator))
+    with open(args.output, "w", encoding="utf-8") if args.output else nullcontext(sys.stdout) as file:
+        for line in (markdown if args.markdown else text)(table):
+            print(line, file=file, flush=True)
+    failing = [row for row in measured if not row.passed]
+    for row in failing:
+        print(_why(row), file=sys.stderr)  # noqa: T201
+    if failing:
+        raise ValueError(f"{len(failing)} of {len(measured)} rows fail")
+    print(f"{len(measured)} rows, none fails", file=sys.stderr)  # noqa: T201
+
+
+def _why(row: Row) -> str:
+    what = row.trouble or f"{row.error:.3g} > {row.limit:.3g}, or values {row.values}, gradients {row.gradients}"
+    return f"{row.operator}, {row.extreme}, {row.dtype} on {row.device}: {what}"

@@ -1,0 +1,166 @@
+"""No item in a batch, many leading dimensions, every memory layout, and a stream as large as a camera's."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from spikekit.extremes.operators import OPERATORS, Operator
+from spikekit.extremes.table import Cases, Measured, differ, state, ulps, worst
+
+CASES = Cases()
+
+_FLOAT32 = (torch.float32,)
+
+
+def _run(operator: Operator, tensors: tuple[Tensor, ...], device: torch.device) -> tuple[list[Tensor], list[Tensor]]:
+    """Results, and gradients of their sum by the inputs, which keep their strides."""
+    # a view of a leaf, so that the operator sees the strides of the input
+    leaves = [tensor.to(device).requires_grad_() for tensor in tensors]
+    results = operator.results(*leaves)
+    tracked = [result for result in results if result.requires_grad]
+    if not tracked:
+        return list(results), []
+    total = sum((result.sum() for result in tracked), torch.zeros((), device=device))
+    return [result.detach() for result in results], list(torch.autograd.grad(total, leaves))
+
+
+def _measured(error: float, results: list[Tensor], grads: list[Tensor]) -> Measured:
+    return Measured(error, state(*results), state(*grads) if grads else "-")
+
+
+def _empty_batch(operator: Operator, dtype: torch.dtype, device: torch.device) -> Measured:
+    one = [tensor.to(dtype) for tensor in operator.example((1,))]
+    none = tuple(tensor.narrow(operator.axis_in, 0, 0) for tensor in one)
+    expected, _ = _run(operator, tuple(one), device)
+    results, grads = _run(operator, none, device)
+    error = sum(
+        differ(result, like.narrow(operator.axis_out, 0, 0)) for result, like in zip(results, expected, strict=True)
+    )
+    error += sum(differ(grad, tensor) for grad, tensor in zip(grads, none, strict=False))
+    return _measured(error, results, grads)
+
+
+def _leading(operator: Operator, dtype: torch.dtype, device: torch.device) -> Measured:
+    """(2, 1, 3, ...) is six times the same as one."""
+    tensors = [tensor.to(dtype) for tensor in operator.example((2, 1, 3))]
+    results, grads = _run(operator, tuple(tensors), device)
+    error, into, out = 0.0, operator.axis_in, operator.axis_out
+    for i in range(2):
+        for j in range(3):
+            alone, alone_grads = _run(operator, tuple(_item(tensor, into, i, j) for tensor in tensors), device)
+            error += sum(differ(_item(all_, out, i, j), one) for all_, one in zip(results, alone, strict=True))
+            error += sum(differ(_item(all_, into, i, j), one) for all_, one in zip(grads, alone_grads, strict=True))
+    return _measured(error, results, grads)
+
+
+def _item(tensor: Tensor, axis: int, i: int, j: int) -> Tensor:
+    return tensor.select(axis + 2, j).select(axis + 1, 0).select(axis, i)
+
+
+def _same(operator: Operator, views: list[Tensor], device: torch.device) -> Measured:
+    """A view gives what its contiguous copy gives, in ulp of the largest number."""
+    expected, expected_grads = _run(operator, tuple(view.contiguous().clone() for view in views), device)
+    results, grads = _run(operator, tuple(view.detach() for view in views), device)
+    errors = [
+        ulps(got, like.cpu(), like.cpu().abs().max().double().expand(like.shape))
+        for got, like in zip([*results, *grads], [*expected, *expected_grads], strict=True)
+    ]
+    return _measured(worst(*errors), results, grads)
+
+
+def _strided(operator: Operator, dtype: torch.dtype, device: torch.device) -> Measured:
+    wide = [tensor.to(dtype) for tensor in operator.example((2,), (12, 8))]
+    views = [tensor.mT[..., ::2, ::2].flip(operator.axis_in) for tensor in wide]
+    reversed_ = [view.movedim(operator.axis_in, -1).contiguous().movedim(-1, operator.axis_in) for view in views]
+    return _same(operator, reversed_, device)
+
+
+def _expanded(operator: Operator, dtype: torch.dtype, device: torch.device) -> Measured:
+    one = [tensor.to(dtype) for tensor in operator.example((1,))]
+    shapes = [[*tensor.shape] for tensor in one]
+    for shape in shapes:
+        shape[operator.axis_in] = 3
+    return _same(operator, [tensor.expand(shape) for tensor, shape in zip(one, shapes, strict=True)], device)
+
+
+def _channels_last(operator: Operator, dtype: torch.dtype, device: torch.device) -> Measured:
+    tensors = [tensor.to(dtype) for tensor in operator.example((2,))]
+    last = [tensor.movedim(-3, -1).contiguous().movedim(-1, -3) for tensor in tensors]
+    return _same(operator, last, device)
+
+
+_EXACT: dict[str, Any] = {"bound": "0: bit for bit"}
+_IN_ANY_ORDER: dict[str, Any] = {"limit": 4.0, "bound": "4 ulp: the order of sums is free"}
+
+for _operator in OPERATORS:
+    _gradients = "-" if _operator.name == "spike_interval" else "finite"
+    _layout = _IN_ANY_ORDER if _operator.name.startswith("flow_warp") else _EXACT
+    for _extreme, _measure, _bound in (
+        ("batch of 0", _empty_batch, _EXACT),
+        ("leading dimensions (2, 1, 3)", _leading, _EXACT),
+        ("non-contiguous", _strided, _layout),
+        ("expanded", _expanded, _layout),
+        ("channels last", _channels_last, _layout),
+    ):
+        CASES.add(_operator.name, _extreme, _FLOAT32, gradients=_gradients, **_bound)(partial(_measure, _operator))
+
+
+_PEAK = """
+import torch, spikekit as sk
+def peak():
+    return next(int(line.split()[1]) * 1024 for line in open("/proc/self/status") if line.startswith("VmHWM"))
+def call(stream):
+    return {call}
+call(torch.zeros(3, 4, 4, dtype={dtype}))
+stream = {stream}
+before = peak()
+result = call(stream)
+print((peak() - before - result.nbytes) / result.numel())
+"""
+_PEAK_ON_CUDA = """
+import torch, spikekit as sk
+def call(stream):
+    return {call}
+stream = {stream}.to("cuda")
+torch.cuda.reset_peak_memory_stats()
+before = torch.cuda.memory_allocated()
+result = call(stream)
+print((torch.cuda.max_memory_allocated() - before - result.nbytes) / result.numel())
+"""
+_BITS = "(torch.arange(1000000).reshape(1000, 1000) % 3 == 0).to(torch.uint8).expand(400, 1000, 1000)"
+
+
+def _memory(call: str, stream: str, dtype: torch.dtype, device: torch.device) -> Measured:
+    """Bytes a pixel that an operator takes beside its input and its result, in a process of its own."""
+    code = _PEAK_ON_CUDA if device.type == "cuda" else _PEAK
+    code = code.format(call=call, stream=stream, dtype=dtype)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(done.stderr.strip().splitlines()[-1] if done.stderr else f"exit status {done.returncode}")
+    return Measured(max(float(done.stdout), 0.0), "finite")
+
+
+_STREAM: dict[str, Any] = {"limit": 1.0, "bound": "1 byte a pixel beside input and result", "gradients": "-"}
+if Path("/proc/self/status").exists():
+    for _name, _call in {
+        "spike_interval": "sk.spike_interval(stream)",
+        "tfi": "sk.tfi(stream, 255.0, dtype=torch.uint8)",
+        "tfp": "sk.tfp(stream, 41, 255.0, dtype=torch.uint8)",
+    }.items():
+        CASES.add(_name, "1000 x 1000 x 400 stream", (torch.uint8,), slow=True, **_STREAM)(
+            partial(_memory, _call, _BITS)
+        )
+    CASES.add("spike_integrate_fire", "1000 x 1000 x 400 stream", _FLOAT32, slow=True, **_STREAM)(
+        partial(
+            _memory,
+            "sk.spike_integrate_fire(stream, dtype=torch.uint8)[0]",
+            "torch.linspace(0, 1, 1000000).reshape(1000, 1000).expand(400, 1000, 1000)",
+        )
+    )

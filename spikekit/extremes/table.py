@@ -1,0 +1,176 @@
+"""One row of the table: an operator at an extreme, in one dtype, on one device, and what is asserted of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+HALVES = (torch.bfloat16, torch.float16)
+FLOATS = (torch.float64, torch.float32, *HALVES)
+BITS = (torch.bool, torch.uint8)
+
+Limit = float | Callable[[torch.dtype], float]
+
+
+class Measured(NamedTuple):
+    """What one run of a case found.
+
+    Attributes:
+        error: the worst error, in the unit that the case names; NaN where a number was expected and none came.
+        values: ``"finite"``, ``"Inf"``, ``"NaN"``, or another outcome such as the name of an exception.
+        gradients: the same; ``"-"`` where there are none.
+    """
+
+    error: float
+    values: str
+    gradients: str = "-"
+
+
+Measure = Callable[[torch.dtype, torch.device], Measured]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table, with its verdict."""
+
+    operator: str
+    extreme: str
+    dtype: str
+    device: str
+    error: float
+    limit: float
+    bound: str
+    values: str
+    gradients: str
+    passed: bool
+    trouble: str = ""
+
+
+@dataclass(frozen=True)
+class Case:
+    """An operator at an extreme, in one or more dtypes.
+
+    Attributes:
+        operator: name of the public function.
+        extreme: what is extreme about it, in words.
+        dtypes: in which types it is measured.
+        measure: runs it in one dtype on one device.
+        limit: the error that is allowed, or a function of the dtype that gives it.
+        bound: the same in words, with its unit and where it comes from.
+        values: which outcome of the values is right.
+        gradients: which outcome of the gradients is right; bool and uint8 have none.
+        slow: takes seconds.
+    """
+
+    operator: str
+    extreme: str
+    dtypes: tuple[torch.dtype, ...]
+    measure: Measure
+    limit: Limit
+    bound: str
+    values: str
+    gradients: str
+    slow: bool
+
+    def row(self, dtype: torch.dtype, device: torch.device | str = "cpu") -> Row:
+        """Measure, and compare with what is allowed; an exception that is not expected is a row that fails."""
+        device = torch.device(device)
+        limit = self.limit(dtype) if callable(self.limit) else self.limit
+        trouble = ""
+        try:
+            measured = self.measure(dtype, device)
+        except Exception as error:
+            measured = Measured(float("nan"), type(error).__name__)
+            trouble = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        expected = self.values, self.gradients if dtype.is_floating_point else "-"
+        right = measured.error <= limit and (measured.values, measured.gradients) == expected
+        return Row(
+            self.operator, self.extreme, short(dtype), device.type, measured.error, limit, self.bound,
+            measured.values, measured.gradients, right, trouble,
+        )  # fmt: skip
+
+
+class Cases(list[Case]):
+    """The cases of a family."""
+
+    def add(
+        self,
+        operator: str,
+        extreme: str,
+        dtypes: Iterable[torch.dtype] = FLOATS,
+        *,
+        limit: Limit = 0.0,
+        bound: str = "0: bit for bit",
+        values: str = "finite",
+        gradients: str = "finite",
+        slow: bool = False,
+    ) -> Callable[[Measure], Measure]:
+        """Add the decorated ``measure(dtype, device)``, see :class:`Case`."""
+
+        def add(measure: Measure) -> Measure:
+            self.append(Case(operator, extreme, tuple(dtypes), measure, limit, bound, values, gradients, slow))
+            return measure
+
+        return add
+
+
+def short(dtype: torch.dtype) -> str:
+    """Return ``"float32"`` for ``torch.float32``."""
+    return str(dtype).removeprefix("torch.")
+
+
+def state(*tensors: Tensor) -> str:
+    """Return the worst of ``"finite"``, ``"Inf"`` and ``"NaN"`` that is among the numbers."""
+    numbers = [tensor.detach().double().flatten() for tensor in tensors]
+    if any(number.isnan().any() for number in numbers):
+        return "NaN"
+    return "Inf" if any(number.isinf().any() for number in numbers) else "finite"
+
+
+def differ(got: Tensor, expected: Tensor) -> float:
+    """Count the elements that are not the same number (NaN equals NaN); infinite where the shapes differ."""
+    got, expected = got.detach().double().cpu(), expected.detach().double().cpu()
+    if got.shape != expected.shape:
+        return float("inf")
+    return float(((got != expected) & ~(got.isnan() & expected.isnan())).sum())
+
+
+def ulps(got: Tensor, exact: Tensor, scale: Tensor | None = None) -> float:
+    """Return the worst error of ``got`` in units in the last place, of its own dtype, at ``exact`` or at ``scale``."""
+    info = torch.finfo(got.dtype)
+    got, exact = got.detach().double().cpu(), exact.double()
+    if got.shape != exact.shape:
+        return float("inf")
+    _, exponent = torch.frexp((exact if scale is None else scale).abs())
+    ulp = torch.ldexp(torch.full_like(exact, info.eps), exponent - 1).clamp(min=info.tiny * info.eps)
+    error = torch.where(got == exact, 0.0, (got - exact).abs() / ulp)  # infinity is equal to infinity
+    return float(error.max()) if error.numel() else 0.0
+
+
+def rounded_once(noise: float) -> Callable[[torch.dtype], float]:
+    """Allow ``noise`` ulp in float64 and float32; in half precision half an ulp, and the noise of float32."""
+
+    def limit(dtype: torch.dtype) -> float:
+        if dtype not in HALVES:
+            return noise
+        return 0.5 + noise * torch.finfo(torch.float32).eps / torch.finfo(dtype).eps
+
+    return limit
+
+
+def worst(*errors: float) -> float:
+    """Return the largest, NaN being larger than any."""
+    return max(errors, key=lambda error: (error != error, error))
+
+
+def outcome_of(error: type[Exception], call: Callable[[], object]) -> Measured:
+    """Return the name of the exception that ``call`` raises where it is the one that is expected."""
+    try:
+        call()
+    except error as raised:
+        return Measured(0.0, type(raised).__name__)
+    return Measured(float("nan"), "no error")
