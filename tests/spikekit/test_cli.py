@@ -215,6 +215,16 @@ def test_decode_reads_only_what_it_needs(tmp_path, monkeypatch, words, expected)
     assert [tuple(part) for part in read] == expected
 
 
+def test_decode_reads_an_array_once(tmp_path, monkeypatch):
+    """Every way into an .npz begins at its start."""
+    calls = []
+    monkeypatch.setattr(cli, "iter_spikes", lambda *_, **__: calls.append(__) or iter_spikes(*_, **__))
+    write_spikes(tmp_path / "a.npz", torch.ones(90, 2, 4))
+    words = ["--method", "tfp", "--window", "3", "--frame", "10:90:20", "--alpha", "1"]
+    assert main(["decode", str(tmp_path / "a.npz"), *words, "-o", str(tmp_path / "{frame}.png")]) == 0
+    assert [call["start"] for call in calls] == [9]
+
+
 @pytest.mark.parametrize("name", ["a.dat", "a.npz"])
 @pytest.mark.parametrize("method", ["tfi", "tfp"])
 @pytest.mark.parametrize("frames", ["0:500:83", "240:260:7", ":3", "498:", "17:18"])
