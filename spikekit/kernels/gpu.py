@@ -1,0 +1,305 @@
+"""The sensor and the decoders on a GPU (CUDA or ROCm): fused Triton kernels; with those of the warp, all there are.
+
+Every public function takes the arguments of the custom operator of the same name and gives what its torch path gives,
+in the memory layout of ``torch.empty_like``. It returns ``NotImplemented`` where the torch path is to run instead.
+
+Streams are seen as (B, T, P): batch, time, pixel. A program has a block of the pixels of one stream and loops over
+time. Quotients are rounded as IEEE 754 asks and products are not fused with sums: Triton's defaults would move spikes.
+"""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from spikekit.kernels.gpu_parts import launch, my_pixels, store, wide_dtype
+from spikekit.kernels.gpu_warp import nearest_known, weighted_dot, weighted_gather, weighted_scatter
+
+__all__ = [
+    "integrate_fire",
+    "integrate_fire_grad",
+    "nearest_known",
+    "spike_interval",
+    "tfi",
+    "tfi_grad",
+    "tfp",
+    "tfp_grad",
+    "weighted_dot",
+    "weighted_gather",
+    "weighted_scatter",
+]
+
+BLOCK = 512  # pixels of a program: four a thread, so that a thread reads four bytes or more at a time
+STAGES = tl.constexpr(4)  # frames on their way from memory while one is worked on
+
+
+def _bytes(tensor: Tensor) -> Tensor:
+    """A bool tensor as what it is in memory; Triton would take it for single bits."""
+    return tensor.view(torch.uint8) if tensor.dtype is torch.bool else tensor
+
+
+def _flat(stream: Tensor) -> Tensor:
+    """(*, T, H, W) as (B, T, P); a view where strides allow it."""
+    return _bytes(stream.detach()).reshape(stream.shape[:-3].numel(), stream.shape[-3], stream.shape[-2:].numel())
+
+
+def _scalar(value: float, like: Tensor, dtype: torch.dtype) -> Tensor:
+    """A number in memory: as an argument Triton would round it to float32."""
+    return torch.full((), value, dtype=dtype, device=like.device)
+
+
+def _as(layout: Tensor, result: Tensor) -> Tensor:
+    """The contiguous ``result`` in the shape and the memory layout of ``torch.empty_like(layout)``."""
+    if torch.empty_like(layout, device="meta").is_contiguous():
+        return result.reshape(layout.shape)
+    return torch.empty_like(layout, dtype=result.dtype).copy_(result.reshape(layout.shape))
+
+
+def _blocks(stream: Tensor) -> int:
+    return stream.shape[0] * triton.cdiv(stream.shape[2], BLOCK)
+
+
+@triton.jit
+def _divide(a, b):
+    """IEEE division; the plain one is approximate in float32."""
+    if a.dtype == tl.float64:
+        return a / b
+    else:  # noqa: RET505 - Triton compiles the branch that is taken, and only that one
+        return tl.div_rn(a, b)
+
+
+@triton.jit(do_not_specialize=["frames"])
+def _integrate_fire_kernel(
+    light, threshold, charge, spikes, left, frames, pixels, light_b, light_t, light_p, block: tl.constexpr
+):
+    """Integrate the light of a block of pixels, clock after clock: one read of the light, one write of the spikes."""
+    b, pixel, inside = my_pixels(pixels, block)
+    light += b * light_b + pixel * light_p
+    light_t = tl.cast(light_t, tl.int64)
+    pixels = tl.cast(pixels, tl.int64)
+    spikes += b * frames * pixels + pixel
+    theta = tl.load(threshold)
+    rest = tl.load(charge + b * pixels + pixel, mask=inside, other=0)
+    for t in tl.range(frames, num_stages=STAGES):
+        full = rest + tl.load(light + t * light_t, mask=inside, other=0).to(theta.dtype)
+        fired = full >= theta
+        if spikes.dtype.element_ty == tl.uint8:
+            tl.store(spikes + t * pixels, fired.to(tl.uint8), mask=inside)
+        else:
+            store(spikes + t * pixels, fired.to(theta.dtype), inside)
+        rest = tl.where(fired, full - theta, full)
+        remainder = full - tl.floor(_divide(full, theta)) * theta
+        remainder = tl.where((remainder >= 0) & (remainder < theta), remainder, 0)
+        rest = tl.where(rest >= theta, remainder, rest)
+    tl.store(left + b * pixels + pixel, rest, mask=inside)
+
+
+def integrate_fire(light: Tensor, threshold: float, charge: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Two passes over memory: light in, spikes out."""
+    flat, start = _flat(light), charge.detach().contiguous()
+    spikes, left = flat.new_empty(flat.shape, dtype=dtype), torch.empty_like(start)
+    theta = _scalar(threshold, light, charge.dtype)
+    sizes = *flat.shape[1:], *flat.stride()
+    launch(_integrate_fire_kernel, _blocks(flat), flat, theta, start, _bytes(spikes), left, *sizes, block=BLOCK)
+    return _as(light, spikes), _as(charge, left)
+
+
+@triton.jit
+def _integrate_fire_grad_kernel(grad, light, threshold, result, size, block: tl.constexpr):
+    """A block of elements: two reads, one write."""
+    _, element, inside = my_pixels(size, block)
+    theta = tl.load(threshold)
+    value = tl.load(light + element, mask=inside, other=0).to(theta.dtype)
+    share = _divide(tl.load(grad + element, mask=inside, other=0).to(theta.dtype), theta)
+    linear = (value >= 0) & (value <= theta)
+    store(result + element, tl.where(linear, share, 0), inside)
+
+
+def integrate_fire_grad(grad: Tensor, light: Tensor, threshold: float) -> Tensor:
+    """Three passes over memory: gradient and light in, gradient out."""
+    flat, light = grad.detach().contiguous(), light.detach().contiguous()
+    result = torch.empty_like(flat)
+    arguments = flat, light, _scalar(threshold, light, wide_dtype(light)), result, result.numel()
+    launch(_integrate_fire_grad_kernel, triton.cdiv(result.numel(), BLOCK), *arguments, block=BLOCK)
+    return _as(grad, result)
+
+
+@triton.jit(do_not_specialize=["frames"])
+def _interval_kernel(
+    spikes, interval, light, max_range, frames, pixels, spikes_b, spikes_t, spikes_p,
+    as_light: tl.constexpr, block: tl.constexpr,
+):  # fmt: skip
+    """Intervals of a block of pixels in two sweeps, or, with as_light, max_range over them.
+
+    Backwards reads the spikes and leaves the next spike of every frame in ``interval``; forwards, which knows the last
+    one, turns it into the result. So memory is read twice and written twice.
+    """
+    b, pixel, inside = my_pixels(pixels, block)
+    spikes += b * spikes_b + pixel * spikes_p
+    spikes_t = tl.cast(spikes_t, tl.int64)
+    pixels = tl.cast(pixels, tl.int64)
+    interval += b * frames * pixels + pixel
+    light += b * frames * pixels + pixel
+
+    following = tl.zeros([block], tl.int32) + frames  # T where there is none
+    first = tl.zeros([block], tl.int32)  # the first complete interval
+    for i in tl.range(frames, num_stages=STAGES):
+        n = frames - 1 - i
+        fired = tl.load(spikes + n * spikes_t, mask=inside, other=0) != 0
+        first = tl.where(fired & (following < frames), following - n, first)
+        following = tl.where(fired, n, following)
+        tl.store(interval + n * pixels, following.to(interval.dtype.element_ty), mask=inside)
+
+    tl.debug_barrier()  # what one thread has stored, another may load
+    white = tl.load(max_range)
+    previous = tl.zeros([block], tl.int32) - 1  # -1 where there is none
+    last = tl.zeros([block], tl.int32)  # the latest complete interval
+    for n in tl.range(frames, num_stages=STAGES):
+        following = tl.load(interval + n * pixels, mask=inside, other=0).to(tl.int32)
+        fired = following == n
+        complete = tl.where(previous < 0, first, tl.where(following < frames, 0, last))
+        observed = tl.maximum(following - previous, complete)
+        last = tl.where(fired & (previous >= 0), n - previous, last)
+        previous = tl.where(fired, n, previous)
+        if as_light:
+            observed = tl.maximum(observed, 1).to(white.dtype)  # pixels beyond the picture have 0
+            store(light + n * pixels, _divide(white, observed), inside)
+        else:
+            tl.store(interval + n * pixels, observed.to(interval.dtype.element_ty), mask=inside)
+
+
+def _intervals(spikes: Tensor, max_range: float = 1.0, dtype: torch.dtype | None = None) -> Tensor:
+    flat = _flat(spikes)
+    interval = flat.new_empty(flat.shape, dtype=torch.int16 if flat.shape[1] < 32767 else torch.int32)
+    light = interval if dtype is None else flat.new_empty(flat.shape, dtype=dtype)
+    white = _scalar(max_range, flat, wide_dtype(light))
+    sizes = *flat.shape[1:], *flat.stride()
+    constants = {"as_light": dtype is not None, "block": BLOCK}
+    launch(_interval_kernel, _blocks(flat), flat, interval, light, white, *sizes, **constants)
+    return _as(spikes, light)
+
+
+def spike_interval(spikes: Tensor) -> Tensor:
+    """Read the spikes once, write the intervals twice and read them once."""
+    return _intervals(spikes)
+
+
+def tfi(spikes: Tensor, max_range: float, dtype: torch.dtype) -> Tensor:
+    """Read the spikes once, write and read the next spike as int16, and write the light once."""
+    return _intervals(spikes, max_range, dtype)
+
+
+@triton.jit(do_not_specialize=["frames"])
+def _tfi_grad_kernel(
+    grad, spikes, rate, sums, result, frames, pixels,
+    grad_b, grad_t, grad_p, spikes_b, spikes_t, spikes_p, rate_b, rate_t, rate_p, block: tl.constexpr,
+):  # fmt: skip
+    """Gradient of a block of pixels in two sweeps: forwards sums every interval, backwards spreads what is complete."""
+    b, pixel, inside = my_pixels(pixels, block)
+    grad += b * grad_b + pixel * grad_p
+    spikes += b * spikes_b + pixel * spikes_p
+    rate += b * rate_b + pixel * rate_p
+    grad_t, spikes_t, rate_t = tl.cast(grad_t, tl.int64), tl.cast(spikes_t, tl.int64), tl.cast(rate_t, tl.int64)
+    pixels = tl.cast(pixels, tl.int64)
+    sums += b * frames * pixels + pixel
+    result += b * frames * pixels + pixel
+
+    total = tl.zeros([block], sums.dtype.element_ty)
+    spread = total
+    for n in tl.range(frames, num_stages=STAGES):
+        spread = total + tl.load(grad + n * grad_t, mask=inside, other=0).to(total.dtype)
+        tl.store(sums + n * pixels, spread, mask=inside)
+        fired = tl.load(spikes + n * spikes_t, mask=inside, other=0) != 0
+        total = tl.where(fired, 0, spread)
+
+    tl.debug_barrier()  # what one thread has stored, another may load
+    for i in tl.range(frames, num_stages=STAGES):
+        n = frames - 1 - i
+        fired = tl.load(spikes + n * spikes_t, mask=inside, other=0) != 0
+        spread = tl.where(fired, tl.load(sums + n * pixels, mask=inside, other=0), spread)
+        share = spread * tl.load(rate + n * rate_t, mask=inside, other=0).to(spread.dtype)
+        store(result + n * pixels, share, inside)
+
+
+def tfi_grad(grad: Tensor, spikes: Tensor, rate: Tensor) -> Tensor:
+    """Sum the gradient over every interval, spread the sum on it, and weigh it by the rate."""
+    flat, fired, rates = _flat(grad), _flat(spikes), _flat(rate)
+    result = fired.new_empty(fired.shape, dtype=spikes.dtype)
+    wide = wide_dtype(grad, spikes)
+    sums = result if result.dtype is wide else result.new_empty(result.shape, dtype=wide)
+    sizes = *flat.shape[1:], *flat.stride(), *fired.stride(), *rates.stride()
+    launch(_tfi_grad_kernel, _blocks(flat), flat, fired, rates, sums, result, *sizes, block=BLOCK)
+    return _as(spikes, result)
+
+
+@triton.jit
+def _window_size(n, half, frames):
+    """Number of frames that exist in the window around frame n."""
+    return tl.minimum(n + half, frames - 1) - tl.maximum(n - half, 0) + 1
+
+
+@triton.jit
+def _term(
+    values, n, exists, frames, step, half, max_range, pixel, pixels, counter: tl.constexpr, adjoint: tl.constexpr
+):
+    """What frame n adds to a window, 0 where there is no such frame."""
+    value = tl.load(values + n * step, mask=pixel < tl.where(exists, pixels, 0), other=0).to(counter)
+    if adjoint:
+        value *= max_range / tl.maximum(_window_size(n, half, frames), 1).to(counter)
+    return value
+
+
+@triton.jit(do_not_specialize=["frames", "half"])
+def _window_kernel(
+    values, max_range, result, frames, half, pixels, values_b, values_t, values_p,
+    counter: tl.constexpr, adjoint: tl.constexpr, block: tl.constexpr,
+):  # fmt: skip
+    """Mean over the window around every frame, or its adjoint, by a sum that frames enter and leave.
+
+    Reads every frame twice, as it enters and as it leaves, and writes the result once, whatever the window.
+    """
+    b, pixel, inside = my_pixels(pixels, block)
+    values += b * values_b + pixel * values_p
+    values_t = tl.cast(values_t, tl.int64)
+    pixels = tl.cast(pixels, tl.int64)
+    result += b * frames * pixels + pixel
+    white = tl.load(max_range)
+    total = tl.zeros([block], counter)
+    for n in tl.range(half, num_stages=STAGES):
+        total += _term(values, n, n < frames, frames, values_t, half, white, pixel, pixels, counter, adjoint)
+    for n in tl.range(frames, num_stages=STAGES):
+        enters, leaves = n + half, n - half - 1
+        total += _term(values, enters, enters < frames, frames, values_t, half, white, pixel, pixels, counter, adjoint)
+        total -= _term(values, leaves, leaves >= 0, frames, values_t, half, white, pixel, pixels, counter, adjoint)
+        if adjoint:
+            store(result + n * pixels, total, inside)
+        else:
+            size = _window_size(n, half, frames).to(white.dtype)
+            store(result + n * pixels, _divide(total.to(white.dtype) * white, size), inside)
+
+
+def _windows(values: Tensor, window: int, max_range: Tensor, dtype: torch.dtype, adjoint: bool) -> Tensor:
+    flat = _flat(values)
+    result = flat.new_empty(flat.shape, dtype=dtype)
+    frames, pixels = flat.shape[1:]
+    sizes = frames, min(window // 2, frames), pixels, *flat.stride()
+    if values.is_floating_point():
+        count = tl.float64  # a sum that runs must not forget what is small
+    else:
+        count = tl.int32 if values.dtype in (torch.bool, torch.uint8) else tl.int64
+    constants = {"counter": count, "adjoint": adjoint, "block": BLOCK}
+    launch(_window_kernel, _blocks(flat), flat, max_range, result, *sizes, **constants)
+    return _as(values, result)
+
+
+def tfp(spikes: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Tensor:
+    """Read the spikes twice and write the light once, whatever the window."""
+    wide = torch.float64 if torch.float64 in (spikes.dtype, dtype) else torch.float32
+    return _windows(spikes, window, _scalar(max_range, spikes, wide), dtype, False)
+
+
+def tfp_grad(grad: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Tensor:
+    """Read the gradient twice and write the result once: every frame shares among the frames of its window."""
+    return _windows(grad, window, _scalar(max_range, grad, torch.float64), dtype, True)

@@ -1,0 +1,48 @@
+"""What the GPU kernels have in common."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+
+def launch(kernel: Any, programs: int, *args: Any, **constants: Any) -> None:
+    """Run ``programs`` programs of a kernel on the device of its first argument."""
+    device = args[0].device
+    if programs:
+        with torch.cuda.device(device) if device.type == "cuda" else nullcontext():
+            kernel[(programs,)](*args, **constants, enable_fp_fusion=False)
+
+
+def wide_dtype(*tensors: Tensor) -> torch.dtype:
+    """What to compute in: float64 where one of the tensors is, else float32."""
+    return torch.float64 if torch.float64 in [tensor.dtype for tensor in tensors] else torch.float32
+
+
+@triton.jit
+def my_pixels(pixels, block: tl.constexpr):
+    """Stream of this program, its pixels, and which of them exist; 64 bits, as all that is counted in elements."""
+    blocks = tl.cdiv(pixels, block)
+    program = tl.program_id(0)
+    pixel = (program % blocks).to(tl.int64) * block + tl.arange(0, block)
+    return (program // blocks).to(tl.int64), pixel, pixel < pixels
+
+
+@triton.jit
+def store(pointer, value, mask):
+    """Store floats: to uint8 by rounding half to even and cutting what is beyond, to halves through float32."""
+    if pointer.dtype.element_ty == tl.uint8:
+        value = tl.minimum(tl.maximum(value, 0.0), 255.0)
+        whole = value.to(tl.int32)
+        rest = value - whole.to(value.dtype)
+        up = (rest > 0.5) | ((rest == 0.5) & (whole % 2 == 1))
+        tl.store(pointer, (whole + up.to(tl.int32)).to(tl.uint8), mask=mask)
+    elif pointer.dtype.element_ty == tl.float64:
+        tl.store(pointer, value.to(tl.float64), mask=mask)
+    else:
+        tl.store(pointer, value.to(tl.float32).to(pointer.dtype.element_ty), mask=mask)

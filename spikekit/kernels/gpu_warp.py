@@ -1,0 +1,244 @@
+"""The warp on a GPU: the search of the nearest known pixels, and the weighted gather with its two derivatives.
+
+A picture's positions and planes are long; programs have a block of positions, or a tile of channels and positions.
+"""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+from spikekit.kernels.gpu_parts import launch, my_pixels, store, wide_dtype
+from spikekit.kernels.layout import empty_like_layout, is_channels_last
+
+_BLOCK = 128  # positions that a program searches, one a thread
+_TILE = 1024  # numbers that a program gathers
+_CHANNELS = 8  # of a tile, or _CHANNELS_LAST of them where they lie side by side
+_CHANNELS_LAST = 64
+
+
+@triton.jit
+def _split(flow, pixel):
+    """The nearest whole position to pixel + flow, and what is missing: both exact, whatever the size of the picture.
+
+    Adding 1.5 * 2^52 leaves no room for a fraction, so that the sum is rounded, half to even.
+    """
+    whole = (flow.to(tl.float64) + 6755399441055744.0) - 6755399441055744.0
+    return pixel + whole.to(tl.int64), flow.to(tl.float64) - whole
+
+
+@triton.jit
+def _on_axis(table, length, cell, part, inside):
+    """Position that the table names for cell + part, -1 for none, and its squared distance less a common reference's.
+
+    (p - q)^2 - (r - q)^2 without squaring what is far away; q = cell + part, and r is the cell, moved into the axis.
+    """
+    half = 2 * cell + tl.ceil(2 * part).to(tl.int64)
+    half = tl.minimum(tl.maximum(half, 0), 2 * length - 1)
+    position = tl.load(table + half, mask=inside, other=-1)
+    reference = tl.minimum(tl.maximum(cell, 0), length - 1)
+    step = (position - reference).to(tl.float64)
+    return position, step * (step + 2 * ((reference - cell).to(tl.float64) - part))
+
+
+@triton.jit
+def _distance(index, width, x, x_part, y, y_part):
+    """Distance of a pixel from (x + x_part, y + y_part)."""
+    row = index // width
+    dx = (index - row * width - x).to(tl.float64) - x_part
+    dy = (row - y).to(tl.float64) - y_part
+    return tl.sqrt(dx * dx + dy * dy)
+
+
+@triton.jit(do_not_specialize=["height", "width", "products", "on_rows", "on_columns", "neighbors"])
+def _nearest_known_kernel(
+    flow, rows, columns, index, weight, height, width, products, on_rows, on_columns, neighbors, block: tl.constexpr
+):
+    """Nearest known pixels of a block of positions, one after the other, and their weights.
+
+    The next one is the first, by distance and then by index, of the candidates that come after the last one. A
+    candidate is the i-th nearest row and the j-th nearest column of a product, with i j at most ``neighbors``: any
+    other has as many before it. The flow is read once, the index written and read once, and the weight written once;
+    the tables stay in the cache.
+    """
+    plane = tl.cast(height, tl.int64) * width
+    b, pixel, inside = my_pixels(plane, block)
+    x, x_part = _split(tl.load(flow + 2 * b * plane + pixel, mask=inside, other=0), pixel % width)
+    y, y_part = _split(tl.load(flow + (2 * b + 1) * plane + pixel, mask=inside, other=0), pixel // width)
+    index += b * neighbors * plane + pixel
+    weight += b * neighbors * plane + pixel
+
+    nearest = tl.full([block], -1, tl.int64)
+    last = nearest
+    last_distance = tl.full([block], float("-inf"), tl.float64)
+    for slot in range(neighbors):
+        best = tl.full([block], -1, tl.int64)
+        best_distance = tl.full([block], float("inf"), tl.float64)
+        for i in range(products * on_rows):
+            row, row_distance = _on_axis(rows + i * 2 * height, height, y, y_part, inside)
+            of_product = i // on_rows * on_columns
+            for j in range(of_product, of_product + tl.minimum(on_columns, neighbors // (i % on_rows + 1))):
+                column, column_distance = _on_axis(columns + j * 2 * width, width, x, x_part, inside)
+                distance = row_distance + column_distance
+                candidate = row.to(tl.int64) * width + column
+                ahead = (distance > last_distance) | ((distance == last_distance) & (candidate > last))
+                first = (distance < best_distance) | ((distance == best_distance) & (candidate < best))
+                closer = (row >= 0) & (column >= 0) & ahead & first
+                best = tl.where(closer, candidate, best)
+                best_distance = tl.where(closer, distance, best_distance)
+        nearest = tl.where(nearest < 0, best, nearest)
+        last, last_distance = best, best_distance
+        tl.store(index + slot * plane, tl.where(best < 0, nearest, best), mask=inside)
+
+    tl.debug_barrier()  # what one thread has stored, another may load
+    shortest = _distance(nearest, width, x, x_part, y, y_part)
+    total = tl.zeros([block], tl.float64) + 1
+    for slot in range(1, neighbors):
+        pixel_k = tl.load(index + slot * plane, mask=inside, other=0)
+        distance = _distance(pixel_k, width, x, x_part, y, y_part)
+        total += tl.where(pixel_k == nearest, 0.0, shortest / tl.where(pixel_k == nearest, 1.0, distance))
+    store(weight, 1 / total, inside)
+    for slot in range(1, neighbors):
+        pixel_k = tl.load(index + slot * plane, mask=inside, other=0)
+        distance = _distance(pixel_k, width, x, x_part, y, y_part)
+        ratio = tl.where(pixel_k == nearest, 0.0, shortest / tl.where(pixel_k == nearest, 1.0, distance))
+        store(weight + slot * plane, ratio / total, inside)
+
+
+def nearest_known(flow: Tensor, products: list[tuple[Tensor, Tensor]], neighbors: int) -> tuple[Tensor, Tensor]:
+    """Exact search, in float64: as the operator of the same name without a table of steps.
+
+    ``products`` has the tables of the rows and columns that the mask consists of, int32: for every half of a pixel on
+    the axis, its nearest known positions, (at most ``neighbors``, 2 H) and (at most ``neighbors``, 2 W).
+    """
+    rows, columns = (pad_sequence(list(axis), True, -1).contiguous() for axis in zip(*products, strict=True))
+    batch, _, height, width = flow.shape
+    index = flow.new_empty(batch, neighbors, height * width, dtype=torch.int64)
+    weight = flow.new_empty(index.shape)
+    sizes = height, width, len(products), rows.shape[1], columns.shape[1], neighbors
+    programs = batch * triton.cdiv(height * width, _BLOCK)
+    arguments = flow.detach().contiguous(), rows, columns, index, weight
+    launch(_nearest_known_kernel, programs, *arguments, *sizes, block=_BLOCK)
+    return index, weight
+
+
+@triton.jit
+def _my_tile(channels, points, tile_c: tl.constexpr, tile_q: tl.constexpr):
+    """Picture, channels (a column) and points (a row) of this program; programs of the same points are neighbours."""
+    program = tl.program_id(0)
+    blocks = tl.cdiv(channels, tile_c)
+    c = (program % blocks).to(tl.int64) * tile_c + tl.arange(0, tile_c)[:, None]
+    program = program // blocks
+    blocks = tl.cdiv(points, tile_q)
+    q = (program % blocks).to(tl.int64) * tile_q + tl.arange(0, tile_q)[None, :]
+    return (program // blocks).to(tl.int64), c, q
+
+
+@triton.jit(do_not_specialize=["neighbors"])
+def _gather_kernel(
+    values, index, weight, result, channels, points, neighbors,
+    values_b, values_c, values_p, result_b, result_c, result_q,
+    wide: tl.constexpr, tile_c: tl.constexpr, tile_q: tl.constexpr,
+):  # fmt: skip
+    """Weigh and sum the neighbours of a tile of channels and points: every neighbour is read once a channel."""
+    b, c, q = _my_tile(channels, points, tile_c, tile_q)
+    inside = (c < channels) & (q < points)
+    values += b * values_b + c * values_c
+    total = tl.zeros([tile_c, tile_q], wide)
+    for k in range(neighbors):
+        entry = (b * neighbors + k) * points + q
+        pixel = tl.load(index + entry, mask=q < points, other=0)
+        share = tl.load(weight + entry, mask=q < points, other=0).to(wide)
+        total += tl.load(values + pixel * values_p, mask=inside, other=0).to(wide) * share
+    store(result + b * result_b + c * result_c + q * result_q, total, inside)
+
+
+@triton.jit(do_not_specialize=["neighbors"])
+def _scatter_kernel(
+    grad, index, weight, result, channels, points, neighbors,
+    grad_b, grad_c, grad_q, result_b, result_c, result_p,
+    wide: tl.constexpr, tile_c: tl.constexpr, tile_q: tl.constexpr,
+):  # fmt: skip
+    """Add a tile of channels and points, weighed, to the neighbours: read once, added atomically once a neighbour."""
+    b, c, q = _my_tile(channels, points, tile_c, tile_q)
+    inside = (c < channels) & (q < points)
+    value = tl.load(grad + b * grad_b + c * grad_c + q * grad_q, mask=inside, other=0).to(wide)
+    result += b * result_b + c * result_c
+    for k in range(neighbors):
+        entry = (b * neighbors + k) * points + q
+        pixel = tl.load(index + entry, mask=q < points, other=0)
+        share = tl.load(weight + entry, mask=q < points, other=0).to(wide)
+        tl.atomic_add(result + pixel * result_p, value * share, mask=inside, sem="relaxed")
+
+
+@triton.jit(do_not_specialize=["neighbors"])
+def _dot_kernel(
+    values, grad, index, result, channels, points, neighbors,
+    values_b, values_c, values_p, grad_b, grad_c, grad_q,
+    wide: tl.constexpr, tile_c: tl.constexpr, tile_q: tl.constexpr,
+):  # fmt: skip
+    """Multiply and sum over the channels, for a block of points and one neighbour: both are read once a neighbour."""
+    b, k, q = _my_tile(neighbors, points, 1, tile_q)
+    entry = (b * neighbors + k) * points + q
+    pixel = tl.load(index + entry, mask=q < points, other=0)
+    values += b * values_b + pixel * values_p
+    grad += b * grad_b + q * grad_q
+    total = tl.zeros([tile_c, tile_q], wide)
+    for begin in range(0, channels, tile_c):
+        c = tl.cast(begin, tl.int64) + tl.arange(0, tile_c)[:, None]
+        inside = (c < channels) & (q < points)
+        value = tl.load(values + c * values_c, mask=inside, other=0).to(wide)
+        total += value * tl.load(grad + c * grad_c, mask=inside, other=0).to(wide)
+    store(result + entry, tl.sum(total, axis=0)[None, :], q < points)
+
+
+def _tile(values: Tensor, dtype: torch.dtype) -> dict[str, int | tl.dtype]:
+    """Channels by points of a program, and the type of its sums."""
+    most = _CHANNELS_LAST if is_channels_last(values) else _CHANNELS
+    channels = min(most, triton.next_power_of_2(values.shape[1]))
+    wide = tl.float64 if dtype is torch.float64 else tl.float32
+    return {"tile_c": channels, "tile_q": _TILE // channels, "wide": wide}
+
+
+def _tiles(batch: int, channels: int, points: int, tile: dict[str, int | tl.dtype]) -> int:
+    return batch * triton.cdiv(channels, tile["tile_c"]) * triton.cdiv(points, tile["tile_q"])
+
+
+def weighted_gather(values: Tensor, index: Tensor, weight: Tensor) -> Tensor:
+    """Read every neighbour of every point once, write the sums once."""
+    values, index, weight = values.detach(), index.contiguous(), weight.detach().contiguous()
+    (batch, channels, _), (_, neighbors, points) = values.shape, index.shape
+    result = empty_like_layout(values, points)
+    tile = _tile(values, wide_dtype(values, weight))
+    sizes = channels, points, neighbors, *values.stride(), *result.stride()
+    launch(_gather_kernel, _tiles(batch, channels, points, tile), values, index, weight, result, *sizes, **tile)
+    return result
+
+
+def weighted_scatter(grad: Tensor, index: Tensor, weight: Tensor, size: int) -> Tensor:
+    """Read the gradient once and add it to every neighbour, in any order: not where that order must be the same."""
+    if torch.are_deterministic_algorithms_enabled():
+        return NotImplemented
+    grad, index, weight = grad.detach(), index.contiguous(), weight.detach().contiguous()
+    (batch, channels, points), neighbors = grad.shape, index.shape[1]
+    dtype = wide_dtype(grad, weight)
+    result = empty_like_layout(grad, size).to(dtype).zero_()
+    tile = _tile(grad, dtype)
+    sizes = channels, points, neighbors, *grad.stride(), *result.stride()
+    launch(_scatter_kernel, _tiles(batch, channels, points, tile), grad, index, weight, result, *sizes, **tile)
+    return result.to(grad.dtype)
+
+
+def weighted_dot(values: Tensor, grad: Tensor, index: Tensor) -> Tensor:
+    """Read every neighbour of every point, and the gradient as often, and write the sums once."""
+    values, grad, index = values.detach(), grad.detach(), index.contiguous()
+    (batch, channels, _), (_, neighbors, points) = values.shape, index.shape
+    result = values.new_empty(index.shape, dtype=wide_dtype(values, grad))
+    tile = _tile(values, result.dtype)
+    sizes = channels, points, neighbors, *values.stride(), *grad.stride()
+    programs = batch * neighbors * triton.cdiv(points, tile["tile_q"])
+    launch(_dot_kernel, programs, values, grad, index, result, *sizes, **tile)
+    return result
