@@ -27,7 +27,7 @@ from spikekit.bench.measure import Ratio, Run, Timer, floor_run, interleave, pea
 CASES = {**streams.CASES, **pictures.CASES}
 
 #: Seconds of one case after which no further round is begun.
-CASE_SECONDS = 2.5
+CASE_SECONDS = 1.5
 
 COLUMNS = [
     "operator", "case", "beside", "other / ours", "rounds", "Mpixel/s", "ours / floor", "MiB ours", "MiB other", "equal"

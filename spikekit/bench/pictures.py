@@ -51,7 +51,7 @@ def _flow_warp_idw(setup: Setup) -> Iterator[Case]:
                 note="bilinear, from all pixels: another operation",
             )
         ]
-        if layout == "NCHW":
+        if layout == "NCHW" and (colour == "R" or not backward):  # it takes a second and more
             search = partial(_warp, plain.idw_window, *args, mask=mask, radius=2 * scale + 1)
             others.append(Other("window and topk", lambda: search, _values, tolerance=1e-3))
         return Case(

@@ -175,12 +175,12 @@ def _tfp(setup: Setup) -> Iterator[Case]:
             [Other("plain torch", lambda window=window: partial(plain.tfp, spikes, window))],
         )
     yield Case(
-        f"uint8 {sizes(spikes)} -> uint8 picture, w = 41",
-        lambda: tfp(spikes, 41, 255, dtype=torch.uint8),
+        f"uint8 {sizes(spikes)} -> uint8 picture, w = 11",
+        lambda: tfp(spikes, 11, 255, dtype=torch.uint8),
         spikes.numel(),
         spikes.numel(),
         spikes.numel(),
-        [Other("plain torch", lambda: lambda: (255 * plain.tfp(spikes, 41)).round().to(torch.uint8), tolerance=1)],
+        [Other("plain torch", lambda: lambda: (255 * plain.tfp(spikes, 11)).round().to(torch.uint8), tolerance=1)],
     )
 
 
