@@ -57,7 +57,8 @@ def _lines(table: Iterable[Row]) -> Iterator[tuple[str, list[str]]]:
         for extreme, group in groupby(of_operator, key=lambda row: row.extreme):
             line = list(group)
             errors = {row.dtype: f"{row.error:.2g}{'' if row.passed else ' FAILS'}" for row in line}
-            outcomes = ["/".join(dict.fromkeys(getattr(row, name) for row in line)) for name in ("values", "gradients")]
+            values, gradients = ({getattr(row, name) for row in line} for name in ("values", "gradients"))
+            outcomes = ["/".join(sorted(values)), "/".join(sorted(gradients - {"-"})) or "-"]  # bits have no gradient
             yield "", [extreme, *(errors.get(dtype, "") for dtype in dtypes), *outcomes, line[0].bound]
 
 
