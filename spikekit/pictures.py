@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import torch
 from kornia.color import hsv_to_rgb
+from kornia_rs.io import read_image_png_u16
 from torch import Tensor
 
 from spikekit.check import check_planes, check_positive
@@ -17,8 +20,9 @@ from spikekit.check import check_planes, check_positive
 def read_picture(path: str | Path) -> Tensor:
     """Read a picture file as a colour image.
 
-    Grey pictures get three equal channels, alpha is laid over white, 16-bit files keep their depth. Values stay
-    gamma-encoded as in the file.
+    Grey pictures get three equal channels, 16-bit files keep their depth (where they are grey, or RGB with or without
+    alpha). Alpha is laid over white, as a page shows it; dropping it would bring up colours that nobody was meant to
+    see, and where it is opaque it changes nothing. Values stay gamma-encoded as in the file.
 
     Args:
         path: any file that scikit-image reads (PNG, JPEG, TIFF, ...).
@@ -37,21 +41,38 @@ def read_picture(path: str | Path) -> Tensor:
         ...     read_picture(f"{folder}/grey.png").shape
         torch.Size([3, 4, 6])
     """
-    from skimage import color, io, util
+    from skimage import color, util
 
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such picture")
     try:
-        pixels = util.img_as_float32(io.imread(path))
+        pixels = util.img_as_float32(_pixels(path))
         if pixels.ndim == 3 and pixels.shape[-1] == 4:
             pixels = color.rgba2rgb(pixels)
         elif pixels.ndim == 2 or pixels.shape[-1] == 1:
             pixels = color.gray2rgb(pixels.reshape(pixels.shape[:2]))
     except Exception as error:
-        raise ValueError(f"{path}: not a picture that can be read ({error})") from error
+        said = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ValueError(f"{path}: not a picture that can be read ({said})") from error
     if pixels.ndim != 3 or pixels.shape[-1] != 3 or 0 in pixels.shape:
         raise ValueError(f"{path}: expected a grey or colour picture, got an array of shape {pixels.shape}")
     return torch.from_numpy(pixels.astype("float32")).permute(2, 0, 1).contiguous()
+
+
+def _pixels(path: str | Path) -> np.ndarray:
+    """Read the numbers of a file: (H, W), (H, W, 3) or (H, W, 4), red first, alpha last, in its own depth."""
+    from PIL import Image
+    from skimage import io
+
+    with open(path, "rb") as file:
+        head = file.read(26)
+    if head.startswith(b"\x89PNG") and head[24:] in (b"\x10\x02", b"\x10\x06"):
+        # 16 bits in colour, of which Pillow would keep 8
+        return read_image_png_u16(str(path), "rgb" if head[25] == 2 else "rgba")
+    with suppress(OSError), Image.open(path) as picture:
+        if picture.mode in ("P", "PA", "LA", "CMYK", "YCbCr", "LAB"):
+            return np.asarray(picture.convert("RGBA" if picture.has_transparency_data else "RGB"))
+    return io.imread(path)
 
 
 def write_picture(path: str | Path, image: Tensor) -> None:

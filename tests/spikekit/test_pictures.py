@@ -1,8 +1,12 @@
 """Pictures to files and back, panels, flow as colour."""
 
+import struct
+import zlib
+
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from skimage import io
 
 from spikekit import flow_to_rgb, panel, read_picture, write_picture
@@ -41,6 +45,55 @@ def test_read(tmp_path, pixels, expected):
     assert rgb.dtype == torch.float32
     assert rgb.is_contiguous()
     assert torch.allclose(rgb, torch.tensor(expected, dtype=torch.float32).reshape(3, 1, 1).expand(3, 4, 5), atol=1e-7)
+
+
+def write_png16(path, pixels):
+    """A PNG of 16 bits a channel, (H, W, C), which neither Pillow nor scikit-image writes in colour."""
+    height, width, channels = pixels.shape
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in pixels)
+    header = struct.pack(">IIBBBBB", width, height, 16, {3: 2, 4: 6}[channels], 0, 0, 0)
+    with open(path, "wb") as file:
+        file.write(b"\x89PNG\r\n\x1a\n")
+        for kind, data in ((b"IHDR", header), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")):
+            file.write(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)))
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_16_bits_in_colour(tmp_path, channels):
+    pixels = np.random.default_rng(0).integers(0, 65536, (4, 5, channels)).astype(np.uint16)
+    write_png16(tmp_path / "a.png", pixels)
+    expected = pixels[..., :3] / 65535
+    if channels == 4:
+        alpha = pixels[..., 3:] / 65535
+        expected = alpha * expected + (1 - alpha)
+    rgb = read_picture(tmp_path / "a.png").permute(1, 2, 0).numpy()
+    assert np.abs(rgb - expected).max() < 1e-6  # one part in 65535 is 1.5e-5
+
+
+@pytest.mark.parametrize(
+    ("mode", "color", "expected"),
+    [
+        ("1", 1, [1, 1, 1]),
+        ("LA", (51, 255), [0.2, 0.2, 0.2]),
+        ("LA", (51, 0), [1, 1, 1]),
+        ("P", (255, 0, 51), [1, 0, 0.2]),
+        ("CMYK", (0, 255, 255, 0), [1, 0, 0]),  # of four channels, none of which is alpha
+    ],
+)
+def test_read_modes(tmp_path, mode, color, expected):
+    path = tmp_path / ("a.tif" if mode == "CMYK" else "a.png")
+    Image.new("RGB" if mode == "P" else mode, (5, 4), color).convert(mode).save(path)
+    rgb = read_picture(path)
+    assert torch.allclose(rgb, torch.tensor(expected, dtype=torch.float32).reshape(3, 1, 1).expand(3, 4, 5), atol=1e-6)
+
+
+def test_palette_with_a_transparent_colour(tmp_path):
+    picture = Image.new("P", (5, 4), 1)
+    picture.putpalette([0, 0, 0, 255, 0, 0])
+    picture.save(tmp_path / "red.png")
+    picture.save(tmp_path / "clear.png", transparency=1)
+    assert read_picture(tmp_path / "red.png")[:, 0, 0].tolist() == [1, 0, 0]
+    assert read_picture(tmp_path / "clear.png")[:, 0, 0].tolist() == [1, 1, 1]
 
 
 def test_files_that_are_no_pictures(tmp_path):
