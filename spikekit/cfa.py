@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from kornia.color import CFA
 from torch import Tensor, nn
 
@@ -416,7 +415,8 @@ def merge_bayer(planes: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
     cell = [planes[0]] * 4
     for plane, (_, row, column) in zip(planes, bayer_sites(pattern), strict=True):
         cell[2 * row + column] = plane
-    return F.pixel_shuffle(torch.stack(cell, dim=-3), 2).squeeze(-3)
+    rows = torch.stack(cell[:2], dim=-1).flatten(-2), torch.stack(cell[2:], dim=-1).flatten(-2)
+    return torch.stack(rows, dim=-2).flatten(-3, -2)
 
 
 class MergeBayer(nn.Module):

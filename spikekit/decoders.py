@@ -211,7 +211,7 @@ def spike_interval(spikes: Tensor) -> Tensor:
 
     Returns:
         The intervals in frames, :math:`(*, T, H, W)`: in the dtype of ``spikes`` where that is floating, else int16
-        (int32 from T = 32767 on).
+        (int32 from T = 32767 on). float16 counts to 2048 exactly and ends at 65504.
 
     Raises:
         TypeError: ``spikes`` is not a tensor of real numbers.

@@ -123,7 +123,8 @@ def spike_integrate_fire(
 
     Raises:
         TypeError: ``light`` or ``charge`` is not a floating-point tensor, ``dtype`` neither floating nor of a byte.
-        ValueError: fewer than three dimensions, a charge that does not fit, a threshold that is not above 0.
+        ValueError: fewer than three dimensions, a charge that does not fit, a threshold that is not above 0 or
+            that the charge's type cannot hold.
 
     Example:
         >>> light = torch.full((5, 1, 1), 0.5)
@@ -150,6 +151,8 @@ def spike_integrate_fire(
             charge = charge.detach().to(torch.promote_types(wide, charge.dtype)).expand(planes)
         except RuntimeError:
             raise ValueError(f"charge: expected {tuple(planes)}, got {tuple(charge.shape)}") from None
+    if not torch.finfo(charge.dtype).tiny <= threshold <= torch.finfo(charge.dtype).max:
+        raise ValueError(f"threshold: expected a number that {charge.dtype} can hold, got {threshold}")
     return _StraightThrough.apply(light, float(threshold), charge, dtype or light.dtype)
 
 

@@ -252,6 +252,8 @@ def test_charge_broadcasts():
         (ValueError, (torch.ones(3, 2, 2), 0)),
         (ValueError, (torch.ones(3, 2, 2), -1.0)),
         (ValueError, (torch.ones(3, 2, 2), float("nan"))),
+        (ValueError, (torch.ones(3, 2, 2), 1e-60)),  # 0 in float32: dark pixels would fire
+        (ValueError, (torch.ones(3, 2, 2), 1e60)),
         (ValueError, (torch.ones(3, 2, 2), 1.0, torch.ones(3, 2))),
         (ValueError, (torch.ones(3, 2, 2), 1.0, torch.ones(5, 2, 2))),
         (TypeError, (torch.ones(3, 2, 2), 1.0, torch.ones(2, 2, dtype=torch.int64))),
