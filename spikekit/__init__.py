@@ -23,8 +23,9 @@ from spikekit.files import SpikeFileError, iter_spikes, read_spikes, spikes_shap
 from spikekit.metrics import psnr, ssim
 from spikekit.motion import JointFlow, LinearMotion, UpsampleFlow, joint_flow, linear_motion, upsample_flow
 from spikekit.pictures import flow_to_rgb, panel, read_picture, write_picture
-from spikekit.scene import Layer, Motion, Scene, simulate_spikes
+from spikekit.scene import Layer, Motion, Scene
 from spikekit.sensor import SpikeIntegrateFire, spike_integrate_fire
+from spikekit.simulate import simulate_spikes
 from spikekit.warp import FlowWarp, FlowWarpIdw, flow_warp, flow_warp_idw
 
 __version__ = "0.1.0.dev0"

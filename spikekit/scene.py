@@ -13,7 +13,6 @@ from torch import Tensor
 
 from spikekit.cfa import bayer_sites
 from spikekit.check import check_planes, check_positive, check_scale
-from spikekit.sensor import spike_integrate_fire
 
 _CHUNK = 1 << 16  # positions sampled at a time: what they need stays in the cache
 
@@ -294,45 +293,3 @@ def _touched(
         return slice(int(low), int(high))
 
     return between(rows, ends.imag), between(columns, ends.real)
-
-
-def simulate_spikes(light: Tensor, *, photons: float | None = None, generator: torch.Generator | None = None) -> Tensor:
-    r"""Let the camera look at light: photon noise, if wanted, a random charge to begin with, and spikes.
-
-    .. math:: I'_t \sim \operatorname{Poisson}(p I_t) / p, \quad c_0 \sim U[0, 1)
-
-    Convention:
-        Time is axis -3, the threshold is 1, and the spikes are those of :func:`spikekit.spike_integrate_fire`. The
-        charge of every pixel begins uniform in [0, 1), because the camera has been running before. The same generator
-        state gives the same charge with and without noise. No gradient.
-
-    Args:
-        light: charge per clock, :math:`(*, T, H, W)`, floating, >= 0, on the generator's device.
-        photons: p, how many photons make one threshold; Poisson noise of that strength. ``None``: no noise.
-        generator: where chance comes from; torch's default one when not given.
-
-    Returns:
-        ``spikes``, uint8, in the shape of ``light``.
-
-    Raises:
-        TypeError: ``light`` is not a floating-point tensor.
-        ValueError: fewer than three dimensions, or ``photons`` is not above 0.
-        RuntimeError: negative or NaN light, with ``photons``.
-
-    Example:
-        >>> spikes = simulate_spikes(torch.full((40, 8, 8), 0.25), generator=torch.Generator().manual_seed(0))
-        >>> spikes.dtype, spikes.sum(0).unique().tolist()
-        (torch.uint8, [10])
-
-    Reference:
-        Dong et al., CVPR 2024, section 5.1.
-    """
-    check_planes("light", light, 3, "(*, T, H, W)", floating=True)
-    size = light.shape[:-3] + light.shape[-2:]
-    dtype = torch.promote_types(light.dtype, torch.float32)
-    charge = torch.rand(size, generator=generator, device=light.device, dtype=dtype)
-    if photons is not None:
-        check_positive("photons", photons)
-        light = torch.poisson(light.to(dtype) * photons, generator=generator) / photons
-    spikes, _ = spike_integrate_fire(light, charge=charge)
-    return spikes.to(torch.uint8)

@@ -5,6 +5,7 @@ import torch
 from skimage import data
 
 import spikekit as sk
+from spikekit.noise import SensorNoise
 
 background = sk.Layer(
     torch.tensor(data.chelsea()).permute(2, 0, 1)[:, :200, 100:330] / 255,
@@ -22,7 +23,7 @@ scene = sk.Scene([background, coin], 144, 176)
 light = scene.light("RGGB", scale=2, alpha=0.4)
 flow = scene.flow(40, scale=2)
 spikes = {
-    photons: sk.simulate_spikes(light, photons=photons, generator=torch.Generator().manual_seed(0))
+    photons: sk.simulate_spikes(light, noise=SensorNoise(photons=photons), generator=torch.Generator().manual_seed(0))
     for photons in (None, 10)
 }
 

@@ -18,7 +18,9 @@ from lightning_modules.data.pictures import cached_picture, embedded_pictures, f
 from lightning_modules.data.textures import outline_mask, texture
 from spikekit import bayer_pattern
 from spikekit.check import check_positive, check_scale
-from spikekit.scene import Layer, Motion, Scene, simulate_spikes
+from spikekit.noise import SensorNoise
+from spikekit.scene import Layer, Motion, Scene
+from spikekit.simulate import simulate_spikes
 
 _TEXTURES = 0.3  # share of procedural pictures among embedded ones
 _MOST_WORKERS = 8
@@ -89,7 +91,7 @@ class StillClips(Dataset):
         light = scene.light(self.pattern, scale=self.scale, alpha=self.alpha)
         generator = torch.Generator().manual_seed(int(self._rng(index, "spikes").integers(2**63)))
         return {
-            "spikes": simulate_spikes(light, photons=self.photons, generator=generator),
+            "spikes": simulate_spikes(light, noise=SensorNoise(photons=self.photons), generator=generator),
             "rgb": scene.rgb(scene.middle),
             "flow": torch.stack([scene.flow(clock, scale=self.scale) for clock in self.flow_times]),
         }

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from spikekit import PATTERNS, bin_to_sensor, demosaic, flow_warp, upsample_flow
-from spikekit.scene import Layer, Motion, Scene, simulate_spikes
+from spikekit.scene import Layer, Motion, Scene
+from spikekit.simulate import simulate_spikes
 
 
 def smooth_picture(height, width, dtype=torch.float64):
@@ -217,24 +218,6 @@ def test_spikes_count_the_light():
     assert not torch.equal(spikes, other)
 
 
-def test_photon_noise_has_the_variance_of_poisson(monkeypatch):
-    seen = {}
-    monkeypatch.setattr(
-        "spikekit.scene.spike_integrate_fire",
-        lambda light, charge: (seen.update(light=light, charge=charge) or torch.zeros_like(light), charge),
-    )
-    light = torch.full((50, 60, 60), 0.3)
-    simulate_spikes(light, photons=20.0, generator=torch.Generator().manual_seed(0))
-    noisy, charge = seen["light"], seen["charge"]
-    assert abs(noisy.mean() - 0.3) < 0.001
-    assert abs(noisy.var() / (0.3 / 20) - 1) < 0.02  # mean over photons
-    assert abs(charge.mean() - 0.5) < 0.01
-    assert 0 <= charge.min() <= charge.max() < 1
-    simulate_spikes(light, generator=torch.Generator().manual_seed(0))
-    assert seen["light"] is light  # off: nothing done
-    assert torch.equal(seen["charge"], charge)
-
-
 def test_errors_say_what_was_expected():
     picture = torch.rand(3, 8, 8)
     with pytest.raises(ValueError, match="layers: expected a background"):
@@ -253,5 +236,3 @@ def test_errors_say_what_was_expected():
         Scene([Layer(picture)], 8, 8).light(scale=3)
     with pytest.raises(ValueError, match="frames: expected at least 1"):
         Scene([Layer(picture)], 8, 8, 0)
-    with pytest.raises(ValueError, match="photons: expected"):
-        simulate_spikes(torch.rand(3, 4, 4), photons=0.0)
