@@ -9,6 +9,8 @@ Everything that warps with the same flow and mask can share them::
 from __future__ import annotations
 
 from functools import lru_cache, partial
+from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -209,6 +211,15 @@ def _(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, T
         if len(products) <= 2 and all(len(table) == 4 for product in products for table in product):
             return cpu_warp.nearest_four(flow, products)
     return _nearest_known(flow, mask, neighbors, steps)
+
+
+if find_spec("triton") is not None:
+
+    @nearest_known.register_kernel("cuda")
+    def _(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
+        if steps:
+            return _nearest_known(flow, mask, neighbors, steps)
+        return import_module("spikekit.kernels.gpu").nearest_known(flow, products_of(mask, neighbors), neighbors)
 
 
 fold_into_batch(nearest_known, 1)

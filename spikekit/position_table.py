@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 _CHUNK = 1 << 15  # positions that are searched at a time
+_LARGEST = 1 << 23  # positions of a table: 128 MiB of four neighbours
 
 
 class TableAxis:
@@ -60,7 +61,7 @@ class PositionTable:
         device: of the mask.
 
     Raises:
-        ValueError: the mask has no period.
+        ValueError: the mask has no period, and is so large that the table would be huge.
     """
 
     def __init__(
@@ -73,15 +74,15 @@ class PositionTable:
     ) -> None:
         height, self.width = known.shape
         period = _period(known), _period(known.T)
-        if not all(period):
-            raise ValueError(
-                f"mask: expected a pattern that repeats along rows and columns for steps={steps}, got one that does "
-                "not: its table would be larger than the picture is worth"
-            )
         margin = _margin(known, period, neighbors)
         self.rows = TableAxis(height, period[0], margin, steps, device)
         self.columns = TableAxis(self.width, period[1], margin, steps, device)
         (y, y_offset), (x, x_offset) = self.rows.positions(), self.columns.positions()
+        if len(y) * len(x) > _LARGEST:
+            raise ValueError(
+                f"mask: expected a pattern that repeats along rows and columns, got one whose table of steps={steps} "
+                f"would have {len(y) * len(x)} positions"
+            )
         self.columns_length = len(x)
         cell = torch.stack([x.repeat(len(y)), y.repeat_interleave(len(x))])
         part = torch.stack([x_offset.repeat(len(y)), y_offset.repeat_interleave(len(x))])
@@ -97,10 +98,8 @@ class PositionTable:
 
 
 def _period(known: np.ndarray) -> int:
-    """Return the smallest shift along the first axis that maps a mask on itself, 0 if it does not repeat in full."""
-    if len(known) == 1:
-        return 1
-    return next((shift for shift in range(1, len(known) // 2 + 1) if (known[shift:] == known[:-shift]).all()), 0)
+    """Return the smallest shift along the first axis that maps a mask on itself."""
+    return next(shift for shift in range(1, len(known) + 1) if (known[shift:] == known[: len(known) - shift]).all())
 
 
 def _margin(known: np.ndarray, period: tuple[int, int], neighbors: int) -> int:

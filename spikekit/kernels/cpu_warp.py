@@ -6,7 +6,7 @@ faster. Copies that are not contiguous are NumPy's: torch would share each small
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
@@ -20,13 +20,13 @@ _PIECE = 1 << 18  # numbers that are gathered at a time
 _TILE = 1 << 13  # positions that are searched at a time
 
 
-def _empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+def _new(shape: tuple[int, ...], dtype: torch.dtype, numpy_new: Callable[..., np.ndarray] = np.empty) -> Tensor:
     """From NumPy, which asks for huge pages."""
-    return torch.from_numpy(np.empty(shape, f"i{dtype.itemsize}")).view(dtype)
+    return torch.from_numpy(numpy_new(shape, f"i{dtype.itemsize}")).view(dtype)
 
 
-def _empty_like_layout(values: Tensor, size: int) -> Tensor:
-    return empty_like_layout(values, size, lambda shape: _empty(shape, values.dtype))
+def _new_like_layout(values: Tensor, size: int, numpy_new: Callable[..., np.ndarray] = np.empty) -> Tensor:
+    return empty_like_layout(values, size, lambda shape: _new(shape, values.dtype, numpy_new))
 
 
 def _array(values: Tensor) -> np.ndarray:
@@ -48,7 +48,7 @@ def _rows(planes: Tensor, dtype: torch.dtype) -> Tensor:
     rows = planes.t()
     if rows.is_contiguous() and rows.dtype == dtype:
         return rows
-    result = _empty(tuple(rows.shape), dtype)
+    result = _new(tuple(rows.shape), dtype)
     for piece in _pieces(*rows.shape):
         result[piece].copy_(planes[:, piece].contiguous().t())  # torch transposes quickly what is contiguous
     return result
@@ -64,7 +64,7 @@ def _used_rows(planes: Tensor, index: np.ndarray, dtype: torch.dtype) -> tuple[T
     pixel = np.flatnonzero(used)
     place = np.empty(pixels, np.int32)
     place[pixel] = np.arange(len(pixel), dtype=np.int32)
-    rows = _empty((len(pixel), channels), dtype)
+    rows = _new((len(pixel), channels), dtype)
     for piece in _pieces(len(pixel), channels):
         rows[piece].copy_(planes.index_select(1, torch.from_numpy(pixel[piece])).t())
     return rows, place
@@ -78,7 +78,7 @@ def _bags(index: np.ndarray, place: np.ndarray | None, piece: slice) -> np.ndarr
 
 def weighted_gather(values: Tensor, index: Tensor, weight: Tensor) -> Tensor:
     """Rows are made of what is read only; the sums of a piece are transposed while they are in the cache."""
-    out, dtype = _empty_like_layout(values, index.shape[2]), _wide(values, weight)
+    out, dtype = _new_like_layout(values, index.shape[2]), _wide(values, weight)
     for planes, index_b, weight_b, out_b in zip(values.detach(), index.numpy(), weight.detach(), out, strict=True):
         rows, place = _used_rows(planes, index_b, dtype)
         for piece in _pieces(*out_b.t().shape):
@@ -90,7 +90,7 @@ def weighted_gather(values: Tensor, index: Tensor, weight: Tensor) -> Tensor:
 
 def weighted_scatter(grad: Tensor, index: Tensor, weight: Tensor, size: int) -> Tensor:
     """Sorted by pixel, what arrives at one is a bag: a gather again."""
-    out, dtype = _empty_like_layout(grad, size).zero_(), _wide(grad, weight)
+    out, dtype = _new_like_layout(grad, size, np.zeros), _wide(grad, weight)
     for planes, index_b, weight_b, out_b in zip(grad.detach(), index.numpy(), weight.detach(), out, strict=True):
         pixel, order = torch.from_numpy(index_b.ravel().astype(np.int32)).sort(stable=True)
         first = np.flatnonzero(np.diff(pixel.numpy(), prepend=-1))
@@ -113,7 +113,7 @@ def weighted_scatter(grad: Tensor, index: Tensor, weight: Tensor, size: int) -> 
 def weighted_dot(values: Tensor, grad: Tensor, index: Tensor) -> Tensor:
     """Products of rows, a piece at a time."""
     dtype = _wide(values, grad)
-    out = _empty(tuple(index.shape), dtype)
+    out = _new(tuple(index.shape), dtype)
     for planes, grad_b, index_b, out_b in zip(values.detach(), grad.detach(), index.numpy(), out.numpy(), strict=True):
         rows, place = _used_rows(planes, index_b, dtype)
         for piece in _pieces(*grad_b.t().shape):
@@ -137,7 +137,7 @@ def nearest_four(flow: Tensor, products: list[tuple[Tensor, Tensor]]) -> tuple[T
     count, _, height, width = flow.shape
     plane = height * width
     steps = [tuple(_steps(table.numpy()) for table in product) for product in products]
-    index, weight = _empty((count, 4, plane), torch.int64), _empty((count, 4, plane), flow.dtype)
+    index, weight = _new((count, 4, plane), torch.int64), _new((count, 4, plane), flow.dtype)
     moved = flow.detach().flatten(2).numpy()
     pixel_x, pixel_y = np.tile(np.arange(1.0 * width), height), np.repeat(np.arange(1.0 * height), width)
     for images in _slices(count, max(_TILE // plane, 1)):
@@ -157,7 +157,7 @@ def nearest_in_table(flow: Tensor, table: PositionTable) -> tuple[Tensor, Tensor
     """Nearest pixels of rounded positions, from a table, and the weights that they have at the exact ones."""
     count, _, height, width = flow.shape
     plane, neighbors = height * width, len(table.shift)
-    index, weight = _empty((count, neighbors, plane), torch.int64), _empty((count, neighbors, plane), flow.dtype)
+    index, weight = _new((count, neighbors, plane), torch.int64), _new((count, neighbors, plane), flow.dtype)
     moved, shift = flow.detach().flatten(2).numpy(), table.shift.numpy()
     pixel_x, pixel_y = np.tile(np.arange(1.0 * width), height), np.repeat(np.arange(1.0 * height), width)
     for images in _slices(count, max(_TILE // plane, 1)):
