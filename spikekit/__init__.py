@@ -20,12 +20,15 @@ from spikekit.cfa import (
 from spikekit.decoders import SpikeInterval, Tfi, Tfp, spike_interval, tfi, tfp
 from spikekit.demosaic import Demosaic, demosaic
 from spikekit.files import SpikeFileError, iter_spikes, read_spikes, spikes_shape, write_spikes
+from spikekit.keyframe import spike_interval_at, tfi_at
 from spikekit.metrics import psnr, ssim
 from spikekit.motion import JointFlow, LinearMotion, UpsampleFlow, joint_flow, linear_motion, upsample_flow
+from spikekit.packing import pack_spikes, unpack_spikes
 from spikekit.pictures import flow_to_rgb, panel, read_picture, write_picture
 from spikekit.scene import Layer, Motion, Scene
 from spikekit.sensor import SpikeIntegrateFire, spike_integrate_fire
 from spikekit.simulate import simulate_spikes
+from spikekit.streams import decode_in_chunks
 from spikekit.warp import FlowWarp, FlowWarpIdw, flow_warp, flow_warp_idw
 
 __version__ = "0.1.0.dev0"
@@ -56,6 +59,7 @@ __all__ = [
     "bayer_pattern",
     "bayer_sites",
     "bin_to_sensor",
+    "decode_in_chunks",
     "demosaic",
     "flow_to_rgb",
     "flow_warp",
@@ -65,6 +69,7 @@ __all__ = [
     "linear_motion",
     "merge_bayer",
     "mosaic",
+    "pack_spikes",
     "panel",
     "psnr",
     "read_picture",
@@ -72,12 +77,15 @@ __all__ = [
     "simulate_spikes",
     "spike_integrate_fire",
     "spike_interval",
+    "spike_interval_at",
     "spikes_shape",
     "split_bayer",
     "split_colors",
     "ssim",
     "tfi",
+    "tfi_at",
     "tfp",
+    "unpack_spikes",
     "upsample_flow",
     "write_picture",
     "write_spikes",

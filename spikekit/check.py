@@ -52,6 +52,18 @@ def check_positive(name: str, value: float) -> None:
         raise ValueError(f"{name}: expected a finite number above 0, got {value}")
 
 
+def check_index(name: str, value: int) -> int:
+    """Return ``value`` as an int; raise unless it is a whole number, such as Python's or NumPy's.
+
+    Raises:
+        TypeError: anything else.
+    """
+    try:
+        return operator.index(value)
+    except TypeError:
+        raise TypeError(f"{name}: expected a whole number, got {value!r}") from None
+
+
 def check_whole(name: str, value: int) -> int:
     """Return ``value`` as an int; raise unless it is a whole number, 1 or more.
 

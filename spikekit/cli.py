@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from spikekit import bench, extremes
 from spikekit.cfa import PATTERNS
 from spikekit.demosaic import demosaic
 from spikekit.files import iter_spikes, spikes_shape
@@ -194,6 +195,11 @@ def _parser() -> argparse.ArgumentParser:
         "if not given, the picture is scaled until the 99.9th percentile of the spike rate in the frames it is made "
         "from is white, and many pictures all as the one in their middle",
     )
+
+    example = "extremes --operator tfi --markdown"
+    extremes.add_arguments(_add_verb(verbs, extremes.run, "extremes", "how exact the operators are at worst", example))
+    example = "bench tfi tfp --size small"
+    bench.add_arguments(_add_verb(verbs, bench.run, "bench", "how fast the operators are beside others", example))
     return parser
 
 

@@ -15,7 +15,7 @@ from spikekit.kernels import batch_first, register
 @torch.library.custom_op("spikekit::spike_interval", mutates_args=())
 def _spike_interval(spikes: Tensor) -> Tensor:
     fired, frames = spikes != 0, spikes.shape[-3]
-    interval = torch.empty_like(fired, dtype=_interval_dtype(frames))
+    interval = torch.empty_like(fired, dtype=interval_dtype(frames))
     planes = list(zip(fired.unbind(-3), interval.unbind(-3), strict=True))
 
     # Backwards: the next spike, T where there is none; what remains in `first` is the first complete interval.
@@ -40,10 +40,11 @@ def _spike_interval(spikes: Tensor) -> Tensor:
 
 @_spike_interval.register_fake
 def _(spikes: Tensor) -> Tensor:
-    return torch.empty_like(spikes, dtype=_interval_dtype(spikes.shape[-3]))
+    return torch.empty_like(spikes, dtype=interval_dtype(spikes.shape[-3]))
 
 
-def _interval_dtype(frames: int) -> torch.dtype:
+def interval_dtype(frames: int) -> torch.dtype:
+    """Return the smallest type that holds every interval of a clip."""
     return torch.int16 if frames < 32767 else torch.int32
 
 
@@ -52,7 +53,7 @@ def _tfi(spikes: Tensor, max_range: float, dtype: torch.dtype) -> Tensor:
     wide = torch.promote_types(dtype, torch.float32)
     interval = torch.ops.spikekit.spike_interval(spikes)
     # a tensor over a tensor: torch divides a number by a tensor through the inverse, and 255 / 5 is not 51 then
-    return _to(torch.full_like(interval, max_range, dtype=wide) / interval, dtype)
+    return cast_light(torch.full_like(interval, max_range, dtype=wide) / interval, dtype)
 
 
 @_tfi.register_fake
@@ -60,7 +61,7 @@ def _(spikes: Tensor, max_range: float, dtype: torch.dtype) -> Tensor:
     return torch.empty_like(spikes, dtype=dtype)
 
 
-def _to(value: Tensor, dtype: torch.dtype) -> Tensor:
+def cast_light(value: Tensor, dtype: torch.dtype) -> Tensor:
     """Cast; to uint8 by rounding to the nearest whole number, and cutting what is beyond."""
     return value.round().clamp(0, 255).to(dtype) if dtype is torch.uint8 else value.to(dtype)
 
@@ -126,7 +127,7 @@ class _SumOnIntervals(torch.autograd.Function):
 def _tfp(spikes: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Tensor:
     wide = torch.promote_types(torch.promote_types(dtype, torch.float32), spikes.dtype)
     total = _inside(spikes, window, wide if spikes.is_floating_point() else torch.int32)
-    return _to(total.to(wide) * max_range / _window_sizes(spikes, window), dtype)
+    return cast_light(total.to(wide) * max_range / _window_sizes(spikes, window), dtype)
 
 
 @_tfp.register_fake

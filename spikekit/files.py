@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 import secrets
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -12,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spikekit.check import check_planes, check_whole
+from spikekit.check import check_index, check_planes, check_whole
 from spikekit.formats import (
     SpikeFileError,
     Wanted,
@@ -146,8 +145,8 @@ def spikes_shape(path: str | Path, height: int | None = None, width: int | None 
         TypeError: as :func:`read_spikes`.
     """
     path = Path(path)
-    height = None if height is None else _whole("height", height)
-    width = None if width is None else _whole("width", width)
+    height = None if height is None else check_index("height", height)
+    width = None if width is None else check_index("width", width)
     with reading(path):
         if path.is_dir():
             raise SpikeFileError(f"{path}: expected a recording, got a folder")
@@ -269,8 +268,8 @@ def _open(
     """Check everything but the frames themselves; return them, ``chunk`` at a time or all at once."""
     path = Path(path)
     total, height, width = spikes_shape(path, height, width)
-    start = _whole("start", start)
-    frames = total - start if frames is None else _whole("frames", frames)
+    start = check_index("start", start)
+    frames = total - start if frames is None else check_index("frames", frames)
     if start < 0 or frames < 1 or start + frames > total:
         raise SpikeFileError(f"{path}: expected frames within 0 .. {total - 1}, got {frames} from frame {start} on")
     read = dat_blocks if path.suffix.lower() == ".dat" else npz_blocks
@@ -282,11 +281,3 @@ def _check_suffix(path: Path) -> str:
     if suffix not in (".dat", ".npz"):
         raise SpikeFileError(f"{path}: expected a recording that ends in .dat or .npz, got {suffix or 'no ending'}")
     return suffix
-
-
-def _whole(name: str, value: int) -> int:
-    """Return as an int what can stand for one."""
-    try:
-        return operator.index(value)
-    except TypeError:
-        raise TypeError(f"{name}: expected a whole number, got {value!r}") from None

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Iterable
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from spikekit.check import check_dtype, check_planes, check_positive, default_float
+from spikekit.check import check_dtype, check_index, check_planes, check_positive, default_float
+from spikekit.decoders import cast_light, interval_dtype
 
 
 @torch.library.custom_op("spikekit::spike_interval_at", mutates_args=())
@@ -19,7 +19,7 @@ def _spike_interval_at(spikes: Tensor, frame: int) -> Tensor:
     before, gap_before = _look(fired[..., :frame, :, :].flip(-3))
     frames = spikes.shape[-3]
     gap = torch.where(before == frame, gap_after, torch.where(after == frames - frame, gap_before, 0))
-    return torch.maximum(before + after + 1, gap).to(_interval_dtype(frames))
+    return torch.maximum(before + after + 1, gap).to(interval_dtype(frames))
 
 
 def _look(fired: Tensor) -> tuple[Tensor, Tensor]:
@@ -45,11 +45,7 @@ def _(spikes: Tensor, frame: int) -> Tensor:
 @_spike_interval_at.register_fake
 def _(spikes: Tensor, frame: int) -> Tensor:
     size = spikes.shape[:-3] + spikes.shape[-2:]
-    return spikes.new_empty(size, dtype=_interval_dtype(spikes.shape[-3]))
-
-
-def _interval_dtype(frames: int) -> torch.dtype:
-    return torch.int16 if frames < 32767 else torch.int32
+    return spikes.new_empty(size, dtype=interval_dtype(spikes.shape[-3]))
 
 
 def search(plane: Callable[[int], np.ndarray], frame: int, clip: range) -> np.ndarray:
@@ -187,15 +183,12 @@ def tfi_at(spikes: Tensor, frame: int, max_range: float = 1.0, *, dtype: torch.d
     dtype = dtype or default_float(spikes)
     # a tensor over a tensor: torch divides a number by a tensor through the inverse, and 255 / 5 is not 51 then
     rate = torch.full_like(interval, max_range, dtype=torch.promote_types(dtype, torch.float32)) / interval
-    return (rate.round().clamp(0, 255) if dtype is torch.uint8 else rate).to(dtype)
+    return cast_light(rate, dtype)
 
 
 def _interval(spikes: Tensor, frame: int) -> Tensor:
     check_planes("spikes", spikes, 3, "(*, T, H, W)")
-    try:
-        frame = operator.index(frame)
-    except TypeError:
-        raise TypeError(f"frame: expected a whole number, got {frame!r}") from None
+    frame = check_index("frame", frame)
     if not 0 <= frame < spikes.shape[-3]:
         raise ValueError(f"frame: expected 0 .. {spikes.shape[-3] - 1}, got {frame}")
     return _spike_interval_at(spikes.detach(), frame)

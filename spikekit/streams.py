@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Iterable, Iterator
 
 import torch
 from torch import Tensor
 
-from spikekit.check import check_planes
+from spikekit.check import check_index, check_planes
 
 
 def decode_in_chunks(decode: Callable[[Tensor], Tensor], chunks: Iterable[Tensor], overlap: int) -> Iterator[Tensor]:
@@ -53,10 +52,7 @@ def decode_in_chunks(decode: Callable[[Tensor], Tensor], chunks: Iterable[Tensor
     Reference:
         The overlap-save method of convolution.
     """
-    try:
-        overlap = operator.index(overlap)
-    except TypeError:
-        raise TypeError(f"overlap: expected a whole number of frames, got {overlap!r}") from None
+    overlap = check_index("overlap", overlap)
     if overlap < 0:
         raise ValueError(f"overlap: expected 0 or more frames, got {overlap}")
     return _pieces(decode, chunks, overlap)

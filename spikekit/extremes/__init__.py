@@ -90,11 +90,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Print the table of extremes.
-
-    Raises:
-        ValueError: an error is larger than its bound, or an outcome is not the documented one.
-    """
+    """Print the table of extremes; the exit status is 1 where an error is larger than its bound."""
     measured: list[Row] = []
 
     def noted(table: Iterable[Row]) -> Iterator[Row]:

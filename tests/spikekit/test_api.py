@@ -12,12 +12,12 @@ from torch import nn
 import spikekit as sk
 
 PUBLIC = """
-    PATTERNS BayerMask BinToSensor Demosaic FlowWarp FlowWarpIdw JointFlow Layer LinearMotion MergeBayer Mosaic
-    Motion Scene SpikeFileError SpikeIntegrateFire SpikeInterval SplitBayer SplitColors Tfi Tfp UpsampleFlow
-    bayer_mask bayer_pattern bayer_sites bin_to_sensor demosaic flow_to_rgb flow_warp flow_warp_idw iter_spikes
-    joint_flow linear_motion merge_bayer mosaic panel psnr read_picture read_spikes simulate_spikes
-    spike_integrate_fire spike_interval spikes_shape split_bayer split_colors ssim tfi tfp upsample_flow write_picture
-    write_spikes
+    PATTERNS BayerMask BinToSensor Demosaic FlowWarp FlowWarpIdw JointFlow Layer LinearMotion MergeBayer Mosaic Motion
+    Scene SpikeFileError SpikeIntegrateFire SpikeInterval SplitBayer SplitColors Tfi Tfp UpsampleFlow bayer_mask
+    bayer_pattern bayer_sites bin_to_sensor decode_in_chunks demosaic flow_to_rgb flow_warp flow_warp_idw iter_spikes
+    joint_flow linear_motion merge_bayer mosaic pack_spikes panel psnr read_picture read_spikes simulate_spikes
+    spike_integrate_fire spike_interval spike_interval_at spikes_shape split_bayer split_colors ssim tfi tfi_at tfp
+    unpack_spikes upsample_flow write_picture write_spikes
 """.split()  # noqa: SIM905
 
 SPIKES = (torch.rand(2, 9, 4, 6, generator=torch.Generator().manual_seed(1)) < 0.4).double()
@@ -239,7 +239,7 @@ def test_custom_operators_with_dynamic_sizes(op, tensors):
         (torch.ops.spikekit.tfp, (SPIKES.clone().requires_grad_(), 3, 1.0, torch.float64)),
         (torch.ops.spikekit.tfp_grad, (SPIKES.clone().requires_grad_(), 3, 1.0, torch.float64)),
         (torch.ops.spikekit.spike_interval, (SPIKES > 0,)),
-        (torch.ops.spikekit.nearest_known, (FLOW.floor().long(), FLOW - FLOW.floor(), MASK, 4)),
+        (torch.ops.spikekit.nearest_known, (FLOW, MASK, 4, 0)),
     ],
     ids=lambda value: str(value).rpartition(".")[2] if "spikekit" in str(value) else "",
 )

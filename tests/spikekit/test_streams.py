@@ -171,7 +171,7 @@ def test_sensor_in_chunks(tmp_path):
     ("chunks", "overlap", "error", "message"),
     [
         ([], -1, ValueError, "overlap: expected 0 or more frames, got -1"),
-        ([], 2.0, TypeError, r"overlap: expected a whole number of frames, got 2\.0"),
+        ([], 2.0, TypeError, r"overlap: expected a whole number, got 2\.0"),
     ],
 )
 def test_bad_overlap_at_the_call(chunks, overlap, error, message):
