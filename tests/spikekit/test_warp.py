@@ -5,9 +5,10 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch.autograd import gradcheck
+from torch._dynamo.testing import CompileCounterWithBackend
+from torch.autograd import gradcheck, gradgradcheck
 
-from spikekit import bayer_mask, flow_warp, flow_warp_idw
+from spikekit import FlowWarpIdw, bayer_mask, flow_warp, flow_warp_idw
 
 UNIT = 4096  # the flows below are multiples of 1 / UNIT
 
@@ -145,11 +146,17 @@ def test_idw_reads_known_pixels_only(kind):
 
 
 @pytest.mark.parametrize("neighbors", [1, 3, 4])
-def test_idw_gradcheck(neighbors):
-    flow = (torch.rand(2, 2, 4, 6, dtype=torch.float64) * 4 - 2).requires_grad_()
-    features = torch.randn(2, 1, 4, 6, dtype=torch.float64, requires_grad=True)
+def test_idw_gradients_and_their_gradients(neighbors):
+    flow = (torch.rand(1, 2, 4, 6, dtype=torch.float64) * 4 - 2).requires_grad_()
+    features = torch.randn(1, 1, 4, 6, dtype=torch.float64, requires_grad=True)
     for mask in (bayer_mask(2, 3, scale=2)[1], torch.rand(4, 6) < 0.5):
-        assert gradcheck(lambda f, w, mask=mask: flow_warp_idw(f, w, mask, neighbors=neighbors), (features, flow))
+        for steps in (None, 4):
+
+            def warp(features, flow, mask=mask, steps=steps):
+                return flow_warp_idw(features, flow, mask, neighbors=neighbors, steps=steps)
+
+            assert gradcheck(warp, (features, flow))
+            assert gradgradcheck(warp, (features, flow))
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16, torch.float16])
@@ -177,7 +184,127 @@ def test_idw_gradient_of_the_flow_is_zero_on_a_known_pixel():
     assert (grad[..., mask] == 0).all()
 
 
-@pytest.mark.parametrize("lead", [(), (2,), (2, 3)])
+@pytest.mark.parametrize("channels", [1, 9])
+def test_idw_second_gradient_is_finite(channels):
+    """On known pixels and at ties as well."""
+    features, flow = torch.randn(2, channels, 4, 6).requires_grad_(), torch.zeros(2, 2, 4, 6)
+    flow[1] = 0.5
+    flow.requires_grad_()
+    warped = flow_warp_idw(features, flow, bayer_mask(4, 6)[1])
+    grads = torch.autograd.grad(warped.square().sum(), (features, flow), create_graph=True)
+    for grad in torch.autograd.grad(sum(grad.square().sum() for grad in grads), (features, flow)):
+        assert grad.isfinite().all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("op", [flow_warp, lambda f, w: flow_warp_idw(f, w, bayer_mask(4, 6)[0])])
+def test_flow_that_is_not_finite(op, dtype):
+    """NaN counts as 0, infinity as very far, and there is no gradient there."""
+    features = torch.randn(1, 2, 4, 6).to(dtype)
+    flow = torch.randn(1, 2, 4, 6).to(dtype)
+    bad = torch.rand(1, 2, 4, 6) < 0.5
+    cases = {float("nan"): 0.0, float("inf"): 60000.0, float("-inf"): -60000.0}
+    for value, same in cases.items():
+        leaf = flow.masked_fill(bad, value).requires_grad_()
+        warped = op(features, leaf)
+        torch.testing.assert_close(warped, op(features, flow.masked_fill(bad, same)), rtol=1e-3, atol=1e-3)
+        (grad,) = torch.autograd.grad(warped.sum(), leaf)
+        assert grad.isfinite().all()
+        assert (grad[bad] == 0).all()
+
+
+@pytest.mark.parametrize("known", [[(2, 3)], [(0, 0), (4, 5)], [(1, 0), (1, 4), (3, 0)]])
+def test_idw_reads_known_pixels_only_where_they_are_few(known):
+    mask = torch.zeros(5, 6, dtype=torch.bool)
+    for y, x in known:
+        mask[y, x] = True
+    for channels in (2, 9):
+        features = torch.full((7, channels, 5, 6), float("nan"), dtype=torch.float64)
+        features[..., mask] = torch.randn(7, channels, len(known), dtype=torch.float64)
+        features.requires_grad_()
+        warped = flow_warp_idw(features, flows(5, 6), mask)
+        assert warped.isfinite().all()
+        (grad,) = torch.autograd.grad(warped.sum(), features)
+        assert (grad[..., ~mask] == 0).all()
+
+
+@pytest.mark.parametrize("channels", [2, 9])
+def test_idw_keeps_the_memory_format(channels):
+    features, flow, mask = torch.randn(2, channels, 6, 8), torch.randn(2, 2, 6, 8), bayer_mask(6, 8)[1]
+    expected = flow_warp_idw(features, flow, mask)
+    assert expected.is_contiguous()
+    last = features.contiguous(memory_format=torch.channels_last).requires_grad_()
+    warped = flow_warp_idw(last, flow, mask)
+    assert warped.is_contiguous(memory_format=torch.channels_last)
+    torch.testing.assert_close(warped, expected)
+    (grad,) = torch.autograd.grad(warped, last, torch.ones_like(warped))
+    assert grad.is_contiguous(memory_format=torch.channels_last)
+
+
+def test_idw_by_torch_func():
+    features, flow = torch.randn(3, 2, 9, 4, 6), torch.randn(3, 2, 2, 4, 6)
+    mask = bayer_mask(4, 6)[2]
+    expected = flow_warp_idw(features, flow, mask)
+    torch.testing.assert_close(torch.func.vmap(flow_warp_idw, (0, 0, None))(features, flow, mask), expected)
+    torch.testing.assert_close(torch.func.vmap(flow_warp_idw, (1, 1, None), 1)(features, flow, mask), expected)
+    one_flow = torch.func.vmap(flow_warp_idw, (0, None, None))(features, flow[0], mask)
+    torch.testing.assert_close(one_flow[2], flow_warp_idw(features[2], flow[0], mask))
+
+    def energy(flow, features):
+        return flow_warp_idw(features, flow, mask).square().sum()
+
+    leaf = flow.clone().requires_grad_()
+    (grad,) = torch.autograd.grad(energy(leaf, features), leaf)
+    torch.testing.assert_close(torch.func.vmap(torch.func.grad(energy))(flow, features), grad)
+
+
+def test_idw_compiles_once_for_all_sizes():
+    torch.compiler.reset()
+    counter = CompileCounterWithBackend("aot_eager")
+    compiled = torch.compile(lambda *a: flow_warp_idw(*a), fullgraph=True, dynamic=True, backend=counter)
+    for batch, height, width in [(4, 5, 7), (5, 8, 6), (6, 10, 12)]:
+        features = torch.randn(batch, 9, height, width, requires_grad=True)
+        flow = torch.randn(batch, 2, height, width, requires_grad=True)
+        results = []
+        for op in (compiled, flow_warp_idw):
+            warped = op(features, flow, bayer_mask(height, width)[1])
+            results.append([warped, *torch.autograd.grad(warped.square().sum(), (features, flow))])
+        for got, expected in zip(*results, strict=True):
+            torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-5)
+    assert counter.frame_count == 1
+
+
+def test_idw_exports_with_any_size():
+    batch, height, width = (torch.export.Dim(name) for name in ("batch", "height", "width"))
+    planes = {0: batch, 2: height, 3: width}
+    args = torch.randn(3, 9, 5, 7), torch.randn(3, 2, 5, 7), bayer_mask(5, 7)[1]
+    shapes = planes, planes, {0: height, 1: width}
+    exported = torch.export.export(FlowWarpIdw(steps=4), args, dynamic_shapes=shapes, strict=False).module()
+    for size in [(5, 7), (8, 6)]:
+        args = torch.randn(2, 9, *size), torch.randn(2, 2, *size), bayer_mask(*size)[1]
+        torch.testing.assert_close(exported(*args), flow_warp_idw(*args, steps=4))
+
+
+def test_idw_with_steps():
+    features, flow, mask = torch.rand(2, 3, 24, 32), 4 * torch.rand(2, 2, 24, 32) - 2, bayer_mask(12, 16, scale=2)[1]
+    exact, fine = (flow_warp_idw(features, flow, mask, steps=steps) for steps in (None, 16))
+    assert not torch.equal(fine, exact)
+    assert (fine - exact).square().mean().sqrt() < 0.05
+    assert ((fine - exact).abs() < 1e-6).float().mean() > 0.9
+    module = FlowWarpIdw(steps=16)
+    assert torch.equal(module(features, flow, mask), fine)
+    assert "steps=16" in repr(module)
+
+
+def test_numbers_of_numpy():
+    args = torch.rand(1, 1, 6, 8), torch.rand(1, 2, 6, 8), bayer_mask(6, 8)[0]
+    for number in (np.int64(3), np.uint8(3), torch.tensor(3)):
+        assert torch.equal(
+            flow_warp_idw(*args, neighbors=number, steps=number), flow_warp_idw(*args, neighbors=3, steps=3)
+        )
+
+
+@pytest.mark.parametrize("lead", [(), (2,), (2, 3), (0,), (2, 0)])
 def test_leading_dimensions(lead):
     features, flow, mask = torch.randn(*lead, 3, 4, 6), torch.randn(*lead, 2, 4, 6), bayer_mask(4, 6)[0]
     for op in (flow_warp, lambda f, w: flow_warp_idw(f, w, mask)):
@@ -185,6 +312,8 @@ def test_leading_dimensions(lead):
         assert warped.shape == features.shape
         flat = op(features.reshape(-1, 3, 4, 6), flow.reshape(-1, 2, 4, 6))
         torch.testing.assert_close(warped.reshape(-1, 3, 4, 6), flat, rtol=0, atol=0)
+        if 0 in lead:
+            continue
         one = op(features.reshape(-1, 3, 4, 6)[:1], flow.reshape(-1, 2, 4, 6)[:1])
         torch.testing.assert_close(one[0], flat[0], rtol=0, atol=0)
 
@@ -289,3 +418,5 @@ def test_wrong_mask(mask):
 def test_wrong_neighbors(neighbors):
     with pytest.raises(ValueError, match="neighbors"):
         flow_warp_idw(IMAGE, FLOW, MASK, neighbors=neighbors)
+    with pytest.raises(ValueError, match="steps"):
+        flow_warp_idw(IMAGE, FLOW, MASK, steps=neighbors)
