@@ -232,14 +232,21 @@ def bin_to_sensor(rgb: Tensor, pattern: str | CFA = "RGGB", *, scale: int) -> Te
     if channels != 3 or height % scale or width % scale:
         multiples = f" with H and W multiples of {scale}" if scale > 1 else ""
         raise ValueError(f"rgb: expected (*, 3, H, W){multiples}, got {tuple(rgb.shape)}")
-    rows, columns = height // scale, width // scale
-    planes = rgb.unbind(-3)
-    if scale > 1:
-        wide = torch.promote_types(rgb.dtype, torch.float32)
-        blocks = rgb.unflatten(-1, (columns, scale)).unflatten(-3, (rows, scale))
-        planes = blocks.mean(dim=(-3, -1), dtype=wide).to(rgb.dtype).unbind(-3)
-    mask = bayer_mask(rows, columns, pattern, device=rgb.device, dtype=torch.bool)
-    return torch.where(mask[0], planes[0], torch.where(mask[1], planes[1], planes[2]))
+    wide = torch.promote_types(rgb.dtype, torch.float32)
+    raw = rgb.new_empty(*rgb.shape[:-3], height // scale, width // scale)
+    for colour, row, column in bayer_sites(pattern):
+        plane, step, area = rgb[..., colour, :, :], 2 * scale, scale * scale
+        seen = _sum([plane[..., scale * row + a :: step, :] for a in range(scale)], wide)
+        seen = _sum([seen[..., scale * column + b :: step] for b in range(scale)], wide)
+        raw[..., row::2, column::2] = seen / area if scale > 1 else seen
+    return raw
+
+
+def _sum(parts: list[Tensor], dtype: torch.dtype) -> Tensor:
+    total = parts[0]
+    for part in parts[1:]:
+        total = total.to(dtype) + part
+    return total
 
 
 class BinToSensor(nn.Module):
@@ -297,9 +304,10 @@ def split_colors(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
         Dong et al., CVPR 2024, section 4.2.
     """
     check_planes("raw", raw, 2, "(*, H, W)")
-    height, width = raw.shape[-2:]
-    mask = bayer_mask(height, width, pattern, device=raw.device, dtype=torch.bool)
-    return torch.where(mask.reshape(3, *[1] * (raw.ndim - 2), height, width), raw, raw.new_zeros(()))
+    colors = raw.new_zeros(3, *raw.shape)
+    for colour, row, column in bayer_sites(pattern):
+        colors[colour, ..., row::2, column::2] = raw[..., row::2, column::2]
+    return colors
 
 
 class SplitColors(nn.Module):

@@ -41,9 +41,10 @@ def _flat(stream: Tensor) -> Tensor:
 
 def _tiles(batch: int, pixels: int) -> Iterator[_Slices]:
     several = max(_TILE // pixels, 1)
+    part = -(-pixels // -(-pixels // _TILE))  # all of a plane's tiles are equally large
     for b in range(0, batch, several):
-        for p in range(0, pixels, _TILE):
-            yield slice(b, b + several), slice(p, p + _TILE)
+        for p in range(0, pixels, part):
+            yield slice(b, b + several), slice(p, p + part)
 
 
 def _read(flat: Tensor, tile: _Slices) -> np.ndarray:
@@ -186,13 +187,16 @@ def tfi(spikes: Tensor, max_range: float, dtype: torch.dtype) -> Tensor:
         _interval_tile(_read(flat, tile), interval)
         rate = np.empty(out.shape[1:], white.dtype)
         for interval_n, out_n in zip(interval, out, strict=True):
-            np.divide(white, interval_n, out=rate, dtype=rate.dtype)
-            _store(rate, out_n)
+            into = out_n if out_n.dtype == rate.dtype else rate
+            np.divide(white, interval_n, out=into, dtype=rate.dtype)
+            _store(into, out_n)
     return light.tensor
 
 
 def _store(value: np.ndarray, out: np.ndarray) -> None:
     """Write a plane of floats, rounded to the nearest whole number and cut to the range where ``out`` is uint8."""
+    if value is out:
+        return
     if out.dtype == np.uint8:
         np.rint(value, out=value)
         np.clip(value, 0, 255, out=value)
@@ -239,8 +243,9 @@ def tfp(spikes: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Te
             np.copyto(mean, total, casting="same_kind")
             if max_range != 1:
                 np.multiply(mean, wide.type(max_range), out=mean)
-            np.divide(mean, size, out=mean)
-            _store(mean, out_n)
+            into = out_n if out_n.dtype == wide else mean
+            np.divide(mean, size, out=into)
+            _store(into, out_n)
     return light.tensor
 
 
