@@ -72,9 +72,9 @@ class SensorNoise:
             dead pixels that together exceed 1, a spread of a dark current of 0.
 
     Example:
-        The constants of Hu et al., a camera of 250 x 400 pixels at 20 kHz: a threshold is a charge of 4.35 fF x 1.09 V
-        or 30 000 electrons; 0.44 pA of dark current, with a standard deviation of 39 %, make 0.0047 of it in a clock;
-        the gains of pixels spread by 6 %:
+        The constants of Hu et al. for a camera of 250 x 400 pixels at 20 kHz, which are bare numbers, read as fF, V and
+        pA: a threshold is a charge of 4.35 fF x 1.09 V or 30 000 electrons; 0.44 pA of dark current, with a standard
+        deviation of 39 %, make 0.0047 of it in a clock; the gains of pixels spread by 6 %:
 
         >>> typical = SensorNoise(photons=30_000, dark_current=0.0047, dark_spread=0.39, gain_spread=0.06)
         >>> for source, change in typical.spike_changes(light=0.2, frames=41).items():
