@@ -304,6 +304,19 @@ def test_numbers_of_numpy():
         )
 
 
+def test_idw_gradient_next_to_a_known_pixel():
+    """As accurate in float32 as far away, on the flank of the cone: no difference of large numbers."""
+    mask, features = bayer_mask(4, 6, dtype=torch.bool)[1], torch.randn(1, 3, 4, 6)
+    for away in (1e-2, 1e-4, 1e-6, 1e-9, 1e-15):
+        flow = away * torch.tensor([0.6, -0.8]).reshape(1, 2, 1, 1).repeat(1, 1, 4, 6)
+        grads = []
+        for dtype in (torch.float32, torch.float64):
+            leaf = flow.to(dtype).requires_grad_()
+            grads.append(torch.autograd.grad(flow_warp_idw(features.to(dtype), leaf, mask).sum(), leaf)[0].double())
+        torch.testing.assert_close(*(grad[..., mask] for grad in grads), rtol=1e-5, atol=1e-5)
+        assert grads[0][..., mask].abs().max() > 0.1
+
+
 @pytest.mark.parametrize("lead", [(), (2,), (2, 3), (0,), (2, 0)])
 def test_leading_dimensions(lead):
     features, flow, mask = torch.randn(*lead, 3, 4, 6), torch.randn(*lead, 2, 4, 6), bayer_mask(4, 6)[0]
