@@ -1,5 +1,6 @@
 """spikekit: differentiable operators for the colour spike camera."""
 
+from spikekit.cameras import CAMERAS, Camera, camera
 from spikekit.cfa import (
     PATTERNS,
     BayerMask,
@@ -23,20 +24,23 @@ from spikekit.files import SpikeFileError, iter_spikes, read_spikes, spikes_shap
 from spikekit.keyframe import spike_interval_at, tfi_at
 from spikekit.metrics import psnr, ssim
 from spikekit.motion import JointFlow, LinearMotion, UpsampleFlow, joint_flow, linear_motion, upsample_flow
+from spikekit.noise import SensorNoise, SpikeChange
 from spikekit.packing import pack_spikes, unpack_spikes
 from spikekit.pictures import flow_to_rgb, panel, read_picture, write_picture
 from spikekit.scene import Layer, Motion, Scene
 from spikekit.sensor import SpikeIntegrateFire, spike_integrate_fire
-from spikekit.simulate import simulate_spikes
+from spikekit.simulate import SpikeSensor, simulate_spikes
 from spikekit.streams import decode_in_chunks
 from spikekit.warp import FlowWarp, FlowWarpIdw, flow_warp, flow_warp_idw
 
 __version__ = "0.1.0.dev0"
 
 __all__ = [
+    "CAMERAS",
     "PATTERNS",
     "BayerMask",
     "BinToSensor",
+    "Camera",
     "Demosaic",
     "FlowWarp",
     "FlowWarpIdw",
@@ -47,9 +51,12 @@ __all__ = [
     "Mosaic",
     "Motion",
     "Scene",
+    "SensorNoise",
+    "SpikeChange",
     "SpikeFileError",
     "SpikeIntegrateFire",
     "SpikeInterval",
+    "SpikeSensor",
     "SplitBayer",
     "SplitColors",
     "Tfi",
@@ -59,6 +66,7 @@ __all__ = [
     "bayer_pattern",
     "bayer_sites",
     "bin_to_sensor",
+    "camera",
     "decode_in_chunks",
     "demosaic",
     "flow_to_rgb",

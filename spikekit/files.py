@@ -143,6 +143,13 @@ def spikes_shape(path: str | Path, height: int | None = None, width: int | None 
     Raises:
         SpikeFileError: as :func:`read_spikes`.
         TypeError: as :func:`read_spikes`.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_spikes(f"{folder}/clip.npz", torch.ones(5, 3, 7))
+        ...     spikes_shape(f"{folder}/clip.npz")
+        (5, 3, 7)
     """
     path = Path(path)
     height = None if height is None else check_index("height", height)
