@@ -125,6 +125,7 @@ def test_gradient_of_what_is_asked_for_only():
     torch.testing.assert_close(got, loops(values, grad, index, weight.detach())[2])
 
 
+@pytest.mark.filterwarnings("error")  # without a rule of its own vmap loops, with a warning
 def test_vmap():
     values, grad, index, weight = (a.unflatten(0, (2, 3)) for a in draw(6, 9, 4))
     for dims in [(0, 0, 0), (1, 1, 1)]:
