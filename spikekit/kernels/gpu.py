@@ -4,7 +4,8 @@ Every public function takes the arguments of the custom operator of the same nam
 in the memory layout of ``torch.empty_like``. It returns ``NotImplemented`` where the torch path is to run instead.
 
 Streams are seen as (B, T, P): batch, time, pixel. A program has a block of the pixels of one stream and loops over
-time. Quotients are rounded as IEEE 754 asks and products are not fused with sums: Triton's defaults would move spikes.
+time; a second sweep is a kernel of its own, so that no thread depends on what another has just stored. Quotients are
+rounded as IEEE 754 asks and products are not fused with sums: Triton's defaults would move spikes.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ __all__ = [
     "weighted_scatter",
 ]
 
-BLOCK = 512  # pixels of a program: four a thread, so that a thread reads four bytes or more at a time
-STAGES = tl.constexpr(4)  # frames on their way from memory while one is worked on
+_BLOCK = 512  # pixels of a program: four a thread, so that a thread reads four bytes or more at a time
+_STAGES = tl.constexpr(4)  # frames on their way from memory while one is worked on
 
 
 def _bytes(tensor: Tensor) -> Tensor:
@@ -58,7 +59,7 @@ def _as(layout: Tensor, result: Tensor) -> Tensor:
 
 
 def _blocks(stream: Tensor) -> int:
-    return stream.shape[0] * triton.cdiv(stream.shape[2], BLOCK)
+    return stream.shape[0] * triton.cdiv(stream.shape[2], _BLOCK)
 
 
 @triton.jit
@@ -82,7 +83,7 @@ def _integrate_fire_kernel(
     spikes += b * frames * pixels + pixel
     theta = tl.load(threshold)
     rest = tl.load(charge + b * pixels + pixel, mask=inside, other=0)
-    for t in tl.range(frames, num_stages=STAGES):
+    for t in tl.range(frames, num_stages=_STAGES):
         full = rest + tl.load(light + t * light_t, mask=inside, other=0).to(theta.dtype)
         fired = full >= theta
         if spikes.dtype.element_ty == tl.uint8:
@@ -102,7 +103,7 @@ def integrate_fire(light: Tensor, threshold: float, charge: Tensor, dtype: torch
     spikes, left = flat.new_empty(flat.shape, dtype=dtype), torch.empty_like(start)
     theta = _scalar(threshold, light, charge.dtype)
     sizes = *flat.shape[1:], *flat.stride()
-    launch(_integrate_fire_kernel, _blocks(flat), flat, theta, start, _bytes(spikes), left, *sizes, block=BLOCK)
+    launch(_integrate_fire_kernel, _blocks(flat), flat, theta, start, _bytes(spikes), left, *sizes, block=_BLOCK)
     return _as(light, spikes), _as(charge, left)
 
 
@@ -122,63 +123,70 @@ def integrate_fire_grad(grad: Tensor, light: Tensor, threshold: float) -> Tensor
     flat, light = grad.detach().contiguous(), light.detach().contiguous()
     result = torch.empty_like(flat)
     arguments = flat, light, _scalar(threshold, light, wide_dtype(light)), result, result.numel()
-    launch(_integrate_fire_grad_kernel, triton.cdiv(result.numel(), BLOCK), *arguments, block=BLOCK)
+    launch(_integrate_fire_grad_kernel, triton.cdiv(result.numel(), _BLOCK), *arguments, block=_BLOCK)
     return _as(grad, result)
 
 
 @triton.jit(do_not_specialize=["frames"])
-def _interval_kernel(
-    spikes, interval, light, max_range, frames, pixels, spikes_b, spikes_t, spikes_p,
-    as_light: tl.constexpr, block: tl.constexpr,
-):  # fmt: skip
-    """Intervals of a block of pixels in two sweeps, or, with as_light, max_range over them.
+def _next_spike_kernel(spikes, following, first, frames, pixels, spikes_b, spikes_t, spikes_p, block: tl.constexpr):
+    """Next spike of every frame, T where there is none, and the first complete interval, for a block of pixels.
 
-    Backwards reads the spikes and leaves the next spike of every frame in ``interval``; forwards, which knows the last
-    one, turns it into the result. So memory is read twice and written twice.
+    Backwards in time: one read of the spikes, one write.
     """
     b, pixel, inside = my_pixels(pixels, block)
     spikes += b * spikes_b + pixel * spikes_p
     spikes_t = tl.cast(spikes_t, tl.int64)
     pixels = tl.cast(pixels, tl.int64)
-    interval += b * frames * pixels + pixel
-    light += b * frames * pixels + pixel
-
-    following = tl.zeros([block], tl.int32) + frames  # T where there is none
-    first = tl.zeros([block], tl.int32)  # the first complete interval
-    for i in tl.range(frames, num_stages=STAGES):
+    following += b * frames * pixels + pixel
+    after = tl.zeros([block], tl.int32) + frames
+    complete = tl.zeros([block], tl.int32)
+    for i in tl.range(frames, num_stages=_STAGES):
         n = frames - 1 - i
         fired = tl.load(spikes + n * spikes_t, mask=inside, other=0) != 0
-        first = tl.where(fired & (following < frames), following - n, first)
-        following = tl.where(fired, n, following)
-        tl.store(interval + n * pixels, following.to(interval.dtype.element_ty), mask=inside)
+        complete = tl.where(fired & (after < frames), after - n, complete)
+        after = tl.where(fired, n, after)
+        tl.store(following + n * pixels, after.to(following.dtype.element_ty), mask=inside)
+    tl.store(first + b * pixels + pixel, complete, mask=inside)
 
-    tl.debug_barrier()  # what one thread has stored, another may load
+
+@triton.jit(do_not_specialize=["frames"])
+def _interval_kernel(following, first, result, max_range, frames, pixels, as_light: tl.constexpr, block: tl.constexpr):
+    """Intervals of a block of pixels, or, with as_light, max_range over them; the result may lie on ``following``.
+
+    Forwards in time: one read of the next spikes, one write.
+    """
+    b, pixel, inside = my_pixels(pixels, block)
+    pixels = tl.cast(pixels, tl.int64)
+    following += b * frames * pixels + pixel
+    result += b * frames * pixels + pixel
     white = tl.load(max_range)
-    previous = tl.zeros([block], tl.int32) - 1  # -1 where there is none
-    last = tl.zeros([block], tl.int32)  # the latest complete interval
-    for n in tl.range(frames, num_stages=STAGES):
-        following = tl.load(interval + n * pixels, mask=inside, other=0).to(tl.int32)
-        fired = following == n
-        complete = tl.where(previous < 0, first, tl.where(following < frames, 0, last))
-        observed = tl.maximum(following - previous, complete)
-        last = tl.where(fired & (previous >= 0), n - previous, last)
-        previous = tl.where(fired, n, previous)
+    first_complete = tl.load(first + b * pixels + pixel, mask=inside, other=0)
+    last_complete = tl.zeros([block], tl.int32)
+    before = tl.zeros([block], tl.int32) - 1  # the last spike, -1 where there is none
+    for n in tl.range(frames, num_stages=_STAGES):
+        after = tl.load(following + n * pixels, mask=inside, other=0).to(tl.int32)
+        fired = after == n
+        complete = tl.where(before < 0, first_complete, tl.where(after < frames, 0, last_complete))
+        interval = tl.maximum(after - before, complete)
+        last_complete = tl.where(fired & (before >= 0), n - before, last_complete)
+        before = tl.where(fired, n, before)
         if as_light:
-            observed = tl.maximum(observed, 1).to(white.dtype)  # pixels beyond the picture have 0
-            store(light + n * pixels, _divide(white, observed), inside)
+            interval = tl.maximum(interval, 1).to(white.dtype)  # pixels beyond the picture have 0
+            store(result + n * pixels, _divide(white, interval), inside)
         else:
-            tl.store(interval + n * pixels, observed.to(interval.dtype.element_ty), mask=inside)
+            tl.store(result + n * pixels, interval.to(result.dtype.element_ty), mask=inside)
 
 
 def _intervals(spikes: Tensor, max_range: float = 1.0, dtype: torch.dtype | None = None) -> Tensor:
     flat = _flat(spikes)
-    interval = flat.new_empty(flat.shape, dtype=torch.int16 if flat.shape[1] < 32767 else torch.int32)
-    light = interval if dtype is None else flat.new_empty(flat.shape, dtype=dtype)
-    white = _scalar(max_range, flat, wide_dtype(light))
-    sizes = *flat.shape[1:], *flat.stride()
-    constants = {"as_light": dtype is not None, "block": BLOCK}
-    launch(_interval_kernel, _blocks(flat), flat, interval, light, white, *sizes, **constants)
-    return _as(spikes, light)
+    batch, frames, pixels = flat.shape
+    following = flat.new_empty(flat.shape, dtype=torch.int16 if frames < 32767 else torch.int32)
+    first = flat.new_empty(batch, pixels, dtype=torch.int32)
+    launch(_next_spike_kernel, _blocks(flat), flat, following, first, frames, pixels, *flat.stride(), block=_BLOCK)
+    result = following if dtype is None else flat.new_empty(flat.shape, dtype=dtype)
+    arguments = following, first, result, _scalar(max_range, flat, wide_dtype(result)), frames, pixels
+    launch(_interval_kernel, _blocks(flat), *arguments, as_light=dtype is not None, block=_BLOCK)
+    return _as(spikes, result)
 
 
 def spike_interval(spikes: Tensor) -> Tensor:
@@ -192,30 +200,42 @@ def tfi(spikes: Tensor, max_range: float, dtype: torch.dtype) -> Tensor:
 
 
 @triton.jit(do_not_specialize=["frames"])
-def _tfi_grad_kernel(
-    grad, spikes, rate, sums, result, frames, pixels,
-    grad_b, grad_t, grad_p, spikes_b, spikes_t, spikes_p, rate_b, rate_t, rate_p, block: tl.constexpr,
-):  # fmt: skip
-    """Gradient of a block of pixels in two sweeps: forwards sums every interval, backwards spreads what is complete."""
+def _sums_kernel(
+    grad, spikes, sums, frames, pixels, grad_b, grad_t, grad_p, spikes_b, spikes_t, spikes_p, block: tl.constexpr
+):
+    """Sums of the gradient since the last spike, for a block of pixels: two reads, one write."""
     b, pixel, inside = my_pixels(pixels, block)
     grad += b * grad_b + pixel * grad_p
     spikes += b * spikes_b + pixel * spikes_p
+    grad_t, spikes_t = tl.cast(grad_t, tl.int64), tl.cast(spikes_t, tl.int64)
+    pixels = tl.cast(pixels, tl.int64)
+    sums += b * frames * pixels + pixel
+    total = tl.zeros([block], sums.dtype.element_ty)
+    for n in tl.range(frames, num_stages=_STAGES):
+        total += tl.load(grad + n * grad_t, mask=inside, other=0).to(total.dtype)
+        tl.store(sums + n * pixels, total, mask=inside)
+        fired = tl.load(spikes + n * spikes_t, mask=inside, other=0) != 0
+        total = tl.where(fired, 0, total)
+
+
+@triton.jit(do_not_specialize=["frames"])
+def _spread_kernel(
+    sums, spikes, rate, result, frames, pixels, spikes_b, spikes_t, spikes_p, rate_b, rate_t, rate_p,
+    block: tl.constexpr,
+):  # fmt: skip
+    """The sum at the end of every interval, weighed, on all its frames, for a block of pixels: three reads, one write.
+
+    The result may lie on ``sums``.
+    """
+    b, pixel, inside = my_pixels(pixels, block)
+    spikes += b * spikes_b + pixel * spikes_p
     rate += b * rate_b + pixel * rate_p
-    grad_t, spikes_t, rate_t = tl.cast(grad_t, tl.int64), tl.cast(spikes_t, tl.int64), tl.cast(rate_t, tl.int64)
+    spikes_t, rate_t = tl.cast(spikes_t, tl.int64), tl.cast(rate_t, tl.int64)
     pixels = tl.cast(pixels, tl.int64)
     sums += b * frames * pixels + pixel
     result += b * frames * pixels + pixel
-
-    total = tl.zeros([block], sums.dtype.element_ty)
-    spread = total
-    for n in tl.range(frames, num_stages=STAGES):
-        spread = total + tl.load(grad + n * grad_t, mask=inside, other=0).to(total.dtype)
-        tl.store(sums + n * pixels, spread, mask=inside)
-        fired = tl.load(spikes + n * spikes_t, mask=inside, other=0) != 0
-        total = tl.where(fired, 0, spread)
-
-    tl.debug_barrier()  # what one thread has stored, another may load
-    for i in tl.range(frames, num_stages=STAGES):
+    spread = tl.load(sums + (frames - 1) * pixels, mask=inside, other=0)
+    for i in tl.range(frames, num_stages=_STAGES):
         n = frames - 1 - i
         fired = tl.load(spikes + n * spikes_t, mask=inside, other=0) != 0
         spread = tl.where(fired, tl.load(sums + n * pixels, mask=inside, other=0), spread)
@@ -226,11 +246,14 @@ def _tfi_grad_kernel(
 def tfi_grad(grad: Tensor, spikes: Tensor, rate: Tensor) -> Tensor:
     """Sum the gradient over every interval, spread the sum on it, and weigh it by the rate."""
     flat, fired, rates = _flat(grad), _flat(spikes), _flat(rate)
+    _, frames, pixels = flat.shape
     result = fired.new_empty(fired.shape, dtype=spikes.dtype)
     wide = wide_dtype(grad, spikes)
     sums = result if result.dtype is wide else result.new_empty(result.shape, dtype=wide)
-    sizes = *flat.shape[1:], *flat.stride(), *fired.stride(), *rates.stride()
-    launch(_tfi_grad_kernel, _blocks(flat), flat, fired, rates, sums, result, *sizes, block=BLOCK)
+    sizes = frames, pixels, *flat.stride(), *fired.stride()
+    launch(_sums_kernel, _blocks(flat), flat, fired, sums, *sizes, block=_BLOCK)
+    sizes = frames, pixels, *fired.stride(), *rates.stride()
+    launch(_spread_kernel, _blocks(flat), sums, fired, rates, result, *sizes, block=_BLOCK)
     return _as(spikes, result)
 
 
@@ -267,9 +290,9 @@ def _window_kernel(
     result += b * frames * pixels + pixel
     white = tl.load(max_range)
     total = tl.zeros([block], counter)
-    for n in tl.range(half, num_stages=STAGES):
+    for n in tl.range(half, num_stages=_STAGES):
         total += _term(values, n, n < frames, frames, values_t, half, white, pixel, pixels, counter, adjoint)
-    for n in tl.range(frames, num_stages=STAGES):
+    for n in tl.range(frames, num_stages=_STAGES):
         enters, leaves = n + half, n - half - 1
         total += _term(values, enters, enters < frames, frames, values_t, half, white, pixel, pixels, counter, adjoint)
         total -= _term(values, leaves, leaves >= 0, frames, values_t, half, white, pixel, pixels, counter, adjoint)
@@ -289,7 +312,7 @@ def _windows(values: Tensor, window: int, max_range: Tensor, dtype: torch.dtype,
         count = tl.float64  # a sum that runs must not forget what is small
     else:
         count = tl.int32 if values.dtype in (torch.bool, torch.uint8) else tl.int64
-    constants = {"counter": count, "adjoint": adjoint, "block": BLOCK}
+    constants = {"counter": count, "adjoint": adjoint, "block": _BLOCK}
     launch(_window_kernel, _blocks(flat), flat, max_range, result, *sizes, **constants)
     return _as(values, result)
 

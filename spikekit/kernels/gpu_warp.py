@@ -54,23 +54,20 @@ def _distance(index, width, x, x_part, y, y_part):
 
 
 @triton.jit(do_not_specialize=["height", "width", "products", "on_rows", "on_columns", "neighbors"])
-def _nearest_known_kernel(
-    flow, rows, columns, index, weight, height, width, products, on_rows, on_columns, neighbors, block: tl.constexpr
+def _search_kernel(
+    flow, rows, columns, index, height, width, products, on_rows, on_columns, neighbors, block: tl.constexpr
 ):
-    """Nearest known pixels of a block of positions, one after the other, and their weights.
+    """Nearest known pixels of a block of positions, one after the other; the first again where there are no more.
 
     The next one is the first, by distance and then by index, of the candidates that come after the last one. A
     candidate is the i-th nearest row and the j-th nearest column of a product, with i j at most ``neighbors``: any
-    other has as many before it. The flow is read once, the index written and read once, and the weight written once;
-    the tables stay in the cache.
+    other has as many before it. The flow is read once and the index written once; the tables stay in the cache.
     """
     plane = tl.cast(height, tl.int64) * width
     b, pixel, inside = my_pixels(plane, block)
     x, x_part = _split(tl.load(flow + 2 * b * plane + pixel, mask=inside, other=0), pixel % width)
     y, y_part = _split(tl.load(flow + (2 * b + 1) * plane + pixel, mask=inside, other=0), pixel // width)
     index += b * neighbors * plane + pixel
-    weight += b * neighbors * plane + pixel
-
     nearest = tl.full([block], -1, tl.int64)
     last = nearest
     last_distance = tl.full([block], float("-inf"), tl.float64)
@@ -93,19 +90,34 @@ def _nearest_known_kernel(
         last, last_distance = best, best_distance
         tl.store(index + slot * plane, tl.where(best < 0, nearest, best), mask=inside)
 
-    tl.debug_barrier()  # what one thread has stored, another may load
+
+@triton.jit
+def _ratio(pixel, nearest, shortest, width, x, x_part, y, y_part):
+    """Inverse distance relative to that of the nearest pixel: no overflow, and 0 for all others where that is hit."""
+    distance = _distance(pixel, width, x, x_part, y, y_part)
+    again = pixel == nearest
+    return tl.where(again, 0.0, shortest / tl.where(again, 1.0, distance))
+
+
+@triton.jit(do_not_specialize=["height", "width", "neighbors"])
+def _weigh_kernel(flow, index, weight, height, width, neighbors, block: tl.constexpr):
+    """Weights of the neighbours of a block of positions: the index is read twice, the weight written once."""
+    plane = tl.cast(height, tl.int64) * width
+    b, pixel, inside = my_pixels(plane, block)
+    x, x_part = _split(tl.load(flow + 2 * b * plane + pixel, mask=inside, other=0), pixel % width)
+    y, y_part = _split(tl.load(flow + (2 * b + 1) * plane + pixel, mask=inside, other=0), pixel // width)
+    index += b * neighbors * plane + pixel
+    weight += b * neighbors * plane + pixel
+    nearest = tl.load(index, mask=inside, other=0)
     shortest = _distance(nearest, width, x, x_part, y, y_part)
     total = tl.zeros([block], tl.float64) + 1
-    for slot in range(1, neighbors):
-        pixel_k = tl.load(index + slot * plane, mask=inside, other=0)
-        distance = _distance(pixel_k, width, x, x_part, y, y_part)
-        total += tl.where(pixel_k == nearest, 0.0, shortest / tl.where(pixel_k == nearest, 1.0, distance))
+    for k in range(1, neighbors):
+        pixel_k = tl.load(index + k * plane, mask=inside, other=0)
+        total += _ratio(pixel_k, nearest, shortest, width, x, x_part, y, y_part)
     store(weight, 1 / total, inside)
-    for slot in range(1, neighbors):
-        pixel_k = tl.load(index + slot * plane, mask=inside, other=0)
-        distance = _distance(pixel_k, width, x, x_part, y, y_part)
-        ratio = tl.where(pixel_k == nearest, 0.0, shortest / tl.where(pixel_k == nearest, 1.0, distance))
-        store(weight + slot * plane, ratio / total, inside)
+    for k in range(1, neighbors):
+        pixel_k = tl.load(index + k * plane, mask=inside, other=0)
+        store(weight + k * plane, _ratio(pixel_k, nearest, shortest, width, x, x_part, y, y_part) / total, inside)
 
 
 def nearest_known(flow: Tensor, products: list[tuple[Tensor, Tensor]], neighbors: int) -> tuple[Tensor, Tensor]:
@@ -118,10 +130,11 @@ def nearest_known(flow: Tensor, products: list[tuple[Tensor, Tensor]], neighbors
     batch, _, height, width = flow.shape
     index = flow.new_empty(batch, neighbors, height * width, dtype=torch.int64)
     weight = flow.new_empty(index.shape)
-    sizes = height, width, len(products), rows.shape[1], columns.shape[1], neighbors
     programs = batch * triton.cdiv(height * width, _BLOCK)
-    arguments = flow.detach().contiguous(), rows, columns, index, weight
-    launch(_nearest_known_kernel, programs, *arguments, *sizes, block=_BLOCK)
+    sizes = height, width, len(products), rows.shape[1], columns.shape[1], neighbors
+    flow = flow.detach().contiguous()
+    launch(_search_kernel, programs, flow, rows, columns, index, *sizes, block=_BLOCK)
+    launch(_weigh_kernel, programs, flow, index, weight, height, width, neighbors, block=_BLOCK)
     return index, weight
 
 
