@@ -11,12 +11,14 @@ With them a warp can be differentiated as often as one likes. Sums run in float3
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from spikekit.kernels import cpu_warp, register
+from spikekit.kernels import cpu_warp
 from spikekit.kernels.layout import empty_like_layout, is_channels_last
 
 _FEW = 8  # channels: of fewer planes, a CPU gathers one after the other faster than rows of all
@@ -76,12 +78,18 @@ def fold_into_batch(op: Any, count: int) -> None:
 
 def _operator(plain: Callable[..., Tensor], name: str) -> Any:
     op = torch.library.custom_op(f"spikekit::{name}", plain, mutates_args=())
-    register(op, name)
     rows = getattr(cpu_warp, name)
 
     @op.register_kernel("cpu")
     def _(first: Tensor, *others: Any) -> Tensor:
         return (rows if is_channels_last(first) or first.shape[1] >= _FEW else plain)(first, *others)
+
+    if find_spec("triton") is not None:
+
+        @op.register_kernel("cuda")
+        def _(*args: Any) -> Tensor:
+            result = getattr(import_module("spikekit.kernels.gpu"), name)(*args)
+            return plain(*args) if result is NotImplemented else result
 
     fold_into_batch(op, 3)
     return op
