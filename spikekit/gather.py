@@ -11,14 +11,12 @@ With them a warp can be differentiated as often as one likes. Sums run in float3
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib import import_module
-from importlib.util import find_spec
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from spikekit.kernels import cpu_warp
+from spikekit.kernels import cpu_warp, gpu_kernel, register_on_gpu
 from spikekit.kernels.layout import empty_like_layout, is_channels_last
 
 _FEW = 8  # channels: of fewer planes, a CPU gathers one after the other faster than rows of all
@@ -84,13 +82,11 @@ def _operator(plain: Callable[..., Tensor], name: str) -> Any:
     def _(first: Tensor, *others: Any) -> Tensor:
         return (rows if is_channels_last(first) or first.shape[1] >= _FEW else plain)(first, *others)
 
-    if find_spec("triton") is not None:
+    def on_gpu(*args: Any) -> Tensor:
+        result = gpu_kernel(name)(*args)
+        return plain(*args) if result is NotImplemented else result
 
-        @op.register_kernel("cuda")
-        def _(*args: Any) -> Tensor:
-            result = getattr(import_module("spikekit.kernels.gpu"), name)(*args)
-            return plain(*args) if result is NotImplemented else result
-
+    register_on_gpu(op, on_gpu)
     fold_into_batch(op, 3)
     return op
 

@@ -9,8 +9,6 @@ Everything that warps with the same flow and mask can share them::
 from __future__ import annotations
 
 from functools import lru_cache, partial
-from importlib import import_module
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -19,7 +17,7 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from spikekit.gather import fold_into_batch
-from spikekit.kernels import cpu_warp
+from spikekit.kernels import cpu_warp, gpu_kernel, register_on_gpu
 from spikekit.position_table import PositionTable
 
 _FARTHEST = 2.0**30  # flow beyond it is cut: positions must fit an integer
@@ -213,15 +211,13 @@ def _(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, T
     return _nearest_known(flow, mask, neighbors, steps)
 
 
-if find_spec("triton") is not None:
-
-    @nearest_known.register_kernel("cuda")
-    def _(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
-        if steps:
-            return _nearest_known(flow, mask, neighbors, steps)
-        return import_module("spikekit.kernels.gpu").nearest_known(flow, products_of(mask, neighbors), neighbors)
+def _on_gpu(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
+    if steps:
+        return _nearest_known(flow, mask, neighbors, steps)
+    return gpu_kernel("nearest_known")(flow, products_of(mask, neighbors), neighbors)
 
 
+register_on_gpu(nearest_known, _on_gpu)
 fold_into_batch(nearest_known, 1)
 
 

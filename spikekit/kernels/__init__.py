@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -12,19 +13,20 @@ from spikekit.kernels import cpu
 
 
 def register(op: Any, name: str) -> None:
-    """Run a custom operator by the function ``name`` of :mod:`spikekit.kernels.cpu` and :mod:`spikekit.kernels.gpu`.
+    """Run a custom operator by the function ``name`` of :mod:`spikekit.kernels.cpu` and :mod:`spikekit.kernels.gpu`."""
+    op.register_kernel("cpu")(getattr(cpu, name))
+    register_on_gpu(op, lambda *args: gpu_kernel(name)(*args))
 
-    The latter is Triton: imported when first needed, and left out where Triton is not installed. Where a file has no
-    such function, the operator's own torch path runs.
-    """
-    if hasattr(cpu, name):
-        op.register_kernel("cpu")(getattr(cpu, name))
+
+def register_on_gpu(op: Any, kernel: Callable[..., Any]) -> None:
+    """Run a custom operator by a Triton kernel, where Triton is installed; else its own torch path runs."""
     if find_spec("triton") is not None:
+        op.register_kernel("cuda")(kernel)
 
-        def on_gpu(*args: Any) -> Tensor | tuple[Tensor, ...]:
-            return getattr(import_module("spikekit.kernels.gpu"), name)(*args)
 
-        op.register_kernel("cuda")(on_gpu)
+def gpu_kernel(name: str) -> Callable[..., Any]:
+    """Return a function of :mod:`spikekit.kernels.gpu`, which is imported when it is first needed."""
+    return getattr(import_module("spikekit.kernels.gpu"), name)
 
 
 def batch_first(op: Any) -> None:

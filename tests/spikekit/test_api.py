@@ -25,6 +25,7 @@ SPIKES = (torch.rand(2, 9, 4, 6, generator=torch.Generator().manual_seed(1)) < 0
 RGB = torch.rand(2, 3, 4, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
 FLOW = 4 * torch.rand(2, 2, 4, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(3)) - 2
 MASK = sk.bayer_mask(4, 6, dtype=torch.float64)[1]
+INDEX, WEIGHT = torch.arange(192).reshape(2, 4, 24) % 24, RGB.repeat(1, 2, 1, 1)[:, :4].flatten(2)
 TIMES = (0.0, 2.0, 5.0)
 
 # function, arguments of the module, tensors it is called with, arguments of the function
@@ -241,6 +242,9 @@ def test_custom_operators_with_dynamic_sizes(op, tensors):
         (torch.ops.spikekit.tfp_grad, (SPIKES.clone().requires_grad_(), 3, 1.0, torch.float64)),
         (torch.ops.spikekit.spike_interval, (SPIKES > 0,)),
         (torch.ops.spikekit.nearest_known, (FLOW, MASK, 4, 0)),
+        (torch.ops.spikekit.weighted_gather, (RGB.flatten(2), INDEX, WEIGHT)),
+        (torch.ops.spikekit.weighted_scatter, (RGB.flatten(2), INDEX, WEIGHT, 24)),
+        (torch.ops.spikekit.weighted_dot, (RGB.flatten(2), RGB.flatten(2), INDEX)),
     ],
     ids=lambda value: str(value).rpartition(".")[2] if "spikekit" in str(value) else "",
 )
