@@ -16,7 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spikekit import bench, extremes
+from spikekit import bench, extremes, simulate_cli
+from spikekit.arguments import UsageError, one_line, positive, whole
 from spikekit.cfa import PATTERNS
 from spikekit.demosaic import demosaic
 from spikekit.files import iter_spikes, spikes_shape
@@ -51,10 +52,6 @@ _PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 
 # Pixels that are counted at a time.
 _BLOCK = 1 << 24
-
-
-class UsageError(ValueError):
-    """A command line that asks for what cannot be."""
 
 
 def info(args: argparse.Namespace) -> None:
@@ -122,13 +119,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             args.run(args)
         print(end="", flush=True)
     except (ValueError, MemoryError) as error:
-        print(f"spikekit: {_one_line(error)}", file=sys.stderr)
+        print(f"spikekit: {one_line(error)}", file=sys.stderr)
         return 2 if isinstance(error, UsageError) else 1
     except OSError as error:  # nobody reads what is printed, or it finds no room
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it flushes at exit
         if isinstance(error, BrokenPipeError):
             return 141
-        print(f"spikekit: standard output: {_one_line(error)}", file=sys.stderr)
+        print(f"spikekit: standard output: {one_line(error)}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 130
@@ -182,20 +179,22 @@ def _parser() -> argparse.ArgumentParser:
     )
     verb.add_argument(
         "--window",
-        type=_whole(1),
+        type=whole(1),
         metavar="W",
         help=f"frames that tfp averages, odd, the frame in their middle, fewer at the ends of the recording; "
         f"{TFP_WINDOW} if not given",
     )
     verb.add_argument(
         "--alpha",
-        type=_positive,
+        type=positive,
         metavar="A",
         help="gain of a simulated recording (a white pixel fires A times a frame), to divide by; "
         "if not given, the picture is scaled until the 99.9th percentile of the spike rate in the frames it is made "
         "from is white, and many pictures all as the one in their middle",
     )
 
+    example = "simulate walk -o walk.dat --scale 4"
+    simulate_cli.add_arguments(_add_verb(verbs, simulate_cli.run, "simulate", "a stream of a film", example))
     example = "extremes --operator tfi --markdown"
     extremes.add_arguments(_add_verb(verbs, extremes.run, "extremes", "how exact the operators are at worst", example))
     example = "bench tfi tfp --size small"
@@ -217,38 +216,15 @@ def _add_verb(verbs: Any, run: Any, name: str, summary: str, example: str) -> ar
 
 def _add_recording(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("file", type=Path, metavar="FILE", help="a recording, .dat (8 pixels a byte, no header) or .npz")
-    verb.add_argument("--height", type=_whole(1), metavar="H", help="rows of a frame; a .dat needs it")
-    verb.add_argument("--width", type=_whole(1), metavar="W", help="columns of a frame; a .dat needs it")
+    verb.add_argument("--height", type=whole(1), metavar="H", help="rows of a frame; a .dat needs it")
+    verb.add_argument("--width", type=whole(1), metavar="W", help="columns of a frame; a .dat needs it")
     verb.add_argument("--flip", action="store_true", help="the frames are stored upside down, as real cameras do")
-
-
-def _whole(least: int) -> Any:
-    def whole(text: str) -> int:
-        try:
-            number = int(text)
-        except ValueError:
-            number = least - 1
-        if number < least:
-            raise argparse.ArgumentTypeError(f"expected a whole number, {least} or more, got {text}")
-        return number
-
-    return whole
 
 
 def _frames(text: str) -> str:
     if not re.fullmatch(r"\d+|\d*:\d*(:0*[1-9]\d*)?", text, re.ASCII):
         raise argparse.ArgumentTypeError(f"expected a whole number, 0 or more, or A:B or A:B:STEP, got {text}")
     return text
-
-
-def _positive(text: str) -> float:
-    try:
-        number = float(text)
-    except ValueError:
-        number = 0.0
-    if not 0 < number < float("inf"):
-        raise argparse.ArgumentTypeError(f"expected a number above 0, got {text}")
-    return number
 
 
 def _picture(text: str) -> Path:
@@ -352,7 +328,7 @@ def _write(path: Path, picture: Tensor) -> None:
         write_picture(part, picture)
         part.replace(path)
     except Exception as error:  # what a picture library raises depends on the ending
-        raise ValueError(f"{path}: cannot be written ({_one_line(error)})") from error
+        raise ValueError(f"{path}: cannot be written ({one_line(error)})") from error
     finally:
         with suppress(OSError):
             part.unlink(missing_ok=True)
@@ -361,8 +337,3 @@ def _write(path: Path, picture: Tensor) -> None:
 def _at(rates: Tensor, index: Tensor) -> str:
     row, column = divmod(int(index), rates.shape[-1])
     return f"{rates.flatten()[index]:.4f} spikes a frame, at row {row}, column {column}"
-
-
-def _one_line(error: BaseException) -> str:
-    text = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    return " ".join(text.split())

@@ -1,0 +1,171 @@
+"""Side-cars: what a simulated stream was made of, in a JSON file beside it."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+#: What the first line of a side-car says it is.
+KIND = "spikekit simulation 1"
+
+
+@dataclass(frozen=True)
+class Sidecar:
+    """What is known about a simulated stream; the values are those of JSON.
+
+    Args:
+        stream: ``file``, ``frames``, ``height``, ``width`` and ``sha256``, that of the frames as a ``.dat`` holds them.
+        truth: pictures of the scene, by their path from the side-car: the frame of the stream at which each was seen.
+        source: ``path``, from the side-car, and ``frames``: SHA-256 of the pixels of every frame that was looked at.
+        settings: all that was asked for, or left at its default.
+        plan: what was modelled.
+        versions: of what computed it.
+    """
+
+    stream: dict[str, Any]
+    truth: dict[str, float]
+    source: dict[str, Any]
+    settings: dict[str, Any]
+    plan: dict[str, Any]
+    versions: dict[str, str]
+
+    def dumps(self) -> str:
+        """Return the text of the file."""
+        return json.dumps({"kind": KIND} | asdict(self), indent=1) + "\n"
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what a stream depends on."""
+    from spikekit import __version__
+
+    return {
+        "spikekit": __version__,
+        "torch": str(torch.__version__),
+        "numpy": np.__version__,
+        "python": platform.python_version(),
+        "machine": f"{platform.machine()}, {torch.backends.cpu.get_cpu_capability()}",
+    }
+
+
+def read_sidecar(path: Path) -> Sidecar:
+    """Read a side-car.
+
+    Args:
+        path: the file.
+
+    Returns:
+        What it says.
+
+    Raises:
+        ValueError: it cannot be read, or is something else; the message names it.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(data, dict) or data.pop("kind", None) != KIND:
+            raise ValueError(f"expected the side-car of a simulation ({KIND})")
+        sidecar = Sidecar(**data)
+        sizes = [sidecar.stream[key] for key in ("frames", "height", "width")]
+        if not all(isinstance(size, int) and size > 0 for size in sizes):
+            raise ValueError(f"expected frames, height and width above 0, got {sizes}")
+        sidecar.stream["file"], sidecar.stream["sha256"], sidecar.source["path"], sidecar.source["frames"]
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except (ValueError, TypeError, KeyError) as error:
+        said = f"lacks {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
+        raise ValueError(f"{path}: not a side-car that can be read ({said})") from error
+    return sidecar
+
+
+def find_sidecar(stream: Path) -> Sidecar | None:
+    """Return the side-car of a stream: the JSON file of the same name, where it speaks of this file.
+
+    Args:
+        stream: a recording.
+
+    Returns:
+        The side-car; ``None`` where there is none, or that of another stream.
+    """
+    path = stream.with_suffix(".json")
+    try:
+        sidecar = read_sidecar(path)
+    except ValueError:
+        return None
+    return sidecar if sidecar.stream["file"] == stream.name else None
+
+
+@contextmanager
+def published(output: Path) -> Iterator[Path]:
+    """Give a folder to write to; when all is written, put everything under its final name, the side-car last.
+
+    Convention:
+        The folder lies beside ``output``, hidden. Its contents move to where ``output`` is, each by one renaming, and
+        the side-car, ``output`` with the ending ``.json``, after all others. One that is there already and says
+        something else goes first. So a stream beside its side-car is complete, whenever the process was killed: what
+        remains of one that was is a hidden folder that ends in ``.part``.
+
+        Processes that write the same output publish one after the other.
+
+    Args:
+        output: the stream.
+
+    Returns:
+        A context that yields the folder.
+
+    Raises:
+        ValueError: the folder cannot be made, something cannot be moved, or the place of the side-car is taken by
+            something else.
+    """
+    target, last = output.parent, output.with_suffix(".json")
+    if last.exists():
+        stream = read_sidecar(last).stream["file"]  # raises where the file is something else
+        if stream != output.name:
+            raise ValueError(f"{output}: its side-car, {last}, would replace that of {stream}; choose another name")
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+        part = Path(tempfile.mkdtemp(".part", f".{output.name}.", target))
+    except OSError as error:
+        raise ValueError(f"{output}: cannot be written ({error.strerror or error})") from error
+    try:
+        yield part
+        try:
+            with _alone(target):
+                _publish(part, target, last.name)
+        except OSError as error:
+            raise ValueError(f"{error.filename2 or output}: cannot be written ({error.strerror or error})") from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _publish(part: Path, target: Path, last: str) -> None:
+    sidecar = target / last
+    if sidecar.is_file() and sidecar.read_bytes() != (part / last).read_bytes():
+        sidecar.unlink()
+    files = sorted((path for path in part.rglob("*") if path.is_file()), key=lambda path: path == part / last)
+    for path in files:
+        final = target / path.relative_to(part)
+        final.parent.mkdir(exist_ok=True)
+        os.replace(path, final)
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Wait until no other process publishes in this folder; a lock ends with its process."""
+    with ExitStack() as stack:
+        with suppress(OSError, ImportError):  # not every system and not every file system has locks
+            import fcntl
+
+            handle = os.open(folder, os.O_RDONLY)
+            stack.callback(os.close, handle)
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
