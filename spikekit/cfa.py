@@ -235,18 +235,16 @@ def bin_to_sensor(rgb: Tensor, pattern: str | CFA = "RGGB", *, scale: int) -> Te
     wide = torch.promote_types(rgb.dtype, torch.float32)
     raw = rgb.new_empty(*rgb.shape[:-3], height // scale, width // scale)
     for colour, row, column in bayer_sites(pattern):
-        plane, step, area = rgb[..., colour, :, :], 2 * scale, scale * scale
+        plane, step = rgb[..., colour, :, :], 2 * scale
         seen = _sum([plane[..., scale * row + a :: step, :] for a in range(scale)], wide)
         seen = _sum([seen[..., scale * column + b :: step] for b in range(scale)], wide)
-        raw[..., row::2, column::2] = seen / area if scale > 1 else seen
+        raw[..., row::2, column::2] = seen / scale**2 if scale > 1 else seen
     return raw
 
 
 def _sum(parts: list[Tensor], dtype: torch.dtype) -> Tensor:
-    total = parts[0]
-    for part in parts[1:]:
-        total = total.to(dtype) + part
-    return total
+    # stacked: torch.compile would guard how the strides of two views compare
+    return torch.stack(parts).sum(dim=0, dtype=dtype) if len(parts) > 1 else parts[0]
 
 
 class BinToSensor(nn.Module):
