@@ -1,0 +1,100 @@
+"""How good latent frames are where the truth is known: ``python -m spikekit.bench.interpolation [FILM ...]``.
+
+Of every film, each second frame is left out and made again from its two neighbours. Of scenes whose motion is known
+exactly, frames a given displacement apart are given, and the one half way between them is asked for.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from spikekit.interpolate import Between, Blend, FlowInterpolation, Still
+from spikekit.metrics import psnr
+from spikekit.scene import Layer, Motion, Scene
+from spikekit.video import read_video
+
+METHODS: dict[str, Callable[[Tensor, Tensor], Between]] = {
+    "nearest": Still(),
+    "blend": Blend(),
+    "flow": FlowInterpolation(),
+    "flow, shrink 2": FlowInterpolation(shrink=2),
+}
+
+#: Displacements between the two frames, in pixels.
+PIXELS = (0, 1, 2, 6, 15)
+
+_Triple = tuple[Tensor, Tensor, Tensor]  # first, truth half way, second
+
+
+def film(path: Path, every: int) -> Iterator[_Triple]:
+    """Give three frames in a row, from every so many frames on."""
+    frames = read_video(path)
+    for n in range(0, len(frames) - 2, every):
+        first, truth, second = frames[n : n + 3]
+        yield first, truth, second
+
+
+def scene(pixels: float, *, hidden: bool) -> _Triple:
+    """Give a view of 256 x 256 that moves by so many pixels; an object moves against it where something is hidden."""
+    from scipy.ndimage import gaussian_filter
+    from skimage import data
+
+    def picture(pixels: object) -> Tensor:  # a little soft, so that no detail is finer than the pixels can show
+        return torch.from_numpy(gaussian_filter(pixels / 255.0, (0.8, 0.8, 0))).permute(2, 0, 1).float()
+
+    def motion(x: float, y: float) -> Motion:
+        return Motion(velocity=(x * pixels / 20, y * pixels / 20))
+
+    layers = [Layer(picture(data.astronaut()), motion(-0.4, 0.3) if hidden else motion(0.8, 0.6), (-100, -60))]
+    if hidden:
+        layers.append(Layer(picture(data.chelsea()[60:160, 120:220]), motion(0.6, 0), (80, 70), torch.ones(100, 100)))
+    view = Scene(layers, 256, 256, frames=21)
+    return view.rgb(0), view.rgb(10), view.rgb(20)
+
+
+def measure(triples: Iterator[_Triple]) -> tuple[int, dict[str, float], dict[str, float]]:
+    """Return how many triples there were, and each method's mean PSNR and seconds of CPU time a pair."""
+    scores: dict[str, list[float]] = {name: [] for name in METHODS}
+    seconds: dict[str, list[float]] = {name: [] for name in METHODS}
+    for first, truth, second in triples:
+        for name, method in METHODS.items():
+            begin = time.process_time()
+            made = method(first, second).at(0.5)
+            seconds[name].append(time.process_time() - begin)
+            scores[name].append(psnr(made, truth).item())
+    count = len(scores["nearest"])
+    return count, *({name: sum(given) / count for name, given in column.items()} for column in (scores, seconds))
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(prog="python -m spikekit.bench.interpolation", description=__doc__)
+    parser.add_argument("films", nargs="*", type=Path, metavar="FILM", help="folder of pictures, or video file")
+    parser.add_argument("--every", type=int, default=6, metavar="N", help="begin at every Nth frame (default: 6)")
+    args = parser.parse_args(argv)
+    cases = [(str(path.name), film(path, args.every)) for path in args.films]
+    for hidden in (False, True):
+        kind = "scene with an object in front" if hidden else "scene"
+        cases += [(f"{kind}, {pixels} px", iter([scene(pixels, hidden=hidden)])) for pixels in PIXELS]
+
+    def line(name: str, count: str, cells: Sequence[str]) -> None:
+        sys.stdout.write(f"{name:36}{count:>6}" + "".join(f"{cell:>16}" for cell in cells) + "\n")
+        sys.stdout.flush()
+
+    line("PSNR in dB of the frame half way", "pairs", list(METHODS))
+    for name, triples in cases:
+        count, scores, seconds = measure(triples)
+        line(name, str(count), [f"{score:.2f}" for score in scores.values()])
+        if len(args.films) and triples is cases[0][1]:
+            line("  CPU seconds a pair and frame", "", [f"{cost:.2f}" for cost in seconds.values()])
+
+
+if __name__ == "__main__":
+    main()
