@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from torch import Tensor
 
 from lightning_modules.networks import ClassicalDecoder
 from spikekit import panel, psnr, ssim, write_picture
+
+_MOST_TABLES = 20
 
 
 class ValidationPictures(Callback):
@@ -47,7 +50,8 @@ class ValidationPictures(Callback):
 class TestReport(Callback):
     """Print one table of a test, every method on the same clips, and write ``test.csv`` and ``test.png``.
 
-    PSNR and SSIM as :func:`spikekit.psnr` and :func:`spikekit.ssim`, averaged over clips.
+    PSNR and SSIM as :func:`spikekit.psnr` and :func:`spikekit.ssim`, averaged over clips. Data that name their clips,
+    in ``test_names``, get a table for each of them, too, where they are no more than 20.
 
     Args:
         output: the folder that they are written to.
@@ -78,18 +82,30 @@ class TestReport(Callback):
             return
         self.output.mkdir(parents=True, exist_ok=True)
         clips = len(next(iter(self._scores.values())))
-        table = [f"{'':24}{'PSNR (dB)':>10}{'SSIM':>10}   mean of {clips} clips"]
+        named = getattr(trainer.datamodule, "test_names", None)
+        names = range(clips) if named is None else named[:clips]
+        means = {
+            method: torch.tensor(scores, dtype=torch.float64).mean(dim=0).tolist()
+            for method, scores in self._scores.items()
+        }
+        table = _lines(f"mean of {clips} clips", means)
+        if named and clips <= _MOST_TABLES:
+            for clip, name in enumerate(names):
+                table += ["", *_lines(name, {method: scores[clip] for method, scores in self._scores.items()})]
         with open(self.output / "test.csv", "w", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(["method", "clip", "psnr", "ssim"])
             for method, scores in self._scores.items():
-                writer.writerows([method, clip, *map(_rounded, score)] for clip, score in enumerate(scores))
-                mean = torch.tensor(scores, dtype=torch.float64).mean(dim=0).tolist()
-                writer.writerow([method, "mean", *map(_rounded, mean)])
-                table.append(f"{method:24}{mean[0]:10.2f}{mean[1]:10.4f}")
+                writer.writerows([method, n, *map(_rounded, score)] for n, score in zip(names, scores, strict=True))
+                writer.writerow([method, "mean", *map(_rounded, means[method])])
         write_picture(self.output / "test.png", panel(self._rows))
         print("\n".join(["", *table, ""]))  # noqa: T201
         print(f"{self.output / 'test.csv'}, {self.output / 'test.png'} (columns: {', '.join(self._scores)}, truth)")  # noqa: T201
+
+
+def _lines(heading: str, scores: dict[str, Sequence[float]]) -> list[str]:
+    first = f"{'':24}{'PSNR (dB)':>10}{'SSIM':>10}   {heading}"
+    return [first, *(f"{method:24}{psnr:10.2f}{ssim:10.4f}" for method, (psnr, ssim) in scores.items())]
 
 
 def _rounded(value: float) -> str:

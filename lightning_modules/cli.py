@@ -17,13 +17,13 @@ from pytorch_lightning.cli import LightningArgumentParser, LightningCLI
 from pytorch_lightning.loggers import TensorBoardLogger
 
 from lightning_modules.callbacks import PredictionPictures, TestReport, ValidationPictures
-from lightning_modules.data import Recording, StillScenes
+from lightning_modules.data import FilmScenes, Recording, StillScenes
 from lightning_modules.module import CheckpointMismatchError, SuperResolution
 from lightning_modules.networks import CSCSR, Network
 from spikekit import SpikeFileError
 
 #: classes whose arguments ``--help`` lists, by the option that names them
-CHOICES = (("model.network", CSCSR), ("data", StillScenes), ("data", Recording))
+CHOICES = (("model.network", CSCSR), ("data", StillScenes), ("data", FilmScenes), ("data", Recording))
 
 
 class InputError(ValueError):
@@ -78,7 +78,8 @@ class Command(LightningCLI):
     def instantiate_classes(self) -> None:  # noqa: D102
         try:
             super().instantiate_classes()
-            self.datamodule.setup()  # here, so that what is wrong with it is known before anything is written
+            # here, so that what is wrong with it is known before anything is written
+            self.datamodule.setup(self.subcommand)
             _check_agreement(self.model.network, self.datamodule)
         except (OSError, ValueError) as error:
             raise InputError(str(error)) from error
@@ -116,7 +117,7 @@ class Command(LightningCLI):
 
 def _check_agreement(network: Network, data: LightningDataModule) -> None:
     """Scale, frames and alpha of the data follow the network; a recording has a Bayer phase of its own."""
-    if isinstance(data, StillScenes) and data.options["pattern"] != network.pattern:
+    if isinstance(data, (StillScenes, FilmScenes)) and data.options["pattern"] != network.pattern:
         raise ValueError(
             f"data.pattern: expected {network.pattern}, as the network has it, got {data.options['pattern']}"
         )

@@ -22,8 +22,9 @@ class CheckpointMismatchError(ValueError):
 class SuperResolution(LightningModule):
     """Train a network on clips whose truth is known, judge it beside the classical decoders, run it on recordings.
 
-    Training uses the true flow of the scene. Everything else uses the network's own estimator, as a recording would;
-    ``test`` shows the result with the true flow in a row of its own.
+    Training uses the flow of the scene, where the data have it: the true one of analytic scenes, or that which the
+    frames of a film were interpolated with. Everything else uses the network's own estimator, as a recording would;
+    ``test`` shows the result with the scene's flow in a row of its own.
 
     Args:
         network: the network, such as CSCSR.
@@ -55,7 +56,7 @@ class SuperResolution(LightningModule):
         }
 
     def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:  # noqa: D102
-        rgb = self.network(batch["spikes"], batch["flow"])
+        rgb = self.network(batch["spikes"], batch.get("flow"))
         loss = F.l1_loss(rgb, batch["rgb"])
         self.log("train/loss", loss)
         self.log("train/psnr", psnr(rgb.detach(), batch["rgb"]).mean(), prog_bar=True)
@@ -73,12 +74,14 @@ class SuperResolution(LightningModule):
         spikes, settings = batch["spikes"], self.network.settings
         name = type(self.network).__name__
         shared = settings["scale"], settings["pattern"], settings["alpha"]
-        return {
+        pictures = {
             "TFI": ClassicalDecoder("tfi", *shared)(spikes),
             "TFP": ClassicalDecoder("tfp", *shared)(spikes),
             name: self.network(spikes),
-            f"{name}, true flow": self.network(spikes, batch["flow"]),
         }
+        if "flow" in batch:
+            pictures[f"{name}, true flow"] = self.network(spikes, batch["flow"])
+        return pictures
 
     def predict_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:
         """Return rgb (B, 3, s H, s W), clamped to [0, 1]."""

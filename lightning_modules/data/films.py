@@ -1,0 +1,396 @@
+"""Films as seen by the camera: clips of REDS, Vid4, Vimeo-90K and any other folder of frames."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import pickle
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytorch_lightning as pl
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from lightning_modules.data.cache import ClipCache, clip_key, code_digest, file_digest, pack_clip, unpack_clip
+from lightning_modules.data.layouts import EXPECTED, Collection, FilmFiles, find_films
+from lightning_modules.data.pictures import split_pictures
+from lightning_modules.data.stills import _ClipLoader, _default_workers, _FreshClips, _one_thread, _to_arrays
+from spikekit import bayer_pattern
+from spikekit.check import check_positive, check_scale, check_whole
+from spikekit.film import Film, FilmClip
+from spikekit.interpolate import FlowInterpolation
+from spikekit.noise import SensorNoise
+from spikekit.video import read_video
+
+
+@dataclass(frozen=True)
+class ClipRecipe:
+    """How a clip is made of a film; the same of the same frames, in whatever process and order.
+
+    Args:
+        scale: super-resolution factor.
+        frames: spike frames of a clip; the truth is the source frame at ``frames // 2``.
+        pattern: Bayer phase of the sensor.
+        alpha: light of a white pixel per clock, the threshold being 1.
+        clocks: clocks from one source frame to the next.
+        flow_times: spike frames to which the flow from the middle is given; empty for no flow.
+        interpolation: what makes latent frames.
+        noise: what the sensor adds.
+        seed: where chance begins.
+
+    Raises:
+        ValueError: an argument that makes no sense; the message names it.
+    """
+
+    scale: int = 4
+    frames: int = 41
+    pattern: str = "RGGB"
+    alpha: float = 0.4
+    clocks: int = 20
+    flow_times: tuple[int, ...] = (5, 35)
+    interpolation: Callable[[Tensor, Tensor], Any] = field(default_factory=FlowInterpolation)
+    noise: SensorNoise = field(default_factory=SensorNoise)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_scale(self.scale)
+        check_positive("alpha", self.alpha)
+        check_whole("frames", self.frames)
+        check_whole("clocks", self.clocks)
+        bayer_pattern(self.pattern)
+        if any(not 0 <= time < self.frames for time in self.flow_times):
+            raise ValueError(f"flow_times: expected clocks in [0, {self.frames}), got {self.flow_times}")
+        if self.seed < 0:
+            raise ValueError(f"seed: expected 0 or more, got {self.seed}")
+
+    @property
+    def reach(self) -> tuple[int, int]:
+        """Source frames that a clip needs before and after the one in its middle."""
+        return -(-(self.frames // 2) // self.clocks), -(-((self.frames - 1) // 2) // self.clocks)
+
+    def files(self, film: FilmFiles, middle: int) -> list[Path]:
+        """Return the files that a clip is made of, the truth last where it is a file of its own."""
+        before, after = self.reach
+        paths = [film.folder / name for name in film.frames[middle - before : middle + after + 1]]
+        return paths if film.truth is None else [*paths, film.truth / film.frames[middle]]
+
+    def key(self, film: FilmFiles, middle: int) -> str:
+        """Return the name of a clip in a cache."""
+        part = type(self.interpolation).__module__
+        return clip_key(
+            code=[code_digest("spikekit.film", "spikekit.video"), file_digest(Path(__file__)), code_digest(part)],
+            files=[file_digest(path) for path in self.files(film, middle)],
+            truth=film.truth is not None,
+            shrink=film.shrink,
+            interpolation=hashlib.sha256(pickle.dumps(self.interpolation)).hexdigest(),
+            noise=asdict(self.noise),
+            pattern=bayer_pattern(self.pattern),
+            flow_times=list(self.flow_times),
+            **{name: getattr(self, name) for name in ("scale", "frames", "alpha", "clocks", "seed")},
+        )
+
+    def clip(self, film: FilmFiles, middle: int) -> dict[str, Tensor]:
+        """Simulate a clip around a source frame.
+
+        Args:
+            film: the film.
+            middle: which of its frames is in the middle.
+
+        Returns:
+            ``spikes`` uint8 (N, H, W), ``rgb`` (3, s H, s W), the truth, and ``flow`` (times, 2, H, W), in sensor
+            pixels, all of the whole view. Where the film is cut, nothing can be followed, and flow is 0.
+
+        Raises:
+            spikekit.video.VideoError: a file that cannot be read; the message names it.
+            ValueError: frames too small for the sensor, or a truth of another size than theirs.
+        """
+        paths = self.files(film, middle)
+        pictures = [_shrunk(read_video(path)[0], film.shrink) for path in paths[: sum(self.reach) + 1]]
+        own = film.truth is None
+        seen = Film(
+            pictures,
+            scale=self.scale if own else 1,
+            pattern=self.pattern,
+            alpha=self.alpha,
+            clocks=self.clocks,
+            interpolation=self.interpolation,
+        )
+        clip = seen.clip(self.reach[0], self.frames)
+        spikes = torch.cat(list(seen.spikes(clip.first, self.frames, noise=self.noise, seed=self._chance(paths))))
+        rgb = clip.rgb(clip.middle) if own else _truth(paths[-1], tuple(pictures[0].shape[1:]), self.scale, spikes)
+        made = {"spikes": spikes, "rgb": rgb}
+        if self.flow_times:
+            made["flow"] = torch.stack([self._flow(clip, time) for time in self.flow_times])
+        return made
+
+    def _flow(self, clip: FilmClip, time: int) -> Tensor:
+        try:
+            return clip.flow(time)
+        except ValueError:
+            if not isinstance(self.interpolation, FlowInterpolation):
+                raise
+            return torch.zeros(2, clip.height // clip.film.scale, clip.width // clip.film.scale)  # beyond a cut
+
+    def _chance(self, paths: list[Path]) -> int:
+        """A seed for the sensor that depends on what the frames show, not on where they lie."""
+        return int(clip_key(seed=self.seed, files=[file_digest(path) for path in paths])[:15], 16)
+
+
+def _shrunk(rgb: Tensor, factor: int) -> Tensor:
+    """Reduce a picture as the field does, bicubic and to 8 bits."""
+    if factor == 1:
+        return rgb
+    height, width = (length // factor for length in rgb.shape[1:])
+    rgb = rgb[None, :, : height * factor, : width * factor]
+    small = F.interpolate(rgb, (height, width), mode="bicubic", antialias=True)[0]
+    return small.mul(255).round().clamp(0, 255).div(255)
+
+
+def _truth(path: Path, size: tuple[int, int], scale: int, spikes: Tensor) -> Tensor:
+    rgb = read_video(path)[0]
+    wanted = tuple(scale * length for length in size)
+    if tuple(length // scale * scale for length in rgb.shape[1:]) != wanted:
+        expected, got = (f"{height} x {width}" for height, width in (wanted, rgb.shape[1:]))
+        raise ValueError(f"{path}: expected {expected}, {scale} times the frames that the sensor sees, got {got}")
+    return rgb[:, : scale * spikes.shape[1], : scale * spikes.shape[2]]
+
+
+class FilmClips(Dataset):
+    """Clips of films, around some frames of each.
+
+    The frames that a clip can have in its middle are cut into as many parts of one length as there are clips. Whole
+    clips stand in the middle of a part. Patches stand at a frame of it that the seed chooses once, so that a
+    cache comes to hold them all; they are shuffled in every round, and the place of a patch is another each time, at
+    even offsets, which keep the Bayer phase. Which clip, the seed and the index say, in whatever process and order.
+
+    Args:
+        films: what was found by :func:`lightning_modules.data.layouts.find_films`.
+        recipe: how clips are made.
+        clips: clips of a film; fewer where it has too few frames.
+        patch: side of a patch in sensor pixels; None for whole clips.
+        cache: where clips are kept; None to simulate each whenever it is asked for.
+
+    Raises:
+        ValueError: no films, a film too short for a clip, a number of clips or a patch below 1.
+    """
+
+    def __init__(
+        self,
+        films: Sequence[FilmFiles],
+        recipe: ClipRecipe,
+        clips: int = 1,
+        patch: int | None = None,
+        cache: ClipCache | None = None,
+    ) -> None:
+        self.recipe, self.patch, self.cache = recipe, patch, cache
+        check_whole("clips", clips)
+        if patch is not None:
+            check_whole("patch", patch)
+        if not films:
+            raise ValueError("films: expected at least one, got none")
+        self.places = [(film, *part) for film in films for part in self._parts(film, clips)]
+
+    def _parts(self, film: FilmFiles, clips: int) -> list[tuple[int, int]]:
+        before, after = self.recipe.reach
+        count, needed = len(film.frames) - before - after, before + after + 1
+        if count < 1:
+            raise ValueError(f"{film.folder}: expected at least {needed} frames for a clip, got {len(film.frames)}")
+        clips = min(clips, count)
+        return [(before + part * count // clips, before + (part + 1) * count // clips) for part in range(clips)]
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    @property
+    def names(self) -> list[str]:
+        """Film and middle frame of every clip."""
+        places = (self.place(index) for index in range(len(self)))
+        return [f"{film.name}/{Path(film.frames[middle]).stem}" for film, middle in places]
+
+    def place(self, index: int) -> tuple[FilmFiles, int]:
+        """Return the film and the middle frame of a clip, without regard to the shuffling of patches."""
+        film, first, end = self.places[index]
+        if self.patch is None:
+            return film, (first + end) // 2
+        rng = np.random.default_rng([self.recipe.seed, zlib.crc32(film.name.encode()), first])
+        return film, int(rng.integers(first, end))
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        """Return a clip, see :meth:`ClipRecipe.clip`; of patches, any index from 0 on can be had."""
+        if self.patch is None:
+            return self._clip(*self.place(index), None)
+        turn, index_in_turn = divmod(index, len(self))
+        order = np.random.default_rng([self.recipe.seed, turn]).permutation(len(self))
+        place = self.place(int(order[index_in_turn]))
+        return self._clip(*place, np.random.default_rng([self.recipe.seed, index, 1]))
+
+    def _clip(self, film: FilmFiles, middle: int, rng: np.random.Generator | None) -> dict[str, Tensor]:
+        key = self.cache and self.recipe.key(film, middle)
+        packed = self.cache and self.cache.load(key)
+        if packed is None:
+            packed = pack_clip(self.recipe.clip(film, middle))
+            if self.cache is not None:
+                self.cache.store(key, packed)
+        scale = self.recipe.scale
+        height, width = (length // scale for length in packed["rgb"].shape[1:])
+        part = 0, 0, height, width
+        if rng is not None:
+            if self.patch > min(height, width):
+                raise ValueError(
+                    f"patch: expected at most {min(height, width)}, as {film.folder} gives {height} x {width} sensor "
+                    f"pixels at scale {scale}, got {self.patch}"
+                )
+            corner = (2 * int(rng.integers((length - self.patch) // 2 + 1)) for length in (height, width))
+            part = *corner, self.patch, self.patch
+        return unpack_clip(packed, part, scale)
+
+
+class FilmScenes(pl.LightningDataModule):
+    """Clips of films, seen by a simulated camera: REDS, Vid4, Vimeo-90K, or any folder of frame folders.
+
+    What lies in ``root`` says which data set it is. Of the 120-fps REDS, 240 scenes train and 30 validate and test, 5
+    clips each. Vid4 is for tests. Vimeo-90K is for a scale of 4: the camera sees its low-resolution sequences, which
+    are the official ones of its test set, or those of a folder ``BIx4`` beside ``sequences``, or made here; the truth
+    is the full-size frame in the middle. Of other films one in twenty validates, and all are tested.
+
+    Training takes patches, everything else whole views, cut at the bottom and at the right to multiples of twice the
+    scale. The whole view is simulated also for a patch, which takes seconds where frames are large: give a ``cache``.
+
+    Args:
+        root: folder of the data set, with what its archives hold.
+        scale: super-resolution factor.
+        patch: side of a training clip in sensor pixels.
+        frames: spike frames of a clip. The truth is the source frame at frame ``frames // 2``.
+        pattern: Bayer phase of the sensor: RGGB, BGGR, GRBG or GBRG.
+        alpha: light of a white pixel per clock; a threshold of charge is 1.
+        clocks: spike frames from one source frame to the next.
+        clips: clips of a film, spread over it. Null for 5 of REDS and of other films, 1 of Vid4 and Vimeo-90K.
+        flow: give the interpolation's flow from the middle to ``flow_times``. False for an interpolation that has
+            none; training then uses the network's own estimator.
+        flow_times: frames to which the flow is given.
+        interpolation: what makes frames between two source frames, by its class path; motion-compensated, without
+            weights, when null.
+        noise: what the sensor adds, such as ``{photons: 1000}``; nothing when null.
+        cache: folder where simulated clips are kept, found again by the content of their frames, by all settings and
+            by the code of the simulator. It is never emptied: delete it, or files in it, at any time. Null for none.
+        batch_size: training clips in a batch; everything else goes one by one.
+        workers: processes that make clips. Null takes one less than there are cores, eight at most.
+        seed: where chance begins. The same seed gives the same clips, whatever the number of workers.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        scale: int = 4,
+        patch: int = 96,
+        frames: int = 41,
+        pattern: str = "RGGB",
+        alpha: float = 0.4,
+        clocks: int = 20,
+        clips: int | None = None,
+        flow: bool = True,
+        flow_times: tuple[int, int] = (5, 35),
+        interpolation: Callable[[Tensor, Tensor], Any] | None = None,
+        noise: SensorNoise | None = None,
+        cache: str | None = None,
+        batch_size: int = 4,
+        workers: int | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.root, self.patch, self.clips, self.cache = root, patch, clips, cache
+        self.batch_size, self.seed = batch_size, seed
+        self.workers = _default_workers() if workers is None else workers
+        self.options = {
+            "scale": scale,
+            "frames": frames,
+            "pattern": pattern,
+            "alpha": alpha,
+            "clocks": clocks,
+            "flow_times": tuple(flow_times) if flow else (),
+            "seed": seed,
+        }
+        if interpolation is not None:
+            self.options["interpolation"] = interpolation
+        if noise is not None:
+            self.options["noise"] = noise
+        self.found: Collection | None = None
+
+    def setup(self, stage: str | None = None) -> None:
+        """Find the films.
+
+        Args:
+            stage: ``fit``, ``validate``, ``test``; all that is there when not given.
+
+        Raises:
+            FileNotFoundError: the folder is missing, or has not what the stage needs; the message shows what was
+                expected.
+            OSError: the cache cannot be made.
+            ValueError: an argument that makes no sense, or a film too short for a clip.
+        """
+        recipe = ClipRecipe(**self.options)
+        check_whole("batch_size", self.batch_size)
+        if self.found is None:
+            self.found = find_films(self.root, lambda films: split_pictures(films, self.seed))
+        found = self.found
+        if found.scale not in (None, recipe.scale):
+            raise ValueError(
+                f"scale: expected {found.scale} with {found.name}, whose small frames are the full ones divided by "
+                f"{found.scale}, got {recipe.scale}"
+            )
+        needed = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}.get(stage, ())
+        missing = [split for split in needed if not getattr(found, split)]
+        if missing:
+            raise FileNotFoundError(
+                f"{self.root}: {found.name} without films for {stage} ({missing[0]}); expected one of\n{EXPECTED}"
+            )
+        clips, cache = self.clips or found.clips, self.cache and ClipCache(self.cache)
+        if found.train:
+            self.train_set = FilmClips(found.train, recipe, clips, self.patch, cache or None)
+        if found.val:
+            self.val_set = FilmClips(found.val, recipe, clips, None, cache or None)
+        if found.test:
+            self.test_set = FilmClips(found.test, recipe, clips, None, cache or None)
+        if stage == "fit" and self.train_clips < self.batch_size:
+            raise ValueError(
+                f"batch_size: expected at most the {self.train_clips} training clips of {self.root}, got "
+                f"{self.batch_size}"
+            )
+
+    @property
+    def train_clips(self) -> int:
+        """Training clips in an epoch."""
+        return len(self.train_set)
+
+    @property
+    def test_names(self) -> list[str]:
+        """Film and frame of every test clip."""
+        return self.test_set.names
+
+    def train_dataloader(self) -> DataLoader:  # noqa: D102
+        return self._loader(self.train_set, self.batch_size, sampler=_FreshClips(self), drop_last=True)
+
+    def val_dataloader(self) -> DataLoader:  # noqa: D102
+        return self._loader(self.val_set, 1)
+
+    def test_dataloader(self) -> DataLoader:  # noqa: D102
+        return self._loader(self.test_set, 1)
+
+    def _loader(self, clips: FilmClips, batch_size: int, **how: object) -> DataLoader:
+        workers = min(self.workers, math.ceil(len(clips) / batch_size))
+        return _ClipLoader(
+            clips,
+            batch_size=batch_size,
+            num_workers=workers,
+            persistent_workers=workers > 0,
+            worker_init_fn=_one_thread,
+            collate_fn=_to_arrays,
+            **how,
+        )

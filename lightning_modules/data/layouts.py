@@ -1,0 +1,192 @@
+"""The films of a folder: how REDS, Vid4 and Vimeo-90K are distributed, and any other folder of frame folders."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from spikekit.video import PICTURE_ENDINGS
+
+#: What a folder may look like, for messages.
+EXPECTED = """\
+  REDS 120 fps   train/train_orig/000/00000000.png ...    240 scenes (train_orig_part0.zip to part15.zip)
+                 val/val_orig/000/00000000.png ...        30 scenes (val_orig_part0.zip and part1.zip)
+  Vid4           GT/calendar/00000000.png ...             calendar, city, foliage, walk
+  Vimeo-90K      sequences/00001/0001/im1.png ... im7.png
+                 sep_trainlist.txt, sep_testlist.txt
+    or its       low_resolution/00001/0266/im1.png ... im7.png
+    test set     target/00001/0266/im4.png, sep_testlist.txt
+  other films    NAME/FRAME.png ...                       one folder of frames for each film"""
+
+_VID4 = ("calendar", "city", "foliage", "walk")
+
+# Where the scenes of REDS lie when its archives are unpacked together, each in a folder of its own, or below.
+_REDS = ("{0}/{0}_orig", "{0}_orig", "{0}_orig_part*/{0}/{0}_orig", "{0}_orig_part*/{0}_orig", "{0}")
+
+
+@dataclass(frozen=True)
+class FilmFiles:
+    """A film as files.
+
+    Args:
+        name: what it is called, such as ``walk`` or ``00001/0266``.
+        folder: where its frames lie.
+        frames: the names of its files, in order.
+        truth: folder of pictures that are sharper than the frames, under the same names; ``None`` where the frames are
+            the truth.
+        shrink: by how much the frames must be reduced before the sensor sees them.
+    """
+
+    name: str
+    folder: Path
+    frames: tuple[str, ...]
+    truth: Path | None = None
+    shrink: int = 1
+
+
+@dataclass(frozen=True)
+class Collection:
+    """What was found in a folder.
+
+    Args:
+        name: the data set.
+        train: films to learn from.
+        val: films to choose by.
+        test: films to judge by.
+        clips: clips of a film, as the paper has it.
+        scale: the only super-resolution factor that the films are for, if there is only one.
+    """
+
+    name: str
+    train: tuple[FilmFiles, ...] = ()
+    val: tuple[FilmFiles, ...] = ()
+    test: tuple[FilmFiles, ...] = ()
+    clips: int = 1
+    scale: int | None = None
+
+
+def find_films(root: str | Path, hold_out: Callable[[list], tuple[list, list]]) -> Collection:
+    """Find out what is in a folder, by its files.
+
+    Args:
+        root: the folder: what the archives of a data set were unpacked into, or one folder further down.
+        hold_out: splits films that have no official split into those to train on and those to validate by.
+
+    Returns:
+        The films; frames are not opened.
+
+    Raises:
+        FileNotFoundError: there is no such folder, none of the layouts fits, or a listed sequence is missing; the
+            message shows what was expected.
+        NotADirectoryError: it is a file.
+    """
+    root = Path(root).expanduser()
+    if not root.exists():
+        raise FileNotFoundError(f"{root}: no such folder of films")
+    if not root.is_dir():
+        raise NotADirectoryError(f"{root}: expected a folder of films, got a file")
+    found = _reds(root) or _vimeo(root) or _vid4(root) or _others(root, hold_out)
+    if found is None:
+        raise FileNotFoundError(f"{root}: no films in this folder; expected one of\n{EXPECTED}")
+    return found
+
+
+def natural(name: str) -> list[tuple[bool, int, str]]:
+    """Sort key that puts ``f2`` before ``f10``."""
+    parts = re.findall(r"[0-9]+|[^0-9]+", name)
+    return [(part.isdecimal(), int(part) if part.isdecimal() else 0, part) for part in parts]
+
+
+def _reds(root: Path) -> Collection | None:
+    train, val = (
+        _films(folder for pattern in _REDS for folder in sorted(root.glob(pattern.format(split))))
+        for split in ("train", "val")
+    )
+    return Collection("REDS", train, val, val, clips=5) if train or val else None
+
+
+def _vid4(root: Path) -> Collection | None:
+    films = _films([root / "GT"])
+    if not films:
+        films = _films([root])
+        if not films or any(film.name not in _VID4 for film in films):
+            return None
+    return Collection("Vid4", val=films, test=films)
+
+
+def _others(root: Path, hold_out: Callable[[list], tuple[list, list]]) -> Collection | None:
+    films = _films([root]) or _films([root.parent], only=root.name)
+    if not films:
+        return None
+    train, val = hold_out(list(films))
+    return Collection("films", tuple(train), tuple(val), films, clips=5)
+
+
+def _vimeo(root: Path) -> Collection | None:
+    train = test = ()
+    for folder in (root, root / "vimeo_septuplet"):
+        if (folder / "sequences").is_dir():
+            small = _first_folder(
+                folder / "BIx4",
+                folder / "low_resolution",
+                folder.with_name("vimeo_septuplet_matlabLRx4") / "sequences",
+            )
+            train, test = (_septuplets(folder, small, f"sep_{split}list.txt") for split in ("train", "test"))
+            break
+    for folder in (root, root / "vimeo_super_resolution_test"):
+        if (folder / "low_resolution").is_dir() and (folder / "target").is_dir():
+            test = _septuplets(folder, folder / "low_resolution", "sep_testlist.txt", "target")
+    return Collection("Vimeo-90K", train, test, test, scale=4) if train or test else None
+
+
+def _septuplets(folder: Path, small: Path | None, listed: str, large: str = "sequences") -> tuple[FilmFiles, ...]:
+    """Return the sequences of a list, which has ``00001/0001`` and the like in its lines."""
+    if not (folder / listed).is_file():
+        return ()
+    names = (folder / listed).read_text().split()
+    parents = sorted({name.partition("/")[0] for name in names})
+    for place in filter(None, (small, folder / large)):
+        # one look at each folder of folders: there are 96 of them, but 91,701 sequences
+        there = {f"{parent}/{name}" for parent in parents for name in _subfolders(place / parent)}
+        missing = [name for name in names if name not in there]
+        if missing:
+            raise FileNotFoundError(
+                f"{folder / listed}: {len(missing)} of {len(names)} sequences are not in {place}, the first is "
+                f"{missing[0]}; expected\n{EXPECTED}"
+            )
+    frames = tuple(f"im{n}.png" for n in range(1, 8))
+    return tuple(
+        FilmFiles(name, (small or folder / large) / name, frames, folder / large / name, 1 if small else 4)
+        for name in names
+    )
+
+
+def _films(folders: Iterable[Path], only: str | None = None) -> tuple[FilmFiles, ...]:
+    """Return the folders inside some folders that hold pictures."""
+    films: dict[str, FilmFiles] = {}
+    for folder in folders:
+        for name in [only] if only else sorted(_subfolders(folder), key=natural):
+            frames = tuple(sorted(_pictures(folder / name), key=natural))
+            if frames:
+                films.setdefault(name, FilmFiles(name, folder / name, frames))
+    return tuple(films[name] for name in sorted(films, key=natural))
+
+
+def _first_folder(*folders: Path) -> Path | None:
+    return next((folder for folder in folders if folder.is_dir()), None)
+
+
+def _subfolders(folder: Path) -> list[str]:
+    if not folder.is_dir():
+        return []
+    with os.scandir(folder) as entries:
+        return [entry.name for entry in entries if entry.is_dir() and not entry.name.startswith(".")]
+
+
+def _pictures(folder: Path) -> list[str]:
+    with os.scandir(folder) as entries:
+        names = [entry.name for entry in entries if not entry.name.startswith(".")]
+    return [name for name in names if os.path.splitext(name)[1].lower() in PICTURE_ENDINGS]
