@@ -16,25 +16,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spikekit import bench, extremes, simulate_cli
+from spikekit import bench, extremes, simulate_cli, view_cli
 from spikekit.arguments import UsageError, one_line, positive, whole
 from spikekit.cfa import PATTERNS
 from spikekit.demosaic import demosaic
-from spikekit.files import iter_spikes, spikes_shape
+from spikekit.files import iter_spikes
 from spikekit.keyframe import search
 from spikekit.pictures import write_picture
+from spikekit.recording import Recording, add_arguments, open_recording, white_rate
 
 #: Clocks a second of the cameras.
 CLOCK_HZ = 20_000
-
-#: (height, width) of what the field's headerless recordings come from.
-USUAL_SIZES = {
-    (250, 400): "grey Vidar camera",
-    (250, 416): "grey Vidar camera, 16 columns of header",
-    (250, 250): "UHSR",
-    (1000, 1000): "colour spike camera",
-    (1000, 1024): "colour spike camera, PCIe stream",
-}
 
 #: Frames that TFI looks at on each side; a pixel that fires more rarely is decoded as if it fired once in all of them.
 TFI_REACH = 200
@@ -56,9 +48,9 @@ _BLOCK = 1 << 24
 
 def info(args: argparse.Namespace) -> None:
     """Print what a recording holds, in one pass over its frames."""
-    _check_size_given(args)
-    frames, height, width = spikes_shape(args.file, args.height, args.width)
-    counts = _counts(args, height, width, 0, frames)
+    recording = open_recording(args)
+    frames, (height, width) = recording.frames, recording.size
+    counts = _counts(recording, 0, frames)
     pixels, spikes = counts.numel(), int(counts.sum())
     rates = counts.double() / frames
     dead, full = int((counts == 0).sum()), int((counts == frames).sum())
@@ -77,27 +69,29 @@ def info(args: argparse.Namespace) -> None:
 
 def decode(args: argparse.Namespace) -> None:
     """Write the picture of one frame, or of many, reading only as much around each as the method needs."""
-    _check_size_given(args)
     if args.window is not None and (args.method != "tfp" or args.window % 2 == 0):
         raise UsageError(f"--window: expected an odd number, with --method tfp, got {args.window} with {args.method}")
     if args.output.is_dir():
         raise ValueError(f"{args.output}: expected a picture to write, got a folder")
-    frames, height, width = spikes_shape(args.file, args.height, args.width)
+    recording = open_recording(args)
+    frames = recording.frames
     chosen = _chosen(args, frames)
     if len(chosen) > 1 and _NUMBER not in str(args.output):
         raise UsageError(f"--output: expected {_NUMBER} in the name of {len(chosen)} pictures, got {args.output}")
 
     reach = (args.window or TFP_WINDOW) // 2 if args.method == "tfp" else TFI_REACH
     key = chosen[len(chosen) // 2]
-    white, scaling = _white(args, (frames, height, width), key, reach)
+    alpha = args.alpha or recording.alpha
+    white, scaling = _white(alpha, recording, key, reach)
     show = len(chosen) > 1 and sys.stderr.isatty()
     try:
-        for done, (n, plane) in enumerate(_windows(args, (frames, height, width), chosen, reach)):
+        for done, (n, plane) in enumerate(_windows(recording, chosen, reach)):
             if show:
                 print(f"\r{done} of {len(chosen)} pictures", end="", file=sys.stderr, flush=True)
             raw = _decode_frame(args.method, plane, n, *_span(n, reach, frames)) / white
             path = Path(str(args.output).replace(_NUMBER, f"{n:0{len(str(frames - 1))}}"))
-            _write(path, raw if args.pattern is None else demosaic(raw, args.pattern))
+            picture = raw if recording.pattern is None else demosaic(raw, recording.pattern)
+            _write(path, recording.show(picture, known=alpha is not None))
     finally:
         if show:
             print("\r\033[K", end="", file=sys.stderr, flush=True)
@@ -142,7 +136,7 @@ def _parser() -> argparse.ArgumentParser:
     verbs = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
 
     verb = _add_verb(verbs, info, "info", "what a recording holds", "info street.dat --height 250 --width 400")
-    _add_recording(verb)
+    add_arguments(verb)
 
     verb = _add_verb(
         verbs,
@@ -151,7 +145,7 @@ def _parser() -> argparse.ArgumentParser:
         "the picture of one frame, or of many",
         "decode water.dat --height 1000 --width 1000 --flip --pattern BGGR --method tfi -o water.png",
     )
-    _add_recording(verb)
+    add_arguments(verb)
     verb.add_argument(
         "--method",
         required=True,
@@ -195,6 +189,8 @@ def _parser() -> argparse.ArgumentParser:
 
     example = "simulate walk -o walk.dat --scale 4"
     simulate_cli.add_arguments(_add_verb(verbs, simulate_cli.run, "simulate", "a stream of a film", example))
+    example = "view walk.dat -o walk.html"
+    view_cli.add_arguments(_add_verb(verbs, view_cli.run, "view", "a recording as a picture or a page", example))
     example = "extremes --operator tfi --markdown"
     extremes.add_arguments(_add_verb(verbs, extremes.run, "extremes", "how exact the operators are at worst", example))
     example = "bench tfi tfp --size small"
@@ -214,13 +210,6 @@ def _add_verb(verbs: Any, run: Any, name: str, summary: str, example: str) -> ar
     return verb
 
 
-def _add_recording(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument("file", type=Path, metavar="FILE", help="a recording, .dat (8 pixels a byte, no header) or .npz")
-    verb.add_argument("--height", type=whole(1), metavar="H", help="rows of a frame; a .dat needs it")
-    verb.add_argument("--width", type=whole(1), metavar="W", help="columns of a frame; a .dat needs it")
-    verb.add_argument("--flip", action="store_true", help="the frames are stored upside down, as real cameras do")
-
-
 def _frames(text: str) -> str:
     if not re.fullmatch(r"\d+|\d*:\d*(:0*[1-9]\d*)?", text, re.ASCII):
         raise argparse.ArgumentTypeError(f"expected a whole number, 0 or more, or A:B or A:B:STEP, got {text}")
@@ -232,24 +221,6 @@ def _picture(text: str) -> Path:
     if path.suffix.lower() not in _PICTURE_ENDINGS:  # the picture library would write TIFF, over a recording as well
         raise argparse.ArgumentTypeError(f"expected a picture that ends in {', '.join(_PICTURE_ENDINGS)}, got {text}")
     return path
-
-
-def _check_size_given(args: argparse.Namespace) -> None:
-    """Raise where a headerless file comes without its size, and help to find it."""
-    path = args.file
-    if path.suffix.lower() != ".dat" or not path.is_file() or None not in (args.height, args.width):
-        return
-    size = path.stat().st_size
-    fits = {}
-    for (height, width), camera in USUAL_SIZES.items():
-        frames, rest = divmod(size, -(-height * width // 8))
-        if frames and not rest:
-            fits[height, width] = f"{height} x {width} ({camera}: {frames} frames)"
-    sizes = " and ".join(fits.values()) or f"none of {', '.join(f'{h} x {w}' for h, w in USUAL_SIZES)}"
-    raise UsageError(
-        f"{path}: a .dat has no header, give --height and --width; of the usual sizes (H x W), "
-        f"{sizes} divide{'' if len(fits) > 1 else 's'} its {size} bytes exactly"
-    )
 
 
 def _chosen(args: argparse.Namespace, frames: int) -> range:
@@ -265,14 +236,13 @@ def _chosen(args: argparse.Namespace, frames: int) -> range:
     return chosen
 
 
-def _white(args: argparse.Namespace, shape: tuple[int, int, int], key: int, reach: int) -> tuple[float, str]:
+def _white(alpha: float | None, recording: Recording, key: int, reach: int) -> tuple[float, str]:
     """Return what becomes white, and a sentence that says so."""
-    if args.alpha is not None:
-        return args.alpha, f"divided by alpha {args.alpha:g}"
-    first, last = _span(key, reach, shape[0])
+    if alpha is not None:
+        return alpha, f"divided by alpha {alpha:g}"
+    first, last = _span(key, reach, recording.frames)
     # Of the rate, not of the picture: TFI makes 1 or 1/2 of a bright pixel, and its percentile is one of the two.
-    rate = _counts(args, *shape[1:], first, last - first + 1).numpy() / (last - first + 1)
-    white = float(np.quantile(rate, 0.999)) or float(rate.max()) or 1.0
+    white = white_rate(_counts(recording, first, last - first + 1) / (last - first + 1))
     scale = f"multiplied by {1 / white:.4g}"
     return white, f"{scale}, so that the 99.9th percentile of the spike rate around frame {key} is white"
 
@@ -282,21 +252,19 @@ def _span(frame: int, reach: int, frames: int) -> tuple[int, int]:
     return max(frame - reach, 0), min(frame + reach, frames - 1)
 
 
-def _windows(
-    args: argparse.Namespace, shape: tuple[int, int, int], chosen: range, reach: int
-) -> Iterator[tuple[int, _Plane]]:
+def _windows(recording: Recording, chosen: range, reach: int) -> Iterator[tuple[int, _Plane]]:
     """Read forwards; yield every chosen frame and what unpacks it and its neighbours."""
-    frames, height, width = shape
+    path, frames, (height, width) = recording.path, recording.frames, recording.stored
     held = np.empty((min(2 * reach + 1, frames), height, -(-width // 8)), np.uint8)  # frame n at n modulo the length
 
     def plane(n: int) -> np.ndarray:
-        return np.unpackbits(held[n % len(held)], axis=-1, count=width, bitorder="little")
+        return recording.unpack(held[n % len(held)])
 
     stream, stop = None, 0
     for n in chosen:
         first, last = _span(n, reach, frames)
-        if stream is None or (stop < first and args.file.suffix.lower() == ".dat"):  # an .npz has no short cut
-            stream = iter_spikes(args.file, height, width, flip=args.flip, start=first, packed=True)
+        if stream is None or (stop < first and path.suffix.lower() == ".dat"):  # an .npz has no short cut
+            stream = iter_spikes(path, height, width, flip=recording.flip, start=first, packed=True)
             stop = first
         for k in range(stop, last + 1):
             held[k % len(held)] = next(stream).numpy()
@@ -312,13 +280,15 @@ def _decode_frame(method: str, plane: _Plane, frame: int, first: int, last: int)
     return torch.from_numpy(total / np.float32(last + 1 - first))
 
 
-def _counts(args: argparse.Namespace, height: int, width: int, start: int, frames: int) -> Tensor:
+def _counts(recording: Recording, start: int, frames: int) -> Tensor:
     """Count the spikes of every pixel in some frames."""
+    height, width = recording.stored
     counts = torch.zeros(height, width, dtype=torch.int64)
     chunk = min(max(_BLOCK // (height * width), 1), 255)  # whose sum fits into a byte
-    for part in iter_spikes(args.file, height, width, flip=args.flip, start=start, frames=frames, chunk=chunk):
+    parts = iter_spikes(recording.path, height, width, flip=recording.flip, start=start, frames=frames, chunk=chunk)
+    for part in parts:
         counts += torch.from_numpy(part.numpy().sum(axis=0, dtype=np.uint8))
-    return counts
+    return recording.prepare(counts)
 
 
 def _write(path: Path, picture: Tensor) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import os
 import platform
@@ -111,8 +112,8 @@ def published(output: Path) -> Iterator[Path]:
     Convention:
         The folder lies beside ``output``, hidden. Its contents move to where ``output`` is, each by one renaming, and
         the side-car, ``output`` with the ending ``.json``, after all others. One that is there already and says
-        something else goes first. So a stream beside its side-car is complete, whenever the process was killed: what
-        remains of one that was is a hidden folder that ends in ``.part``.
+        something else goes first. So a stream beside its side-car is complete, whenever the process was killed. What
+        remains of one that was is a hidden folder that ends in ``.part``, which the next one removes.
 
         Processes that write the same output publish one after the other.
 
@@ -131,20 +132,25 @@ def published(output: Path) -> Iterator[Path]:
         stream = read_sidecar(last).stream["file"]  # raises where the file is something else
         if stream != output.name:
             raise ValueError(f"{output}: its side-car, {last}, would replace that of {stream}; choose another name")
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-        part = Path(tempfile.mkdtemp(".part", f".{output.name}.", target))
-    except OSError as error:
-        raise ValueError(f"{output}: cannot be written ({error.strerror or error})") from error
-    try:
+    with ExitStack() as stack:
+        try:
+            target.mkdir(parents=True, exist_ok=True)
+            with _locked(target):
+                for other in target.glob(f".{glob.escape(output.name)}.*.part"):
+                    with _locked(other, wait=False) as dead:
+                        if dead:
+                            shutil.rmtree(other, ignore_errors=True)
+                part = Path(tempfile.mkdtemp(".part", f".{output.name}.", target))
+                stack.callback(shutil.rmtree, part, ignore_errors=True)
+                stack.enter_context(_locked(part))
+        except OSError as error:
+            raise ValueError(f"{output}: cannot be written ({error.strerror or error})") from error
         yield part
         try:
-            with _alone(target):
+            with _locked(target):
                 _publish(part, target, last.name)
         except OSError as error:
             raise ValueError(f"{error.filename2 or output}: cannot be written ({error.strerror or error})") from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
 
 
 def _publish(part: Path, target: Path, last: str) -> None:
@@ -159,13 +165,15 @@ def _publish(part: Path, target: Path, last: str) -> None:
 
 
 @contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Wait until no other process publishes in this folder; a lock ends with its process."""
+def _locked(folder: Path, *, wait: bool = True) -> Iterator[bool]:
+    """Hold the lock of a folder, which ends with the process; yields whether it is held."""
     with ExitStack() as stack:
+        held = False
         with suppress(OSError, ImportError):  # not every system and not every file system has locks
             import fcntl
 
             handle = os.open(folder, os.O_RDONLY)
             stack.callback(os.close, handle)
-            fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
+            fcntl.flock(handle, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+            held = True
+        yield held

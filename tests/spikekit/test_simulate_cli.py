@@ -300,6 +300,8 @@ def test_killed_at_random_moments(film):
         process.wait()
         if Path("a.json").exists():
             assert believed(Path("a.dat"))
+    simulate(film, "-o", "a.dat", *QUICK)
+    assert not list(Path().glob(".*"))
 
 
 @pytest.mark.parametrize(("room", "words", "name"), [(8000, ["--all", "--clocks", "200"], "a.dat"), (500, [], "a.png")])
