@@ -1,0 +1,210 @@
+"""The layouts of data sets: found by their files, and shown where they are not there."""
+
+import re
+
+import pytest
+import torch
+
+from lightning_modules.data.films import ClipRecipe, FilmClips, FilmScenes
+from lightning_modules.data.layouts import find_films
+from spikekit import mosaic, read_picture
+
+SMALL = {"scale": 2, "patch": 8, "batch_size": 2, "workers": 0}
+
+
+def scenes(root, stage=None, **options):
+    data = FilmScenes(str(root), **{**SMALL, **options})
+    data.setup(stage)
+    return data
+
+
+def names(films):
+    return [film.name for film in films]
+
+
+def found(root):
+    return find_films(root, lambda films: (films[1:], films[:1]))
+
+
+@pytest.mark.parametrize(
+    ("train", "val"),
+    [
+        ("train/train_orig", "val/val_orig"),
+        ("train_orig", "val_orig"),
+        ("train_orig_part3/train/train_orig", "val_orig_part0/val/val_orig"),
+        ("train_orig_part15/train_orig", "val_orig_part1/val_orig"),
+        ("train", "val"),
+    ],
+)
+def test_reds(tmp_path, train, val, reds):
+    reds(tmp_path, train, val)
+    films = found(tmp_path)
+    assert (films.name, films.clips, films.scale) == ("REDS", 5, None)
+    assert names(films.train) == ["000", "001"]
+    assert names(films.val) == names(films.test) == ["000"]
+    assert films.train[1].folder == tmp_path / train / "001"
+    assert films.train[1].frames == tuple(f"{n:08d}.png" for n in range(9))
+
+
+def test_reds_in_parts(tmp_path, write_film):
+    for part in range(2):
+        write_film(tmp_path / f"train_orig_part{part}/train/train_orig/{15 * part:03d}", 3)
+    write_film(tmp_path / "val/val_orig/007", 3)
+    films = found(tmp_path)
+    assert names(films.train) == ["000", "015"]
+    assert names(films.val) == ["007"]
+
+
+@pytest.mark.parametrize("folder", ["GT", "."])
+def test_vid4_is_for_tests(tmp_path, folder, write_film):
+    for name in ("walk", "city"):
+        write_film(tmp_path / folder / name, 5)
+    if folder == "GT":
+        write_film(tmp_path / "BIx4" / "walk", 5, (8, 12))
+    films = found(tmp_path)
+    assert (films.name, films.clips, films.train) == ("Vid4", 1, ())
+    assert names(films.test) == ["city", "walk"]
+    assert films.test[1].folder == tmp_path / folder / "walk"
+    assert scenes(tmp_path, "test").test_names == ["city/00000002", "walk/00000002"]
+    with pytest.raises(FileNotFoundError, match=r"Vid4 without films for fit \(train\)"):
+        scenes(tmp_path, "fit")
+
+
+def test_vimeo_septuplets(tmp_path, septuplets):
+    septuplets(tmp_path, ["00001/0001", "00001/0002", "00002/0001"])
+    (tmp_path / "sep_trainlist.txt").write_text("00001/0001\n00002/0001\n")
+    (tmp_path / "sep_testlist.txt").write_text("00001/0002\n\n")
+    for root in (tmp_path, tmp_path.parent / "up"):
+        films = found(root)
+        assert (films.name, films.clips, films.scale) == ("Vimeo-90K", 1, 4)
+        assert names(films.train) == ["00001/0001", "00002/0001"]
+        assert names(films.val) == names(films.test) == ["00001/0002"]
+        assert (films.test[0].folder, films.test[0].shrink) == (tmp_path / "sequences/00001/0002", 4)
+        if root is tmp_path:
+            (tmp_path.parent / "up").mkdir()
+            tmp_path = tmp_path.rename(tmp_path.parent / "up" / "vimeo_septuplet")
+
+
+@pytest.mark.parametrize("small", ["BIx4", "../vimeo_septuplet_matlabLRx4/sequences"])
+def test_vimeo_with_small_frames(tmp_path, small, septuplets):
+    root = tmp_path / "vimeo_septuplet"
+    septuplets(root, ["00001/0001"])
+    septuplets(root, ["00001/0001"], small, (16, 24))
+    for split in ("train", "test"):
+        (root / f"sep_{split}list.txt").write_text("00001/0001\n")
+    (film,) = found(root).train
+    assert film.folder.samefile(root / small / "00001/0001")
+    assert (film.truth, film.shrink) == (root / "sequences/00001/0001", 1)
+
+
+def test_vimeo_test_set(tmp_path, septuplets):
+    septuplets(tmp_path, ["00001/0266"], "low_resolution", (16, 24))
+    septuplets(tmp_path, ["00001/0266"], "target", frames=[4])
+    (tmp_path / "sep_testlist.txt").write_text("00001/0266")
+    films = found(tmp_path)
+    assert (names(films.train), names(films.test)) == ([], ["00001/0266"])
+    data = scenes(tmp_path, "test", scale=4)
+    assert data.test_names == ["00001/0266/im4"]
+    clip = data.test_set[0]
+    assert {name: tuple(value.shape) for name, value in clip.items()} == {
+        "spikes": (41, 16, 24),
+        "rgb": (3, 64, 96),
+        "flow": (2, 2, 16, 24),
+    }
+    assert torch.equal(clip["rgb"], read_picture(tmp_path / "target/00001/0266/im4.png"))
+    # the camera sees the small frames, pixel by pixel
+    seen = mosaic(read_picture(tmp_path / "low_resolution/00001/0266/im4.png"))
+    other = mosaic(read_picture(tmp_path / "low_resolution/00001/0266/im7.png"))
+    rate = clip["spikes"].float().mean(0) / 0.4
+    assert (rate - seen).square().mean() < (rate - other).square().mean()
+    assert (rate - seen).abs().median() < 1 / 41 / 0.4
+
+
+def test_vimeo_made_small(tmp_path, septuplets):
+    septuplets(tmp_path, ["00001/0001"])
+    (tmp_path / "sep_testlist.txt").write_text("00001/0001")
+    clip = scenes(tmp_path, "test", scale=4).test_set[0]
+    truth = read_picture(tmp_path / "sequences/00001/0001/im4.png")
+    assert torch.equal(clip["rgb"], truth)
+    assert clip["spikes"].shape == (41, 16, 24)
+    small = torch.nn.functional.interpolate(truth[None], scale_factor=0.25, mode="bicubic", antialias=True)[0]
+    assert (clip["spikes"].float().mean(0) / 0.4 - mosaic(small)).abs().median() < 1 / 41 / 0.4
+
+
+def test_other_films(tmp_path, write_film):
+    for name in ("a2", "a10", "b"):
+        write_film(tmp_path / name, 3, name="f{}.png", first=9)
+    write_film(tmp_path / ".hidden", 3)
+    (tmp_path / "notes").mkdir()
+    films = found(tmp_path)
+    assert (films.name, films.clips) == ("films", 5)
+    assert names(films.test) == ["a2", "a10", "b"]
+    assert (names(films.train), names(films.val)) == (["a10", "b"], ["a2"])
+    assert films.test[0].frames == ("f9.png", "f10.png", "f11.png")
+    assert names(found(tmp_path / "b").test) == ["b"]  # one film alone
+
+
+def test_what_is_missing_is_shown(tmp_path, reds):
+    empty = tmp_path / "empty"
+    (empty / "train").mkdir(parents=True)
+    for root in (empty, tmp_path / "nowhere"):
+        with pytest.raises(FileNotFoundError, match=re.escape(str(root))) as error:
+            found(root)
+    with pytest.raises(FileNotFoundError, match="expected one of") as error:
+        found(empty)
+    for layout in ("train/train_orig/000/", "GT/calendar/", "sep_trainlist.txt", "low_resolution/", "NAME/FRAME.png"):
+        assert layout in str(error.value)
+    (tmp_path / "file").touch()
+    with pytest.raises(NotADirectoryError, match="expected a folder of films, got a file"):
+        found(tmp_path / "file")
+    reds(tmp_path / "reds", scenes=(1, 0))
+    with pytest.raises(FileNotFoundError, match=r"REDS without films for fit \(val\)"):
+        scenes(tmp_path / "reds", "fit")
+
+
+def test_a_listed_sequence_is_missing(tmp_path, septuplets):
+    septuplets(tmp_path, ["00001/0001"])
+    (tmp_path / "sep_testlist.txt").write_text("00001/0001\n00001/0009\n00003/0001")
+    with pytest.raises(FileNotFoundError, match=r"2 of 3 sequences are not in .*sequences, the first is 00001/0009"):
+        found(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"batch_size": 11}, "batch_size: expected at most the 10 training clips"),
+        ({"alpha": 0}, "alpha: expected a finite number above 0"),
+        ({"clips": -1}, "clips: expected a whole number >= 1"),
+        ({"flow_times": (5, 41)}, r"flow_times: expected clocks in \[0, 41\)"),
+        ({"pattern": "RGB"}, "pattern"),
+        ({"seed": -1}, "seed: expected 0 or more"),
+        ({"frames": 201}, "000: expected at least 11 frames for a clip, got 9"),
+    ],
+)
+def test_arguments_that_make_no_sense(tmp_path, options, message, reds):
+    reds(tmp_path)
+    with pytest.raises(ValueError, match=message):
+        scenes(tmp_path, "fit", **options)
+
+
+def test_vimeo_is_for_four(tmp_path, septuplets):
+    septuplets(tmp_path, ["00001/0001"])
+    (tmp_path / "sep_testlist.txt").write_text("00001/0001")
+    with pytest.raises(ValueError, match="scale: expected 4 with Vimeo-90K"):
+        scenes(tmp_path, "test", scale=2)
+
+
+def test_bad_files_are_named(tmp_path, write_film):
+    write_film(tmp_path / "a", 3)
+    write_film(tmp_path / "b", 3)
+    (tmp_path / "a" / "00000001.png").write_bytes(b"no picture")
+    write_film(tmp_path / "b", 1, (32, 50), first=2)
+    clips = scenes(tmp_path).test_set
+    with pytest.raises(ValueError, match=r"a/00000001\.png"):
+        clips[0]
+    with pytest.raises(ValueError, match="expected 32 x 48"):
+        clips[1]
+    write_film(tmp_path / "b", 3)
+    train = FilmClips(found(tmp_path / "b").test, ClipRecipe(scale=2), patch=18)
+    with pytest.raises(ValueError, match=r"patch: expected at most 16, as .* gives 16 x 24 sensor pixels at scale 2"):
+        train[0]
