@@ -107,6 +107,62 @@ def test_motion_that_explains_the_change_is_no_flicker():
     assert abs(profile_of(first, second, Steady(2.0)).flicker) < 0.1 * change
 
 
+@pytest.mark.parametrize(("fast_rows", "cells"), [(1, 1.0), (12, 2.0)])  # of 300
+def test_one_per_cent_may_be_faster(fast_rows, cells):
+    first, second = torch.rand(2, 3, 1200, 32).unbind()
+
+    def motion(one, other):
+        flow = Steady(1.0)(one, other).forward.clone()
+        flow[0, 100 : 100 + fast_rows] = 2.0
+        return SimpleNamespace(forward=flow, backward=-flow)
+
+    assert profile_of(first, second, motion).displacement == pytest.approx(2 * cells / 20)
+
+
+def test_motion_where_nothing_is_seen_does_not_count():
+    first, second = torch.rand(2, 3, 64, 64).unbind()
+    first[..., 24:] = 0.5  # flat, and brighter at the next frame
+    second[..., 24:] = 0.7
+
+    def motion(one, other):
+        flow = Steady(1.0)(one, other).forward.clone()
+        flow[0, :, 10:] = 2.0
+        return SimpleNamespace(forward=flow, backward=-flow)
+
+    profile = profile_of(first, second, motion)
+    assert profile.displacement == pytest.approx(2 * 1.0 / 20, rel=0.3)
+    assert profile.displacement_max == pytest.approx(2 * 2.0 / 20)
+
+
+def test_blending_stands_for_pixels_without_flow_too():
+    """Half of the pixels have flow that is not consistent: the estimate is that of the other half, twice."""
+    first, second = torch.rand(2, 3, 64, 64).unbind()
+
+    def motion(one, other):
+        between = Steady(0.5)(one, other)
+        backward = between.backward.clone()
+        backward[:, 8:] = 9.0
+        return SimpleNamespace(forward=between.forward, backward=backward)
+
+    everywhere = profile_of(first, second, Steady(0.5)).blending
+    assert profile_of(first, second, motion).blending == pytest.approx(everywhere, rel=0.3)
+
+
+def test_blending_along_a_diagonal():
+    """A wave bends along the way across it, and not at all along its crests."""
+    y, x = torch.meshgrid(torch.arange(64.0), torch.arange(64.0), indexing="ij")
+    first, second = ((0.5 + 0.4 * torch.sin((x + y) / 4 + phase)).expand(3, 64, 64) for phase in (0.0, 0.5))
+    across, along = (profile_of(first, second, Steady(0.5, y)).blending for y in (0.5, -0.5))
+    assert along < 0.2 * across
+
+
+def test_flicker_is_the_mean_of_all_pixels():
+    first = torch.full((3, 160, 160), 0.5)
+    second = first.clone()
+    second[:, 40:60, 40:60] += 0.1
+    assert profile_of(first, second).flicker == pytest.approx(0.4 * 0.1 * 400 / 160**2, rel=1e-3)
+
+
 def test_inconsistent_flow_does_not_count():
     first, second = torch.rand(2, 3, 64, 64).unbind()
 
