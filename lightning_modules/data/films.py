@@ -173,7 +173,7 @@ class FilmClips(Dataset):
     Args:
         films: what was found by :func:`lightning_modules.data.layouts.find_films`.
         recipe: how clips are made.
-        clips: clips of a film; fewer where it has too few frames.
+        clips: clips of a film; fewer where it has too few frames, and one of a film with a middle of its own.
         patch: side of a patch in sensor pixels; None for whole clips.
         cache: where clips are kept; None to simulate each whenever it is asked for.
 
@@ -202,6 +202,8 @@ class FilmClips(Dataset):
         count, needed = len(film.frames) - before - after, before + after + 1
         if count < 1:
             raise ValueError(f"{film.folder}: expected at least {needed} frames for a clip, got {len(film.frames)}")
+        if film.middle is not None:
+            return [(film.middle, film.middle + 1)]
         clips = min(clips, count)
         return [(before + part * count // clips, before + (part + 1) * count // clips) for part in range(clips)]
 

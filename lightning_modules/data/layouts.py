@@ -38,6 +38,7 @@ class FilmFiles:
         truth: folder of pictures that are sharper than the frames, under the same names; ``None`` where the frames are
             the truth.
         shrink: by how much the frames must be reduced before the sensor sees them.
+        middle: the only frame that may be the middle of a clip; ``None`` where any may.
     """
 
     name: str
@@ -45,6 +46,7 @@ class FilmFiles:
     frames: tuple[str, ...]
     truth: Path | None = None
     shrink: int = 1
+    middle: int | None = None
 
 
 @dataclass(frozen=True)
@@ -159,7 +161,7 @@ def _septuplets(folder: Path, small: Path | None, listed: str, large: str = "seq
             )
     frames = tuple(f"im{n}.png" for n in range(1, 8))
     return tuple(
-        FilmFiles(name, (small or folder / large) / name, frames, folder / large / name, 1 if small else 4)
+        FilmFiles(name, (small or folder / large) / name, frames, folder / large / name, 1 if small else 4, middle=3)
         for name in names
     )
 

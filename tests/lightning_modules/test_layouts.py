@@ -127,6 +127,11 @@ def test_vimeo_made_small(tmp_path, septuplets):
     truth = read_picture(tmp_path / "sequences/00001/0001/im4.png")
     assert torch.equal(clip["rgb"], truth)
     assert clip["spikes"].shape == (41, 16, 24)
+    data = scenes(tmp_path, "test", scale=4, clips=3)
+    assert data.test_names == ["00001/0001/im4"]
+    assert [FilmClips(data.found.test, ClipRecipe(seed=seed), patch=8).names for seed in range(5)] == [
+        ["00001/0001/im4"]
+    ] * 5
     small = torch.nn.functional.interpolate(truth[None], scale_factor=0.25, mode="bicubic", antialias=True)[0]
     assert (clip["spikes"].float().mean(0) / 0.4 - mosaic(small)).abs().median() < 1 / 41 / 0.4
 
