@@ -149,6 +149,15 @@ def read_video(path: str | Path, *, start: int = 0, count: int | None = None) ->
         VideoError: as :class:`VideoFrames`.
         TypeError: as :class:`VideoFrames`.
         ValueError: as :class:`VideoFrames`.
+
+    Example:
+        >>> import tempfile
+        >>> from spikekit import write_picture
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for n in range(3):
+        ...         write_picture(f"{folder}/{n}.png", torch.full((3, 4, 6), n / 2))
+        ...     [frame.mean().round(decimals=1).item() for frame in read_video(folder)]
+        [0.0, 0.5, 1.0]
     """
     return VideoFrames(path, start=start, count=count)
 

@@ -12,13 +12,13 @@ from torch import nn
 import spikekit as sk
 
 PUBLIC = """
-    CAMERAS PATTERNS BayerMask BinToSensor Camera Demosaic FlowWarp FlowWarpIdw JointFlow Layer LinearMotion
-    MergeBayer Mosaic Motion Scene SensorNoise SpikeChange SpikeFileError SpikeIntegrateFire SpikeInterval SpikeSensor
-    SplitBayer SplitColors Tfi Tfp UpsampleFlow bayer_mask bayer_pattern bayer_sites bin_to_sensor camera
-    decode_in_chunks demosaic flow_to_rgb flow_warp flow_warp_idw iter_spikes joint_flow linear_motion merge_bayer
-    mosaic pack_spikes panel psnr read_picture read_spikes simulate_spikes spike_integrate_fire spike_interval
-    spike_interval_at spikes_shape split_bayer split_colors ssim tfi tfi_at tfp unpack_spikes upsample_flow
-    write_picture write_spikes
+    CAMERAS PATTERNS BayerMask Between BinToSensor Blend Camera Demosaic Film FilmClip FlowInterpolation FlowWarp
+    FlowWarpIdw JointFlow Layer LinearMotion MergeBayer Mosaic Motion Plan Scene SceneProfile SensorNoise SpikeChange
+    SpikeFileError SpikeIntegrateFire SpikeInterval SpikeSensor SplitBayer SplitColors Still Tfi Tfp UpsampleFlow
+    VideoError VideoFrames bayer_mask bayer_pattern bayer_sites bin_to_sensor camera decode_in_chunks demosaic
+    flow_to_rgb flow_warp flow_warp_idw iter_spikes joint_flow linear_motion merge_bayer mosaic pack_spikes panel psnr
+    read_picture read_spikes read_video simulate_spikes spike_integrate_fire spike_interval spike_interval_at
+    spikes_shape split_bayer split_colors ssim tfi tfi_at tfp unpack_spikes upsample_flow write_picture write_spikes
 """.split()  # noqa: SIM905
 
 SPIKES = (torch.rand(2, 9, 4, 6, generator=torch.Generator().manual_seed(1)) < 0.4).double()
