@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import inspect
 import os
 import re
 import secrets
@@ -202,7 +203,7 @@ def _add_verb(verbs: Any, run: Any, name: str, summary: str, example: str) -> ar
     verb = verbs.add_parser(
         name,
         help=summary,
-        description=run.__doc__,
+        description=inspect.getdoc(run),
         epilog=f"example:\n  spikekit {example}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

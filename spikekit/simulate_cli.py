@@ -11,6 +11,7 @@ from spikekit.arguments import UsageError, positive, whole
 from spikekit.cfa import PATTERNS
 from spikekit.noise import SensorNoise
 from spikekit.sidecar import Sidecar, read_sidecar
+from spikekit.simulation import Settings, Source, simulate
 
 _NOISE = {
     "photons": "electrons that make a threshold: light comes in photons",
@@ -35,8 +36,6 @@ def run(args: argparse.Namespace) -> None:
     All appear under their names when they are complete, the side-car last: a stream without one is not to be
     believed.
     """
-    from spikekit.simulation import Settings, Source, simulate
-
     if args.output.is_dir():
         raise ValueError(f"{args.output}: expected a stream to write, got a folder")
     given = {name: value for name, value in vars(args).items() if name in _names(Settings) | _names(SensorNoise)}
@@ -59,9 +58,7 @@ def _names(kind: Any) -> set[str]:
     return {field.name for field in fields(kind)}
 
 
-def _settings(given: dict[str, Any]) -> Any:
-    from spikekit.simulation import Settings
-
+def _settings(given: dict[str, Any]) -> Settings:
     noise = {name: value for name, value in given.items() if name in _names(SensorNoise)}
     try:
         return Settings(
@@ -73,9 +70,7 @@ def _settings(given: dict[str, Any]) -> Any:
         raise UsageError(f"--{str(error).replace('_', '-', 1)}") from error
 
 
-def _settings_of(path: Path, sidecar: Sidecar, given: dict[str, Any]) -> Any:
-    from spikekit.simulation import Settings
-
+def _settings_of(path: Path, sidecar: Sidecar, given: dict[str, Any]) -> Settings:
     if given:
         options = ", ".join(f"--{name.replace('_', '-')}" for name in given)
         raise UsageError(f"{path}: a side-car has its own settings, got {options} as well")
@@ -91,12 +86,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("input", type=Path, metavar="INPUT", help="a folder of pictures, a video file, a picture, or a side-car")
     add("-o", "--output", required=True, type=_stream, metavar="OUT.dat", help="the stream to write, .dat or .npz")
     add("--scale", type=whole(1), default=default, metavar="S", help="pixels of a frame that a sensor pixel is wide")
-    add("--pattern", type=str.upper, choices=PATTERNS, default=default, help="Bayer phase of the sensor; RGGB")
-    add("--alpha", type=positive, default=default, metavar="A", help="times that a white pixel fires per clock; 0.4")
-    add("--clocks", type=whole(1), default=default, metavar="N", help="clocks from one frame to the next; 20")
+    add(
+        "--pattern",
+        type=str.upper,
+        choices=PATTERNS,
+        default=default,
+        help=f"Bayer phase of the sensor; {Settings.pattern} if not given",
+    )
+    add(
+        "--alpha",
+        type=positive,
+        default=default,
+        metavar="A",
+        help=f"times that a white pixel fires per clock; {Settings.alpha} if not given",
+    )
+    add(
+        "--clocks",
+        type=whole(1),
+        default=default,
+        metavar="N",
+        help=f"clocks from one frame to the next; {Settings.clocks} if not given",
+    )
     part = parser.add_mutually_exclusive_group()
     part.add_argument(
-        "--frames", type=whole(1), default=default, metavar="N", help="frames of the stream, around one of the film; 41"
+        "--frames",
+        type=whole(1),
+        default=default,
+        metavar="N",
+        help=f"frames of the stream, around one of the film; {Settings.frames} if not given",
     )
     part.add_argument("--all", dest="frames", action="store_const", const=None, default=default, help="the whole film")
     add(
@@ -104,10 +121,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=whole(0),
         default=default,
         metavar="M",
-        help="which frame of the film is in the middle, from 0; that in its middle",
+        help="which frame of the film is in the middle, from 0; that in its middle if not given",
     )
-    add("--readout", type=whole(1), default=default, metavar="N", help="clocks for every frame of the stream; 1")
-    add("--seed", type=whole(0), default=default, metavar="N", help="where chance begins: first charge and noise; 0")
+    add(
+        "--readout",
+        type=whole(1),
+        default=default,
+        metavar="N",
+        help=f"clocks for every frame of the stream; {Settings.readout} if not given",
+    )
+    add(
+        "--seed",
+        type=whole(0),
+        default=default,
+        metavar="N",
+        help=f"where chance begins: first charge and noise; {Settings.seed} if not given",
+    )
     add("--source", type=Path, metavar="PATH", help="where the frames of a side-car are, if they have moved")
 
     model = parser.add_argument_group("what is modelled")
@@ -116,27 +145,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_plan,
         default=default,
         metavar="scene|everything|K",
-        help="what the scene requires, every clock and all noise, or K latent frames between two frames; scene",
+        help="what the scene requires, every clock and all noise, or K latent frames between two frames; "
+        f"{Settings.plan} if not given",
     )
     model.add_argument(
         "--tolerance",
         type=positive,
         default=default,
         metavar="SHARE",
-        help="share of the spikes that may change by not modelling more; 0.05",
+        help=f"share of the spikes that may change by not modelling more; {Settings.tolerance} if not given",
     )
     model.add_argument(
         "--step",
         type=positive,
         default=default,
         metavar="PIXELS",
-        help="largest displacement between latent frames, in sensor pixels; 0.5",
+        help=f"largest displacement between latent frames, in sensor pixels; {Settings.step} if not given",
     )
     model.add_argument(
         "--interpolation",
         default=default,
         metavar="CLASS",
-        help="what makes latent frames: package.module.Class, or package.module.Class(name=value); FlowInterpolation",
+        help="what makes latent frames: package.module.Class, or package.module.Class(name=value); "
+        f"{Settings.interpolation} if not given",
     )
 
     noise = parser.add_argument_group("noise of the sensor, none if not given")

@@ -209,7 +209,8 @@ class Moment:
 _STYLE = (
     "body{font:15px system-ui,sans-serif;margin:2em auto;max-width:1500px;color:#222;background:#fff}"
     "figure{display:inline-block;margin:0 1.5em 1.5em 0;vertical-align:top}figcaption{margin-bottom:.4em}"
-    "img{image-rendering:pixelated;display:block}input{width:100%}"
+    "img{image-rendering:pixelated}img:not([hidden]){display:block}"
+    "input{width:100%}"
 )
 
 
@@ -233,7 +234,7 @@ def _page(moment: Moment, starts: list[int], window: int, pictures: list[Tensor]
 <figure><figcaption>TFP, frames <output id="at"></output></figcaption><div id="film">{frames_of}</div>
 <input id="time" type="range" min="0" max="{last}" value="{last // 2}" aria-label="time"></figure>
 {figures}
-<script>
+<script type="module">
 const starts = {starts}, length = {window}, time = document.getElementById("time");
 function show() {{
   const n = +time.value;

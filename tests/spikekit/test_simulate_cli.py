@@ -18,7 +18,7 @@ from skimage import io
 from spikekit import read_picture, read_spikes, tfp, write_picture
 from spikekit.cli import main
 from spikekit.film import Film
-from spikekit.sidecar import find_sidecar, read_sidecar
+from spikekit.sidecar import find_sidecar, published, read_sidecar
 from spikekit.simulation import Settings, build
 
 COMMAND = [sys.executable, "-c", "from spikekit.cli import main; raise SystemExit(main())"]
@@ -165,6 +165,7 @@ class Hold:
 
     def __call__(self, first, second):
         hold = self
+        Hold.threads = torch.get_num_threads()
 
         class Between:
             forward = backward = None
@@ -250,16 +251,18 @@ def test_four_at_once(film):
     assert {name: Path(name).read_bytes() for name in at_once} == at_once
 
 
-def test_threads_change_nothing(film):
+def test_one_thread(film, monkeypatch):
+    """However many threads there are, sums are taken in one order."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
     threads = torch.get_num_threads()
     try:
-        for count in (1, 2):
-            torch.set_num_threads(count)
-            simulate(film, "-o", f"{count}.dat", "--scale", 2)
-            assert torch.get_num_threads() == count
+        torch.set_num_threads(2)
+        own = "test_simulate_cli.Hold"
+        simulate(film, "-o", "a.dat", "--scale", 2, "--plan", "everything", "--interpolation", own)
+        assert sys.modules["test_simulate_cli"].Hold.threads == 1
+        assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(threads)
-    assert Path("1.dat").read_bytes() == Path("2.dat").read_bytes()
 
 
 # --- whole or not at all ----------------------------------------------------------------------------------------------
@@ -302,6 +305,17 @@ def test_killed_at_random_moments(film):
             assert believed(Path("a.dat"))
     simulate(film, "-o", "a.dat", *QUICK)
     assert not list(Path().glob(".*"))
+
+
+def test_what_was_killed_is_removed_and_what_runs_is_not(film):
+    Path(".a.dat.12345678.part").mkdir()
+    with published(Path("a.dat")) as running:
+        assert not Path(".a.dat.12345678.part").exists()
+        simulate(film, "-o", "a.dat", *QUICK)
+        assert running.is_dir()
+        (running / "a.json").write_bytes(Path("a.json").read_bytes())
+    assert not list(Path().glob(".*"))
+    assert believed(Path("a.dat"))
 
 
 @pytest.mark.parametrize(("room", "words", "name"), [(8000, ["--all", "--clocks", "200"], "a.dat"), (500, [], "a.png")])

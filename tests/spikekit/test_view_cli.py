@@ -123,6 +123,7 @@ def test_a_page_of_its_own(still):
     assert len(starts) == sliding == 22
     assert starts[-1] == 21
     assert 'max="21"' in page
+    assert "img:not([hidden]){display:block}" in page  # or all would be seen at once
     assert "length = 20" in page
     assert "41 frames of 32 x 48, alpha 0.5 is white" in page
 
@@ -249,6 +250,11 @@ def test_a_camera_is_known(own_camera, capsys, header):
     assert (known - (1.5 * inner).sqrt()).abs().max() < 0.01
     view(*words, "-o", "v.png")
     assert read_picture("v.png").shape[0] == 3
+    known = recording.camera("own.json")
+    shown = recording.Recording(Path("a.dat"), 400, (6, 10 if header else 8), known.flip, camera=known)
+    for n, plane in enumerate(shown.packed(7, 3), 7):
+        assert (shown.unpack(plane) == known.prepare(spikes[n]).numpy()).all()
+        assert shown.read(n, 1)[0].equal(known.prepare(spikes[n]))
 
 
 def test_decode_by_its_sidecar(still, capsys):
