@@ -134,14 +134,16 @@ class FlowInterpolation:
         Flow is estimated once a pair, on luma, by two estimators of scikit-image whose weaknesses differ (TV-L1 and
         iterative Lucas-Kanade); of both, each pixel keeps the one under which its surroundings match better. For every
         time, each frame's flow is splatted to where its pixels are then; among pixels that meet, those that match
-        across the frames prevail, so that what is in front covers what is behind. The four candidates that a pixel
-        gets (from both frames, from either one, and no motion) are told apart by how well they match around it. What
-        comes from outside of one frame is taken from the other alone. Frames are sampled bicubically, and the result
-        is kept in the range of the two frames.
+        across the frames prevail, so that what is in front covers what is behind. The three candidates that a pixel
+        gets, from both frames and from either one, are told apart by how well the frames match around it. What comes
+        from outside of one frame is taken from the other alone. Frames are compared at the same mean brightness and
+        sampled bicubically, and the result is kept in the range of the two frames.
 
-        Where too much of the two frames has no counterpart, the film was cut: ``cut`` is true, there is no flow, and
-        the nearer frame is shown. No gradient. Flow is estimated on the CPU, the rest runs where the frames are. On the
-        CPU the same frames give the same pictures, bit for bit.
+        Where more than half of the pixels have no counterpart in the other frame, the film was cut, or motion was too
+        large to be followed: ``cut`` is true, there is no flow, and the nearer frame is shown.
+
+        No gradient. Flow is estimated on the CPU, the rest runs where the frames are. On the CPU the same frames give
+        the same pictures, bit for bit.
 
     Args:
         shrink: how many times smaller the pictures are that flow is estimated on; faster, but less accurate.
@@ -227,14 +229,14 @@ class _Carried(Between):
         return picture.clamp(low, high).to(self.first.dtype)
 
     def _candidates(self, shares: Tensor) -> Tensor:
-        """Return what the motion may be at every pixel of the picture at a time, (4, 2, H, W)."""
+        """Return what the motion may be at every pixel of the picture at a time, (3, 2, H, W)."""
         carried = _splat(torch.cat([self._motion * self._trust, self._trust], dim=1), -shares * self._motion)
         motion, trust = carried[:, :2], carried[:, 2:]
         nothing = 1e-6  # nothing arrived here
         anywhere = self._motion.mean(dim=0)
         both = torch.where(trust.sum(dim=0) > nothing, motion.sum(dim=0) / (trust.sum(dim=0) + 1e-12), anywhere)
         either = torch.where(trust > nothing, motion / (trust + 1e-12), both)
-        return torch.stack([both, *either, torch.zeros_like(both)])
+        return torch.stack([both, *either])
 
 
 def _light(pair: Tensor) -> Tensor:

@@ -9,8 +9,9 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from spikekit import psnr
-from spikekit.interpolate import Between, Blend, FlowInterpolation, Still
+from spikekit import psnr, write_picture
+from spikekit.bench import interpolation
+from spikekit.interpolate import Between, Blend, FlowInterpolation, Still, _Carried
 from spikekit.scene import Layer, Motion, Scene
 from spikekit.video import read_video
 
@@ -181,6 +182,45 @@ def test_what_an_object_hides(tau):
     assert error < 0.02 < plain
 
 
+def ball(radius, pixels):
+    """A white ball that moves to the right, in front of a dark background that stands still."""
+    axis = torch.arange(2.0 * radius + 1) - radius
+    disc = (axis[:, None] ** 2 + axis**2 < radius**2).float()
+    ball = Layer(torch.full((3, *disc.shape), 0.95), Motion((pixels / 20, 0.0)), (50, 50), disc)
+    return Scene([Layer(texture(200, 200) * 0.6, position=(-40, -40)), ball], 120, 120, frames=21)
+
+
+@pytest.mark.parametrize(("radius", "pixels", "tau", "least"), [(4, 10, 0.5, 40), (5, 12, 0.5, 36), (6, 16, 0.5, 34)])
+def test_a_ball_that_moves_farther_than_it_is_wide(radius, pixels, tau, least):
+    # half way, both frames show only background where the ball is: its motion must be carried there
+    scene = ball(radius, pixels)
+    assert psnr(FlowInterpolation()(*ends(scene)).at(tau), scene.rgb(20 * tau)) > least
+
+
+def test_what_is_in_front_covers_what_is_behind():
+    scene = passing((0.0, 0.0), (6.0, 0.0))
+    frames = torch.stack(ends(scene))
+    flows = torch.zeros(2, 2, 120, 120)
+    flows[0, 0, 36:84, 33:81] = 6
+    flows[1, 0, 36:84, 39:87] = -6
+    between = _Carried(*frames, frames, torch.ones(2, 1, 1, 1), flows)
+    motion = between._candidates(torch.tensor([-0.5, 0.5]).reshape(2, 1, 1, 1))[1]
+    # there the square meets background that the second frame no longer shows; a plain mean of the two would be 3
+    meeting = motion[0, 36:84, 81:84]
+    assert meeting.mean() > 5
+    assert (motion[1] == 0).all()
+
+
+@pytest.mark.parametrize("method", [Blend(), FlowInterpolation()], ids=repr)
+def test_the_nearer_frame_counts_more(method):
+    scene = panning(3.0, 2.0)
+    grain = torch.randn(2, 3, scene.height, scene.width) * 0.05
+    first, second = ((frame + noise).clamp(0, 1) for frame, noise in zip(ends(scene), grain, strict=True))
+    between = method(first, second)
+    for tau, frame in ((0.05, first), (0.95, second)):
+        assert psnr(between.at(tau), frame) > 33
+
+
 def test_what_comes_in_from_outside():
     scene = panning(12.0, 0.0)
     first, second = ends(scene)
@@ -204,9 +244,12 @@ def test_light_that_changes_is_not_motion(gain):
 def test_shrink_finds_the_motion_too():
     scene = panning(4.0, 3.0)
     truth = scene.rgb(10)
-    fine, coarse = (psnr(FlowInterpolation(shrink)(*ends(scene)).at(0.5), truth) for shrink in (1, 2))
-    assert min(fine, coarse) > psnr(Blend()(*ends(scene)).at(0.5), truth) + 6
-    assert fine != coarse
+    fine, coarse = (FlowInterpolation(shrink)(*ends(scene)) for shrink in (1, 2))
+    assert not fine.forward.equal(coarse.forward)
+    for between in (fine, coarse):
+        assert psnr(between.at(0.5), truth) > psnr(Blend()(*ends(scene)).at(0.5), truth) + 6
+        error = between.forward[:, 20:-20, 20:-20] - torch.tensor([4.0, 3.0]).reshape(2, 1, 1)
+        assert error.abs().mean() < 0.1
 
 
 # --- cuts, chance -----------------------------------------------------------------------------------------------------
@@ -249,6 +292,24 @@ torch.save([between.forward, between.at(0.3), between.at(0.7)], sys.argv[3])
 
 
 # --- films ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_benchmark(tmp_path):
+    for n in range(7):
+        write_picture(tmp_path / f"{n}.png", torch.full((3, 20, 20), n / 255))
+    triples = list(interpolation.film(tmp_path, 2))
+    assert [[round(frame.mean().item() * 255) for frame in three] for three in triples] == [
+        [0, 1, 2],
+        [2, 3, 4],
+        [4, 5, 6],
+    ]
+    count, scores, seconds = interpolation.measure(iter([interpolation.scene(2, hidden=True)]))
+    assert count == 1
+    assert scores.keys() == seconds.keys() == interpolation.METHODS.keys()
+    assert scores["flow"] > scores["blend"] + 2 > scores["nearest"] + 2
+    first, truth, second = interpolation.scene(0, hidden=False)
+    assert first.equal(truth)
+    assert first.equal(second)
 
 
 @needs_video
