@@ -170,7 +170,7 @@ def _films(folders: Iterable[Path], only: str | None = None) -> tuple[FilmFiles,
     """Return the folders inside some folders that hold pictures."""
     films: dict[str, FilmFiles] = {}
     for folder in folders:
-        for name in [only] if only else sorted(_subfolders(folder), key=natural):
+        for name in [only] if only else _subfolders(folder):
             frames = tuple(sorted(_pictures(folder / name), key=natural))
             if frames:
                 films.setdefault(name, FilmFiles(name, folder / name, frames))

@@ -4,6 +4,7 @@ import functools
 import shutil
 import types
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ import torch
 from skimage import io
 
 from lightning_modules.data.films import ClipRecipe, FilmScenes
+from lightning_modules.data.layouts import find_films
 from spikekit import bin_to_sensor, read_picture
+from spikekit.interpolate import FlowInterpolation
 from spikekit.noise import SensorNoise
 
 SMALL = {"scale": 2, "patch": 8, "batch_size": 2, "workers": 0}
@@ -235,7 +238,7 @@ def test_cached_clips_equal_fresh_ones(film, tmp_path, simulated):
         {"flow_times": (5, 34)},
         {"flow": False},
         {"noise": SensorNoise(photons=100)},
-        {"interpolation": First(), "flow": False},
+        {"interpolation": FlowInterpolation(shrink=2)},
         {"seed": 1},
     ],
     ids=lambda changed: next(iter(changed)),
@@ -249,6 +252,17 @@ def test_another_setting_is_another_clip(film, tmp_path, simulated, changed):
     assert simulated.clips == 2
     scenes(film, cache=cache, clips=1).test_set[0]
     assert simulated.clips == 2
+
+
+def test_keys_tell_code_and_kinds_of_films_apart(film, tmp_path, monkeypatch):
+    (one,) = find_films(film, lambda films: (films, films)).test
+    recipe = ClipRecipe()
+    keys = {recipe.key(kind, 2) for kind in (one, replace(one, shrink=4), replace(one, truth=one.folder))}
+    keys.add(ClipRecipe(interpolation=First()).key(one, 2))
+    assert recipe.key(replace(one, name="other"), 2) in keys
+    monkeypatch.setattr("lightning_modules.data.films.code_digest", lambda *modules: "new")
+    keys.add(recipe.key(one, 2))
+    assert len(keys) == 5
 
 
 def test_other_frames_are_another_clip(film, tmp_path, simulated, write_film):

@@ -82,16 +82,20 @@ def test_test_on_vid4_prints_every_clip(tmp_path, command, capsys, write_film):
 
 
 @pytest.mark.slow
-def test_fit_on_vimeo_and_on_films_without_flow(tmp_path, command, write_film, septuplets):
+def test_fit_on_vimeo_and_on_films_without_flow(tmp_path, command, capsys, write_film, septuplets):
     septuplets(tmp_path / "vimeo", ["00001/0001", "00001/0002", "00002/0001"])
     (tmp_path / "vimeo/sep_trainlist.txt").write_text("00001/0001\n00002/0001\n")
     (tmp_path / "vimeo/sep_testlist.txt").write_text("00001/0002\n")
     command("fit", "vimeo90k", "--data.root", tmp_path / "vimeo", "-o", tmp_path / "run", scale=4)
     for name in ("a", "b"):
         write_film(tmp_path / "films" / name, 4)
-    interpolation = "--data.interpolation", "spikekit.interpolate.Blend"
-    command("fit", "films", "--data.root", tmp_path / "films", "--data.flow", "false", *interpolation, "-o", "other")
+    blended = "--data.root", tmp_path / "films", "--data.interpolation", "spikekit.interpolate.Blend"
+    command("fit", "films", *blended, "--data.flow", "false", "-o", "other")
     assert (tmp_path / "other" / "checkpoints" / "best.ckpt").is_file()
+    command("test", "films", *blended, "--data.flow", "false", "-o", "other", "--ckpt_path", "best")
+    printed = capsys.readouterr().out
+    assert "\nCSCSR " in printed
+    assert "true flow" not in printed
 
 
 @pytest.mark.parametrize(
