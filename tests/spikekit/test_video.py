@@ -202,7 +202,8 @@ def test_a_folder_that_cannot_be_listed(tmp_path, monkeypatch):
 def write_film(path, frames=30, codec="libx264", pixels="yuv420p", level=8, **options):
     """A film whose frame n is grey of ``level * n``."""
     av = pytest.importorskip("av")
-    with av.open(str(path), "w") as container:
+    muxing = {"movflags": "faststart"} if path.suffix == ".mp4" else {}  # the index before the frames
+    with av.open(str(path), "w", options=muxing) as container:
         stream = container.add_stream(codec, rate=25)
         (stream.height, stream.width), stream.pix_fmt, stream.options = SIZE, pixels, options
         stream.bit_rate = 10_000_000
@@ -297,9 +298,27 @@ def test_damaged_video_files(tmp_path):
     assert 3 < len(reached) < 29
     assert all(rgb.equal(whole) for rgb, whole in zip(reached, frames, strict=False))
     assert cut[3].equal(frames[3])  # what came before stays usable
-    for name, data in (("empty.mp4", b""), ("text.mp4", b"no film " * 99), ("short.mp4", whole[:40])):
+    said = []
+    for _ in range(2):
+        with pytest.raises(VideoError) as info:
+            cut[len(reached)]
+        said.append(str(info.value))
+    assert said[0] == said[1]
+    for name, data in (("empty.mp4", b""), ("text.mp4", b"no film " * 99), ("short.avi", whole[:40])):
         (tmp_path / name).write_bytes(data)
         fails(tmp_path / name)
+
+
+def test_a_film_shorter_than_its_header_says(tmp_path):
+    whole = write_film(tmp_path / "a.mp4", bf="0").read_bytes()
+    (tmp_path / "a.mp4").write_bytes(whole[:-200])
+    frames = read_video(tmp_path / "a.mp4")
+    assert len(frames) == 30  # what is missing is told, not left out
+    fails(tmp_path / "a.mp4", "ends after", "of 30 frames")
+    for _ in range(2):  # an error does not stand in the way of what can be read
+        with pytest.raises(VideoError):
+            frames[29]
+        assert level_of(frames[0]) == pytest.approx(0, abs=0.4)
 
 
 def test_sound_is_no_film(tmp_path):
