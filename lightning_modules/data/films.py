@@ -87,7 +87,6 @@ class ClipRecipe:
         return clip_key(
             code=[code_digest("spikekit.film", "spikekit.video"), file_digest(Path(__file__)), code_digest(part)],
             files=[file_digest(path) for path in self.files(film, middle)],
-            truth=film.truth is not None,
             shrink=film.shrink,
             interpolation=hashlib.sha256(pickle.dumps(self.interpolation)).hexdigest(),
             noise=asdict(self.noise),

@@ -11,6 +11,7 @@ import pytest
 import torch
 from skimage import io
 
+from lightning_modules.data import films
 from lightning_modules.data.films import ClipRecipe, FilmScenes
 from lightning_modules.data.layouts import find_films
 from spikekit import bin_to_sensor, read_picture
@@ -255,14 +256,15 @@ def test_another_setting_is_another_clip(film, tmp_path, simulated, changed):
 
 
 def test_keys_tell_code_and_kinds_of_films_apart(film, tmp_path, monkeypatch):
-    (one,) = find_films(film, lambda films: (films, films)).test
+    (one,) = find_films(film, lambda found: (found, found)).test
     recipe = ClipRecipe()
     keys = {recipe.key(kind, 2) for kind in (one, replace(one, shrink=4), replace(one, truth=one.folder))}
     keys.add(ClipRecipe(interpolation=First()).key(one, 2))
     assert recipe.key(replace(one, name="other"), 2) in keys
-    monkeypatch.setattr("lightning_modules.data.films.code_digest", lambda *modules: "new")
-    keys.add(recipe.key(one, 2))
-    assert len(keys) == 5
+    for changed in (None, "spikekit.film", "spikekit.video", "spikekit.interpolate"):
+        monkeypatch.setattr(films, "code_digest", lambda *modules, changed=changed: str(changed in modules))
+        keys.add(recipe.key(one, 2))
+    assert len(keys) == 7  # the film and the reading of its frames are one part of the key
 
 
 def test_other_frames_are_another_clip(film, tmp_path, simulated, write_film):
