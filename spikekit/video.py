@@ -53,7 +53,7 @@ class VideoFrames(Sequence[Tensor]):
         channels, alpha is laid over white (an opaque one changes nothing), 16-bit files keep their depth; see
         :func:`spikekit.read_picture`. All frames have the size of the first.
 
-        In a folder the pictures are those with one of the endings :data:`PICTURE_ENDINGS`, in natural order (``f2``
+        In a folder the pictures are the PNG, JPEG, BMP and TIFF files, told by their endings, in natural order (``f2``
         before ``f10``); folders, hidden files and files with other endings are left out. A single picture is a film
         of one frame.
 
@@ -113,7 +113,7 @@ class VideoFrames(Sequence[Tensor]):
 
     @property
     def names(self) -> list[str]:
-        """What each frame is called: its file in a folder, its number in a video file."""
+        """Names of the frames, of files in a folder, and numbers in a video file."""
         return [self._source.names[i] for i in self._chosen]
 
     def __len__(self) -> int:
