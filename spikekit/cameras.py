@@ -108,11 +108,11 @@ class Camera:
         """Make of stored frames what the camera saw: only pixels, upright, without the border.
 
         Args:
-            spikes: frames (*, H, W) as they are stored, with or without the columns that are no pixels.
+            spikes: frames :math:`(*, H, W)` as they are stored, with or without the columns that are no pixels.
             flip: turn them upside down; as the camera needs it when not given. ``False`` where reading has done it.
 
         Returns:
-            (*, H', W') of :attr:`prepared_size`, in the dtype of ``spikes``.
+            Frames :math:`(*, H', W')` of :attr:`prepared_size`, in the dtype of ``spikes``.
 
         Raises:
             TypeError: ``spikes`` is not a tensor of real numbers.

@@ -51,7 +51,7 @@ class Film:
         plan: what is modelled, in every interval; ``Plan.everything(clocks)`` for all there is.
         tolerance: share of the spikes that may change by not modelling more, see :meth:`SceneProfile.plan`.
         step: displacement between latent frames in sensor pixels, likewise.
-        motion: what finds motion for the profile, see :func:`profile_interval`.
+        motion: what finds motion for the profile, see ``spikekit.plan.profile_interval``.
 
     Raises:
         TypeError: frames that are not floating-point tensors.

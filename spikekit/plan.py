@@ -168,7 +168,7 @@ class SceneProfile:
             frames: clocks of a clip, over which noise adds up.
 
         Returns:
-            The plan; change it by :func:`dataclasses.replace`.
+            The plan; change it by ``dataclasses.replace``.
 
         Raises:
             ValueError: a tolerance or a step that is not above 0.

@@ -77,10 +77,10 @@ class SpikeSensor:
 
         Args:
             light: charge per frame, :math:`(*, T, H, W)`, floating, T a multiple of ``readout``; chunks of one
-                recording have the same (*, H, W).
+                recording have the same :math:`(*, H, W)`.
 
         Returns:
-            ``spikes`` of shape (*, T / readout, H, W), uint8.
+            ``spikes`` of shape :math:`(*, T / readout, H, W)`, uint8.
 
         Raises:
             TypeError: ``light`` is not a floating-point tensor.

@@ -144,7 +144,7 @@ def lets_through(features, flow, mask, **options):
 
 
 def one_graph_a_size(light, *args, **options):
-    return FIRE(light * (1 if light.shape[-1] > 10 else 1.0), *args, **options)
+    return FIRE(light * (1 if light.shape[-1] > 15 else 1.0), *args, **options)
 
 
 FIRE, TFI, TFP, IDW = sk.spike_integrate_fire, sk.tfi, sk.tfp, sk.flow_warp_idw
