@@ -1,8 +1,10 @@
+import numpy as np
 import pytest
 import torch
+from skimage.registration import optical_flow_ilk
 
-from lightning_modules.motion import ClassicalFlow, ZeroFlow
-from spikekit import mosaic, spike_integrate_fire
+from lightning_modules.motion import ClassicalFlow, MotionEstimator, ZeroFlow
+from spikekit import mosaic, spike_integrate_fire, split_bayer, tfi
 
 TIMES = (5, 20, 35)
 
@@ -51,3 +53,44 @@ def test_any_size(size):
 def test_wrong_radius():
     with pytest.raises(ValueError, match="radius"):
         ClassicalFlow(radius=0)
+
+
+@pytest.mark.parametrize("size", [(32, 40), (33, 35)])
+def test_flows_of_the_sites_are_in_bayer_cells_and_in_the_order_of_split_bayer(size):
+    spikes = moving((0.2, -0.1), *size, "GRBG").repeat(2, 1, 1, 1)
+    estimator = ClassicalFlow()
+    flows = estimator.channel_flows(spikes, TIMES, "GRBG")
+    sites = spike_sites(spikes, "GRBG")
+    for flow in flows:
+        assert flow.shape == (4, 2, 2, (size[0] + 1) // 2, (size[1] + 1) // 2)
+    middle, last = (tfi(sites)[:, :, t] for t in TIMES[1:])
+    for site in range(4):
+        down, right = optical_flow_ilk(
+            middle[site, 1].numpy(), last[site, 1].numpy(), radius=10, gaussian=True, dtype="float32"
+        )
+        torch.testing.assert_close(flows[1][site, 1], torch.from_numpy(np.stack([right, down])))
+
+
+def spike_sites(spikes, pattern):
+    """Sub-streams of a clip of any size, an odd side continued by the pixel of the same site."""
+    spikes = torch.cat([spikes, spikes[..., -2:-1, :]], -2) if spikes.shape[-2] % 2 else spikes
+    spikes = torch.cat([spikes, spikes[..., -2:-1]], -1) if spikes.shape[-1] % 2 else spikes
+    return split_bayer(spikes, pattern)
+
+
+class Constant(MotionEstimator):
+    """Every site has a flow of its own."""
+
+    def channel_flows(self, spikes, times, pattern):
+        height, width = ((side + 1) // 2 for side in spikes.shape[-2:])
+        flow = torch.tensor([[1.0, 2], [3, 4], [5, 6], [7, 12]]).reshape(4, 1, 2, 1, 1)
+        flow = flow.expand(4, len(spikes), 2, height, width)
+        return -flow, flow
+
+
+@pytest.mark.parametrize("size", [(8, 10), (7, 9)])
+def test_joint_flow_is_the_mean_of_the_sites_in_sensor_pixels(size):
+    to_first, to_last = Constant()(torch.zeros(3, 41, *size), TIMES, "RGGB")
+    expected = torch.tensor([8.0, 12]).reshape(1, 2, 1, 1).expand(3, 2, *size)
+    assert to_last.equal(expected)
+    assert to_first.equal(-expected)

@@ -1,0 +1,58 @@
+"""What every estimator of motion promises, and the way from the flows of four sub-streams to the joint one."""
+
+from __future__ import annotations
+
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from spikekit import joint_flow, split_bayer, upsample_flow
+
+
+class MotionEstimator(nn.Module):
+    r"""Base of the estimators; they implement :meth:`channel_flows`, and ``forward`` where they have a better one.
+
+    ``forward`` averages the flows of the four sub-streams, eq. (7), and brings them to the sensor's resolution.
+
+    Shape:
+        - Input: spikes :math:`(B, N, H, W)`, any real dtype; the times of the first, the middle and the last time
+          point, in spike frames; the Bayer phase
+        - Output: two flows :math:`(B, 2, H, W)` in sensor pixels, middle to first and middle to last
+
+    Reference:
+        Dong et al., CVPR 2024, section 4.3, joint motion estimation.
+    """
+
+    def channel_flows(self, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> tuple[Tensor, Tensor]:
+        """Estimate the flows of every sub-stream by itself.
+
+        Args:
+            spikes: (B, N, H, W), any real dtype.
+            times: the first, the middle and the last time point, in spike frames.
+            pattern: Bayer phase.
+
+        Returns:
+            Two flows (4, B, 2, h, w), middle to first and middle to last, in pixels of the sub-streams, that is in
+            Bayer cells: h and w are half of H and W, rounded up. The sites are in the order of
+            :func:`spikekit.split_bayer`.
+        """
+        raise NotImplementedError
+
+    def forward(self, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> tuple[Tensor, Tensor]:
+        """Estimate the two flows."""
+        height, width = spikes.shape[-2:]
+        to_first, to_last = self.channel_flows(spikes, times, pattern)
+        return tuple(upsample_flow(joint_flow(flows), 2)[..., :height, :width] for flows in (to_first, to_last))
+
+
+def split_any_size(raw: Tensor, pattern: str) -> Tensor:
+    """Split like :func:`spikekit.split_bayer`, with an odd side mirrored: without the border, to keep the Bayer phase.
+
+    Args:
+        raw: (B, T, H, W), floating, of at least 2 x 2 pixels.
+        pattern: Bayer phase.
+
+    Returns:
+        (4, B, T, h, w), h and w being half of H and W, rounded up.
+    """
+    height, width = raw.shape[-2:]
+    return split_bayer(F.pad(raw, (0, width % 2, 0, height % 2), "reflect"), pattern)
