@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 from jsonargparse import ArgumentParser
-from pytorch_lightning import Callback, LightningDataModule, Trainer
+from pytorch_lightning import Callback, LightningDataModule, LightningModule, Trainer
 from pytorch_lightning.callbacks import LearningRateMonitor, ModelCheckpoint
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI
 from pytorch_lightning.loggers import TensorBoardLogger
@@ -23,7 +23,13 @@ from lightning_modules.networks import CSCSR, Network
 from spikekit import SpikeFileError
 
 #: classes whose arguments ``--help`` lists, by the option that names them
-CHOICES = (("model.network", CSCSR), ("data", StillScenes), ("data", FilmScenes), ("data", Recording))
+CHOICES = (
+    ("model", SuperResolution),
+    ("model.network", CSCSR),
+    ("data", StillScenes),
+    ("data", FilmScenes),
+    ("data", Recording),
+)
 
 
 class InputError(ValueError):
@@ -35,7 +41,7 @@ class Parser(LightningArgumentParser):
 
     def format_help(self) -> str:  # noqa: D102
         text = super().format_help()
-        if any(action.dest == "model.network" for action in self._actions):
+        if any(action.dest == "model" for action in self._actions):
             for option, choice in CHOICES:
                 parser = ArgumentParser(add_help=False, usage=argparse.SUPPRESS)
                 parser.add_class_arguments(choice, option)
@@ -54,11 +60,12 @@ class Command(LightningCLI):
             default="runs",
             help="Folder of the run: checkpoints, TensorBoard files, config.yaml, tables and pictures.",
         )
+        parser.set_defaults({"model": {"class_path": "SuperResolution"}})
+        network = "model.init_args.network.init_args"
         for name in ("scale", "frames", "alpha"):
-            parser.link_arguments(f"model.network.init_args.{name}", f"data.init_args.{name}")
-        frames_and_window = "model.network.init_args.frames", "model.network.init_args.window"
+            parser.link_arguments(f"{network}.{name}", f"data.init_args.{name}")
         parser.link_arguments(
-            frames_and_window,
+            (f"{network}.frames", f"{network}.window"),
             "data.init_args.flow_times",
             lambda frames, window: (window // 2, frames - 1 - window // 2),
         )
@@ -82,7 +89,9 @@ class Command(LightningCLI):
             self.datamodule.setup(self.subcommand)
             _check_agreement(self.model.network, self.datamodule)
         except (OSError, ValueError) as error:
-            raise InputError(str(error)) from error
+            # jsonargparse wraps what a class of a class says into a page about its own types
+            said = error.__cause__ if "Union subtypes" in str(error) and error.__cause__ else error
+            raise InputError(str(said)) from error
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """Send everything to one folder, and use bfloat16 on a GPU that has it."""
@@ -137,8 +146,9 @@ def main(args: Sequence[str] | None = None) -> None:
     logging.getLogger("pytorch_lightning.utilities.rank_zero").addFilter(lambda line: "litlogger" not in line.msg)
     try:
         Command(
-            SuperResolution,
+            LightningModule,
             LightningDataModule,
+            subclass_mode_model=True,
             subclass_mode_data=True,
             auto_configure_optimizers=False,
             parser_class=Parser,

@@ -25,6 +25,7 @@ from spikekit.files import iter_spikes
 from spikekit.keyframe import search
 from spikekit.pictures import write_picture
 from spikekit.recording import Recording, add_arguments, open_recording, white_rate
+from spikekit.video import PICTURE_ENDINGS
 
 #: Clocks a second of the cameras.
 CLOCK_HZ = 20_000
@@ -40,8 +41,6 @@ _Plane = Callable[[int], np.ndarray]
 
 # Stands for the number of the frame in the name of a picture.
 _NUMBER = "{frame}"
-
-_PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 
 # Pixels that are counted at a time.
 _BLOCK = 1 << 24
@@ -219,8 +218,8 @@ def _frames(text: str) -> str:
 
 def _picture(text: str) -> Path:
     path = Path(text)
-    if path.suffix.lower() not in _PICTURE_ENDINGS:  # the picture library would write TIFF, over a recording as well
-        raise argparse.ArgumentTypeError(f"expected a picture that ends in {', '.join(_PICTURE_ENDINGS)}, got {text}")
+    if path.suffix.lower() not in PICTURE_ENDINGS:  # the picture library would write TIFF, over a recording as well
+        raise argparse.ArgumentTypeError(f"expected a picture that ends in {', '.join(PICTURE_ENDINGS)}, got {text}")
     return path
 
 

@@ -354,9 +354,10 @@ def tfp(spikes: Tensor, window: int, max_range: float = 1.0, *, dtype: torch.dty
 
 
 def _check_window(window: int) -> int:
-    if check_whole("window", window) % 2 == 0:
+    window = check_whole("window", window)
+    if window % 2 == 0:
         raise ValueError(f"window: expected an odd number of frames, got {window}")
-    return check_whole("window", window)
+    return window
 
 
 class Tfp(nn.Module):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import pickle
 import zlib
 from collections.abc import Callable, Sequence
@@ -20,8 +19,8 @@ from torch.utils.data import DataLoader, Dataset
 
 from lightning_modules.data.cache import ClipCache, clip_key, code_digest, file_digest, pack_clip, unpack_clip
 from lightning_modules.data.layouts import EXPECTED, Collection, FilmFiles, find_films
+from lightning_modules.data.loading import FreshClips, default_workers, load_clips
 from lightning_modules.data.pictures import split_pictures
-from lightning_modules.data.stills import _ClipLoader, _default_workers, _FreshClips, _one_thread, _to_arrays
 from spikekit import bayer_pattern
 from spikekit.check import check_positive, check_scale, check_whole
 from spikekit.film import Film, FilmClip
@@ -308,7 +307,7 @@ class FilmScenes(pl.LightningDataModule):
         super().__init__()
         self.root, self.patch, self.clips, self.cache = root, patch, clips, cache
         self.batch_size, self.seed = batch_size, seed
-        self.workers = _default_workers() if workers is None else workers
+        self.workers = default_workers() if workers is None else workers
         self.options = {
             "scale": scale,
             "frames": frames,
@@ -376,22 +375,11 @@ class FilmScenes(pl.LightningDataModule):
         return self.test_set.names
 
     def train_dataloader(self) -> DataLoader:  # noqa: D102
-        return self._loader(self.train_set, self.batch_size, sampler=_FreshClips(self), drop_last=True)
+        clips = FreshClips(self, self.batch_size, self.train_clips)
+        return load_clips(self.train_set, self.batch_size, self.workers, sampler=clips, drop_last=True)
 
     def val_dataloader(self) -> DataLoader:  # noqa: D102
-        return self._loader(self.val_set, 1)
+        return load_clips(self.val_set, 1, self.workers)
 
     def test_dataloader(self) -> DataLoader:  # noqa: D102
-        return self._loader(self.test_set, 1)
-
-    def _loader(self, clips: FilmClips, batch_size: int, **how: object) -> DataLoader:
-        workers = min(self.workers, math.ceil(len(clips) / batch_size))
-        return _ClipLoader(
-            clips,
-            batch_size=batch_size,
-            num_workers=workers,
-            persistent_workers=workers > 0,
-            worker_init_fn=_one_thread,
-            collate_fn=_to_arrays,
-            **how,
-        )
+        return load_clips(self.test_set, 1, self.workers)

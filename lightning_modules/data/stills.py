@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +11,9 @@ import pytorch_lightning as pl
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset
 
+from lightning_modules.data.loading import FreshClips, default_workers, load_clips
 from lightning_modules.data.pictures import cached_picture, embedded_pictures, folder_pictures, split_pictures
 from lightning_modules.data.textures import outline_mask, texture
 from spikekit import bayer_pattern
@@ -23,7 +23,6 @@ from spikekit.scene import Layer, Motion, Scene
 from spikekit.simulate import simulate_spikes
 
 _TEXTURES = 0.3  # share of procedural pictures among embedded ones
-_MOST_WORKERS = 8
 
 
 class StillClips(Dataset):
@@ -201,52 +200,6 @@ def _augment(picture: Tensor, rng: np.random.Generator) -> Tensor:
     return picture.contiguous()
 
 
-class _FreshClips(Sampler[int]):
-    """Consecutive indices that go on where training stands, so that a resumed run sees what an unbroken one would."""
-
-    def __init__(self, data: StillScenes) -> None:
-        self.data = data
-
-    def __len__(self) -> int:
-        return self.data.train_clips
-
-    def __iter__(self) -> Iterator[int]:
-        start, trainer = 0, self.data.trainer
-        if trainer is not None:
-            a_step = self.data.batch_size * trainer.accumulate_grad_batches * trainer.world_size
-            start = trainer.global_step * a_step
-        return iter(range(start, start + len(self)))
-
-
-def _to_arrays(clips: list[dict[str, Tensor]]) -> dict[str, np.ndarray]:
-    return {name: np.stack([clip[name].numpy() for clip in clips]) for name in clips[0]}
-
-
-class _ClipLoader(DataLoader):
-    """A loader whose workers send arrays through pipes: tensors would need more shared memory than containers give."""
-
-    def __iter__(self) -> Iterator[dict[str, Tensor]]:
-        return ({name: torch.from_numpy(value) for name, value in batch.items()} for batch in super().__iter__())
-
-    # Lightning takes a loader with these two for one that can be resumed. It can: training's step says where it stands.
-    def state_dict(self) -> dict[str, object]:
-        return {}
-
-    def load_state_dict(self, state: dict[str, object]) -> None:
-        pass
-
-
-def _one_thread(_: int) -> None:
-    torch.set_num_threads(1)
-
-
-def _default_workers() -> int:
-    # One core stays with training; the cap of eight is a guess that no GPU has tested. A lone core makes its clips
-    # between the steps: a process beside it would only take turns with it.
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(0, min(_MOST_WORKERS, cores - 1))
-
-
 class StillScenes(pl.LightningDataModule):
     """Clips of still pictures in motion, made while training runs.
 
@@ -306,7 +259,7 @@ class StillScenes(pl.LightningDataModule):
         self.patch, self.val_patch = patch, val_patch
         self.train_clips, self.val_clips = train_clips, val_clips
         self.batch_size, self.seed = batch_size, seed
-        self.workers = _default_workers() if workers is None else workers
+        self.workers = default_workers() if workers is None else workers
         self.options = {
             "scale": scale,
             "frames": frames,
@@ -347,22 +300,11 @@ class StillScenes(pl.LightningDataModule):
         return train, val if self.val_root is None else folder_pictures(self.val_root)
 
     def train_dataloader(self) -> DataLoader:  # noqa: D102
-        return self._loader(self.train_set, sampler=_FreshClips(self), drop_last=True)
+        clips = FreshClips(self, self.batch_size, self.train_clips)
+        return load_clips(self.train_set, self.batch_size, self.workers, sampler=clips, drop_last=True)
 
     def val_dataloader(self) -> DataLoader:  # noqa: D102
-        return self._loader(self.val_set)
+        return load_clips(self.val_set, self.batch_size, self.workers)
 
     def test_dataloader(self) -> DataLoader:  # noqa: D102
-        return self._loader(self.val_set)
-
-    def _loader(self, clips: StillClips, **how: object) -> DataLoader:
-        workers = min(self.workers, -(-len(clips) // self.batch_size))
-        return _ClipLoader(
-            clips,
-            batch_size=self.batch_size,
-            num_workers=workers,
-            persistent_workers=workers > 0,
-            worker_init_fn=_one_thread,
-            collate_fn=_to_arrays,
-            **how,
-        )
+        return load_clips(self.val_set, self.batch_size, self.workers)

@@ -67,7 +67,7 @@ def test_fit_leaves_checkpoints_and_pictures(trained):
     events = EventAccumulator(str(trained)).Reload()
     assert {"train/loss", "val/psnr", "val/ssim"} <= set(events.Tags()["scalars"])
     assert events.Tags()["images"] == ["val/tfi, result, truth"]
-    assert yaml.safe_load((trained / "config.yaml").read_text())["model"]["network"]["init_args"]["width"] == 4
+    assert yaml.safe_load((trained / "config.yaml").read_text())["model"]["init_args"]["network"]["init_args"]["width"] == 4
 
 
 @pytest.mark.slow
@@ -182,14 +182,15 @@ def test_the_paper_is_the_default(configs, capsys):
     with pytest.raises(SystemExit):
         main(["fit", "-c", str(configs / "x4.yaml"), "--print_config"])
     config = yaml.safe_load(capsys.readouterr().out)
-    network, data = config["model"]["network"]["init_args"], config["data"]["init_args"]
+    model, data = config["model"]["init_args"], config["data"]["init_args"]
+    network = model["network"]["init_args"]
     assert [network[name] for name in ("scale", "frames", "window", "stride", "pattern")] == [4, 41, 11, 3, "RGGB"]
     assert network["alpha"] == 0.4
     assert [data[name] for name in ("patch", "batch_size", "pattern")] == [96, 4, "RGGB"]
-    assert config["model"]["optimizer"]["class_path"] == "torch.optim.Adam"
-    assert config["model"]["optimizer"]["init_args"]["lr"] == 1e-4
-    assert config["model"]["lr_scheduler"]["init_args"]["step_size"] == 7500
-    assert config["model"]["lr_scheduler"]["init_args"]["gamma"] == 0.8
+    assert model["optimizer"]["class_path"] == "torch.optim.Adam"
+    assert model["optimizer"]["init_args"]["lr"] == 1e-4
+    assert model["lr_scheduler"]["init_args"]["step_size"] == 7500
+    assert model["lr_scheduler"]["init_args"]["gamma"] == 0.8
 
 
 @pytest.mark.parametrize("overlay", ["quick", "size/s", "size/m", "size/l"])

@@ -47,12 +47,12 @@ def command(tmp_path, configs, monkeypatch):
 def test_fit_and_test_on_reds(tmp_path, command, capsys, reds):
     reds(tmp_path / "reds", count=7)
     root = "--data.root", tmp_path / "reds"
-    command("fit", "reds", *root, "-o", tmp_path / "run", "--trainer.max_steps", 5)
+    command("fit", "films", *root, "-o", tmp_path / "run", "--trainer.max_steps", 5)
     assert len(list((tmp_path / "runs" / "clips").glob("*/*.clip"))) == 15
     config = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["data"]
     assert config["class_path"] == "lightning_modules.data.FilmScenes"
     assert config["init_args"]["cache"] == "runs/clips"
-    command("test", "reds", *root, "-o", tmp_path / "run", "--ckpt_path", "best", "--data.seed", 1)
+    command("test", "films", *root, "-o", tmp_path / "run", "--ckpt_path", "best", "--data.seed", 1)
     assert "mean of 5 clips" in capsys.readouterr().out
 
 
@@ -63,7 +63,7 @@ def test_the_data_follow_the_network(command, monkeypatch):
     monkeypatch.setattr(FilmScenes, "setup", stop)
     network = [f"--model.network.{name}" for name in ("alpha=0.3", "frames=39", "window=9")]
     with pytest.raises(SystemExit) as exit:
-        command("validate", "reds", "--data.root", "nowhere", *network, scale=3)
+        command("validate", "films", "--data.root", "nowhere", *network, scale=3)
     for option in ("validate:", "'scale': 3,", "'frames': 39,", "'alpha': 0.3,", "'flow_times': (4, 34),"):
         assert option in str(exit.value)
 
@@ -72,7 +72,7 @@ def test_the_data_follow_the_network(command, monkeypatch):
 def test_test_on_vid4_prints_every_clip(tmp_path, command, capsys, write_film):
     write_film(tmp_path / "vid4/GT/walk", 3)
     write_film(tmp_path / "vid4/GT/city", 3, (40, 32))
-    command("test", "vid4", "--data.root", tmp_path / "vid4", "-o", tmp_path / "run")
+    command("test", "films", "--data.root", tmp_path / "vid4", "-o", tmp_path / "run")
     printed = capsys.readouterr().out
     assert re.findall(r"SSIM   (.*)", printed) == ["mean of 2 clips", "city/00000001", "walk/00000001"]
     rows = list(csv.DictReader((tmp_path / "run" / "test.csv").open()))
@@ -101,11 +101,11 @@ def test_fit_on_vimeo_and_on_films_without_flow(tmp_path, command, capsys, write
 @pytest.mark.parametrize(
     ("verb", "overlay", "args", "message"),
     [
-        ("fit", "reds", ["--data.root", "nowhere"], "nowhere: no such folder of films"),
-        ("fit", "reds", ["--data.root", "."], "expected one of\n  REDS 120 fps   train/train_orig/000/"),
-        ("test", "reds", ["--data.root", "vid4", "--data.pattern", "BGGR"], "data.pattern: expected RGGB"),
-        ("fit", "vid4", ["--data.root", "vid4"], "Vid4 without films for fit"),
-        ("predict", "vid4", ["--data.root", "vid4"], "--data Recording --data.path FILE"),
+        ("fit", "films", ["--data.root", "nowhere"], "nowhere: no such folder of films"),
+        ("fit", "films", ["--data.root", "."], "expected one of\n  REDS 120 fps   train/train_orig/000/"),
+        ("test", "films", ["--data.root", "vid4", "--data.pattern", "BGGR"], "data.pattern: expected RGGB"),
+        ("fit", "films", ["--data.root", "vid4"], "Vid4 without films for fit"),
+        ("predict", "films", ["--data.root", "vid4"], "--data Recording --data.path FILE"),
     ],
 )
 def test_errors_come_before_anything_is_written(tmp_path, command, verb, overlay, args, message, write_film):

@@ -371,7 +371,7 @@ def test_decode_darkness(tmp_path, capsys):
         (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--window", "5"], "with --method tfp, got 5 with tfi"),
         (
             ["decode", "a.dat", "-o", "a.dat", "--method", "tfi"],
-            "ends in .png, .jpg, .jpeg, .tif, .tiff, .bmp, got a.dat",
+            "ends in .png, .jpg, .jpeg, .bmp, .tif, .tiff, got a.dat",
         ),
     ],
 )

@@ -1,0 +1,89 @@
+"""What loads clips, whichever they are: fresh ones every epoch, as arrays, by workers of one thread."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from pytorch_lightning import LightningDataModule
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset, Sampler
+
+_MOST_WORKERS = 8
+
+
+class FreshClips(Sampler[int]):
+    """Consecutive indices that go on where training stands, so that a resumed run sees what an unbroken one would.
+
+    Args:
+        data: whose training says where it stands.
+        batch_size: clips in a batch.
+        length: clips in an epoch.
+    """
+
+    def __init__(self, data: LightningDataModule, batch_size: int, length: int) -> None:
+        self.data, self.batch_size, self.length = data, batch_size, length
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __iter__(self) -> Iterator[int]:
+        start, trainer = 0, self.data.trainer
+        if trainer is not None:
+            a_step = self.batch_size * trainer.accumulate_grad_batches * trainer.world_size
+            start = trainer.global_step * a_step
+        return iter(range(start, start + len(self)))
+
+
+def load_clips(clips: Dataset, batch_size: int, workers: int, **options: object) -> DataLoader:
+    """Return a loader of clips, which are dictionaries of tensors.
+
+    Args:
+        clips: a data set of them.
+        batch_size: clips in a batch.
+        workers: processes that make clips, at most; of one thread each.
+        options: others of :class:`torch.utils.data.DataLoader`.
+    """
+    workers = min(workers, math.ceil(len(clips) / batch_size))
+    return _ClipLoader(
+        clips,
+        batch_size=batch_size,
+        num_workers=workers,
+        persistent_workers=workers > 0,
+        worker_init_fn=_one_thread,
+        collate_fn=_to_arrays,
+        **options,
+    )
+
+
+class _ClipLoader(DataLoader):
+    """A loader whose workers send arrays through pipes: tensors would need more shared memory than containers give."""
+
+    def __iter__(self) -> Iterator[dict[str, Tensor]]:
+        return ({name: torch.from_numpy(value) for name, value in batch.items()} for batch in super().__iter__())
+
+    # Lightning takes a loader with these two for one that can be resumed. It can: training's step says where it stands.
+    def state_dict(self) -> dict[str, object]:
+        return {}
+
+    def load_state_dict(self, state: dict[str, object]) -> None:
+        pass
+
+
+def default_workers() -> int:
+    """Return how many processes make clips: all cores but one, eight at most."""
+    # The cap of eight is a guess that no GPU has tested. A lone core makes its clips between the steps: a process
+    # beside it would only take turns with it.
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(0, min(_MOST_WORKERS, cores - 1))
+
+
+def _to_arrays(clips: list[dict[str, Tensor]]) -> dict[str, np.ndarray]:
+    return {name: np.stack([clip[name].numpy() for clip in clips]) for name in clips[0]}
+
+
+def _one_thread(_: int) -> None:
+    torch.set_num_threads(1)
