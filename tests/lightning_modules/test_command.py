@@ -67,7 +67,8 @@ def test_fit_leaves_checkpoints_and_pictures(trained):
     events = EventAccumulator(str(trained)).Reload()
     assert {"train/loss", "val/psnr", "val/ssim"} <= set(events.Tags()["scalars"])
     assert events.Tags()["images"] == ["val/tfi, result, truth"]
-    assert yaml.safe_load((trained / "config.yaml").read_text())["model"]["init_args"]["network"]["init_args"]["width"] == 4
+    config = yaml.safe_load((trained / "config.yaml").read_text())
+    assert config["model"]["init_args"]["network"]["init_args"]["width"] == 4
 
 
 @pytest.mark.slow
