@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from inspect import signature
 from typing import Any
 
 import torch
@@ -93,7 +94,9 @@ class SuperResolution(LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse weights of another network: scale, say, is in no parameter, and would go unnoticed."""
         here = {"class": type(self.network).__name__, **self.network.settings}
-        there = checkpoint.get("network", here)
+        # an argument that is younger than the checkpoint had the effect of its default
+        defaults = {name: parameter.default for name, parameter in signature(type(self.network)).parameters.items()}
+        there = {**defaults, **checkpoint.get("network", here)}
         differing = [key for key in here if here[key] != there.get(key)]
         if differing:
             trained = ", ".join(f"{key}={there.get(key)}" for key in differing)

@@ -1,8 +1,9 @@
-"""CSCSR: colour spike camera super-resolution (Dong et al., CVPR 2024), one module per section of the paper."""
+"""CSCSR: colour spike camera super-resolution (Dong et al., CVPR 2024), its parts put together."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Literal, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -10,134 +11,35 @@ from kornia.filters import filter2d_separable
 from torch import Tensor, nn
 
 from lightning_modules.motion import MotionEstimator
+from lightning_modules.networks.layers import ResBlock
+from lightning_modules.networks.motion_fusion import assembled_motion, independent_motion, joint_motion
 from lightning_modules.networks.network import Network
+from lightning_modules.networks.reconstruction import ColorCorrelation, EarlyFusion, SeparateColors
+from lightning_modules.networks.refinement import FeatureRefinement, TimeFusion
+from lightning_modules.networks.representation import IntervalRepresentation, SpikeRepresentation, WindowMeans
 from spikekit import bayer_mask, bayer_pattern, demosaic, flow_warp_idw, linear_motion, split_colors, tfp
 from spikekit.check import check_planes, check_scale
 
 _SEARCHED = 1 << 19  # positions that are searched in one go
 
+T = TypeVar("T")
 
-def conv(inputs: int, outputs: int) -> nn.Conv2d:
-    """3 x 3 convolution that keeps the size."""
-    return nn.Conv2d(inputs, outputs, 3, padding=1)
-
-
-class ConvBlock(nn.Sequential):
-    """3 x 3 convolution and ReLU (Fig. 4)."""
-
-    def __init__(self, inputs: int, outputs: int) -> None:
-        super().__init__(conv(inputs, outputs), nn.ReLU(inplace=True))
+_MOTION_FUSIONS = {"joint": joint_motion, "independent": independent_motion, "assembled": assembled_motion}
+_RECONSTRUCTIONS = {"correlated": ColorCorrelation, "separate": SeparateColors, "early": EarlyFusion}
 
 
-class ResBlock(nn.Module):
-    """Convolution, ReLU, convolution, plus the input: a residual block (He et al., 2016) without normalisation."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.body = nn.Sequential(conv(width, width), nn.ReLU(inplace=True), conv(width, width))
-
-    def forward(self, x: Tensor) -> Tensor:  # noqa: D102
-        return x + self.body(x)
-
-
-class SpikeRepresentation(nn.Module):
-    """BSSR of one colour (section 4.2, Fig. 4): features of every time point, from its window and the whole clip.
-
-    Args:
-        frames: spike frames N of a clip.
-        window: frames that a time point sees.
-        stride: frames between two time points.
-        width: channels inside.
-        features: channels of the result, for every time point.
-
-    Shape:
-        - Input: the spikes of one colour, zero elsewhere, :math:`(B, N, H, W)`
-        - Output: :math:`(B, T, features, H, W)` with :math:`T = (N - window) / stride + 1`
-    """
-
-    def __init__(self, frames: int, window: int, stride: int, width: int, features: int) -> None:
-        super().__init__()
-        self.window = window
-        self.stride = stride
-        self.local = nn.Sequential(ConvBlock(window, width), ResBlock(width))
-        self.whole = nn.Sequential(ConvBlock(frames, width), ResBlock(width))  # global perception
-        self.fuse = nn.Sequential(ConvBlock(2 * width, width), ResBlock(width), conv(width, features))
-
-    def forward(self, spikes: Tensor) -> Tensor:  # noqa: D102
-        windows = spikes.unfold(1, self.window, self.stride).movedim(-1, 2)
-        batch, times = windows.shape[:2]
-        local = self.local(windows.flatten(0, 1))
-        whole = self.whole(spikes).repeat_interleave(times, dim=0)
-        return self.fuse(torch.cat([local, whole], dim=1)).unflatten(0, (batch, times))
-
-
-class FeatureRefinement(nn.Module):
-    """FR (section 4.3, Fig. 5 c): what deviates from the mean over time is looked at by itself.
-
-    Args:
-        times: time points T.
-        features: channels of every time point.
-        width: channels of the result.
-
-    Shape:
-        - Input: temporal-pixel features :math:`(B, T, features, H, W)`
-        - Output: :math:`(B, width, H, W)`
-    """
-
-    def __init__(self, times: int, features: int, width: int) -> None:
-        super().__init__()
-        self.base = nn.Sequential(ConvBlock(times * features, width), conv(width, width))
-        self.residual = nn.Sequential(ConvBlock(times * features, width), conv(width, width))
-
-    def forward(self, pixels: Tensor) -> Tensor:  # noqa: D102
-        residual = pixels - pixels.mean(dim=1, keepdim=True)
-        return self.base(pixels.flatten(1, 2)) + self.residual(residual.flatten(1, 2))
-
-
-class ColorCorrelation(nn.Module):
-    """CCR (section 4.4, Fig. 6 a): the colours are refined side by side and fused after every stage.
-
-    Args:
-        width: channels, of every colour and inside.
-        stages: how often the colours are fused.
-        blocks: residual blocks of every colour in every stage.
-        end_blocks: residual blocks after the last fusion.
-
-    Shape:
-        - Input: features of R, G and B, each :math:`(B, width, H, W)`
-        - Output: rgb :math:`(B, 3, H, W)`
-    """
-
-    def __init__(self, width: int, stages: int, blocks: int, end_blocks: int) -> None:
-        super().__init__()
-        self.refine = nn.ModuleList(
-            nn.ModuleList(nn.Sequential(*(ResBlock(width) for _ in range(blocks))) for _ in range(3))
-            for _ in range(stages)
-        )
-        # leaky, unlike ConvBlock: everything passes through here, and must not die
-        self.fuse = nn.ModuleList(
-            nn.Sequential(conv((3 if stage == 0 else 4) * width, width), nn.LeakyReLU(0.1, inplace=True))
-            for stage in range(stages)
-        )
-        self.end = nn.Sequential(*(ResBlock(width) for _ in range(end_blocks)))
-        self.rgb = conv(width, 3)
-
-    def forward(self, colors: list[Tensor]) -> Tensor:  # noqa: D102
-        fused: list[Tensor] = []
-        for refine, fuse in zip(self.refine, self.fuse, strict=True):
-            colors = [branch(color) for branch, color in zip(refine, colors, strict=True)]
-            fused = [fuse(torch.cat(colors + fused, dim=1))]
-        features = fused[0] + self.end(fused[0])
-        # half precision would round the picture itself
-        with torch.autocast(features.device.type, enabled=False):
-            return self.rgb(features.to(self.rgb.weight.dtype))
+def _choose(name: str, value: str, choices: Mapping[str, T]) -> T:
+    if value not in choices:
+        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
+    return choices[value]
 
 
 class CSCSR(Network):
     r"""Super-resolution of a colour picture from a Bayer-pattern spike stream.
 
     The middle frame of the clip is reconstructed. Widths and depths are not in the paper; the defaults are size M of
-    this project, see ``configs/size``.
+    this project, see ``configs/size``. The arguments from ``representation`` to ``reconstruction`` are the ablations
+    of the paper's Table 3, see ``configs/ablation``; the defaults are the full network (J).
 
     Args:
         scale: super-resolution factor s.
@@ -157,11 +59,28 @@ class CSCSR(Network):
         neighbors: known pixels that the temporal pixel search weighs.
         motion: estimator that is asked where no flow is given; when not given,
             :class:`lightning_modules.motion.ClassicalFlow`.
+        representation: features of a time point: ``"bssr"`` learns them; ``"spikes"``, without BSSR (A), averages the
+            spikes of the window; ``"interval"`` (C) takes the inverse of the spike interval. These two have no weights
+            and one feature.
+        global_perception: BSSR sees the whole clip beside the window; False is B.
+        motion_fusion: where no flow is given, ``"joint"`` moves all colours alike; ``"independent"`` (D) moves each
+            by the flow of its own sub-stream, green by the mean of its two; ``"assembled"`` (E) puts the sub-streams'
+            flows together as their pixels are in the Bayer pattern.
+        search: temporal pixel search along the motion. Without it no motion is estimated, a given one is ignored, and
+            the features of every time point are only enlarged; without refinement as well it is F, no MSR.
+        refinement: FR; False is G, which merges the time points by one convolution.
+        reconstruction: ``"correlated"`` is CCR; ``"separate"`` (H) lets every colour make its channel by itself;
+            ``"early"`` (I) fuses the colours once, at the beginning.
 
     Shape:
         - Input: spikes :math:`(B, N, H, W)`, zeros and ones, any real dtype, any H and W of at least 3; optionally
-          the flows from the middle to the first and to the last time point, :math:`(B, 2, 2, H, W)`, in sensor pixels
+          the flows from the middle to the first and to the last time point, :math:`(B, 2, 2, H, W)`, in sensor
+          pixels, or those of R, G and B, :math:`(B, 3, 2, 2, H, W)`
         - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
+
+    Raises:
+        ValueError: sizes that do not fit each other, an unknown choice, or choices that would have no effect:
+            ``global_perception=False`` without BSSR, a ``motion_fusion`` without search.
 
     Example:
         >>> network = CSCSR(scale=2, width=8, representation_width=8, features=1, stages=1, end_blocks=1)
@@ -189,6 +108,12 @@ class CSCSR(Network):
         alpha: float = 0.4,
         neighbors: int = 4,
         motion: MotionEstimator | None = None,
+        representation: Literal["bssr", "spikes", "interval"] = "bssr",
+        global_perception: bool = True,
+        motion_fusion: Literal["joint", "independent", "assembled"] = "joint",
+        search: bool = True,
+        refinement: bool = True,
+        reconstruction: Literal["correlated", "separate", "early"] = "correlated",
     ) -> None:
         check_scale(scale)
         if frames % 2 == 0 or window % 2 == 0 or not 1 <= window < frames or (frames - window) % stride:
@@ -198,6 +123,12 @@ class CSCSR(Network):
             )
         if min(width, representation_width, features, stages, blocks, end_blocks, neighbors) < 1:
             raise ValueError("widths, stages, blocks and neighbors: expected 1 or more of each")
+        if representation in ("spikes", "interval") and not global_perception:
+            raise ValueError(f"global_perception: part of representation bssr, cannot be taken from {representation}")
+        if motion_fusion in ("independent", "assembled") and not search:
+            raise ValueError(
+                f"motion_fusion: expected joint without search, which asks for no motion, got {motion_fusion}"
+            )
         settings = {
             "scale": scale,
             "frames": frames,
@@ -213,16 +144,32 @@ class CSCSR(Network):
             "skip": skip,
             "alpha": alpha,
             "neighbors": neighbors,
+            "representation": representation,
+            "global_perception": global_perception,
+            "motion_fusion": motion_fusion,
+            "search": search,
+            "refinement": refinement,
+            "reconstruction": reconstruction,
         }
         times = tuple(range(window // 2, frames - window // 2, stride))
         super().__init__(settings, (times[0], frames // 2, times[-1]), motion)
         self.times = times  # centres of the windows, in spike frames
         self.neighbors = neighbors
-        self.representation = nn.ModuleList(
-            SpikeRepresentation(frames, window, stride, representation_width, features) for _ in range(3)
-        )
-        self.refinement = nn.ModuleList(FeatureRefinement(len(self.times), features, width) for _ in range(3))
-        self.reconstruction = ColorCorrelation(width, stages, blocks, end_blocks)
+        self.search = search
+        self._fuse_motion = _choose("motion_fusion", motion_fusion, _MOTION_FUSIONS)
+        represent = {
+            "bssr": lambda: SpikeRepresentation(
+                frames, window, stride, representation_width, features, global_perception
+            ),
+            "spikes": lambda: WindowMeans(window, stride),
+            "interval": lambda: IntervalRepresentation(times),
+        }
+        encoder = _choose("representation", representation, represent)
+        self.representation = nn.ModuleList(encoder() for _ in range(3))
+        refine = FeatureRefinement if refinement else TimeFusion
+        self.refinement = nn.ModuleList(refine(len(times), part.features, width) for part in self.representation)
+        reconstruct = _choose("reconstruction", reconstruction, _RECONSTRUCTIONS)
+        self.reconstruction = reconstruct(width, stages, blocks, end_blocks)
         self.skip = skip
         self.alpha = alpha
         self._initialize()
@@ -234,13 +181,14 @@ class CSCSR(Network):
         A dozen random 3 x 3 filters in a row would blur what the network is to sharpen: training then rests for
         hundreds of steps on a plateau, or dies on it.
         """
-        for module in self.modules():
+        modules = list(nn.ModuleList([self.representation, self.refinement, self.reconstruction]).modules())
+        for module in modules:
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
                 module.weight.data *= 0.2
                 module.weight.data[:, :, 1, 1] += nn.init.orthogonal_(torch.empty(module.weight.shape[:2]), gain=1.2)
                 nn.init.zeros_(module.bias)
-        for module in self.modules():
+        for module in modules:
             if isinstance(module, ResBlock):
                 module.body[-1].weight.data *= 0.1
         if self.skip:
@@ -253,36 +201,60 @@ class CSCSR(Network):
             raise ValueError(f"spikes: expected {expected}, got {tuple(spikes.shape)}")
         batch, _, height, width = spikes.shape
         spikes = spikes.to(self.reconstruction.rgb.weight.dtype)
-        flow = self.estimate_flow(spikes) if flow is None else flow
-        if flow.shape != (batch, 2, 2, height, width):
-            raise ValueError(f"flow: expected {(batch, 2, 2, height, width)}, got {tuple(flow.shape)}")
+        if flow is None and self.search:
+            flow = self.estimate_flow(spikes)
+        if flow is not None and flow.shape not in ((batch, 2, 2, height, width), (batch, 3, 2, 2, height, width)):
+            expected = f"{(batch, 2, 2, height, width)} or {(batch, 3, 2, 2, height, width)}"
+            raise ValueError(f"flow: expected {expected}, got {tuple(flow.shape)}")
+        planes = split_colors(spikes, self.pattern)
+        # one colour after the other: high resolution takes memory
+        features = (encode(plane) for encode, plane in zip(self.representation, planes, strict=True))
+        if self.search:
+            pixels = map(self._search, features, self._offsets(flow), self._mask(height, width, spikes.device))
+        else:
+            pixels = map(self._enlarge, features)
+        rgb = self.reconstruction([refine(part) for refine, part in zip(self.refinement, pixels, strict=True)])
+        return rgb + self._base(spikes) if self.skip else rgb
+
+    def estimate_flow(self, spikes: Tensor) -> Tensor:
+        """Flows from the middle to the first and to the last time point, in sensor pixels; zero if nothing is searched.
+
+        Args:
+            spikes: (B, N, H, W).
+
+        Returns:
+            (B, 2, 2, H, W), or (B, 3, 2, 2, H, W) where every colour has its own.
+        """
+        if not self.search:
+            return torch.zeros(len(spikes), 2, 2, *spikes.shape[-2:], device=spikes.device)
+        return self._fuse_motion(self.motion, spikes, self.flow_times, self.pattern)
+
+    def _offsets(self, flow: Tensor) -> tuple[Tensor, ...]:
+        """How far every colour has moved at every time point, each (B, T, 2, s H, s W)."""
+        flow = flow if flow.ndim == 6 else flow.unsqueeze(1)
         first, middle, last = self.flow_times
         offsets = linear_motion(
-            flow[:, 0], flow[:, 1], self.times, first=first, middle=middle, last=last, scale=self.scale
+            flow[:, :, 0], flow[:, :, 1], self.times, first=first, middle=middle, last=last, scale=self.scale
         )
-        colors = [
-            refine(self._search(encode(plane), offsets, mask))
-            for plane, mask, encode, refine in zip(
-                split_colors(spikes, self.pattern),
-                self._mask(height, width, spikes.device),
-                self.representation,
-                self.refinement,
-                strict=True,
-            )
-        ]
-        rgb = self.reconstruction(colors)
-        return rgb + self._base(spikes) if self.skip else rgb
+        return offsets.expand(-1, 3, -1, -1, -1, -1).unbind(1)
 
     def _search(self, features: Tensor, offsets: Tensor, mask: Tensor) -> Tensor:
         """Temporal pixel search (section 4.3, Fig. 5 b): (B, T, C, H, W) to (B, T, C, s H, s W)."""
         # a few time points after the others: what the search needs on the way is many times its result
         few = max(1, _SEARCHED // (offsets.shape[-2] * offsets.shape[-1]))
-        pixels = []
-        for part, offset in zip(features.flatten(0, 1).split(few), offsets.flatten(0, 1).split(few), strict=True):
-            if self.scale > 1:
-                part = F.interpolate(part, scale_factor=self.scale, mode="bilinear", align_corners=False)
-            pixels.append(flow_warp_idw(part, offset, mask, neighbors=self.neighbors))
+        pixels = [
+            flow_warp_idw(self._enlarge(part), offset, mask, neighbors=self.neighbors)
+            for part, offset in zip(features.flatten(0, 1).split(few), offsets.flatten(0, 1).split(few), strict=True)
+        ]
         return torch.cat(pixels).unflatten(0, features.shape[:2])
+
+    def _enlarge(self, features: Tensor) -> Tensor:
+        """Bilinear: (*, C, H, W) to (*, C, s H, s W)."""
+        if self.scale == 1:
+            return features
+        planes = features.reshape(-1, *features.shape[-3:])
+        planes = F.interpolate(planes, scale_factor=self.scale, mode="bilinear", align_corners=False)
+        return planes.reshape(*features.shape[:-2], *planes.shape[-2:])
 
     def _base(self, spikes: Tensor) -> Tensor:
         """TFP of the whole clip, demosaiced, smoothed, enlarged."""

@@ -1,0 +1,33 @@
+"""The blocks that the parts of CSCSR are made of."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+
+def conv(inputs: int, outputs: int) -> nn.Conv2d:
+    """3 x 3 convolution that keeps the size."""
+    return nn.Conv2d(inputs, outputs, 3, padding=1)
+
+
+class ConvBlock(nn.Sequential):
+    """3 x 3 convolution and ReLU (Fig. 4)."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__(conv(inputs, outputs), nn.ReLU(inplace=True))
+
+
+class ResBlock(nn.Module):
+    """Convolution, ReLU, convolution, plus the input: a residual block (He et al., 2016) without normalisation."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.body = nn.Sequential(conv(width, width), nn.ReLU(inplace=True), conv(width, width))
+
+    def forward(self, x: Tensor) -> Tensor:  # noqa: D102
+        return x + self.body(x)
+
+
+def res_blocks(width: int, count: int) -> nn.Sequential:
+    """Residual blocks one after another."""
+    return nn.Sequential(*(ResBlock(width) for _ in range(count)))

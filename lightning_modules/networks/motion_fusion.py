@@ -1,0 +1,84 @@
+"""From the motion of the sensor to that of every colour: one flow for all (eq. 7), and the ablations D and E."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from lightning_modules.motion import MotionEstimator
+from spikekit import bayer_sites, merge_bayer
+
+
+def joint_motion(motion: MotionEstimator, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> Tensor:
+    """Ask an estimator for one motion of all colours.
+
+    Args:
+        motion: the estimator.
+        spikes: (B, N, H, W).
+        times: the first, the middle and the last time point, in spike frames.
+        pattern: Bayer phase.
+
+    Returns:
+        Flows from the middle to the first and to the last time point, (B, 2, 2, H, W), in sensor pixels.
+    """
+    return torch.stack(motion(spikes, times, pattern), dim=1)
+
+
+def independent_motion(motion: MotionEstimator, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> Tensor:
+    """Ask an estimator for the motion of every colour by itself (ablation D); green is the mean of its two sites.
+
+    Args:
+        motion: the estimator.
+        spikes: (B, N, H, W).
+        times: the first, the middle and the last time point, in spike frames.
+        pattern: Bayer phase.
+
+    Returns:
+        Flows of R, G and B, (B, 3, 2, 2, H, W), in sensor pixels.
+    """
+    height, width = spikes.shape[-2:]
+    red, *greens, blue = (
+        _to_sensor(flow, row, column, height, width)
+        for flow, (_, row, column) in zip(
+            _channel_flows(motion, spikes, times, pattern), bayer_sites(pattern), strict=True
+        )
+    )
+    return torch.stack([red, sum(greens) / 2, blue], dim=1)
+
+
+def assembled_motion(motion: MotionEstimator, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> Tensor:
+    """Put the four sub-streams' flows side by side as their pixels are on the sensor (ablation E).
+
+    Args:
+        motion: the estimator.
+        spikes: (B, N, H, W).
+        times: the first, the middle and the last time point, in spike frames.
+        pattern: Bayer phase.
+
+    Returns:
+        Flows of all colours, (B, 2, 2, H, W), in sensor pixels.
+    """
+    height, width = spikes.shape[-2:]
+    return 2 * merge_bayer(_channel_flows(motion, spikes, times, pattern), pattern)[..., :height, :width]
+
+
+def _channel_flows(motion: MotionEstimator, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> Tensor:
+    """Both flows of the four sub-streams, (4, B, 2, 2, h, w), in Bayer cells."""
+    batch, _, height, width = spikes.shape
+    to_first, to_last = motion.channel_flows(spikes, times, pattern)
+    expected = 4, batch, 2, (height + 1) // 2, (width + 1) // 2
+    if not to_first.shape == to_last.shape == expected:
+        got = f"{tuple(to_first.shape)} and {tuple(to_last.shape)}"
+        raise ValueError(f"channel_flows: expected two flows {expected}, got {got}")
+    flows = torch.stack([to_first, to_last], dim=2)
+    return flows.to(torch.promote_types(flows.dtype, torch.float32))
+
+
+def _to_sensor(flow: Tensor, row: int, column: int, height: int, width: int) -> Tensor:
+    """Bring a sub-stream's flow, whose pixel (i, j) is the sensor's (2 i + row, 2 j + column), to the sensor."""
+    flow, both = flow.flatten(0, 1), flow.shape[:2]
+    flow = F.pad(flow, (column, 1 - column, row, 1 - row), mode="replicate")
+    size = 2 * flow.shape[-2] - 1, 2 * flow.shape[-1] - 1
+    flow = 2 * F.interpolate(flow, size, mode="bilinear", align_corners=True)  # a value kept, one between two
+    return flow[..., row : row + height, column : column + width].unflatten(0, both)

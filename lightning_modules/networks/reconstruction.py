@@ -1,0 +1,104 @@
+"""The picture from the features of three colours: CCR, and the two structures that Fig. 6 sets beside it."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from lightning_modules.networks.layers import conv, res_blocks
+
+
+class ToRgb(nn.Conv2d):
+    """3 x 3 convolution to the three colours, never in half precision, which would round the picture itself."""
+
+    def __init__(self, inputs: int, groups: int = 1) -> None:
+        super().__init__(inputs, 3, 3, padding=1, groups=groups)
+
+    def forward(self, x: Tensor) -> Tensor:  # noqa: D102
+        with torch.autocast(x.device.type, enabled=False):
+            return super().forward(x.to(self.weight.dtype))
+
+
+class ColorFusion(nn.Sequential):
+    """3 x 3 convolution and LeakyReLU: everything passes through here, and must not die as with a ReLU."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__(conv(inputs, outputs), nn.LeakyReLU(0.1, inplace=True))
+
+
+class ColorCorrelation(nn.Module):
+    """CCR (section 4.4, Fig. 6 a): the colours are refined side by side and fused after every stage.
+
+    Args:
+        width: channels, of every colour and inside.
+        stages: how often the colours are fused.
+        blocks: residual blocks of every colour in every stage.
+        end_blocks: residual blocks after the last fusion.
+
+    Shape:
+        - Input: features of R, G and B, each :math:`(B, width, H, W)`
+        - Output: rgb :math:`(B, 3, H, W)`
+    """
+
+    def __init__(self, width: int, stages: int, blocks: int, end_blocks: int) -> None:
+        super().__init__()
+        self.refine = nn.ModuleList(nn.ModuleList(res_blocks(width, blocks) for _ in range(3)) for _ in range(stages))
+        self.fuse = nn.ModuleList(ColorFusion((3 if stage == 0 else 4) * width, width) for stage in range(stages))
+        self.end = res_blocks(width, end_blocks)
+        self.rgb = ToRgb(width)
+
+    def forward(self, colors: list[Tensor]) -> Tensor:  # noqa: D102
+        fused: list[Tensor] = []
+        for refine, fuse in zip(self.refine, self.fuse, strict=True):
+            colors = [branch(color) for branch, color in zip(refine, colors, strict=True)]
+            fused = [fuse(torch.cat(colors + fused, dim=1))]
+        return self.rgb(fused[0] + self.end(fused[0]))
+
+
+class SeparateColors(nn.Module):
+    """No colour correlation (Fig. 6 b, ablation H): every colour makes its own channel of the picture.
+
+    Args:
+        width: channels of every colour.
+        stages: as of :class:`ColorCorrelation`, whose number of residual blocks is kept:
+        blocks: every colour has stages x blocks of them,
+        end_blocks: and its share of these at the end, rounded up.
+
+    Shape:
+        As :class:`ColorCorrelation`.
+    """
+
+    def __init__(self, width: int, stages: int, blocks: int, end_blocks: int) -> None:
+        super().__init__()
+        self.refine = nn.ModuleList(res_blocks(width, stages * blocks) for _ in range(3))
+        self.end = nn.ModuleList(res_blocks(width, -(-end_blocks // 3)) for _ in range(3))
+        self.rgb = ToRgb(3 * width, groups=3)
+
+    def forward(self, colors: list[Tensor]) -> Tensor:  # noqa: D102
+        colors = [refine(color) for refine, color in zip(self.refine, colors, strict=True)]
+        colors = [color + end(color) for end, color in zip(self.end, colors, strict=True)]
+        return self.rgb(torch.cat(colors, dim=1))
+
+
+class EarlyFusion(nn.Module):
+    """Colours fused once, at the beginning (Fig. 6 c, ablation I).
+
+    Args:
+        width: channels, of every colour and inside.
+        stages: as of :class:`ColorCorrelation`, whose number of residual blocks is kept:
+        blocks: 3 x stages x blocks of them
+        end_blocks: and these, one after another.
+
+    Shape:
+        As :class:`ColorCorrelation`.
+    """
+
+    def __init__(self, width: int, stages: int, blocks: int, end_blocks: int) -> None:
+        super().__init__()
+        self.fuse = ColorFusion(3 * width, width)
+        self.refine = res_blocks(width, 3 * stages * blocks + end_blocks)
+        self.rgb = ToRgb(width)
+
+    def forward(self, colors: list[Tensor]) -> Tensor:  # noqa: D102
+        fused = self.fuse(torch.cat(colors, dim=1))
+        return self.rgb(fused + self.refine(fused))

@@ -1,0 +1,46 @@
+"""From the features of all time points to those of the picture: FR (section 4.3), and one convolution instead."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+from lightning_modules.networks.layers import ConvBlock, conv
+
+
+class FeatureRefinement(nn.Module):
+    """FR (section 4.3, Fig. 5 c): what deviates from the mean over time is looked at by itself.
+
+    Args:
+        times: time points T.
+        features: channels of every time point.
+        width: channels of the result.
+
+    Shape:
+        - Input: temporal-pixel features :math:`(B, T, features, H, W)`
+        - Output: :math:`(B, width, H, W)`
+    """
+
+    def __init__(self, times: int, features: int, width: int) -> None:
+        super().__init__()
+        self.base = nn.Sequential(ConvBlock(times * features, width), conv(width, width))
+        self.residual = nn.Sequential(ConvBlock(times * features, width), conv(width, width))
+
+    def forward(self, pixels: Tensor) -> Tensor:  # noqa: D102
+        residual = pixels - pixels.mean(dim=1, keepdim=True)
+        return self.base(pixels.flatten(1, 2)) + self.residual(residual.flatten(1, 2))
+
+
+class TimeFusion(nn.Sequential):
+    """No refinement (ablations F and G): one convolution over the features of all time points.
+
+    Args:
+        times: time points T.
+        features: channels of every time point.
+        width: channels of the result.
+
+    Shape:
+        As :class:`FeatureRefinement`.
+    """
+
+    def __init__(self, times: int, features: int, width: int) -> None:
+        super().__init__(nn.Flatten(1, 2), conv(times * features, width))

@@ -1,0 +1,105 @@
+"""Features of every time point from the spikes of one colour: BSSR (section 4.2), and what the ablations put there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from lightning_modules.networks.layers import ConvBlock, ResBlock, conv
+from spikekit import tfi
+
+
+class SpikeRepresentation(nn.Module):
+    """BSSR of one colour (section 4.2, Fig. 4): features of every time point, from its window and the whole clip.
+
+    Args:
+        frames: spike frames N of a clip.
+        window: frames that a time point sees.
+        stride: frames between two time points.
+        width: channels inside.
+        features: channels of the result, for every time point.
+        global_perception: look at the whole clip, too (GP).
+
+    Shape:
+        - Input: the spikes of one colour, zero elsewhere, :math:`(B, N, H, W)`
+        - Output: :math:`(B, T, features, H, W)` with :math:`T = (N - window) / stride + 1`
+    """
+
+    def __init__(
+        self, frames: int, window: int, stride: int, width: int, features: int, global_perception: bool = True
+    ) -> None:
+        super().__init__()
+        self.window = window
+        self.stride = stride
+        self.features = features
+        self.local = nn.Sequential(ConvBlock(window, width), ResBlock(width))
+        self.whole = nn.Sequential(ConvBlock(frames, width), ResBlock(width)) if global_perception else None
+        seen = 2 * width if global_perception else width
+        self.fuse = nn.Sequential(ConvBlock(seen, width), ResBlock(width), conv(width, features))
+
+    def forward(self, spikes: Tensor) -> Tensor:  # noqa: D102
+        windows = spikes.unfold(1, self.window, self.stride).movedim(-1, 2)
+        batch, times = windows.shape[:2]
+        seen = self.local(windows.flatten(0, 1))
+        if self.whole is not None:
+            seen = torch.cat([seen, self.whole(spikes).repeat_interleave(times, dim=0)], dim=1)
+        return self.fuse(seen).unflatten(0, (batch, times))
+
+
+class WindowMeans(nn.Module):
+    """The spikes as they are, without weights (ablation A): the share of a window's frames in which a pixel fired.
+
+    Args:
+        window: frames that a time point sees.
+        stride: frames between two time points.
+
+    Shape:
+        - Input: the spikes of one colour, zero elsewhere, :math:`(B, N, H, W)`
+        - Output: :math:`(B, T, 1, H, W)` with :math:`T = (N - window) / stride + 1`
+
+    Example:
+        >>> spikes = torch.tensor([1.0, 0, 1, 1, 1]).reshape(1, 5, 1, 1)
+        >>> WindowMeans(window=3, stride=2)(spikes).flatten().tolist()
+        [0.666..., 1.0]
+    """
+
+    features = 1
+
+    def __init__(self, window: int, stride: int) -> None:
+        super().__init__()
+        self.window = window
+        self.stride = stride
+
+    def forward(self, spikes: Tensor) -> Tensor:  # noqa: D102
+        return spikes.unfold(1, self.window, self.stride).mean(dim=-1).unsqueeze(2)
+
+
+class IntervalRepresentation(nn.Module):
+    r"""Light from spike intervals, without weights (ablation C): :math:`1 / \Psi` of eq. (5) at every time point.
+
+    A pixel that never fires gives 0, those of the other colours among them.
+
+    Args:
+        times: time points, in spike frames.
+
+    Shape:
+        - Input: the spikes of one colour, zero elsewhere, :math:`(B, N, H, W)`
+        - Output: :math:`(B, T, 1, H, W)`
+
+    Example:
+        >>> spikes = torch.tensor([[0.0, 0], [1, 0], [0, 0], [0, 0], [1, 0]]).reshape(1, 5, 1, 2)
+        >>> IntervalRepresentation([2, 3])(spikes)[0, :, 0, 0].tolist()
+        [[0.333..., 0.0], [0.333..., 0.0]]
+    """
+
+    features = 1
+
+    def __init__(self, times: Sequence[int]) -> None:
+        super().__init__()
+        self.times = list(times)
+
+    def forward(self, spikes: Tensor) -> Tensor:  # noqa: D102
+        fired = spikes.any(dim=1, keepdim=True)
+        return (tfi(spikes)[:, self.times] * fired).unsqueeze(2)
