@@ -46,6 +46,8 @@ class Parser(LightningArgumentParser):
                 parser = ArgumentParser(add_help=False, usage=argparse.SUPPRESS)
                 parser.add_class_arguments(choice, option)
                 text += f"\nwith --{option} {choice.__name__}:\n\n{parser.format_help()}"
+        elif "{fit," in text:
+            text += "    sweep               Train and test every combination of overlays, values and seeds.\n"
         return text
 
 
@@ -137,23 +139,35 @@ def _precision(accelerator: str) -> str:
     return "bf16-mixed" if wanted else "32-true"
 
 
-def main(args: Sequence[str] | None = None) -> None:
+def main(args: Sequence[str] | None = None, command: type[Command] = Command) -> None:
     """Run the ``lightning`` command.
 
     Args:
         args: what was typed after ``lightning``; ``sys.argv`` when not given.
+        command: what runs it.
     """
     logging.getLogger("pytorch_lightning.utilities.rank_zero").addFilter(lambda line: "litlogger" not in line.msg)
+    verb, *rest = (sys.argv[1:] if args is None else args) or [""]
     try:
-        Command(
-            LightningModule,
-            LightningDataModule,
-            subclass_mode_model=True,
-            subclass_mode_data=True,
-            auto_configure_optimizers=False,
-            parser_class=Parser,
-            save_config_kwargs={"overwrite": True},
-            args=None if args is None else list(args),
-        )
+        if verb == "sweep":
+            from lightning_modules.sweep.cli import sweep
+
+            sweep(rest)
+        else:
+            run(args, command)
     except (InputError, SpikeFileError, CheckpointMismatchError) as error:
         sys.exit(f"lightning: {error}")
+
+
+def run(args: Sequence[str] | None, command: type[Command]) -> Command:
+    """Run what was typed after ``lightning``, with one of Lightning's verbs; what is wrong with it is raised."""
+    return command(
+        LightningModule,
+        LightningDataModule,
+        subclass_mode_model=True,
+        subclass_mode_data=True,
+        auto_configure_optimizers=False,
+        parser_class=Parser,
+        save_config_kwargs={"overwrite": True},
+        args=None if args is None else list(args),
+    )

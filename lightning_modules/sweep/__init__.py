@@ -1,0 +1,1 @@
+"""``lightning sweep``: every combination of overlays, values and seeds, trained and tested under the same budget."""

@@ -1,0 +1,65 @@
+"""How long a trial trains: steps, a wall clock or FLOPs, and a schedule that ends with it."""
+
+from __future__ import annotations
+
+import re
+from copy import deepcopy
+from typing import Any
+
+#: arguments of learning-rate schedules that say at which step they end
+_ENDS = ("T_max", "total_steps")
+
+
+def seconds(text: str) -> float:
+    """Read a time, ``HH:MM:SS`` or ``DD:HH:MM:SS``.
+
+    Raises:
+        ValueError: it is not one, or no time at all.
+
+    Example:
+        >>> seconds("00:05:00"), seconds("1:00:00:00")
+        (300, 86400)
+    """
+    if not re.fullmatch(r"(\d+:)?\d+:[0-5]?\d:[0-5]?\d", text):
+        raise ValueError(f"expected HH:MM:SS or DD:HH:MM:SS, got {text}")
+    time = sum(int(part) * unit for part, unit in zip(text.split(":")[::-1], (1, 60, 3600, 86400), strict=False))
+    if time == 0:
+        raise ValueError(f"expected more than no time, got {text}")
+    return time
+
+
+def with_budget(config: dict[str, Any], budget: dict[str, float]) -> dict[str, Any]:
+    """Return a configuration of ``lightning fit`` that trains as long as a budget says.
+
+    Args:
+        config: the configuration, resolved.
+        budget: nothing, for what the configuration says; or ``steps``; or ``seconds``, in which training stops,
+            validation included; or ``flops``, of which :mod:`lightning_modules.sweep.worker` makes steps once it has
+            counted those of one. Steps are also those at which a schedule ends that has an end, such as that of
+            ``CosineAnnealingLR``.
+
+    Returns:
+        A new configuration.
+
+    Example:
+        >>> cosine = {"class_path": "torch.optim.lr_scheduler.CosineAnnealingLR", "init_args": {"T_max": 1000}}
+        >>> config = {"trainer": {"max_steps": 1000}, "model": {"init_args": {"lr_scheduler": cosine}}}
+        >>> short = with_budget(config, {"steps": 300})
+        >>> short["trainer"]["max_steps"], short["model"]["init_args"]["lr_scheduler"]["init_args"]["T_max"]
+        (300, 300)
+    """
+    if not budget:
+        return config
+    config = deepcopy(config)
+    steps, time = budget.get("steps"), budget.get("seconds")
+    config["trainer"] |= {"max_epochs": -1, "max_steps": steps or -1, "max_time": time and {"seconds": time}}
+    for name in has_end(config) if steps else []:
+        config["model"]["init_args"]["lr_scheduler"]["init_args"][name] = steps
+    return config
+
+
+def has_end(config: dict[str, Any]) -> list[str]:
+    """Return which arguments of a configuration's schedule say at which step it ends."""
+    schedule = config["model"].get("init_args", {}).get("lr_scheduler")
+    arguments = schedule.get("init_args", {}) if isinstance(schedule, dict) else {}
+    return [name for name in _ENDS if arguments.get(name) is not None]

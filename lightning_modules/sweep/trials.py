@@ -1,0 +1,208 @@
+"""The trials of a sweep: every combination, its name, and its configuration as the parser of ``fit`` resolves it."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+from argparse import ArgumentError
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from lightning_modules.cli import Command, InputError, run
+from lightning_modules.sweep.budget import with_budget
+from lightning_modules.sweep.state import write_json
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One training and its test.
+
+    Args:
+        labels: what it takes from each group of overlays or values.
+        seed: of the initial weights; ``None`` for what the configuration says.
+        folder: where everything lies that it leaves.
+        config: its configuration, resolved, as ``lightning fit -c`` reads it.
+        budget: as :func:`lightning_modules.sweep.budget.with_budget` takes it.
+    """
+
+    labels: tuple[str, ...]
+    seed: int | None
+    folder: Path
+    config: dict[str, Any]
+    budget: dict[str, float]
+
+    @property
+    def variant(self) -> str:
+        """The row of the table that the trial belongs to; trials of one variant differ in their seeds."""
+        return "-".join(self.labels)
+
+    def write(self) -> None:
+        """Write down in the folder what the trial is.
+
+        Raises:
+            InputError: the folder holds a trial of another configuration or budget.
+        """
+        config, budget = self.folder / "trial.yaml", self.folder / "budget.json"
+        if budget.is_file():  # it is written last
+            there = {**yaml.safe_load(config.read_text()), "budget": json.loads(budget.read_text())}
+            asked = {**yaml.safe_load(yaml.safe_dump(self.config)), "budget": self.budget}
+            if there != asked:
+                raise InputError(f"{self.folder}: {_difference(there, asked)}; -o goes elsewhere, or delete the folder")
+        elif self.folder.is_dir() and any(path != config for path in self.folder.iterdir()):
+            raise InputError(f"{self.folder}: is not empty, and holds no trial; -o goes elsewhere")
+        else:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            config.write_text(yaml.safe_dump(self.config, sort_keys=False))
+            write_json(budget, self.budget)
+
+
+def make_trials(
+    configs: Sequence[str],
+    over: Sequence[Sequence[str]],
+    settings: Sequence[str],
+    seeds: Sequence[int],
+    budget: dict[str, float],
+    output: Path,
+) -> list[Trial]:
+    """Combine everything with everything, parse and build each combination, and write nothing.
+
+    Args:
+        configs: configurations of all trials, in the order of ``lightning fit -c``.
+        over: groups of overlays; a trial takes one of each.
+        settings: ``KEY=VALUE,VALUE,...``; a trial takes one value of each.
+        seeds: of the initial weights.
+        budget: as :func:`lightning_modules.sweep.budget.with_budget` takes it.
+        output: folder of the sweep.
+
+    Raises:
+        InputError: two combinations of one name, or one that ``lightning fit`` would refuse.
+    """
+    common = [word for config in configs for word in ("-c", str(config))]
+    groups = [[(Path(path).stem, ["-c", str(path)]) for path in group] for group in over]
+    for key, values in map(_key_and_values, settings):
+        choices = [[f"--{key}={value}"] for value in values]
+        if len(choices) == 1:  # the same for all: not part of any name
+            common += choices[0]
+        else:
+            short = key.rpartition(".")[2]
+            groups.append([(f"{short}={value}", choice) for value, choice in zip(values, choices, strict=True)])
+    base = _resolve(common, "")
+    names = _names(base)
+    trials = []
+    for combination in itertools.product(*groups):
+        labels = tuple(label for label, _ in combination) or (Path(configs[-1]).stem,)
+        args = [*common, *(word for _, words in combination for word in words)]
+        config = _resolve(args, f"{'-'.join(labels)}: ", names) if combination else base
+        for seed in seeds or [None]:
+            name = "-".join(labels) + ("" if seed is None else f"-seed{seed}")
+            folder = output / re.sub(r"[^\w.=+-]+", "_", name)
+            own = {} if seed is None else {"seed_everything": seed}
+            resolved = with_budget({**config, **own, "output": str(folder)}, budget)
+            trials.append(Trial(labels, seed, folder, resolved, budget))
+    folders = [trial.folder for trial in trials]
+    twice = next((folder for folder in folders if folders.count(folder) > 1), None)
+    if twice:
+        raise InputError(f"two trials are called {twice.name}: give overlays and values names that differ")
+    return trials
+
+
+def _key_and_values(setting: str) -> tuple[str, list[str]]:
+    """Split at the commas that are in no bracket."""
+    key, equals, values = setting.partition("=")
+    split = re.findall(r"(?:[^,\[{]|\[.*?\]|\{.*?\})+", values)
+    if not (key and equals and split):
+        raise InputError(f"--set: expected KEY=VALUE,VALUE,..., such as model.network.width=16,32, got {setting}")
+    return key.removeprefix("--"), split
+
+
+class _Resolver(Command):
+    """Parses and builds what ``lightning fit`` would, to find mistakes; trains nothing and writes nothing."""
+
+    @staticmethod
+    def subcommands() -> dict[str, set[str]]:
+        return {"fit": Command.subcommands()["fit"]}
+
+    def init_parser(self, **kwargs: Any) -> Any:
+        return super().init_parser(**kwargs, exit_on_error=False)
+
+    def parse_arguments(self, parser: Any, args: Any) -> None:
+        self.config = parser.parse_args(args)
+
+    def _set_seed(self) -> None:
+        pass
+
+    def before_instantiate_classes(self) -> None:
+        pass
+
+    def instantiate_trainer(self, **kwargs: Any) -> None:
+        """None: the machine that trains may be another one."""
+
+    def _run_subcommand(self, subcommand: str) -> None:
+        pass
+
+
+def _resolve(args: Sequence[str], trial: str, names: Sequence[str] = ()) -> dict[str, Any]:
+    try:
+        command = run(["fit", *args], _Resolver)
+    except (ArgumentError, InputError) as error:
+        unknown = [word[2:].partition("=")[0] for word in args if word.startswith("--")]
+        unknown = [key for key in unknown if names and key not in names]
+        raise InputError(trial + _reason(str(error)) + _suggestion(unknown, names)) from error
+    config = yaml.safe_load(command.parser.dump(command.config, skip_none=False))["fit"]
+    # not part of what the trial is
+    return {key: value for key, value in config.items() if key not in ("ckpt_path", "weights_only")}
+
+
+def _reason(message: str) -> str:
+    """Return jsonargparse's message, which is a tree of alternatives, as one line: the deepest, and where it is."""
+    lines = message.splitlines()
+    where = [key for line in lines for key in re.findall(r'[Pp]arser key "([^"]+)"', line)]
+    inner = [line for line in lines if not re.match(r"\s*(- Expected a <class 'NoneType'>|Given value|.*arser key)", line)]
+    deepest = max(inner or lines, key=lambda line: len(line) - len(line.lstrip()))
+    return ".".join(where) + (": " if where else "") + deepest.strip().removeprefix("- ")
+
+
+def _suggestion(unknown: Sequence[str], names: Sequence[str]) -> str:
+    from difflib import get_close_matches
+
+    for key in unknown:
+        ends = {name.rpartition(".")[2] for name in names}
+        close = get_close_matches(key.rpartition(".")[2], ends, 1, 0.75)
+        meant = [name for name in names if close and name.rpartition(".")[2] == close[0]]
+        if meant:
+            return f"; {key}: did you mean {' or '.join(meant)}?"
+    return ""
+
+
+def _names(config: dict[str, Any]) -> list[str]:
+    """Return the keys of a configuration as they are typed: those of the objects in it have no ``init_args``."""
+    return sorted({key.replace(".init_args", "") for key, _ in flatten(config)})
+
+
+def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield dotted keys and what is no dictionary.
+
+    Example:
+        >>> dict(flatten({"network": {"width": 4, "motion": {}}}))
+        {'network.width': 4}
+    """
+    if not isinstance(config, dict):
+        yield prefix, config
+        return
+    for key, value in config.items():
+        yield from flatten(value, f"{prefix}.{key}" if prefix else key)
+
+
+def _difference(there: dict[str, Any], asked: dict[str, Any]) -> str:
+    there, asked = dict(flatten(there)), dict(flatten(asked))
+    keys = sorted(key for key in {**there, **asked} if there.get(key) != asked.get(key))
+    shown = [key.replace(".init_args", "") for key in keys[:3]]
+    more = f" and {len(keys) - 3} more" if len(keys) > 3 else ""
+    first = f"{shown[0]}={there.get(keys[0])}"
+    others = f" (also {', '.join(shown[1:])}{more})" if shown[1:] else ""
+    return f"holds a trial with {first}, and this sweep asks for {asked.get(keys[0])}{others}"
