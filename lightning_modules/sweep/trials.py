@@ -162,7 +162,9 @@ def _reason(message: str) -> str:
     """Return jsonargparse's message, which is a tree of alternatives, as one line: the deepest, and where it is."""
     lines = message.splitlines()
     where = [key for line in lines for key in re.findall(r'[Pp]arser key "([^"]+)"', line)]
-    inner = [line for line in lines if not re.match(r"\s*(- Expected a <class 'NoneType'>|Given value|.*arser key)", line)]
+    inner = [
+        line for line in lines if not re.match(r"\s*(- Expected a <class 'NoneType'>|Given value|.*arser key)", line)
+    ]
     deepest = max(inner or lines, key=lambda line: len(line) - len(line.lstrip()))
     return ".".join(where) + (": " if where else "") + deepest.strip().removeprefix("- ")
 

@@ -1,0 +1,193 @@
+"""The verb ``lightning sweep``."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NoReturn
+
+from lightning_modules.cli import InputError
+from lightning_modules.sweep.budget import seconds
+from lightning_modules.sweep.engines import run_locally, run_on_ray
+from lightning_modules.sweep.plot import plot
+from lightning_modules.sweep.state import PROGRESS, RESULT
+from lightning_modules.sweep.table import collect, markdown, write_csv
+from lightning_modules.sweep.trials import Trial, make_trials
+from lightning_modules.sweep.view import View
+from spikekit.arguments import positive, whole
+
+_ENGINES = {"local": run_locally, "ray": run_on_ray}
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"sweep: {message}")
+
+
+def _time(text: str) -> float:
+    try:
+        return seconds(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="lightning sweep",
+        allow_abbrev=False,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Train and test every combination of overlays, values and seeds under the same budget.",
+        epilog="""\
+A trial is `lightning fit`, then `lightning test` of the weights it ended with, in a process of its own; one that fails
+is reported, and the others go on. All configurations are parsed and built before the first one trains. The same command
+typed again goes on where it was stopped, in whatever way: finished trials are not run again, failed ones are tried
+again, the others go on from their last checkpoint. A folder that holds a trial of other settings is refused.
+
+The result is sweep.md, sweep.csv and sweep.png: a row a variant, mean and spread over seeds, the difference from J or
+from the first row, and the paper's Table 3 for rows named after its letters. Every trial lies in a folder of its own:
+  lightning test -c runs/sweep/c-s-seed1/trial.yaml --ckpt_path last
+
+examples:
+  lightning sweep configs/x4.yaml -c configs/quick.yaml --over configs/ablation/*.yaml --seeds 0 1 --steps 300
+  lightning sweep configs/x4.yaml --over configs/ablation/*.yaml --over configs/size/*.yaml --time 12:00:00 --engine ray
+  lightning sweep configs/x4.yaml --set model.network.width=16,32,64 --set data.root=DIR --flops 1e15
+""",
+    )
+    parser.add_argument(
+        "configs", nargs="*", metavar="CONFIG", help="configuration of all trials, as for lightning fit -c"
+    )
+    parser.add_argument(
+        "-c", "--config", action="append", default=[], metavar="OVERLAY", help="more of them, over those before"
+    )
+    what = parser.add_argument_group("what is combined")
+    what.add_argument(
+        "--over",
+        action="append",
+        nargs="+",
+        default=[],
+        metavar="OVERLAY",
+        help="overlays of which a trial takes one; given again, one of these, too",
+    )
+    what.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE,...",
+        help="values of any argument of lightning fit, of which a trial takes one; a single value goes for all",
+    )
+    what.add_argument(
+        "--seeds",
+        type=whole(0),
+        nargs="+",
+        default=[],
+        metavar="SEED",
+        help="seeds of the initial weights (seed_everything); clips stay those of data.seed, the same for all trials",
+    )
+    group = parser.add_argument_group("budget of each trial; without one, what the configuration says")
+    budget = group.add_mutually_exclusive_group()
+    budget.add_argument("--steps", type=whole(1), help="training steps; a schedule with an end (T_max) ends with them")
+    budget.add_argument(
+        "--time",
+        type=_time,
+        metavar="HH:MM:SS",
+        help="wall clock of training, validation included; for a schedule with an end, a few steps are timed first, "
+        "and training ends with the steps that the time allows, or with the time",
+    )
+    budget.add_argument(
+        "--flops",
+        type=positive,
+        help="floating-point operations of training: as many steps as they pay for, going by those counted in one step "
+        "(convolutions and matrix products, forward and backward; not what is done element by element, nor the warp)",
+    )
+    how = parser.add_argument_group("how")
+    how.add_argument("-o", "--output", type=Path, default=Path("runs/sweep"), metavar="DIR", help="default: runs/sweep")
+    how.add_argument(
+        "--engine",
+        choices=_ENGINES,
+        default="local",
+        help="local: on this machine, one after another; ray: on the Ray cluster of RAY_ADDRESS, or Ray on this "
+        "machine, one trial a GPU, or a node without",
+    )
+    how.add_argument("--jobs", type=whole(1), metavar="N", help="trials at once, which share cores or GPUs")
+    how.add_argument(
+        "--every",
+        type=positive,
+        default=60.0,
+        metavar="SECONDS",
+        help="time between two checkpoints, besides those at the end of each epoch (default: 60)",
+    )
+    return parser
+
+
+def sweep(args: Sequence[str]) -> None:
+    """Run the verb.
+
+    Args:
+        args: what was typed after ``lightning sweep``.
+
+    Raises:
+        InputError: what was asked for cannot be; or trials failed.
+    """
+    asked = _parser().parse_args(args)
+    configs = asked.configs + asked.config
+    if not configs:
+        raise InputError("sweep: expected a configuration, such as configs/x4.yaml")
+    budget = {"steps": asked.steps, "seconds": asked.time, "flops": asked.flops}
+    budget = {name: value for name, value in budget.items() if value is not None}
+    trials = make_trials(configs, asked.over, asked.set, asked.seeds, budget, asked.output)
+    with _locked(asked.output):
+        for trial in trials:
+            trial.write()
+        failed = _run(trials, asked)
+    if failed:
+        raise InputError(f"sweep: {len(failed)} of {len(trials)} trials failed; the same command tries them again")
+
+
+def _run(trials: Sequence[Trial], asked: argparse.Namespace) -> dict[Path, str]:
+    failed: dict[Path, str] = {}
+    by_folder = {trial.folder: trial for trial in trials}
+    waiting = [trial.folder for trial in trials if not (trial.folder / RESULT).is_file()]
+    print(f"{asked.output}: {len(trials)} trials, {len(trials) - len(waiting)} of them finished before")
+    for folder in waiting:
+        (folder / PROGRESS).unlink(missing_ok=True)
+    view = View(trials, failed)
+    try:
+        for ended in _ENGINES[asked.engine](waiting, asked.jobs, asked.every) if waiting else []:
+            for folder, reason in ended.items():
+                if reason is not None:
+                    failed[folder] = reason
+                view.ended(by_folder[folder])
+                _write_tables(trials, failed, asked)
+            view.draw()
+    except KeyboardInterrupt:
+        raise InputError("sweep: stopped; the same command goes on") from None
+    finally:
+        view.close()
+    print(f"\n{_write_tables(trials, failed, asked)}")
+    print(", ".join(str(asked.output / f"sweep.{ending}") for ending in ("md", "csv", "png")))
+    return failed
+
+
+def _write_tables(trials: Sequence[Trial], failed: dict[Path, str], asked: argparse.Namespace) -> str:
+    rows = collect(trials, failed)
+    text = markdown(rows)
+    (asked.output / "sweep.md").write_text(text)
+    write_csv(rows, asked.output / "sweep.csv")
+    plot(rows, asked.output / "sweep.png")
+    return text
+
+
+@contextmanager
+def _locked(output: Path) -> Iterator[None]:
+    """Keep others out of a folder; the lock goes when the process does, however it ends."""
+    import fcntl
+
+    output.mkdir(parents=True, exist_ok=True)
+    with open(output / "lock", "w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"{output}: another sweep is at work here; -o goes elsewhere") from None
+        yield

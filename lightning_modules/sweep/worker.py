@@ -1,0 +1,243 @@
+"""One trial, in a process of its own: ``python -m lightning_modules.sweep.worker FOLDER SECONDS``."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import shutil
+import sys
+import threading
+import time
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from pytorch_lightning import Callback, LightningModule, Trainer
+from pytorch_lightning.callbacks import ModelCheckpoint
+from torch.utils.flop_counter import FlopCounterMode
+
+from lightning_modules.cli import Command, main
+from lightning_modules.sweep.budget import has_end, with_budget
+from lightning_modules.sweep.state import PROGRESS, RESULT, read_json, write_json
+
+_A_MOMENT = 0.5  # seconds between two reports
+
+# Steps that are run to learn how long one takes, and how many of them are too early to count.
+_TIMED, _WARM_UP = 12, 4
+
+
+class DivergedError(RuntimeError):
+    """A loss that is no number any more."""
+
+
+class Report(Callback):
+    """Say in a file where training stands, and stop it where the loss is no number any more.
+
+    Args:
+        path: the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.steps, self.seconds = 0, 0.0  # without validation; of all runs that went on with each other
+
+    def on_train_start(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
+        self._began = self._reported = time.monotonic()
+        self._ended: float | None = None
+        self._first = trainer.global_step
+        self._say(trainer)
+
+    def on_train_batch_end(  # noqa: D102
+        self, trainer: Trainer, module: LightningModule, outputs: dict[str, Any], *_: Any
+    ) -> None:
+        now = time.monotonic()
+        if self._ended is not None:
+            self.steps += 1
+            self.seconds += now - self._ended
+        self._ended, self._loss = now, outputs["loss"]
+        if now - self._reported > _A_MOMENT:
+            self._check(trainer)
+            self._say(trainer)
+            self._reported = now
+
+    def on_validation_start(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
+        self._ended = None
+
+    def on_train_end(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
+        if trainer.global_step > self._first:
+            self._check(trainer)
+        self._say(trainer)
+
+    def on_test_start(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
+        write_json(self.path, {**(read_json(self.path) or {}), "phase": "testing", "share": 1.0})
+
+    def on_test_end(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
+        self.parameters = sum(parameter.numel() for parameter in module.parameters())
+        self.metrics = {name: value.item() for name, value in trainer.callback_metrics.items()}
+
+    def state_dict(self) -> dict[str, Any]:  # noqa: D102
+        return {"steps": self.steps, "seconds": self.seconds}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:  # noqa: D102
+        self.steps, self.seconds = state["steps"], state["seconds"]
+
+    def _check(self, trainer: Trainer) -> None:
+        if not math.isfinite(self._loss):
+            raise DivergedError(f"the loss is {float(self._loss)} at step {trainer.global_step}")
+
+    def _say(self, trainer: Trainer) -> None:
+        step, steps = trainer.global_step, trainer.max_steps
+        now = time.monotonic()
+        shares = [step / steps] if steps > 0 else []
+        for timer in trainer.callbacks:
+            if type(timer).__name__ == "Timer" and timer.time_remaining() is not None:
+                passed = timer.time_elapsed()
+                shares.append(passed / (passed + max(timer.time_remaining(), 0)))
+        write_json(
+            self.path,
+            {
+                "phase": "training",
+                "step": step,
+                "steps": steps if steps > 0 else None,
+                "share": max(shares, default=None),
+                "rate": (step - self._first) / (now - self._began) if step > self._first else None,
+                "val": {key: value.item() for key, value in trainer.callback_metrics.items() if key[:4] == "val/"},
+            },
+        )
+
+
+class _Cost(Callback):
+    """Count the FLOPs of the first step, and time the others."""
+
+    def on_train_batch_start(self, trainer: Trainer, *_: Any) -> None:
+        if trainer.global_step == 0:
+            self._counter = FlopCounterMode(display=False)
+            self._counter.__enter__()
+        self._wait()
+        self._began = time.monotonic() if trainer.global_step <= _WARM_UP else self._began
+
+    def on_train_batch_end(self, trainer: Trainer, *_: Any) -> None:
+        if trainer.global_step == 1:
+            self._counter.__exit__(None, None, None)
+            self.flops = self._counter.get_total_flops()
+        self._wait()
+        self.seconds = (time.monotonic() - self._began) / max(1, trainer.global_step - _WARM_UP)
+
+    def _wait(self) -> None:
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+
+
+def _command(callbacks: list[Callback]) -> type[Command]:
+    class TrialCommand(Command):
+        def _callbacks(self, output: Path) -> list[Callback]:
+            return [*super()._callbacks(output), *callbacks]
+
+    return TrialCommand
+
+
+def plan(folder: Path) -> Path:
+    """Return the configuration that a trial trains with: its own, or one with the steps that its budget pays for.
+
+    One training step is run to count its FLOPs, forward, backward and optimizer, as
+    :class:`torch.utils.flop_counter.FlopCounterMode` does: convolutions and matrix products, two for each product and
+    sum, and nothing that is done element by element, such as the warp. Where it is time that is given and the schedule
+    has an end, a few steps are timed. That is done once: a resumed trial has the plan that it began with.
+    """
+    own, planned = folder / "trial.yaml", folder / "plan.yaml"
+    config, budget = yaml.safe_load(own.read_text()), json.loads((folder / "budget.json").read_text())
+    if "flops" not in budget and not ("seconds" in budget and has_end(config)):
+        return own
+    if not planned.is_file():
+        write_json(folder / PROGRESS, {"phase": "measuring"})
+        steps = 1 if "flops" in budget else _TIMED
+        cost = _Cost()
+        main(["fit", "-c", str(own), f"--trainer.fast_dev_run={steps}"], _command([cost]))
+        count = budget["flops"] / max(1, cost.flops) if "flops" in budget else budget["seconds"] / cost.seconds
+        if count < 1:
+            raise SystemExit(
+                f"lightning: a step takes {cost.flops:.3g} FLOPs, more than the budget {budget['flops']:.3g}"
+            )
+        config = with_budget(config, {**budget, "steps": int(count)})
+        text = f"# a step: {cost.flops:.6g} FLOPs, {cost.seconds:.3g} s\n" + yaml.safe_dump(config, sort_keys=False)
+        partial = planned.with_suffix(".partial")
+        partial.write_text(text)
+        partial.replace(planned)
+    return planned
+
+
+def train_and_test(folder: Path, every: float) -> None:
+    """Train a trial, from where it was stopped if it was, and test the weights that it ends with.
+
+    Args:
+        folder: the trial's, with ``trial.yaml`` and ``budget.json``.
+        every: seconds between two checkpoints, besides those at the end of each epoch.
+    """
+    config = plan(folder)
+    report = Report(folder / PROGRESS)
+    checkpoints = folder / "checkpoints"
+    last = checkpoints / "last.ckpt"
+    if not last.is_file():  # stopped before there was one to go on from
+        shutil.rmtree(checkpoints, ignore_errors=True)
+    often = ModelCheckpoint(
+        checkpoints, "last", train_time_interval=timedelta(seconds=every), enable_version_counter=False
+    )
+    resume = ["--ckpt_path", "last"] if last.is_file() else []
+    main(["fit", "-c", str(config), *resume, "--trainer.enable_progress_bar=false"], _command([report, often]))
+    main(["test", "-c", str(config), "--ckpt_path", "last", "--trainer.enable_progress_bar=false"], _command([report]))
+    write_json(folder / RESULT, _result(folder, last, report))
+
+
+def _result(folder: Path, last: Path, report: Report) -> dict[str, Any]:
+    checkpoint = torch.load(last, map_location="cpu", weights_only=True)
+    network = checkpoint.get("network", {})
+    optimizer = checkpoint["optimizer_states"][0]["param_groups"][0]
+    return {
+        "metrics": _metrics(folder / "test.csv", report),
+        "method": network.get("class"),
+        "steps": checkpoint["global_step"],
+        "seconds_per_step": report.seconds / report.steps if report.steps else None,
+        "parameters": report.parameters,
+        # as the checkpoint has them: what was trained, whatever was asked for
+        "network": network,
+        "optimizer": {
+            "lr": optimizer.get("initial_lr", optimizer["lr"]),
+            "weight_decay": optimizer.get("weight_decay"),
+        },
+    }
+
+
+def _metrics(path: Path, report: Report) -> dict[str, dict[str, float]]:
+    """Return the means of a test by method; of what the module logged, where the test wrote no table."""
+    if not path.is_file():
+        return {"": report.metrics}
+    with open(path, newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["clip"] == "mean"]
+    return {
+        row["method"]: {key: float(value) for key, value in row.items() if key not in ("method", "clip")}
+        for row in rows
+    }
+
+
+def _end_with_parent() -> None:
+    """Stop where the sweep does, even when it is killed: its end of our standard input then closes."""
+
+    def wait() -> None:
+        while os.read(0, 1):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+if __name__ == "__main__":
+    _end_with_parent()
+    arguments, sys.argv = sys.argv[1:], sys.argv[:1]
+    try:
+        train_and_test(Path(arguments[0]), float(arguments[1]))
+    except DivergedError as error:
+        sys.exit(f"lightning: {error}")
