@@ -6,7 +6,7 @@ import csv
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from pytorch_lightning import Callback, LightningModule, Trainer
@@ -26,24 +26,28 @@ class ValidationPictures(Callback):
         clips: how many.
     """
 
+    title = "tfi, result, truth"
+
     def __init__(self, clips: int = 4) -> None:
         self.clips = clips
         self._rows: list[list[Tensor]] = []
 
+    def rows(self, module: LightningModule, outputs: Any, batch: dict[str, Tensor]) -> list[list[Tensor]]:
+        """Return the pictures of every clip of a batch."""
+        settings = module.network.settings
+        decoded = ClassicalDecoder("tfi", settings["scale"], settings["pattern"], settings["alpha"])(batch["spikes"])
+        return [list(row) for row in zip(decoded.clamp(0, 1), outputs, batch["rgb"], strict=True)]
+
     def on_validation_batch_end(  # noqa: D102
-        self, trainer: Trainer, module: LightningModule, outputs: Tensor, batch: dict[str, Tensor], *_: Any
+        self, trainer: Trainer, module: LightningModule, outputs: Any, batch: dict[str, Tensor], *_: Any
     ) -> None:
-        wanted = self.clips - len(self._rows)
-        if wanted > 0:
-            settings = module.network.settings
-            decode = ClassicalDecoder("tfi", settings["scale"], settings["pattern"], settings["alpha"])
-            decoded = decode(batch["spikes"][:wanted]).clamp(0, 1)
-            self._rows += [list(row) for row in zip(decoded, outputs, batch["rgb"][:wanted], strict=False)]
+        if len(self._rows) < self.clips:
+            self._rows += self.rows(module, outputs, batch)[: self.clips - len(self._rows)]
 
     def on_validation_epoch_end(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
         if self._rows and isinstance(trainer.logger, TensorBoardLogger) and trainer.is_global_zero:
             picture = panel(self._rows)
-            trainer.logger.experiment.add_image("val/tfi, result, truth", picture, trainer.global_step)
+            trainer.logger.experiment.add_image(f"val/{self.title}", picture, trainer.global_step)
         self._rows = []
 
 
@@ -60,22 +64,36 @@ class TestReport(Callback):
 
     __test__ = False  # not a test for pytest
 
+    #: column of ``test.csv``, heading of the table, and how many digits the table shows
+    measures: ClassVar[list[tuple[str, str, int]]] = [("psnr", "PSNR (dB)", 2), ("ssim", "SSIM", 4)]
+
     def __init__(self, output: str | Path, clips: int = 6) -> None:
         self.output = Path(output)
         self.clips = clips
 
+    def score(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, list[tuple[float, ...]]]:
+        """Return the measures of every clip of a batch, by method."""
+        truth = batch["rgb"]
+        return {
+            method: list(zip(psnr(rgb, truth).tolist(), ssim(rgb, truth).tolist(), strict=True))
+            for method, rgb in outputs.items()
+        }
+
+    def rows(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> list[list[Tensor]]:
+        """Return the pictures of every clip of a batch: one of every method, and the truth."""
+        return [[rgb.clamp(0, 1).cpu() for rgb in row] for row in zip(*outputs.values(), batch["rgb"], strict=True)]
+
     def on_test_start(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
-        self._scores: dict[str, list[tuple[float, float]]] = defaultdict(list)
+        self._scores: dict[str, list[tuple[float, ...]]] = defaultdict(list)
         self._rows: list[list[Tensor]] = []
 
     def on_test_batch_end(  # noqa: D102
-        self, trainer: Trainer, module: LightningModule, outputs: dict[str, Tensor], batch: dict[str, Tensor], *_: Any
+        self, trainer: Trainer, module: LightningModule, outputs: dict[str, Any], batch: dict[str, Tensor], *_: Any
     ) -> None:
-        truth = batch["rgb"]
-        for method, rgb in outputs.items():
-            self._scores[method] += zip(psnr(rgb, truth).tolist(), ssim(rgb, truth).tolist(), strict=True)
-        for clip in range(min(len(truth), self.clips - len(self._rows))):
-            self._rows.append([rgb[clip].clamp(0, 1).cpu() for rgb in (*outputs.values(), truth)])
+        for method, scores in self.score(outputs, batch).items():
+            self._scores[method] += scores
+        if len(self._rows) < self.clips:
+            self._rows += self.rows(outputs, batch)[: self.clips - len(self._rows)]
 
     def on_test_end(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
         if not trainer.is_global_zero:
@@ -88,13 +106,13 @@ class TestReport(Callback):
             method: torch.tensor(scores, dtype=torch.float64).mean(dim=0).tolist()
             for method, scores in self._scores.items()
         }
-        table = _lines(f"mean of {clips} clips", means)
+        table = self._lines(f"mean of {clips} clips", means)
         if named and clips <= _MOST_TABLES:
             for clip, name in enumerate(names):
-                table += ["", *_lines(name, {method: scores[clip] for method, scores in self._scores.items()})]
+                table += ["", *self._lines(name, {method: scores[clip] for method, scores in self._scores.items()})]
         with open(self.output / "test.csv", "w", newline="") as file:
             writer = csv.writer(file)
-            writer.writerow(["method", "clip", "psnr", "ssim"])
+            writer.writerow(["method", "clip", *(column for column, _, _ in self.measures)])
             for method, scores in self._scores.items():
                 writer.writerows([method, n, *map(_rounded, score)] for n, score in zip(names, scores, strict=True))
                 writer.writerow([method, "mean", *map(_rounded, means[method])])
@@ -102,10 +120,12 @@ class TestReport(Callback):
         print("\n".join(["", *table, ""]))  # noqa: T201
         print(f"{self.output / 'test.csv'}, {self.output / 'test.png'} (columns: {', '.join(self._scores)}, truth)")  # noqa: T201
 
-
-def _lines(heading: str, scores: dict[str, Sequence[float]]) -> list[str]:
-    first = f"{'':24}{'PSNR (dB)':>10}{'SSIM':>10}   {heading}"
-    return [first, *(f"{method:24}{psnr:10.2f}{ssim:10.4f}" for method, (psnr, ssim) in scores.items())]
+    def _lines(self, heading: str, scores: dict[str, Sequence[float]]) -> list[str]:
+        lines = [" " * 24 + "".join(f"{title:>10}" for _, title, _ in self.measures) + f"   {heading}"]
+        for method, values in scores.items():
+            columns = zip(values, self.measures, strict=True)
+            lines.append(f"{method:24}" + "".join(f"{value:10.{digits}f}" for value, (_, _, digits) in columns))
+        return lines
 
 
 def _rounded(value: float) -> str:

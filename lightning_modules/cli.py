@@ -11,21 +11,26 @@ from typing import Any
 
 import torch
 from jsonargparse import ArgumentParser
-from pytorch_lightning import Callback, LightningDataModule, LightningModule, Trainer
+from pytorch_lightning import Callback, LightningDataModule, Trainer
 from pytorch_lightning.callbacks import LearningRateMonitor, ModelCheckpoint
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI
 from pytorch_lightning.loggers import TensorBoardLogger
 
-from lightning_modules.callbacks import PredictionPictures, TestReport, ValidationPictures
+from lightning_modules.callbacks import PredictionPictures
 from lightning_modules.data import FilmScenes, Recording, StillScenes
-from lightning_modules.module import CheckpointMismatchError, SuperResolution
-from lightning_modules.networks import CSCSR, Network
+from lightning_modules.flow_training import FlowTraining
+from lightning_modules.learner import CheckpointMismatchError, Learner
+from lightning_modules.module import SuperResolution
+from lightning_modules.motion import Spike2Flow
+from lightning_modules.networks import CSCSR
 from spikekit import SpikeFileError
 
 #: classes whose arguments ``--help`` lists, by the option that names them
 CHOICES = (
     ("model", SuperResolution),
     ("model.network", CSCSR),
+    ("model", FlowTraining),
+    ("model.network", Spike2Flow),
     ("data", StillScenes),
     ("data", FilmScenes),
     ("data", Recording),
@@ -89,7 +94,7 @@ class Command(LightningCLI):
             super().instantiate_classes()
             # here, so that what is wrong with it is known before anything is written
             self.datamodule.setup(self.subcommand)
-            _check_agreement(self.model.network, self.datamodule)
+            _check_agreement(self.model, self.datamodule)
         except (OSError, ValueError) as error:
             # jsonargparse wraps what a class of a class says into a page about its own types
             said = error.__cause__ if "Union subtypes" in str(error) and error.__cause__ else error
@@ -110,15 +115,16 @@ class Command(LightningCLI):
 
     def _callbacks(self, output: Path) -> list[Callback]:
         if self.subcommand == "fit":
+            monitor, mode = self.model.best
             folder = {"dirpath": output / "checkpoints", "enable_version_counter": False}
             return [
-                ModelCheckpoint(filename="best", monitor="val/psnr", mode="max", **folder),
+                ModelCheckpoint(filename="best", monitor=monitor, mode=mode, **folder),
                 ModelCheckpoint(filename="last", save_on_train_epoch_end=True, **folder),
                 LearningRateMonitor(),
-                ValidationPictures(),
+                self.model.pictures(),
             ]
         if self.subcommand == "test":
-            return [TestReport(output)]
+            return [self.model.report(output)]
         return [PredictionPictures(output)] if self.subcommand == "predict" else []
 
     def before_predict(self) -> None:  # noqa: D102
@@ -126,12 +132,11 @@ class Command(LightningCLI):
             raise InputError("predict: expected a recording: --data Recording --data.path FILE")
 
 
-def _check_agreement(network: Network, data: LightningDataModule) -> None:
-    """Scale, frames and alpha of the data follow the network; a recording has a Bayer phase of its own."""
-    if isinstance(data, (StillScenes, FilmScenes)) and data.options["pattern"] != network.pattern:
-        raise ValueError(
-            f"data.pattern: expected {network.pattern}, as the network has it, got {data.options['pattern']}"
-        )
+def _check_agreement(model: Learner, data: LightningDataModule) -> None:
+    """Scale, frames and alpha of the data follow the model; a recording has a Bayer phase of its own."""
+    if isinstance(data, (StillScenes, FilmScenes)) and data.options["pattern"] != model.pattern:
+        got = data.options["pattern"]
+        raise ValueError(f"data.pattern: expected {model.pattern}, as the network has it, got {got}")
 
 
 def _precision(accelerator: str) -> str:
@@ -162,7 +167,7 @@ def main(args: Sequence[str] | None = None, command: type[Command] = Command) ->
 def run(args: Sequence[str] | None, command: type[Command]) -> Command:
     """Run what was typed after ``lightning``, with one of Lightning's verbs; what is wrong with it is raised."""
     return command(
-        LightningModule,
+        Learner,
         LightningDataModule,
         subclass_mode_model=True,
         subclass_mode_data=True,

@@ -2,37 +2,40 @@
 
 from __future__ import annotations
 
-from inspect import signature
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
-from pytorch_lightning import LightningModule
 from pytorch_lightning.cli import LRSchedulerCallable, OptimizerCallable
 from torch import Tensor
 
+from lightning_modules.callbacks import TestReport, ValidationPictures
+from lightning_modules.learner import Learner
 from lightning_modules.networks import ClassicalDecoder, Network
 from lightning_modules.tiles import forward_in_tiles
 from spikekit import psnr, ssim
 
 
-class CheckpointMismatchError(ValueError):
-    """A checkpoint of another network than the one of this run."""
-
-
-class SuperResolution(LightningModule):
+class SuperResolution(Learner):
     """Train a network on clips whose truth is known, judge it beside the classical decoders, run it on recordings.
 
-    Training uses the flow of the scene, where the data have it: the true one of analytic scenes, or that which the
-    frames of a film were interpolated with. Everything else uses the network's own estimator, as a recording would;
-    ``test`` shows the result with the scene's flow in a row of its own.
+    Everything but training uses the network's own estimator of motion, as a recording would; ``test`` shows the result
+    with the scene's flow in a row of its own. A checkpoint holds the weights of the estimator, too; those of another
+    kind of estimator than this run's are passed over, and this run's stay as they were built.
 
     Args:
         network: the network, such as CSCSR.
         optimizer: builds the optimizer from the parameters; the paper uses Adam at 1e-4.
         lr_scheduler: builds the schedule from the optimizer, counted in steps; the paper multiplies by 0.8 every 7500.
         tile: side of the tiles, in sensor pixels, in which ``predict`` works through a large recording; 0 for none.
+        flow: the motion that training uses. "scene" is that of the data, where they have it: the true one of analytic
+            scenes, or that which the frames of a film were interpolated with. "estimated" is that of the network's own
+            estimator, which learns as well unless it is frozen.
     """
+
+    best = ("val/psnr", "max")
+    pictures = ValidationPictures
+    report = TestReport
 
     def __init__(
         self,
@@ -40,24 +43,18 @@ class SuperResolution(LightningModule):
         optimizer: OptimizerCallable = lambda parameters: torch.optim.Adam(parameters, lr=1e-4),
         lr_scheduler: LRSchedulerCallable = lambda optimizer: torch.optim.lr_scheduler.StepLR(optimizer, 7500, 0.8),
         tile: int = 128,
+        flow: Literal["scene", "estimated"] = "scene",
     ) -> None:
-        super().__init__()
+        super().__init__(network, network.pattern, optimizer, lr_scheduler)
         if tile < 0 or tile % 2:
             raise ValueError(f"tile: expected an even number of sensor pixels, or 0 for no tiles, got {tile}")
-        self.network = network
-        self.make_optimizer = optimizer
-        self.make_lr_scheduler = lr_scheduler
+        if flow not in ("scene", "estimated"):
+            raise ValueError(f"flow: expected 'scene' or 'estimated', got {flow!r}")
         self.tile = tile
-
-    def configure_optimizers(self) -> Any:  # noqa: D102
-        optimizer = self.make_optimizer(self.network.parameters())
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": self.make_lr_scheduler(optimizer), "interval": "step"},
-        }
+        self.flow = flow
 
     def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:  # noqa: D102
-        rgb = self.network(batch["spikes"], batch.get("flow"))
+        rgb = self.network(batch["spikes"], batch.get("flow") if self.flow == "scene" else None)
         loss = F.l1_loss(rgb, batch["rgb"])
         self.log("train/loss", loss)
         self.log("train/psnr", psnr(rgb.detach(), batch["rgb"]).mean(), prog_bar=True)
@@ -88,17 +85,11 @@ class SuperResolution(LightningModule):
         """Return rgb (B, 3, s H, s W), clamped to [0, 1]."""
         return forward_in_tiles(self.network, batch["spikes"], self.tile).clamp(0, 1)
 
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:  # noqa: D102
-        checkpoint["network"] = {"class": type(self.network).__name__, **self.network.settings}
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse weights of another network: scale, say, is in no parameter, and would go unnoticed."""
-        here = {"class": type(self.network).__name__, **self.network.settings}
-        # an argument that is younger than the checkpoint had the effect of its default
-        defaults = {name: parameter.default for name, parameter in signature(type(self.network)).parameters.items()}
-        there = {**defaults, **checkpoint.get("network", here)}
-        differing = [key for key in here if here[key] != there.get(key)]
-        if differing:
-            trained = ", ".join(f"{key}={there.get(key)}" for key in differing)
-            asked = ", ".join(f"{key}={here[key]}" for key in differing)
-            raise CheckpointMismatchError(f"the checkpoint was trained with {trained}; this run asks for {asked}")
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:  # noqa: D102
+        super().on_load_checkpoint(checkpoint)
+        # estimators are exchanged freely: a network is trained with one and tested with all of them
+        weights, prefix = checkpoint["state_dict"], "network.motion."
+        ours = {f"{prefix}{name}": value for name, value in self.network.motion.state_dict().items()}
+        theirs = {name: value for name, value in weights.items() if name.startswith(prefix)}
+        if {name: value.shape for name, value in ours.items()} != {name: value.shape for name, value in theirs.items()}:
+            checkpoint["state_dict"] = {name: weights[name] for name in weights.keys() - theirs.keys()} | ours

@@ -1,0 +1,261 @@
+"""The network inside Spike2Flow: features, correlations, and three flows that are refined again and again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+class ResidualBlock(nn.Module):
+    """Two 3 x 3 convolutions with instance normalisation, and a shortcut."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int = 1) -> None:
+        super().__init__()
+        self.body = nn.Sequential(
+            nn.Conv2d(inputs, outputs, 3, stride, padding=1),
+            nn.InstanceNorm2d(outputs),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(outputs, outputs, 3, padding=1),
+            nn.InstanceNorm2d(outputs),
+            nn.ReLU(inplace=True),
+        )
+        self.shortcut = nn.Identity()
+        if stride > 1:
+            self.shortcut = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride), nn.InstanceNorm2d(outputs))
+
+    def forward(self, x: Tensor) -> Tensor:  # noqa: D102
+        return F.relu(self.shortcut(x) + self.body(x))
+
+
+class GlobalAttention(nn.Module):
+    """Every position adds what it finds at all positions that resemble it; nothing at the beginning of training.
+
+    Args:
+        width: channels that come and go.
+        values: channels of what is found; it is looked for with four times as many.
+    """
+
+    def __init__(self, width: int, values: int) -> None:
+        super().__init__()
+        self.norm = nn.InstanceNorm2d(width)
+        self.query_key = nn.Conv2d(width, 2 * 4 * values, 1, bias=False)
+        self.value = nn.Conv2d(width, values, 1, bias=False)
+        self.project = nn.Conv2d(values, width, 1, bias=False)
+        self.gain = nn.Parameter(torch.zeros(1))
+        self.temperature = values**-0.5
+
+    def forward(self, x: Tensor) -> Tensor:  # noqa: D102
+        normed = self.norm(x)
+        query, key, value = (
+            part.flatten(2).transpose(1, 2) for part in (*self.query_key(normed).chunk(2, dim=1), self.value(normed))
+        )
+        found = F.scaled_dot_product_attention(query, key, value, scale=self.temperature)
+        return x + self.gain * self.project(found.transpose(1, 2).unflatten(2, x.shape[-2:]))
+
+
+class Encoder(nn.Sequential):
+    """From a window of frames to features; every width halves the size once.
+
+    Args:
+        window: frames.
+        widths: channels of the stages.
+        blocks: residual blocks of each stage.
+        outputs: channels of the result.
+        attention: channels of the global attention, 0 for none.
+    """
+
+    def __init__(self, window: int, widths: Sequence[int], blocks: int, outputs: int, attention: int) -> None:
+        layers = [
+            nn.Conv2d(window, widths[0], 7, 2, padding=3),
+            nn.InstanceNorm2d(widths[0]),
+            nn.ReLU(inplace=True),
+        ]
+        for stage, (before, width) in enumerate(zip([widths[0], *widths], widths, strict=False)):
+            layers.append(ResidualBlock(before, width, 1 if stage == 0 else 2))
+            layers += [ResidualBlock(width, width) for _ in range(blocks - 1)]
+        layers.append(nn.Conv2d(widths[-1], outputs, 1))
+        if attention:
+            layers.append(GlobalAttention(outputs, attention))
+        super().__init__(*layers)
+
+
+class Correlation:
+    """How much the features of every pixel resemble those around where its flow points, on several scales.
+
+    Args:
+        features: of the window where the flow begins, (B, C, h, w).
+        others: of the windows where it ends, (B, K, C, h, w).
+        levels: scales, each half as fine as the one before.
+        radius: positions to each side that are looked at.
+    """
+
+    def __init__(self, features: Tensor, others: Tensor, levels: int, radius: int) -> None:
+        channels, self.height, self.width = features.shape[1:]
+        volume = torch.einsum("bcp,bkcq->bkpq", features.flatten(2), others.flatten(3)) / math.sqrt(channels)
+        level = volume.reshape(-1, 1, self.height, self.width)
+        self.pyramid = [level]
+        for _ in range(levels - 1):
+            # what is left over at the border is a pixel by itself; one pixel stays one pixel
+            level = F.avg_pool2d(level, 2, ceil_mode=True)
+            self.pyramid.append(level)
+        around = torch.arange(-radius, radius + 1, dtype=features.dtype, device=features.device)
+        self.around = torch.stack(torch.meshgrid(around, around, indexing="xy"), dim=-1)  # (k, k, 2)
+        axes = (torch.arange(n, dtype=features.dtype, device=features.device) for n in (self.width, self.height))
+        self.here = torch.stack(torch.meshgrid(*axes, indexing="xy"), dim=-1)  # (h, w, 2)
+
+    def __call__(self, flow: Tensor) -> Tensor:
+        """Look up: flow (B K, 2, h, w) to (B K, levels k k, h, w)."""
+        there = (self.here + flow.permute(0, 2, 3, 1)).reshape(-1, 1, 1, 2) + 0.5
+        found = []
+        for number, level in enumerate(self.pyramid):
+            # align_corners=False divides by the width, not by the width less one: one pixel is wide enough
+            size = there.new_tensor([level.shape[-1], level.shape[-2]])
+            grid = (there / 2**number + self.around) * (2 / size) - 1
+            picked = F.grid_sample(level, grid, "bilinear", "zeros", align_corners=False)
+            found.append(picked.reshape(len(flow), self.height, self.width, -1))
+        return torch.cat(found, dim=-1).permute(0, 3, 1, 2)
+
+
+class MotionEncoder(nn.Module):
+    """Features of a flow and of the correlations that it points to."""
+
+    def __init__(self, looked_up: int, correlation: tuple[int, int], motion: int) -> None:
+        super().__init__()
+        self.correlation = nn.Sequential(
+            nn.Conv2d(looked_up, correlation[0], 1),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(correlation[0], correlation[1], 3, padding=1),
+            nn.ReLU(inplace=True),
+        )
+        self.flow = nn.Sequential(
+            nn.Conv2d(2, motion, 7, padding=3),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(motion, motion // 2, 3, padding=1),
+            nn.ReLU(inplace=True),
+        )
+        self.both = nn.Sequential(
+            nn.Conv2d(correlation[1] + motion // 2, motion - 2, 3, padding=1), nn.ReLU(inplace=True)
+        )
+
+    def forward(self, correlation: Tensor, flow: Tensor) -> Tensor:  # noqa: D102
+        both = self.both(torch.cat([self.correlation(correlation), self.flow(flow)], dim=1))
+        return torch.cat([both, flow], dim=1)
+
+
+class SeparableGRU(nn.Module):
+    """Gated recurrent unit of convolutions: once along the rows, once along the columns."""
+
+    def __init__(self, hidden: int, inputs: int) -> None:
+        super().__init__()
+        self.gates = nn.ModuleList()
+        self.candidates = nn.ModuleList()
+        for size, padding in (((1, 5), (0, 2)), ((5, 1), (2, 0))):
+            self.gates.append(nn.Conv2d(hidden + inputs, 2 * hidden, size, padding=padding))
+            self.candidates.append(nn.Conv2d(hidden + inputs, hidden, size, padding=padding))
+
+    def forward(self, hidden: Tensor, inputs: Tensor) -> Tensor:  # noqa: D102
+        for gates, candidate in zip(self.gates, self.candidates, strict=True):
+            update, reset = gates(torch.cat([hidden, inputs], dim=1)).sigmoid().chunk(2, dim=1)
+            new = candidate(torch.cat([reset * hidden, inputs], dim=1)).tanh()
+            hidden = torch.lerp(hidden, new, update)
+        return hidden
+
+
+class RecurrentFlow(nn.Module):
+    r"""Flows from one window of frames to three later ones at equal distances, all of them refined together.
+
+    Args:
+        window: frames of a window.
+        widths: channels of the encoders' stages; the flow is refined at a size that is halved once for each.
+        blocks: residual blocks of each stage.
+        features: channels that are correlated.
+        attention: channels of the encoders' global attention, 0 for none.
+        hidden: channels of the recurrent state, and as many of context.
+        correlation: channels that the correlations are encoded with.
+        motion: channels of a flow's motion features, even.
+        head: channels in front of the flow increments and of the upsampling weights.
+        levels: scales of the correlations.
+        radius: how far they are looked up, in pixels of each scale.
+
+    Shape:
+        - Input: windows :math:`(B, 4, window, h, w)`, any h and w
+        - Output: flows :math:`(B, 3, 2, h, w)` in pixels, from the first window to the others, one for every iteration
+
+    Reference:
+        Zhao et al., Learning Optical Flow from Continuous Spike Streams, NeurIPS 2022; Teed and Deng, RAFT, ECCV 2020.
+    """
+
+    def __init__(
+        self,
+        window: int,
+        widths: Sequence[int],
+        blocks: int,
+        features: int,
+        attention: int,
+        hidden: int,
+        correlation: tuple[int, int],
+        motion: int,
+        head: int,
+        levels: int,
+        radius: int,
+    ) -> None:
+        super().__init__()
+        self.stride = 2 ** len(widths)
+        self.hidden, self.levels, self.radius = hidden, levels, radius
+        self.features = Encoder(window, widths, blocks, features, attention)
+        self.context = Encoder(window, widths, blocks, 2 * hidden, attention)
+        self.motion = MotionEncoder(levels * (2 * radius + 1) ** 2, correlation, motion)
+        self.update = SeparableGRU(hidden, hidden + 3 * motion)
+        self.heads = nn.ModuleList(_head(hidden, head, 2, 3) for _ in range(3))
+        self.mask = _head(hidden, head, 9 * self.stride**2, 1)
+
+    def forward(self, windows: Tensor, iterations: int) -> list[Tensor]:  # noqa: D102
+        batch, _, _, height, width = windows.shape
+        # two pixels of features at least: one alone has no variance to normalise
+        bottom, right = (max(-side % self.stride, 2 * self.stride - side) for side in (height, width))
+        windows = F.pad(windows.flatten(0, 1), (0, right, 0, bottom), "replicate").unflatten(0, (batch, 4))
+        features = self.features(windows.flatten(0, 1)).unflatten(0, (batch, 4))
+        hidden, context = self.context(windows[:, 0]).split(self.hidden, dim=1)
+        hidden, context = hidden.tanh(), context.relu()
+
+        correlation = Correlation(features[:, 0], features[:, 1:], self.levels, self.radius)
+        flow = hidden.new_zeros(3 * batch, 2, *hidden.shape[-2:])
+        flows = []
+        for _ in range(iterations):
+            flow = flow.detach()
+            motion = self.motion(correlation(flow), flow).unflatten(0, (batch, 3))
+            hidden = self.update(hidden, torch.cat([context, motion.flatten(1, 2)], dim=1))
+            # motion is nearly steady: what is wrong with it grows with time
+            step = torch.stack([(k + 1) * head(hidden) for k, head in enumerate(self.heads)], dim=1)
+            flow = flow + step.flatten(0, 1)
+            fine = upsample_convex(flow.unflatten(0, (batch, 3)), 0.25 * self.mask(hidden), self.stride)
+            flows.append(fine[..., :height, :width])
+        return flows
+
+
+def _head(inputs: int, width: int, outputs: int, size: int) -> nn.Sequential:
+    last = nn.Conv2d(width, outputs, size, padding=size // 2)
+    return nn.Sequential(nn.Conv2d(inputs, width, 3, padding=1), nn.ReLU(inplace=True), last)
+
+
+def upsample_convex(flow: Tensor, weights: Tensor, scale: int) -> Tensor:
+    """Bring flow to a finer grid, every fine pixel a weighted mean of the nine coarse ones around it.
+
+    Args:
+        flow: (B, K, 2, h, w), in coarse pixels.
+        weights: (B, 9 scale scale, h, w), before the softmax over the nine.
+        scale: how much finer.
+
+    Returns:
+        (B, K, 2, scale h, scale w), in fine pixels.
+    """
+    batch, count, _, height, width = flow.shape
+    around = F.unfold(F.pad(flow.flatten(1, 2), (1, 1, 1, 1), "replicate"), 3)
+    around = around.reshape(batch, count * 2, 9, 1, height, width)
+    weights = weights.reshape(batch, 1, 9, scale**2, height, width).softmax(dim=2)
+    fine = scale * (around * weights).sum(dim=2)
+    return F.pixel_shuffle(fine.flatten(1, 2), scale).unflatten(1, (count, 2))
