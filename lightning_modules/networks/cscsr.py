@@ -201,9 +201,8 @@ class CSCSR(Network):
             raise ValueError(f"spikes: expected {expected}, got {tuple(spikes.shape)}")
         batch, _, height, width = spikes.shape
         spikes = spikes.to(self.reconstruction.rgb.weight.dtype)
-        if flow is None and self.search:
-            flow = self.estimate_flow(spikes)
-        if flow is not None and flow.shape not in ((batch, 2, 2, height, width), (batch, 3, 2, 2, height, width)):
+        flow = self.estimate_flow(spikes) if flow is None else flow
+        if flow.shape not in ((batch, 2, 2, height, width), (batch, 3, 2, 2, height, width)):
             expected = f"{(batch, 2, 2, height, width)} or {(batch, 3, 2, 2, height, width)}"
             raise ValueError(f"flow: expected {expected}, got {tuple(flow.shape)}")
         planes = split_colors(spikes, self.pattern)

@@ -354,6 +354,16 @@ def test_colours_help_each_other_except_in_h(letter, apart, configs):
         assert changed == ([n == color for n in range(3)] if apart else [True] * 3)
 
 
+def test_h_is_three_reconstructions_side_by_side():
+    module = SeparateColors(4, stages=2, blocks=1, end_blocks=3).double()
+    colors = list(torch.randn(3, 1, 4, 6, 6, dtype=torch.float64))
+    for n, channel in enumerate(module(colors).split(1, dim=1)):
+        refined = module.refine[n](colors[n])
+        refined = refined + module.end[n](refined)
+        one = torch.nn.functional.conv2d(refined, module.rgb.weight[n : n + 1], module.rgb.bias[n : n + 1], padding=1)
+        torch.testing.assert_close(channel, one)
+
+
 @pytest.mark.parametrize("end_blocks", [1, 3, 4])
 def test_the_reconstructions_have_equally_many_residual_blocks(end_blocks, configs):
     counts = {
