@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NoReturn
 
@@ -137,6 +138,8 @@ def sweep(args: Sequence[str]) -> None:
     budget = {"steps": asked.steps, "seconds": asked.time, "flops": asked.flops}
     budget = {name: value for name, value in budget.items() if value is not None}
     trials = make_trials(configs, asked.over, asked.set, asked.seeds, budget, asked.output)
+    if asked.engine == "ray" and find_spec("ray") is None:
+        raise InputError("sweep: --engine ray: Ray is not installed; pip install 'spikekit[ray]' brings it")
     with _locked(asked.output):
         for trial in trials:
             trial.write()

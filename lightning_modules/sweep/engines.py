@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from lightning_modules.cli import InputError
 from lightning_modules.sweep.state import LOG
 
 _A_MOMENT = 0.2  # seconds
@@ -55,14 +54,9 @@ def run_on_ray(folders: Sequence[Path], jobs: int | None, every: float) -> Itera
         folders: of the trials.
         jobs: trials at once; as many as there are GPUs, or else nodes, if ``None``.
         every: seconds between two checkpoints.
-
-    Raises:
-        InputError: Ray is not installed.
     """
-    try:
-        import ray
-    except ImportError as error:
-        raise InputError("--engine ray: Ray is not installed; pip install 'spikekit[ray]' brings it") from error
+    import ray
+
     ray.init(log_to_driver=False, include_dashboard=False, logging_level="ERROR")
     try:
         share = _share([node["Resources"] for node in ray.nodes() if node["Alive"]], jobs)

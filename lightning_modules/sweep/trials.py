@@ -166,7 +166,8 @@ def _reason(message: str) -> str:
         line for line in lines if not re.match(r"\s*(- Expected a <class 'NoneType'>|Given value|.*arser key)", line)
     ]
     deepest = max(inner or lines, key=lambda line: len(line) - len(line.lstrip()))
-    return ".".join(where) + (": " if where else "") + deepest.strip().removeprefix("- ")
+    deepest = re.sub(r'^- |[Pp]arser key "[^"]+":\s*', "", deepest.strip())
+    return ".".join(where) + (": " if where else "") + deepest
 
 
 def _suggestion(unknown: Sequence[str], names: Sequence[str]) -> str:

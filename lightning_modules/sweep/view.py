@@ -36,7 +36,8 @@ class View:
         """Say once how a trial ended."""
         why = self.failed.get(trial.folder)
         if why is None:
-            what = f"done, {_scores(own_scores(read_json(trial.folder / RESULT)))}"
+            scores = own_scores(read_json(trial.folder / RESULT))
+            what = "done, " + _scores({name: value for name, value in scores.items() if "," not in name})
         else:
             what = f"FAILED: {why} ({trial.folder / 'log.txt'})"
         self._print(f"{trial.folder.name:{self.width}}  {what}")
@@ -82,7 +83,7 @@ class View:
         done = sum((trial.folder / RESULT).is_file() for trial in self.trials)
         share = sum(map(self._done, self.trials))
         passed, gained = time.monotonic() - self._began, share - self._share
-        left = f", {_duration(passed / gained * (len(self.trials) - share))} left" if gained > 0.01 else ""
+        left = f", {_duration(passed / gained * (len(self.trials) - share))} left" if gained > 0.1 else ""
         failed = f", {len(self.failed)} failed" if self.failed else ""
         return f"{done} of {len(self.trials)} trials done{failed}, {running} running{left}"
 
