@@ -146,7 +146,9 @@ class FlowInterpolation:
         the same pictures, bit for bit.
 
     Args:
-        shrink: how many times smaller the pictures are that flow is estimated on; faster, but less accurate.
+        shrink: how many times smaller the pictures are that flow is estimated on. 2 takes a quarter of the time of 1
+            and makes the frames of two films as well, within 0.1 dB; small objects in front lose up to 0.8 dB
+            (``python -m spikekit.bench.interpolation``).
 
     Raises:
         ValueError: ``shrink`` is not a whole number, 1 or more.
@@ -167,7 +169,7 @@ class FlowInterpolation:
         Le Besnerais and Champagnat, Dense optical flow by iterative local window registration, ICIP 2005.
     """
 
-    def __init__(self, shrink: int = 1) -> None:
+    def __init__(self, shrink: int = 2) -> None:
         self.shrink = check_whole("shrink", shrink)
 
     @torch.no_grad()

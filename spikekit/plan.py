@@ -243,7 +243,8 @@ def profile_interval(
         alpha: light of a white pixel per clock.
         clocks: T, clocks of the interval.
         tolerance: share of the spikes that may change.
-        motion: what finds it, a call like that of an interpolation; :class:`spikekit.FlowInterpolation` by default.
+        motion: what finds it, a call like that of an interpolation; ``FlowInterpolation(shrink=1)`` by default, because
+            Bayer cells are small already.
 
     Returns:
         The profile of the interval.
@@ -274,7 +275,7 @@ def profile_interval(
     small = torch.stack([F.avg_pool2d(frame, scale)[(..., *part)] for frame in (first, second)])
     gain = ((small[1] + _BLACK) / (small[0] + _BLACK)).mean(0)[moving].median()
     cells = F.avg_pool2d(small, 2)
-    found = (motion or FlowInterpolation())(cells[0], (cells[1] / gain).clamp(0, 1))
+    found = (motion or FlowInterpolation(shrink=1))(cells[0], (cells[1] / gain).clamp(0, 1))
     lost = SceneProfile(
         size, clocks, brightness, 1 - moving.sum().item() / ends[0].numel(), region, math.inf, math.inf, math.inf
     )

@@ -24,7 +24,7 @@ METHODS: dict[str, Callable[[Tensor, Tensor], Between]] = {
     "nearest": Still(),
     "blend": Blend(),
     "flow": FlowInterpolation(),
-    "flow, shrink 2": FlowInterpolation(shrink=2),
+    "flow, shrink 1": FlowInterpolation(shrink=1),
 }
 
 #: Displacements between the two frames, in pixels.

@@ -239,7 +239,7 @@ def test_cached_clips_equal_fresh_ones(film, tmp_path, simulated):
         {"flow_times": (5, 34)},
         {"flow": False},
         {"noise": SensorNoise(photons=100)},
-        {"interpolation": FlowInterpolation(shrink=2)},
+        {"interpolation": FlowInterpolation(shrink=1)},
         {"seed": 1},
     ],
     ids=lambda changed: next(iter(changed)),

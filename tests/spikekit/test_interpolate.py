@@ -132,7 +132,7 @@ def test_the_simple_ones():
 @pytest.mark.parametrize("tau", [0.25, 0.5, 0.8])
 def test_known_translation(x, y, tau):
     scene = panning(x, y)
-    between = FlowInterpolation()(*ends(scene))
+    between = FlowInterpolation(shrink=1)(*ends(scene))
     truth = scene.rgb(20 * tau)
     blend = psnr(Blend()(*ends(scene)).at(tau), truth)
     made = psnr(between.at(tau), truth)
