@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -96,9 +97,9 @@ class Command(LightningCLI):
             self.datamodule.setup(self.subcommand)
             _check_agreement(self.model, self.datamodule)
         except (OSError, ValueError) as error:
-            # jsonargparse wraps what a class of a class says into a page about its own types
-            said = error.__cause__ if "Union subtypes" in str(error) and error.__cause__ else error
-            raise InputError(str(said)) from error
+            # jsonargparse wraps what a class of a class says into pages about its own types
+            said = re.search(r"^ *- (?!Does not validate|Expected a )(.*)$", str(error), re.MULTILINE)
+            raise InputError(said[1] if said else str(error)) from error
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """Send everything to one folder, and use bfloat16 on a GPU that has it."""
@@ -133,10 +134,13 @@ class Command(LightningCLI):
 
 
 def _check_agreement(model: Learner, data: LightningDataModule) -> None:
-    """Scale, frames and alpha of the data follow the model; a recording has a Bayer phase of its own."""
-    if isinstance(data, (StillScenes, FilmScenes)) and data.options["pattern"] != model.pattern:
-        got = data.options["pattern"]
-        raise ValueError(f"data.pattern: expected {model.pattern}, as the network has it, got {got}")
+    """What is not linked, because more than one kind of model has it; a recording has a Bayer phase of its own."""
+    if not isinstance(data, (StillScenes, FilmScenes)):
+        return
+    for name, expected in model.needs.items():
+        got = data.options[name]
+        if got != expected:
+            raise ValueError(f"data.{name}: expected {expected}, as the model has it, got {got}")
 
 
 def _precision(accelerator: str) -> str:

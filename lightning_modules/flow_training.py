@@ -48,12 +48,14 @@ class FlowTraining(Learner):
         optimizer: OptimizerCallable = lambda parameters: torch.optim.AdamW(parameters, lr=1e-3),
         lr_scheduler: LRSchedulerCallable = lambda optimizer: torch.optim.lr_scheduler.StepLR(optimizer, 7500, 0.8),
     ) -> None:
-        super().__init__(network, bayer_pattern(pattern), optimizer, lr_scheduler)
+        first, last = window // 2, frames - 1 - window // 2
+        needs = {"pattern": bayer_pattern(pattern), "frames": frames, "flow_times": (first, last)}
+        super().__init__(network, needs, optimizer, lr_scheduler)
         if frames % 2 == 0 or window % 2 == 0 or not 1 <= window < frames:
             raise ValueError(f"frames, window: expected odd numbers, window below frames, got {frames}, {window}")
         if not any(parameter.requires_grad for parameter in network.parameters()):
             raise ValueError("network: expected one that learns, got a frozen one")
-        self.times = window // 2, frames // 2, frames - 1 - window // 2
+        self.pattern, self.times = needs["pattern"], (first, frames // 2, last)
 
     def forward(self, spikes: Tensor) -> Tensor:
         """Estimate the joint flows to the first and to the last time point, (B, 2, 2, H, W)."""

@@ -19,7 +19,7 @@ class Learner(LightningModule):
 
     Args:
         network: what learns; its ``settings`` say, as plain values, what it was built with.
-        pattern: Bayer phase of the data that it learns from.
+        needs: options of the data, by name, that must be as they are here.
         optimizer: builds the optimizer from the parameters.
         lr_scheduler: builds the schedule from the optimizer, counted in steps.
     """
@@ -32,11 +32,11 @@ class Learner(LightningModule):
     report: ClassVar[type[Callback]]
 
     def __init__(
-        self, network: nn.Module, pattern: str, optimizer: OptimizerCallable, lr_scheduler: LRSchedulerCallable
+        self, network: nn.Module, needs: dict[str, Any], optimizer: OptimizerCallable, lr_scheduler: LRSchedulerCallable
     ) -> None:
         super().__init__()
         self.network = network
-        self.pattern = pattern
+        self.needs = needs
         self.make_optimizer = optimizer
         self.make_lr_scheduler = lr_scheduler
 

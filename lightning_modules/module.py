@@ -45,7 +45,7 @@ class SuperResolution(Learner):
         tile: int = 128,
         flow: Literal["scene", "estimated"] = "scene",
     ) -> None:
-        super().__init__(network, network.pattern, optimizer, lr_scheduler)
+        super().__init__(network, {"pattern": network.pattern}, optimizer, lr_scheduler)
         if tile < 0 or tile % 2:
             raise ValueError(f"tile: expected an even number of sensor pixels, or 0 for no tiles, got {tile}")
         if flow not in ("scene", "estimated"):

@@ -28,7 +28,7 @@ class Spike2Flow(MotionEstimator):
     The defaults are a small size of this project, because the network runs eight times a clip. The paper's is::
 
         Spike2Flow(window=21, widths=(64, 96, 128), blocks=2, features=216, attention=128, hidden=128,
-                   correlation=(196, 160), motion=96, head=196, levels=3, iterations=8)
+                   correlation=(196, 160), motion=96, head=196, levels=3, radius=3, iterations=8)
 
     with 6,501,830 parameters, those that the authors count less the 101,888 that nothing depends on.
 
@@ -68,17 +68,17 @@ class Spike2Flow(MotionEstimator):
     def __init__(
         self,
         window: int = 11,
-        widths: Sequence[int] = (32, 48),
+        widths: Sequence[int] = (24,),
         blocks: int = 1,
-        features: int = 48,
+        features: int = 32,
         attention: int = 0,
-        hidden: int = 32,
-        correlation: tuple[int, int] = (48, 32),
+        hidden: int = 24,
+        correlation: tuple[int, int] = (32, 24),
         motion: int = 16,
-        head: int = 32,
+        head: int = 24,
         levels: int = 2,
-        radius: int = 3,
-        iterations: int = 4,
+        radius: int = 2,
+        iterations: int = 3,
         weights: str | Path | None = None,
         frozen: bool = False,
     ) -> None:
@@ -86,7 +86,9 @@ class Spike2Flow(MotionEstimator):
         sizes = [*widths, blocks, features, hidden, *correlation, head, levels, radius, iterations]
         if window < 1 or window % 2 == 0:
             raise ValueError(f"window: expected an odd number of frames, got {window}")
-        if not widths or min(sizes) < 1 or attention < 0:
+        if attention < 0:
+            raise ValueError(f"attention: expected 0 or more channels, got {attention}")
+        if not widths or min(sizes) < 1:
             raise ValueError(
                 "widths, blocks, features, hidden, correlation, head, levels, radius, iterations: expected 1 or more "
                 f"of each, got {', '.join(map(str, sizes))}"
@@ -141,7 +143,7 @@ class Spike2Flow(MotionEstimator):
             dim=2,
         )
         # large clips bit by bit: correlations of all pixels with all pixels
-        positions = windows.shape[-2] * windows.shape[-1] // self.network.stride**2
+        positions = 1 + windows.shape[-2] * windows.shape[-1] // self.network.stride**2
         few = max(1, _CORRELATIONS // (4 * positions**2))
         with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):
             parts = [self.network(part, self.iterations) for part in windows.flatten(0, 2).split(few)]

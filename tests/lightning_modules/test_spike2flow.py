@@ -1,0 +1,321 @@
+import pytest
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from lightning_modules.motion import Spike2Flow
+from lightning_modules.motion.recurrent import Correlation, GlobalAttention, SeparableGRU, upsample_convex
+from lightning_modules.networks import CSCSR
+from spikekit import spike_interval, split_bayer, upsample_flow
+
+TIMES = (5, 20, 35)
+TINY = {
+    "widths": (4, 6),
+    "features": 4,
+    "hidden": 4,
+    "correlation": (4, 4),
+    "motion": 4,
+    "head": 4,
+    "iterations": 2,
+}
+PAPER = {
+    "window": 21,
+    "widths": (64, 96, 128),
+    "blocks": 2,
+    "features": 216,
+    "attention": 128,
+    "hidden": 128,
+    "correlation": (196, 160),
+    "motion": 96,
+    "head": 196,
+    "levels": 3,
+    "radius": 3,
+    "iterations": 8,
+}
+
+
+def clip(batch=1, height=16, width=20, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return (torch.rand(batch, 41, height, width, generator=generator) < 0.3).to(torch.uint8)
+
+
+def test_size_of_the_paper():
+    with torch.device("meta"):
+        network = Spike2Flow(**PAPER)
+    assert sum(p.numel() for p in network.parameters()) == 6_603_718 - 101_888
+    assert Spike2Flow.__doc__.count("6,501,830") == 1
+
+
+def test_work_of_the_default_size():
+    network = Spike2Flow()
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        network(clip(1, 48, 48), TIMES, "RGGB")
+    assert counter.get_total_flops() / 2 / 48**2 < 0.3e6
+
+
+@pytest.mark.parametrize("size", [(6, 6), (7, 13), (9, 6), (23, 24), (40, 40), (2, 3)])
+@pytest.mark.parametrize("value", [None, 0, 1])
+def test_any_size_and_any_spikes_without_nan(size, value):
+    network = Spike2Flow(**{**TINY, "levels": 4, "attention": 4})
+    with torch.no_grad():
+        network.network.features[-1].gain.fill_(1.0)
+    spikes = clip(2, *size)
+    spikes = spikes if value is None else torch.full_like(spikes, value)
+    flows = network(spikes, TIMES, "RGGB")
+    sites = network.channel_flows(spikes, TIMES, "RGGB")
+    for flow, site in zip(flows, sites, strict=True):
+        assert flow.shape == (2, 2, *size)
+        assert site.shape == (4, 2, 2, *((side + 1) // 2 for side in size))
+        assert flow.isfinite().all()
+    sum(flow.square().sum() for flow in flows).backward()
+    assert all(p.grad.isfinite().all() for p in network.parameters())
+
+
+class Known(torch.nn.Module):
+    """In place of the network: what it was given, and a flow of one, two and three cells by three times as many."""
+
+    stride = 4
+
+    def forward(self, windows, iterations):
+        self.windows = windows
+        flow = torch.tensor([1.0, 2, 3])[:, None] * torch.tensor([1.0, 3.0])
+        flow = flow.reshape(1, 3, 2, 1, 1).expand(len(windows), 3, 2, *windows.shape[-2:])
+        # the streams backwards in time have even places
+        sign = torch.tensor([-1.0, 1.0]).repeat(len(windows) // 2).reshape(-1, 1, 1, 1, 1)
+        return [0 * flow, sign * flow]
+
+
+def test_flow_is_that_of_the_last_iteration_and_of_the_farthest_window_in_sensor_pixels():
+    estimator = Spike2Flow(**TINY)
+    estimator.network = Known()
+    estimator.register_parameter("dtype", torch.nn.Parameter(torch.zeros(1)))
+    spikes = clip(3, 10, 7)
+    to_first, to_last = estimator(spikes, TIMES, "GRBG")
+    expected = torch.tensor([2 * 3.0, 2 * 9.0]).reshape(1, 2, 1, 1).expand(3, 2, 10, 7)
+    assert to_last.equal(expected)
+    assert to_first.equal(-expected)
+
+
+@pytest.mark.parametrize("window", [11, 21])
+def test_windows_are_those_of_intervals_around_the_times(window):
+    estimator = Spike2Flow(**{**TINY, "window": window})
+    estimator.network = Known()
+    estimator.register_parameter("dtype", torch.nn.Parameter(torch.zeros(1)))
+    spikes = clip(2, 8, 6)
+    estimator(spikes, TIMES, "GBRG")
+    seen = estimator.network.windows.unflatten(0, (4, 2, 2))
+    for direction, stream in enumerate((spikes.flip(1), spikes)):
+        sites = spike_interval(split_bayer(stream, "GBRG"))
+        for number, center in enumerate((20, 25, 30, 35)):
+            frames = [min(center + offset, 40) for offset in range(-(window // 2), window // 2 + 1)]
+            assert seen[:, :, direction, number].equal(sites[:, :, frames].float())
+
+
+def test_time_reversed_swaps_the_flows():
+    estimator = Spike2Flow(**TINY)
+    spikes = clip(2)
+    to_first, to_last = estimator(spikes, (5, 19, 34), "RGGB")
+    first, last = estimator(spikes.flip(1), (40 - 34, 40 - 19, 40 - 5), "RGGB")
+    torch.testing.assert_close(first, to_last)
+    torch.testing.assert_close(last, to_first)
+    assert not torch.allclose(to_first, to_last)
+
+
+def test_flow_of_a_clip_is_the_same_alone_and_among_others():
+    estimator = Spike2Flow(**TINY)
+    spikes = clip(3)
+    together = estimator(spikes, TIMES, "RGGB")
+    alone = estimator(spikes[1:2], TIMES, "RGGB")
+    for flows, flow in zip(together, alone, strict=True):
+        torch.testing.assert_close(flows[1:2], flow, rtol=1e-4, atol=1e-5)
+
+
+def test_large_clips_bit_by_bit(monkeypatch):
+    estimator = Spike2Flow(**TINY)
+    spikes = clip(2)
+    whole = estimator(spikes, TIMES, "RGGB")
+    monkeypatch.setattr("lightning_modules.motion.spike2flow._CORRELATIONS", 1)
+    for flow, expected in zip(estimator(spikes, TIMES, "RGGB"), whole, strict=True):
+        torch.testing.assert_close(flow, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_every_parameter_learns():
+    estimator = Spike2Flow(**{**TINY, "attention": 4, "blocks": 2})
+    with torch.no_grad():
+        for encoder in (estimator.network.features, estimator.network.context):
+            encoder[-1].gain.fill_(0.5)  # nothing passes at the beginning
+    flows = estimator.refinements(clip(), TIMES, "RGGB")
+    sum((flow - 1).abs().mean() for flow in flows).backward()
+    for name, parameter in estimator.named_parameters():
+        before_norm = name.endswith("bias") and parameter.grad.abs().max() < 1e-6  # a bias that is normalised away
+        assert before_norm or parameter.grad.abs().sum() > 0, name
+    assert sum(p.grad.abs().sum() > 1e-6 for p in estimator.parameters()) > 40
+
+
+def test_correlation_against_brute_force():
+    generator = torch.Generator().manual_seed(0)
+    here = torch.randn(2, 5, 6, 7, generator=generator, dtype=torch.float64)
+    there = torch.randn(2, 3, 5, 6, 7, generator=generator, dtype=torch.float64)
+    flow = torch.randn(6, 2, 6, 7, generator=generator, dtype=torch.float64) * 2
+    found = Correlation(here, there, levels=1, radius=1)(flow).unflatten(0, (2, 3))
+    assert found.shape == (2, 3, 9, 6, 7)
+    for b, k, y, x in ((0, 0, 0, 0), (1, 2, 3, 4), (0, 1, 5, 6)):
+        u, v = flow.unflatten(0, (2, 3))[b, k, :, y, x].tolist()
+        for number, (dy, dx) in enumerate((dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)):
+            picked = sum(
+                max(0, 1 - abs(x + u + dx - j)) * max(0, 1 - abs(y + v + dy - i)) * there[b, k, :, i, j]
+                for i in range(6)
+                for j in range(7)
+            )
+            expected = (here[b, :, y, x] * picked).sum() / 5**0.5
+            assert found[b, k, number, y, x].item() == pytest.approx(float(expected), abs=1e-9)
+
+
+def test_coarse_correlations_are_centred_on_the_same_point():
+    """A correlation that grows steadily across the picture is found alike on every scale."""
+    here = torch.ones(1, 1, 16, 16)
+    there = torch.arange(16.0).expand(1, 1, 1, 16, 16)
+    found = Correlation(here, there, levels=3, radius=1)(torch.full((1, 2, 16, 16), 0.5)).reshape(3, 9, 16, 16)
+    centre = found[:, 4, 6:10, 6:10]
+    torch.testing.assert_close(centre, (torch.arange(6.0, 10) + 0.5).expand(3, 4, 4))
+    torch.testing.assert_close(found[:, 5, 8, 8] - found[:, 4, 8, 8], torch.tensor([1.0, 2, 4]))  # x is the inner one
+
+
+def test_convex_upsampling():
+    generator = torch.Generator().manual_seed(0)
+    flow = torch.randn(2, 3, 2, 4, 5, generator=generator)
+    fine = upsample_convex(flow, torch.randn(2, 9 * 16, 4, 5, generator=generator), 4)
+    assert fine.shape == (2, 3, 2, 16, 20)
+    constant = upsample_convex(torch.ones(1, 3, 2, 4, 5), torch.randn(1, 9 * 4, 4, 5, generator=generator), 2)
+    torch.testing.assert_close(constant, torch.full_like(constant, 2.0))  # at the border as well
+    only_itself = torch.zeros(2, 9, 16, 4, 5)
+    only_itself[:, 4] = 100
+    nearest = upsample_convex(flow, only_itself.flatten(1, 2), 4)
+    torch.testing.assert_close(nearest, 4 * flow.repeat_interleave(4, -1).repeat_interleave(4, -2))
+    right = torch.zeros(2, 9, 4, 4, 5)
+    right[:, 5, 1] = 200  # the second of the four fine pixels, from the coarse one to the right
+    moved = upsample_convex(flow, right.flatten(1, 2), 2)[..., ::2, 1::2]
+    torch.testing.assert_close(moved[..., :-1], 2 * flow[..., 1:])
+
+
+def test_recurrent_unit_keeps_its_state_where_the_gate_is_shut():
+    unit = SeparableGRU(3, 2)
+    hidden, inputs = torch.randn(1, 3, 4, 5), torch.randn(1, 2, 4, 5)
+    for gates in unit.gates:
+        torch.nn.init.zeros_(gates.weight)
+        torch.nn.init.constant_(gates.bias, -100.0)
+    torch.testing.assert_close(unit(hidden, inputs), hidden)
+    for gates in unit.gates:
+        torch.nn.init.constant_(gates.bias, 100.0)
+    assert not torch.allclose(unit(hidden, inputs), hidden)
+
+
+def test_attention_against_brute_force():
+    attention = GlobalAttention(3, 2).double()
+    x = torch.randn(1, 3, 2, 4, dtype=torch.float64)
+    assert attention(x).equal(x)
+    attention.gain.data.fill_(0.5)
+    normed = torch.nn.functional.instance_norm(x).flatten(2)[0].T
+    query, key = (normed @ attention.query_key.weight[part, :, 0, 0].T for part in (slice(8), slice(8, 16)))
+    weights = (query @ key.T / 2**0.5).softmax(dim=1)
+    found = weights @ (normed @ attention.value.weight[..., 0, 0].T) @ attention.project.weight[..., 0, 0].T
+    torch.testing.assert_close(attention(x), x + 0.5 * found.T.reshape(1, 3, 2, 4))
+
+
+def test_iterations_may_change_after_training():
+    estimator = Spike2Flow(**TINY)
+    flows = estimator.refinements(clip(), TIMES, "RGGB")
+    estimator.iterations = 1
+    assert len(flows) == 2
+    torch.testing.assert_close(estimator.refinements(clip(), TIMES, "RGGB")[0], flows[0])
+
+
+def checkpoint(path, estimator, **changes):
+    weights = {f"network.{name}": value for name, value in estimator.state_dict().items()}
+    content = {"state_dict": weights, "network": {"class": "Spike2Flow", **estimator.settings}}
+    torch.save({**content, **changes}, path)
+    return path
+
+
+@pytest.mark.parametrize("frozen", [True, False])
+def test_weights_plug_into_cscsr(frozen, tmp_path):
+    torch.manual_seed(1)
+    trained = Spike2Flow(**TINY)
+    path = checkpoint(tmp_path / "flow.ckpt", trained)
+    estimator = Spike2Flow(**{**TINY, "iterations": 1}, weights=path, frozen=frozen)
+    trained.iterations = 1
+    network = CSCSR(2, width=4, representation_width=4, features=1, stages=1, end_blocks=1, motion=estimator)
+    network.train()
+    spikes = clip(1, 12, 12)
+    flow = network.estimate_flow(spikes)
+    torch.testing.assert_close(flow, torch.stack(trained(spikes, TIMES, "RGGB"), dim=1))
+    network(spikes).square().mean().backward()
+    grads = [p.grad for p in estimator.parameters()]
+    if frozen:
+        assert not flow.requires_grad
+        assert all(grad is None for grad in grads)
+        assert not any(p.requires_grad for p in estimator.parameters())
+    else:
+        assert all(grad is not None for grad in grads)
+        assert any(grad.abs().sum() > 0 for grad in grads)
+
+
+def test_files_that_hold_no_weights_for_it(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nowhere.ckpt: no such checkpoint"):
+        Spike2Flow(weights=tmp_path / "nowhere.ckpt")
+    damaged = checkpoint(tmp_path / "damaged.ckpt", Spike2Flow(**TINY))
+    damaged.write_bytes(damaged.read_bytes()[:-2000])
+    with pytest.raises(ValueError, match=r"damaged.ckpt: not a checkpoint"):
+        Spike2Flow(**TINY, weights=damaged)
+    other = checkpoint(tmp_path / "other.ckpt", Spike2Flow(**TINY))
+    with pytest.raises(ValueError, match=r"other.ckpt: was trained with hidden=4; this network has hidden=6"):
+        Spike2Flow(**{**TINY, "hidden": 6}, weights=other)
+    short = checkpoint(tmp_path / "short.ckpt", Spike2Flow(**TINY), state_dict={})
+    with pytest.raises(ValueError, match=r"short.ckpt: weights that do not fit"):
+        Spike2Flow(**TINY, weights=short)
+
+    class Harmful:
+        def __reduce__(self):
+            return print, ("this must not run",)
+
+    torch.save({"network": Harmful()}, tmp_path / "harmful.ckpt")
+    with pytest.raises(ValueError, match=r"harmful.ckpt: not a checkpoint") as raised:
+        Spike2Flow(weights=tmp_path / "harmful.ckpt")
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"window": 10}, "window: expected an odd number of frames, got 10"),
+        ({"widths": ()}, "widths"),
+        ({"motion": 3}, "motion: expected an even number"),
+        ({"iterations": 0}, "iterations"),
+        ({"attention": -1}, "attention"),
+    ],
+)
+def test_wrong_arguments(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Spike2Flow(**{**TINY, **arguments})
+
+
+def test_wrong_input():
+    with pytest.raises(ValueError, match=r"spikes: expected a non-empty tensor of shape \(B, N, H, W\)"):
+        Spike2Flow(**TINY)(torch.zeros(41, 8, 8), TIMES, "RGGB")
+
+
+def test_bfloat16_is_close_and_gives_float32():
+    estimator, spikes = Spike2Flow(**TINY), clip(1, 24, 24)
+    with torch.no_grad():
+        exact = estimator(spikes, TIMES, "RGGB")[1]
+        with torch.autocast("cpu", torch.bfloat16):
+            half = estimator(spikes, TIMES, "RGGB")[1]
+    assert half.dtype == torch.float32
+    assert (half - exact).abs().max() < 0.2 * exact.abs().max()
+
+
+def test_phase_of_the_joint_flow():
+    """Flow that the sites see at their own places, and that grows across the sensor, comes out where it was."""
+    x = torch.arange(16.0).expand(1, 1, 16, 16)
+    sites = split_bayer(torch.cat([x, 0 * x], dim=1), "GRBG") / 2
+    joint = upsample_flow(sites.mean(dim=0), 2)
+    torch.testing.assert_close(joint[0, 0, :, 2:-2], x[0, 0, :, 2:-2])
