@@ -61,7 +61,7 @@ def own_scores(result: dict[str, Any]) -> dict[str, float]:
         method = next(iter(metrics), "")
     scores = dict(metrics.get(method, {}))
     for other, values in metrics.items():
-        if method and other.startswith(f"{method}, "):
+        if other.startswith(f"{method}, "):
             scores |= {f"{name}{other.removeprefix(method)}": value for name, value in values.items()}
     return scores
 
@@ -102,6 +102,7 @@ def differences(row: Row, other: Row, name: str) -> list[float]:
 def markdown(rows: Sequence[Row]) -> str:
     """Return the table as Markdown."""
     names = _score_names(rows)
+    names = [name for name in names if "," not in name or name.startswith(names[0])]
     settings = _differing(rows)
     papers = any(row.paper is not None for row in rows)
     compared = list(dict.fromkeys(reference(row, rows).variant for row in rows))
@@ -134,7 +135,9 @@ def markdown(rows: Sequence[Row]) -> str:
     text.append(
         "Means over seeds ± sample standard deviation; differences seed by seed. The weights tested are the last."
     )
-    text += [f"\n{row.variant}, seed {seed}, failed: {why}" for row in rows for seed, why in row.failed.items()]
+    for row in rows:
+        for seed, why in row.failed.items():
+            text.append(f"\n{row.variant}{'' if seed is None else f', seed {seed}'}, failed: {why}")
     unfinished = sum(len(row.trials) - len(row.results) - len(row.failed) for row in rows)
     text += [f"\nNot finished: {unfinished} trials."] if unfinished else []
     for method, scores in _others(rows).items():
@@ -195,11 +198,10 @@ def _others(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     found = [result for row in rows for result in row.results.values()]
     if not found:
         return {}
-    methods = {method: scores for method, scores in found[0]["metrics"].items() if method}
     networks = [result["method"] or "" for result in found]
     return {
         method: scores
-        for method, scores in methods.items()
+        for method, scores in found[0]["metrics"].items()
         if not any(name and method.startswith(name) for name in networks)
         and all(result["metrics"].get(method) == scores for result in found)
     }

@@ -48,9 +48,10 @@ class View:
         if self.live:
             columns = shutil.get_terminal_size().columns - 1
             lines = [f"{trial.folder.name:{self.width}}  {_standing(progress)}" for trial, progress in running]
+            lines.append(self._summary(len(running)))
             self._clear()
-            print(*(line[:columns] for line in [*lines, self._summary(len(running))]), sep="\n", flush=True)  # noqa: T201
-            self._drawn = len(lines) + 1
+            print(*(line[:columns] for line in lines), sep="\n", flush=True)  # noqa: T201
+            self._drawn = len(lines)
             return
         for trial, progress in running:
             if time.monotonic() - self._said[trial.folder] > _EVERY:

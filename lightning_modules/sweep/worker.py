@@ -77,7 +77,6 @@ class Report(Callback):
 
     def on_test_end(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
         self.parameters = sum(parameter.numel() for parameter in module.parameters())
-        self.metrics = {name: value.item() for name, value in trainer.callback_metrics.items()}
 
     def state_dict(self) -> dict[str, Any]:  # noqa: D102
         return {"steps": self.steps, "seconds": self.seconds}
@@ -197,7 +196,7 @@ def _result(folder: Path, last: Path, report: Report) -> dict[str, Any]:
     network = checkpoint.get("network", {})
     optimizer = checkpoint["optimizer_states"][0]["param_groups"][0]
     return {
-        "metrics": _metrics(folder / "test.csv", report),
+        "metrics": _metrics(folder / "test.csv"),
         "method": network.get("class"),
         "steps": checkpoint["global_step"],
         "seconds_per_step": report.seconds / report.steps if report.steps else None,
@@ -211,10 +210,10 @@ def _result(folder: Path, last: Path, report: Report) -> dict[str, Any]:
     }
 
 
-def _metrics(path: Path, report: Report) -> dict[str, dict[str, float]]:
-    """Return the means of a test by method; of what the module logged, where the test wrote no table."""
+def _metrics(path: Path) -> dict[str, dict[str, float]]:
+    """Return the means of a test by method."""
     if not path.is_file():
-        return {"": report.metrics}
+        return {}  # a module whose test writes no table
     with open(path, newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["clip"] == "mean"]
     return {
