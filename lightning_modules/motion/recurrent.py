@@ -9,6 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+_ALL_PAIRS = 1600  # most pixels that are correlated with each other; beyond, looking up is faster and takes less memory
+
 
 class ResidualBlock(nn.Module):
     """Two 3 x 3 convolutions with instance normalisation, and a shortcut."""
@@ -86,6 +88,9 @@ class Encoder(nn.Sequential):
 class Correlation:
     """How much the features of every pixel resemble those around where its flow points, on several scales.
 
+    Small pictures are correlated once, all pixels with all pixels; in large ones only what is looked up is. Both give
+    the same, because pooling and interpolation are linear.
+
     Args:
         features: of the window where the flow begins, (B, C, h, w).
         others: of the windows where it ends, (B, K, C, h, w).
@@ -94,30 +99,42 @@ class Correlation:
     """
 
     def __init__(self, features: Tensor, others: Tensor, levels: int, radius: int) -> None:
-        channels, self.height, self.width = features.shape[1:]
-        volume = torch.einsum("bcp,bkcq->bkpq", features.flatten(2), others.flatten(3)) / math.sqrt(channels)
-        level = volume.reshape(-1, 1, self.height, self.width)
+        self.height, self.width = features.shape[-2:]
+        self.all_pairs = self.height * self.width <= _ALL_PAIRS
+        features = features.flatten(2) / math.sqrt(features.shape[1])
+        if self.all_pairs:
+            level = torch.einsum("bcp,bkcq->bkpq", features, others.flatten(3)).reshape(-1, 1, self.height, self.width)
+        else:
+            level = others.flatten(0, 1)
+            self.features = features.repeat_interleave(others.shape[1], dim=0).unsqueeze(-1)  # (B K, C, h w, 1)
         self.pyramid = [level]
         for _ in range(levels - 1):
             # what is left over at the border is a pixel by itself; one pixel stays one pixel
             level = F.avg_pool2d(level, 2, ceil_mode=True)
             self.pyramid.append(level)
-        around = torch.arange(-radius, radius + 1, dtype=features.dtype, device=features.device)
-        self.around = torch.stack(torch.meshgrid(around, around, indexing="xy"), dim=-1)  # (k, k, 2)
-        axes = (torch.arange(n, dtype=features.dtype, device=features.device) for n in (self.width, self.height))
-        self.here = torch.stack(torch.meshgrid(*axes, indexing="xy"), dim=-1)  # (h, w, 2)
+        self.around = _positions(range(-radius, radius + 1), range(-radius, radius + 1), features)  # (k k, 2)
+        self.here = _positions(range(self.height), range(self.width), features)  # (h w, 2)
 
     def __call__(self, flow: Tensor) -> Tensor:
         """Look up: flow (B K, 2, h, w) to (B K, levels k k, h, w)."""
-        there = (self.here + flow.permute(0, 2, 3, 1)).reshape(-1, 1, 1, 2) + 0.5
+        there = (self.here + flow.flatten(2).transpose(1, 2)).unsqueeze(2) + 0.5  # (B K, h w, 1, 2)
         found = []
         for number, level in enumerate(self.pyramid):
             # align_corners=False divides by the width, not by the width less one: one pixel is wide enough
             size = there.new_tensor([level.shape[-1], level.shape[-2]])
             grid = (there / 2**number + self.around) * (2 / size) - 1
-            picked = F.grid_sample(level, grid, "bilinear", "zeros", align_corners=False)
-            found.append(picked.reshape(len(flow), self.height, self.width, -1))
-        return torch.cat(found, dim=-1).permute(0, 3, 1, 2)
+            if self.all_pairs:
+                picked = F.grid_sample(level, grid.flatten(0, 1).unsqueeze(1), align_corners=False)
+                found.append(picked.reshape(grid.shape[:-1]))
+            else:
+                found.append((self.features * F.grid_sample(level, grid, align_corners=False)).sum(dim=1))
+        return torch.cat(found, dim=-1).transpose(1, 2).unflatten(2, (self.height, self.width))
+
+
+def _positions(rows: range, columns: range, like: Tensor) -> Tensor:
+    """All (x, y), row by row: (rows columns, 2)."""
+    y, x = (torch.tensor(axis, dtype=like.dtype, device=like.device) for axis in (rows, columns))
+    return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).flatten(0, 1)
 
 
 class MotionEncoder(nn.Module):

@@ -14,7 +14,7 @@ from lightning_modules.motion.recurrent import RecurrentFlow
 from spikekit import spike_interval
 from spikekit.check import check_planes
 
-_CORRELATIONS = 1 << 26  # numbers that the correlations of one go may hold
+_PIXELS = 1 << 17  # of streams that are worked on in one go
 
 
 class Spike2Flow(MotionEstimator):
@@ -142,9 +142,8 @@ class Spike2Flow(MotionEstimator):
             ],
             dim=2,
         )
-        # large clips bit by bit: correlations of all pixels with all pixels
-        positions = 1 + windows.shape[-2] * windows.shape[-1] // self.network.stride**2
-        few = max(1, _CORRELATIONS // (4 * positions**2))
+        # large clips stream by stream: every position takes memory for all that is looked up
+        few = max(1, _PIXELS // (windows.shape[-2] * windows.shape[-1]))
         with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):
             parts = [self.network(part, self.iterations) for part in windows.flatten(0, 2).split(few)]
         return [torch.cat(flows).unflatten(0, windows.shape[:3]) for flows in zip(*parts, strict=True)]

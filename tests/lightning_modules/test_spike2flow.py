@@ -33,6 +33,11 @@ PAPER = {
 }
 
 
+@pytest.fixture(autouse=True)
+def _seed():
+    torch.manual_seed(0)
+
+
 def clip(batch=1, height=16, width=20, seed=0):
     generator = torch.Generator().manual_seed(seed)
     return (torch.rand(batch, 41, height, width, generator=generator) < 0.3).to(torch.uint8)
@@ -133,13 +138,21 @@ def test_large_clips_bit_by_bit(monkeypatch):
     estimator = Spike2Flow(**TINY)
     spikes = clip(2)
     whole = estimator(spikes, TIMES, "RGGB")
-    monkeypatch.setattr("lightning_modules.motion.spike2flow._CORRELATIONS", 1)
+    monkeypatch.setattr("lightning_modules.motion.spike2flow._PIXELS", 1)
     for flow, expected in zip(estimator(spikes, TIMES, "RGGB"), whole, strict=True):
         torch.testing.assert_close(flow, expected, rtol=1e-4, atol=1e-5)
 
 
+def test_correlations_of_all_pairs_and_of_those_looked_up_are_the_same(monkeypatch):
+    estimator = Spike2Flow(**{**TINY, "levels": 3})
+    all_pairs = estimator(clip(1, 18, 22), TIMES, "RGGB")
+    monkeypatch.setattr("lightning_modules.motion.recurrent._ALL_PAIRS", 0)
+    for flow, expected in zip(estimator(clip(1, 18, 22), TIMES, "RGGB"), all_pairs, strict=True):
+        torch.testing.assert_close(flow, expected, rtol=1e-4, atol=1e-5)
+
+
 def test_every_parameter_learns():
-    estimator = Spike2Flow(**{**TINY, "attention": 4, "blocks": 2})
+    estimator = Spike2Flow(**{**TINY, "attention": 4, "blocks": 2, "motion": 8})
     with torch.no_grad():
         for encoder in (estimator.network.features, estimator.network.context):
             encoder[-1].gain.fill_(0.5)  # nothing passes at the beginning
@@ -151,6 +164,12 @@ def test_every_parameter_learns():
     assert sum(p.grad.abs().sum() > 1e-6 for p in estimator.parameters()) > 40
 
 
+@pytest.fixture(params=[1600, 0], ids=["all pairs", "looked up"])
+def _kind(request, monkeypatch):
+    monkeypatch.setattr("lightning_modules.motion.recurrent._ALL_PAIRS", request.param)
+
+
+@pytest.mark.usefixtures("_kind")
 def test_correlation_against_brute_force():
     generator = torch.Generator().manual_seed(0)
     here = torch.randn(2, 5, 6, 7, generator=generator, dtype=torch.float64)
@@ -170,6 +189,7 @@ def test_correlation_against_brute_force():
             assert found[b, k, number, y, x].item() == pytest.approx(float(expected), abs=1e-9)
 
 
+@pytest.mark.usefixtures("_kind")
 def test_coarse_correlations_are_centred_on_the_same_point():
     """A correlation that grows steadily across the picture is found alike on every scale."""
     here = torch.ones(1, 1, 16, 16)
