@@ -41,10 +41,11 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Train and test every combination of overlays, values and seeds under the same budget.",
         epilog="""\
-A trial is `lightning fit`, then `lightning test` of the weights it ended with, in a process of its own; one that fails
-is reported, and the others go on. All configurations are parsed and built before the first one trains. The same command
-typed again goes on where it was stopped, in whatever way: finished trials are not run again, failed ones are tried
-again, the others go on from their last checkpoint. A folder that holds a trial of other settings is refused.
+A trial is `lightning fit`, then `lightning test` of the weights it ended with, in a process of its own and on one
+device; one that fails is reported, and the others go on. All configurations are parsed and built before the first one
+trains. The same command typed again goes on where it was stopped, in whatever way: finished trials are not run again,
+failed ones are tried again, the others go on from their last checkpoint. A folder with a trial of other settings is
+refused.
 
 The result is sweep.md, sweep.csv and sweep.png: a row a variant, mean and spread over seeds, the difference from J or
 from the first row, and the paper's Table 3 for rows named after its letters. Every trial lies in a folder of its own:

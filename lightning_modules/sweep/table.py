@@ -126,7 +126,7 @@ def markdown(rows: Sequence[Row]) -> str:
             best = TABLE_3[scale.pop()]["J"] if row.paper is not None else None
             cells += ["", ""] if best is None else [f"{row.paper:.2f}", f"{row.paper - best:+.2f}"]
         times = [result["seconds_per_step"] for result in row.results.values() if result["seconds_per_step"]]
-        cells.append(f"{1000 * statistics.mean(times):.3g}" if times else "")
+        cells.append(f"{1000 * statistics.mean(times):.0f}" if times else "")
         cells.append(_values(row, lambda result: result["steps"]))
         cells.append(_values(row, lambda result: f"{result['parameters']:,}"))
         cells += [_values(row, lambda result, name=name: _settings(result).get(name, "")) for name in settings]

@@ -154,6 +154,9 @@ def _resolve(args: Sequence[str], trial: str, names: Sequence[str] = ()) -> dict
         unknown = [key for key in unknown if names and key not in names]
         raise InputError(trial + _reason(str(error)) + _suggestion(unknown, names)) from error
     config = yaml.safe_load(command.parser.dump(command.config, skip_none=False))["fit"]
+    if config["trainer"]["devices"] not in ("auto", 1, "1"):
+        raise InputError(f"{trial}trainer.devices: expected 1, the one of a trial, got {config['trainer']['devices']}")
+    config["trainer"]["devices"] = 1
     # not part of what the trial is
     return {key: value for key, value in config.items() if key not in ("ckpt_path", "weights_only")}
 
@@ -206,6 +209,6 @@ def _difference(there: dict[str, Any], asked: dict[str, Any]) -> str:
     keys = sorted(key for key in {**there, **asked} if there.get(key) != asked.get(key))
     shown = [key.replace(".init_args", "") for key in keys[:3]]
     more = f" and {len(keys) - 3} more" if len(keys) > 3 else ""
-    first = f"{shown[0]}={there.get(keys[0])}"
+    first = f"{shown[0]}={there[keys[0]]}" if keys[0] in there else f"no {shown[0]}"
     others = f" (also {', '.join(shown[1:])}{more})" if shown[1:] else ""
-    return f"holds a trial with {first}, and this sweep asks for {asked.get(keys[0])}{others}"
+    return f"holds a trial with {first}, and this sweep asks for {asked.get(keys[0], 'none')}{others}"

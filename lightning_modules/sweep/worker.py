@@ -17,7 +17,7 @@ from typing import Any
 import torch
 import yaml
 from pytorch_lightning import Callback, LightningModule, Trainer
-from pytorch_lightning.callbacks import ModelCheckpoint
+from pytorch_lightning.callbacks import ModelCheckpoint, Timer
 from torch.utils.flop_counter import FlopCounterMode
 
 from lightning_modules.cli import Command, main
@@ -93,7 +93,7 @@ class Report(Callback):
         now = time.monotonic()
         shares = [step / steps] if steps > 0 else []
         for timer in trainer.callbacks:
-            if type(timer).__name__ == "Timer" and timer.time_remaining() is not None:
+            if isinstance(timer, Timer) and timer.time_remaining() is not None:
                 passed = timer.time_elapsed()
                 shares.append(passed / (passed + max(timer.time_remaining(), 0)))
         write_json(

@@ -332,6 +332,7 @@ def test_time_ends_training(typed, overlays, tmp_path):
             "width=x: model.network.width: Expected a <class 'int'>. Got value: x",
         ),
         (["X", "--set", "data.motion=1,-1"], "motion=-1: motion: expected 0 or more, got -1.0"),
+        (["X", "--set", "trainer.devices=2"], "trainer.devices: expected 1, the one of a trial, got 2"),
         (["X", "--over", "nowhere.yaml"], "nowhere: config: File does not exist"),
         (["X", "--over", "X", "X"], "two trials are called x4"),
     ],
