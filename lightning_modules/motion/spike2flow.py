@@ -160,7 +160,7 @@ class Spike2Flow(MotionEstimator):
             raise FileNotFoundError(f"{path}: no such checkpoint")
         try:
             checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-            settings, weights = checkpoint["network"], checkpoint["state_dict"]
+            settings, weights = dict(checkpoint["network"]), dict(checkpoint["state_dict"])
         except Exception as error:
             said = (str(error).splitlines() or [""])[0]
             raise ValueError(f"{path}: not a checkpoint of lightning fit ({type(error).__name__}: {said})") from error

@@ -1,3 +1,5 @@
+import os
+
 import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
@@ -295,12 +297,16 @@ def test_files_that_hold_no_weights_for_it(tmp_path):
 
     class Harmful:
         def __reduce__(self):
-            return print, ("this must not run",)
+            return os.mkdir, (str(tmp_path / "harmed"),)
 
-    torch.save({"network": Harmful()}, tmp_path / "harmful.ckpt")
+    checkpoint(tmp_path / "harmful.ckpt", Spike2Flow(**TINY), epoch=Harmful())
     with pytest.raises(ValueError, match=r"harmful.ckpt: not a checkpoint") as raised:
-        Spike2Flow(weights=tmp_path / "harmful.ckpt")
+        Spike2Flow(**TINY, weights=tmp_path / "harmful.ckpt")
     assert "\n" not in str(raised.value)
+    assert not (tmp_path / "harmed").exists()
+    torch.save({"network": 1, "state_dict": 2}, tmp_path / "strange.ckpt")
+    with pytest.raises(ValueError, match=r"strange.ckpt: not a checkpoint"):
+        Spike2Flow(weights=tmp_path / "strange.ckpt")
 
 
 @pytest.mark.parametrize(
