@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 from jsonargparse import ArgumentParser
-from pytorch_lightning import Callback, LightningDataModule, Trainer
+from pytorch_lightning import Callback, LightningDataModule, LightningModule, Trainer
 from pytorch_lightning.callbacks import LearningRateMonitor, ModelCheckpoint
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI
 from pytorch_lightning.loggers import TensorBoardLogger
@@ -129,6 +129,8 @@ class Command(LightningCLI):
         return [PredictionPictures(output)] if self.subcommand == "predict" else []
 
     def before_predict(self) -> None:  # noqa: D102
+        if type(self.model).predict_step is LightningModule.predict_step:
+            raise InputError(f"predict: expected a model that makes pictures, got {type(self.model).__name__}")
         if type(self.datamodule).predict_dataloader is LightningDataModule.predict_dataloader:
             raise InputError("predict: expected a recording: --data Recording --data.path FILE")
 
