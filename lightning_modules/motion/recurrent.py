@@ -102,18 +102,20 @@ class Correlation:
         self.height, self.width = features.shape[-2:]
         self.all_pairs = self.height * self.width <= _ALL_PAIRS
         features = features.flatten(2) / math.sqrt(features.shape[1])
+        wide = torch.promote_types(features.dtype, torch.float32)  # halves cannot tell the pixels of a large picture
         if self.all_pairs:
             level = torch.einsum("bcp,bkcq->bkpq", features, others.flatten(3)).reshape(-1, 1, self.height, self.width)
         else:
             level = others.flatten(0, 1)
             self.features = features.repeat_interleave(others.shape[1], dim=0).unsqueeze(-1)  # (B K, C, h w, 1)
+        level = level.to(wide)
         self.pyramid = [level]
         for _ in range(levels - 1):
             # what is left over at the border is a pixel by itself; one pixel stays one pixel
             level = F.avg_pool2d(level, 2, ceil_mode=True)
             self.pyramid.append(level)
-        self.around = _positions(range(-radius, radius + 1), range(-radius, radius + 1), features)  # (k k, 2)
-        self.here = _positions(range(self.height), range(self.width), features)  # (h w, 2)
+        self.around = _positions(range(-radius, radius + 1), range(-radius, radius + 1), level)  # (k k, 2)
+        self.here = _positions(range(self.height), range(self.width), level)  # (h w, 2)
 
     def __call__(self, flow: Tensor) -> Tensor:
         """Look up: flow (B K, 2, h, w) to (B K, levels k k, h, w)."""
@@ -240,7 +242,7 @@ class RecurrentFlow(nn.Module):
         hidden, context = hidden.tanh(), context.relu()
 
         correlation = Correlation(features[:, 0], features[:, 1:], self.levels, self.radius)
-        flow = hidden.new_zeros(3 * batch, 2, *hidden.shape[-2:])
+        flow = windows.new_zeros(3 * batch, 2, *hidden.shape[-2:])
         flows = []
         for _ in range(iterations):
             flow = flow.detach()

@@ -192,6 +192,16 @@ def test_correlation_against_brute_force():
 
 
 @pytest.mark.usefixtures("_kind")
+def test_halves_are_looked_up_where_they_are():
+    here = torch.ones(1, 1, 1, 700, dtype=torch.bfloat16)
+    there = torch.zeros(1, 1, 1, 1, 700, dtype=torch.bfloat16)
+    there[..., 601] = 1
+    flow = torch.tensor([0.25, 0]).reshape(1, 2, 1, 1).expand(1, 2, 1, 700)
+    found = Correlation(here, there, levels=1, radius=0)(flow)
+    torch.testing.assert_close(found[0, 0, 0, 599:603], torch.tensor([0.0, 0.25, 0.75, 0.0]))
+
+
+@pytest.mark.usefixtures("_kind")
 def test_coarse_correlations_are_centred_on_the_same_point():
     """A correlation that grows steadily across the picture is found alike on every scale."""
     here = torch.ones(1, 1, 16, 16)
