@@ -47,7 +47,7 @@ class CSCSR(Network):
         window: spike frames that a time point sees, odd.
         stride: spike frames between two time points; must divide frames - window.
         pattern: Bayer phase of the streams.
-        width: channels of refinement and reconstruction, at high resolution.
+        width: channels of refinement and reconstruction.
         representation_width: channels of the spike representation, at sensor resolution.
         features: channels of every time point that are warped.
         stages: fusions of the colours.
@@ -71,6 +71,9 @@ class CSCSR(Network):
         refinement: FR; False is G, which merges the time points by one convolution.
         reconstruction: ``"correlated"`` is CCR; ``"separate"`` (H) lets every colour make its channel by itself;
             ``"early"`` (I) fuses the colours once, at the beginning.
+        resolution: where refinement and reconstruction work. ``"output"`` is that of the picture, as in the paper;
+            ``"sensor"`` that of the sensor, with the s x s temporal pixels of a site as channels and a sub-pixel
+            convolution at the end: the same width then costs 1 / s^2 of the work.
 
     Shape:
         - Input: spikes :math:`(B, N, H, W)`, zeros and ones, any real dtype, any H and W of at least 3; optionally
@@ -114,6 +117,7 @@ class CSCSR(Network):
         search: bool = True,
         refinement: bool = True,
         reconstruction: Literal["correlated", "separate", "early"] = "correlated",
+        resolution: Literal["output", "sensor"] = "output",
     ) -> None:
         check_scale(scale)
         if frames % 2 == 0 or window % 2 == 0 or not 1 <= window < frames or (frames - window) % stride:
@@ -150,6 +154,7 @@ class CSCSR(Network):
             "search": search,
             "refinement": refinement,
             "reconstruction": reconstruction,
+            "resolution": resolution,
         }
         times = tuple(range(window // 2, frames - window // 2, stride))
         super().__init__(settings, (times[0], frames // 2, times[-1]), motion)
@@ -167,9 +172,12 @@ class CSCSR(Network):
         encoder = _choose("representation", representation, represent)
         self.representation = nn.ModuleList(encoder() for _ in range(3))
         refine = FeatureRefinement if refinement else TimeFusion
-        self.refinement = nn.ModuleList(refine(len(times), part.features, width) for part in self.representation)
+        self.fold = _choose("resolution", resolution, {"output": 1, "sensor": scale})
+        self.refinement = nn.ModuleList(
+            refine(len(times), part.features * self.fold**2, width) for part in self.representation
+        )
         reconstruct = _choose("reconstruction", reconstruction, _RECONSTRUCTIONS)
-        self.reconstruction = reconstruct(width, stages, blocks, end_blocks)
+        self.reconstruction = reconstruct(width, stages, blocks, end_blocks, self.fold)
         self.skip = skip
         self.alpha = alpha
         self._initialize()
@@ -212,6 +220,7 @@ class CSCSR(Network):
             pixels = map(self._search, features, self._offsets(flow), self._mask(height, width, spikes.device))
         else:
             pixels = map(self._enlarge, features)
+        pixels = (F.pixel_unshuffle(part.flatten(0, 1), self.fold).unflatten(0, part.shape[:2]) for part in pixels)
         rgb = self.reconstruction([refine(part) for refine, part in zip(self.refinement, pixels, strict=True)])
         return rgb + self._base(spikes) if self.skip else rgb
 

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lightning_modules.networks.layers import conv, res_blocks
 
 
 class ToRgb(nn.Conv2d):
-    """3 x 3 convolution to the three colours, never in half precision, which would round the picture itself."""
+    """3 x 3 convolution to the three colours, never in half precision, which would round the picture itself.
 
-    def __init__(self, inputs: int, groups: int = 1) -> None:
-        super().__init__(inputs, 3, 3, padding=1, groups=groups)
+    Args:
+        inputs: channels of the features.
+        enlarge: sub-pixels that every pixel is divided into, along each side (Shi et al., CVPR 2016).
+        groups: 3 where every colour has features of its own.
+    """
+
+    def __init__(self, inputs: int, enlarge: int = 1, groups: int = 1) -> None:
+        super().__init__(inputs, 3 * enlarge**2, 3, padding=1, groups=groups)
+        self.enlarge = enlarge
 
     def forward(self, x: Tensor) -> Tensor:  # noqa: D102
         with torch.autocast(x.device.type, enabled=False):
-            return super().forward(x.to(self.weight.dtype))
+            return F.pixel_shuffle(super().forward(x.to(self.weight.dtype)), self.enlarge)
 
 
 class ColorFusion(nn.Sequential):
@@ -34,18 +42,19 @@ class ColorCorrelation(nn.Module):
         stages: how often the colours are fused.
         blocks: residual blocks of every colour in every stage.
         end_blocks: residual blocks after the last fusion.
+        enlarge: how many times larger the picture is than the features.
 
     Shape:
         - Input: features of R, G and B, each :math:`(B, width, H, W)`
-        - Output: rgb :math:`(B, 3, H, W)`
+        - Output: rgb :math:`(B, 3, enlarge H, enlarge W)`
     """
 
-    def __init__(self, width: int, stages: int, blocks: int, end_blocks: int) -> None:
+    def __init__(self, width: int, stages: int, blocks: int, end_blocks: int, enlarge: int = 1) -> None:
         super().__init__()
         self.refine = nn.ModuleList(nn.ModuleList(res_blocks(width, blocks) for _ in range(3)) for _ in range(stages))
         self.fuse = nn.ModuleList(ColorFusion((3 if stage == 0 else 4) * width, width) for stage in range(stages))
         self.end = res_blocks(width, end_blocks)
-        self.rgb = ToRgb(width)
+        self.rgb = ToRgb(width, enlarge)
 
     def forward(self, colors: list[Tensor]) -> Tensor:  # noqa: D102
         fused: list[Tensor] = []
@@ -63,16 +72,17 @@ class SeparateColors(nn.Module):
         stages: as of :class:`ColorCorrelation`, whose number of residual blocks is kept:
         blocks: every colour has stages x blocks of them,
         end_blocks: and its share of these at the end, rounded up.
+        enlarge: as of :class:`ColorCorrelation`.
 
     Shape:
         As :class:`ColorCorrelation`.
     """
 
-    def __init__(self, width: int, stages: int, blocks: int, end_blocks: int) -> None:
+    def __init__(self, width: int, stages: int, blocks: int, end_blocks: int, enlarge: int = 1) -> None:
         super().__init__()
         self.refine = nn.ModuleList(res_blocks(width, stages * blocks) for _ in range(3))
         self.end = nn.ModuleList(res_blocks(width, -(-end_blocks // 3)) for _ in range(3))
-        self.rgb = ToRgb(3 * width, groups=3)
+        self.rgb = ToRgb(3 * width, enlarge, groups=3)
 
     def forward(self, colors: list[Tensor]) -> Tensor:  # noqa: D102
         colors = [refine(color) for refine, color in zip(self.refine, colors, strict=True)]
@@ -88,16 +98,17 @@ class EarlyFusion(nn.Module):
         stages: as of :class:`ColorCorrelation`, whose number of residual blocks is kept:
         blocks: 3 x stages x blocks of them
         end_blocks: and these, one after another.
+        enlarge: as of :class:`ColorCorrelation`.
 
     Shape:
         As :class:`ColorCorrelation`.
     """
 
-    def __init__(self, width: int, stages: int, blocks: int, end_blocks: int) -> None:
+    def __init__(self, width: int, stages: int, blocks: int, end_blocks: int, enlarge: int = 1) -> None:
         super().__init__()
         self.fuse = ColorFusion(3 * width, width)
         self.refine = res_blocks(width, 3 * stages * blocks + end_blocks)
-        self.rgb = ToRgb(width)
+        self.rgb = ToRgb(width, enlarge)
 
     def forward(self, colors: list[Tensor]) -> Tensor:  # noqa: D102
         fused = self.fuse(torch.cat(colors, dim=1))

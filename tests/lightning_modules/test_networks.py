@@ -98,6 +98,41 @@ def test_result_moves_with_the_scene_by_whole_bayer_periods():
     torch.testing.assert_close(moved[..., 32:-32, 32:-32], network(spikes, still)[..., 32:-32, 32:-32])
 
 
+@pytest.mark.parametrize("reconstruction", ["correlated", "separate", "early"])
+@pytest.mark.parametrize("scale", [1, 2, 3])
+def test_features_at_sensor_resolution(scale, reconstruction):
+    network = CSCSR(scale, **TINY, resolution="sensor", reconstruction=reconstruction)
+    spikes, flow = clip(2, 9, 7)
+    rgb = network(spikes, flow)
+    assert rgb.shape == (2, 3, scale * 9, scale * 7)
+    rgb.square().mean().backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in network.parameters())
+
+
+def test_features_at_sensor_resolution_are_where_the_sensor_has_them():
+    """What a sensor pixel sees changes the picture around its own place."""
+    network = CSCSR(3, **TINY, resolution="sensor").double()
+    still = torch.zeros(1, 2, 2, 64, 64, dtype=torch.float64)
+    spikes, _ = clip(1, 64, 64)
+    other = spikes.clone()
+    other[..., 30, 40] ^= 1
+    change = (network(spikes, still) - network(other, still)).abs().sum(dim=1)[0].detach()
+    y, x = torch.meshgrid(torch.arange(192.0), torch.arange(192.0), indexing="ij")
+    centre = [(change * axis).sum() / change.sum() for axis in (y, x)]
+    assert centre[0] == pytest.approx(30 * 3 + 1, abs=1.5)
+    assert centre[1] == pytest.approx(40 * 3 + 1, abs=1.5)
+
+
+def test_features_at_sensor_resolution_cost_less():
+    def work(resolution):
+        network = CSCSR(4, width=32, representation_width=4, features=1, resolution=resolution)
+        with torch.no_grad(), FlopCounterMode(display=False) as counter:
+            network(torch.zeros(1, 41, 8, 8), torch.zeros(1, 2, 2, 8, 8))
+        return counter.get_total_flops()
+
+    assert work("sensor") < work("output") / 8
+
+
 def test_skip_starts_at_a_smooth_classical_picture():
     """Equal to the classical one where the scene is plain, and without its zipper at edges."""
     spikes = torch.ones(1, 41, 12, 12)
