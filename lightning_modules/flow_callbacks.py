@@ -41,7 +41,7 @@ class FlowReport(TestReport):
 
     measures: ClassVar[list[tuple[str, str, int]]] = [
         ("epe", "EPE (px)", 3),
-        ("over_1px", "> 1 px (%)", 2),
+        ("over_1px", ">1 px (%)", 2),
         ("outliers", "out (%)", 2),
         ("milliseconds", "ms/clip", 1),
     ]
