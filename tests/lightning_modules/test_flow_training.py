@@ -221,6 +221,7 @@ def test_its_checkpoint_goes_into_cscsr_by_an_overlay(trained, configs, tmp_path
     assert weights[f"network.motion.{name}"].equal(motion[f"network.{name}"])  # frozen
 
 
+@pytest.mark.slow
 def test_errors_are_one_line(configs, tmp_path):
     command = ["fit", "-c", configs / "x4.yaml", "-c", configs / "motion/spike2flow.yaml", "-o", tmp_path / "run"]
     with pytest.raises(SystemExit) as exit:
