@@ -170,7 +170,7 @@ def _run(trials: Sequence[Trial], asked: argparse.Namespace) -> dict[Path, str]:
     finally:
         view.close()
     print(f"\n{_write_tables(trials, failed, asked)}")
-    print(", ".join(str(asked.output / f"sweep.{ending}") for ending in ("md", "csv", "png")))
+    print(", ".join(str(path) for path in sorted(asked.output.glob("sweep.*"))))
     return failed
 
 

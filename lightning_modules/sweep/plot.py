@@ -8,25 +8,25 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from lightning_modules.sweep.paper import TABLE_3
-from lightning_modules.sweep.table import Row, differences, reference
+from lightning_modules.sweep.table import Row, differences, reference, score_names
 
 _ZOOM = 2  # drawn larger, so that text and dots are smooth
 _ROW, _WIDTH, _TOP, _FOOT = 26, 460, 44, 62
 _OURS, _PAPER, _INK, _GRID = (38, 92, 160), (200, 96, 20), (40, 40, 40), (222, 222, 222)
 
 
-def plot(rows: Sequence[Row], path: Path) -> bool:
-    """Draw a row a variant: a dot a seed, a bar at their mean, and a diamond for the paper. False if nothing is there.
+def plot(rows: Sequence[Row], path: Path) -> None:
+    """Draw a row a variant: a dot a seed, a bar at their mean, and a diamond for the paper; nothing without results.
 
-    Where the paper has a number for any of them, PSNR is drawn as the difference from J, since its clips are others.
+    Where J is among them, PSNR is drawn as the difference from it, since the paper's clips are others.
     """
     from PIL import Image, ImageDraw, ImageFont
 
-    name = next((name for row in rows for name in row.scores("psnr") and ["psnr"]), None) or _first_score(rows)
-    if name is None:
-        return False
-    papers = {row.variant: paper for row in rows if (paper := _paper_gap(row)) is not None}
+    names = score_names(rows)
+    if not names:
+        return
+    name = names[0]
+    papers = {row.variant: paper for row in rows if (paper := _paper_gap(row, rows)) is not None}
     if papers:
         values = {row.variant: differences(row, reference(row, rows), name) for row in rows}
         title = "PSNR (dB) above or below J, the same seed"
@@ -84,19 +84,13 @@ def plot(rows: Sequence[Row], path: Path) -> bool:
         diamond(left + 174, foot)
         write(left + 184, foot, "the paper, Table 3 (REDS)", "lm")
     image.save(path)
-    return True
 
 
-def _first_score(rows: Sequence[Row]) -> str | None:
-    from lightning_modules.sweep.table import own_scores
-
-    return next((name for row in rows for result in row.results.values() for name in own_scores(result)), None)
-
-
-def _paper_gap(row: Row) -> float | None:
-    if row.paper is None:
+def _paper_gap(row: Row, rows: Sequence[Row]) -> float | None:
+    full = reference(row, rows)
+    if row.paper is None or full.paper is None or "J" not in [label.upper() for label in full.labels]:
         return None
-    return row.paper - TABLE_3[next(iter(row.results.values()))["network"]["scale"]]["J"]
+    return row.paper - full.paper
 
 
 def _axis(values: Sequence[float]) -> tuple[float, float, float]:

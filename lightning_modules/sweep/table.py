@@ -66,6 +66,11 @@ def own_scores(result: dict[str, Any]) -> dict[str, float]:
     return scores
 
 
+def score_names(rows: Sequence[Row]) -> list[str]:
+    """Return what was measured, the first of it what variants are compared by."""
+    return list(dict.fromkeys(name for row in rows for result in row.results.values() for name in own_scores(result)))
+
+
 def collect(trials: Sequence[Trial], failed: dict[Path, str]) -> list[Row]:
     """Gather what is there of the results, in the order of the trials."""
     rows: dict[str, Row] = {}
@@ -101,7 +106,7 @@ def differences(row: Row, other: Row, name: str) -> list[float]:
 
 def markdown(rows: Sequence[Row]) -> str:
     """Return the table as Markdown."""
-    names = _score_names(rows)
+    names = score_names(rows)
     names = [name for name in names if "," not in name or name.startswith(names[0])]
     settings = _differing(rows)
     papers = any(row.paper is not None for row in rows)
@@ -147,7 +152,7 @@ def markdown(rows: Sequence[Row]) -> str:
 
 def write_csv(rows: Sequence[Row], path: Path) -> None:
     """Write every trial, and the mean and spread of every variant."""
-    names, settings = _score_names(rows), _differing(rows)
+    names, settings = score_names(rows), _differing(rows)
     with open(path, "w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(
@@ -175,10 +180,6 @@ def write_csv(rows: Sequence[Row], path: Path) -> None:
             )
             spreads = (_rounded(statistics.stdev(c)) if len(c) > 1 else None for c in columns)
             writer.writerow([row.variant, "spread", *spreads, None, *empty])
-
-
-def _score_names(rows: Sequence[Row]) -> list[str]:
-    return list(dict.fromkeys(name for row in rows for result in row.results.values() for name in own_scores(result)))
 
 
 def _settings(result: dict[str, Any]) -> dict[str, Any]:

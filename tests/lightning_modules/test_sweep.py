@@ -17,9 +17,12 @@ import yaml
 
 from lightning_modules.cli import main
 from lightning_modules.sweep import cli, engines, worker
+from lightning_modules.sweep import plot as plots
 from lightning_modules.sweep.budget import seconds
 from lightning_modules.sweep.paper import TABLE_3
-from lightning_modules.sweep.trials import make_trials
+from lightning_modules.sweep.plot import plot
+from lightning_modules.sweep.table import Row
+from lightning_modules.sweep.trials import Trial, make_trials
 from lightning_modules.sweep.view import View
 from spikekit import read_picture
 
@@ -459,3 +462,23 @@ def test_ray_runs_trials(typed, overlays, tmp_path, monkeypatch):
     main([*typed, "--over", over[1], "--steps", "4", "-o", str(tmp_path / "local")])
     ours, theirs = (weights(tmp_path / engine / "wide")["state_dict"] for engine in ("ray", "local"))
     assert all(ours[name].equal(value) for name, value in theirs.items())
+
+
+def test_the_plot_has_what_is_there(tmp_path):
+    def row(label, *psnr):
+        trials = [Trial((label,), seed, tmp_path, {}, {}) for seed in range(2)]
+        found = {"method": "CSCSR", "network": {"scale": 4}}
+        results = {seed: {**found, "metrics": {"CSCSR": {"psnr": value}}} for seed, value in enumerate(psnr)}
+        return Row(trials, results, {} if psnr else {0: "killed"})
+
+    def marks(*rows):
+        plot(rows, tmp_path / "plot.png")
+        pixels = (read_picture(tmp_path / "plot.png") * 255).round().int().permute(1, 2, 0)[: -2 * 40]
+        blue, orange = ((pixels == torch.tensor(colour)).all(-1).sum().item() for colour in (plots._OURS, plots._PAPER))
+        return blue > 0, orange > 0
+
+    plot([row("c")], tmp_path / "plot.png")
+    assert not (tmp_path / "plot.png").exists()
+    assert marks(row("c", 20.0, 21.0), row("j", 22.0)) == (True, True)
+    assert marks(row("c", 20.0, 21.0), row("h", 22.0)) == (True, False)  # no J to compare with
+    assert marks(row("width=4", 20.0), row("width=8")) == (True, True)  # the word "failed"
