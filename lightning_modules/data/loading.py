@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+import threading
+import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -13,6 +15,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 _MOST_WORKERS = 8
+_A_MOMENT = 2.0  # seconds
 
 
 class FreshClips(Sampler[int]):
@@ -53,7 +56,7 @@ def load_clips(clips: Dataset, batch_size: int, workers: int, **options: object)
         batch_size=batch_size,
         num_workers=workers,
         persistent_workers=workers > 0,
-        worker_init_fn=_one_thread,
+        worker_init_fn=_start_worker,
         collate_fn=_to_arrays,
         **options,
     )
@@ -85,5 +88,13 @@ def _to_arrays(clips: list[dict[str, Tensor]]) -> dict[str, np.ndarray]:
     return {name: np.stack([clip[name].numpy() for clip in clips]) for name in clips[0]}
 
 
-def _one_thread(_: int) -> None:
+def _start_worker(_: int) -> None:
     torch.set_num_threads(1)
+    threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
+
+
+def _end_with_parent(parent: int) -> None:
+    # torch's own watch comes too late for a worker that waits for its clip to be taken out of the pipe
+    while os.getppid() == parent:
+        time.sleep(_A_MOMENT)
+    os._exit(1)

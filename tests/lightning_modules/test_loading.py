@@ -1,0 +1,62 @@
+"""Loading of clips."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+
+from lightning_modules.data.loading import load_clips
+
+# A clip is larger than a pipe: its worker waits for somebody to take it.
+LOAD = """
+import os, torch
+from lightning_modules.data.loading import load_clips
+class Clips(torch.utils.data.Dataset):
+    def __len__(self): return 100
+    def __getitem__(self, index): return {"pid": torch.tensor(os.getpid()), "rgb": torch.zeros(1 << 20)}
+clips = iter(load_clips(Clips(), 1, 2))
+print(*{int(next(clips)["pid"]) for _ in range(8)}, flush=True)
+input()
+"""
+
+
+def alive(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="no such signals")
+def test_workers_end_with_a_killed_run():
+    process = subprocess.Popen([sys.executable, "-c", LOAD], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    workers = [int(pid) for pid in process.stdout.readline().split()]
+    assert len(workers) == 2
+    assert all(map(alive, workers))
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    for _ in range(120):
+        if not any(map(alive, workers)):
+            break
+        time.sleep(0.5)
+    assert not any(map(alive, workers))
+
+
+def test_workers_are_no_more_than_there_are_batches():
+    class Clips(torch.utils.data.Dataset):
+        def __len__(self):
+            return 5
+
+        def __getitem__(self, index):
+            return {"index": torch.tensor(index)}
+
+    assert load_clips(Clips(), 2, 8).num_workers == 3
+    loader = load_clips(Clips(), 2, 0)
+    assert loader.num_workers == 0
+    assert [batch["index"].tolist() for batch in loader] == [[0, 1], [2, 3], [4]]
