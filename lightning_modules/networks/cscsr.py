@@ -199,6 +199,9 @@ class CSCSR(Network):
         for module in modules:
             if isinstance(module, ResBlock):
                 module.body[-1].weight.data *= 0.1
+        for part in self.representation:
+            if isinstance(part, SpikeRepresentation):
+                part.start_at_the_mean()
         if self.skip:
             nn.init.zeros_(self.reconstruction.rgb.weight)
 

@@ -39,6 +39,21 @@ class SpikeRepresentation(nn.Module):
         seen = 2 * width if global_perception else width
         self.fuse = nn.Sequential(ConvBlock(seen, width), ResBlock(width), conv(width, features))
 
+    @torch.no_grad()
+    def start_at_the_mean(self) -> None:
+        """Set weights, so that the first feature is the share of the window's frames in which a pixel fired.
+
+        The others are faint: random filters of single spikes are noise to all that follows, and training would first
+        have to learn to ignore them.
+        """
+        local, fuse, last = self.local[0][0], self.fuse[0][0], self.fuse[-1]
+        for layer, source, weight in ((local, slice(None), 1 / self.window), (fuse, 0, 1), (last, 0, 1)):
+            layer.weight[0] = 0
+            layer.weight[0, source, 1, 1] = weight
+        for block in (self.local[1], self.fuse[1]):
+            block.body[-1].weight[0] = 0
+        last.weight[1:] *= 0.1
+
     def forward(self, spikes: Tensor) -> Tensor:  # noqa: D102
         windows = spikes.unfold(1, self.window, self.stride).movedim(-1, 2)
         batch, times = windows.shape[:2]

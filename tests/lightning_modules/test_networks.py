@@ -5,8 +5,9 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks import CSCSR, ClassicalDecoder
+from lightning_modules.networks.representation import WindowMeans
 from lightning_modules.tiles import forward_in_tiles
-from spikekit import bayer_mask, linear_motion, mosaic, psnr, spike_integrate_fire
+from spikekit import bayer_mask, linear_motion, mosaic, psnr, spike_integrate_fire, split_colors
 
 TINY = {"width": 4, "representation_width": 4, "features": 2, "stages": 2, "blocks": 1, "end_blocks": 1}
 
@@ -132,6 +133,14 @@ def test_features_at_sensor_resolution_cost_less():
         return counter.get_total_flops()
 
     assert work("sensor") < work("output") / 8
+
+
+@pytest.mark.parametrize("global_perception", [True, False])
+def test_representation_starts_at_the_mean_of_the_window(global_perception):
+    network = CSCSR(2, **TINY, global_perception=global_perception)
+    spikes = clip()[0].float()
+    for represent, plane in zip(network.representation, split_colors(spikes, "RGGB"), strict=True):
+        torch.testing.assert_close(represent(plane)[:, :, :1], WindowMeans(11, 3)(plane))
 
 
 def test_skip_starts_at_a_smooth_classical_picture():
