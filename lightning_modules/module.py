@@ -50,6 +50,11 @@ class SuperResolution(Learner):
             raise ValueError(f"tile: expected an even number of sensor pixels, or 0 for no tiles, got {tile}")
         if flow not in ("scene", "estimated"):
             raise ValueError(f"flow: expected 'scene' or 'estimated', got {flow!r}")
+        fusion = network.settings.get("motion_fusion", "joint")
+        if flow == "scene" and fusion != "joint":
+            raise ValueError(
+                f"flow: expected 'estimated' with motion_fusion {fusion!r}, the scene's is one for all colours"
+            )
         self.tile = tile
         self.flow = flow
 

@@ -94,7 +94,7 @@ def _start_worker(_: int) -> None:
 
 
 def _end_with_parent(parent: int) -> None:
-    # torch's own watch comes too late for a worker that waits for its clip to be taken out of the pipe
+    # torch's own watch does not reach a worker that waits for its clip to be taken out of a full pipe
     while os.getppid() == parent:
         time.sleep(_A_MOMENT)
     os._exit(1)

@@ -411,7 +411,7 @@ def test_variants_combine(configs):
 def test_a_checkpoint_of_another_variant_is_refused(letter, configs):
     checkpoint = {"state_dict": {}}
     SuperResolution(variant("j", configs)).on_save_checkpoint(checkpoint)
-    module = SuperResolution(variant(letter, configs))
+    module = SuperResolution(variant(letter, configs), flow="estimated")
     overlay = settings(configs, f"ablation/{letter}")
     younger = settings(configs, "ablation/j")
     former = {name: value for name, value in checkpoint["network"].items() if name not in younger}

@@ -143,6 +143,7 @@ def test_a_finished_run_is_not_written_over(trained, overlay, configs):
         (["fit", "--data.motion", "-1"], "motion: expected 0 or more, got -1"),
         (["fit", "--model.network.frames", "40"], "frames, window, stride: expected odd frames"),
         (["fit", "--data.pattern", "BGGR"], "pattern"),
+        (["fit", "--model.network.motion_fusion", "assembled"], "flow: expected 'estimated' with motion_fusion"),
         (["predict"], "--data Recording --data.path FILE"),
         (["predict", "--data", "Recording", "--data.path", "nowhere.dat"], "nowhere.dat: no such file"),
     ],
