@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import logging
 import re
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 from jsonargparse import ArgumentParser
 from pytorch_lightning import Callback, LightningDataModule, LightningModule, Trainer
 from pytorch_lightning.callbacks import LearningRateMonitor, ModelCheckpoint
@@ -20,10 +22,11 @@ from pytorch_lightning.loggers import TensorBoardLogger
 from lightning_modules.callbacks import PredictionPictures
 from lightning_modules.data import FilmScenes, Recording, StillScenes
 from lightning_modules.flow_training import FlowTraining
-from lightning_modules.learner import CheckpointMismatchError, Learner
+from lightning_modules.learner import Learner
 from lightning_modules.module import SuperResolution
 from lightning_modules.motion import Spike2Flow
 from lightning_modules.networks import CSCSR
+from lightning_modules.pretrained import CheckpointMismatchError, read_weights, write_weights
 from spikekit import SpikeFileError
 
 #: classes whose arguments ``--help`` lists, by the option that names them
@@ -54,7 +57,54 @@ class Parser(LightningArgumentParser):
                 text += f"\nwith --{option} {choice.__name__}:\n\n{parser.format_help()}"
         elif "{fit," in text:
             text += "    sweep               Train and test every combination of overlays, values and seeds.\n"
+            text += "    trade               Measure what every setting costs and what it is worth.\n"
+            text += "    export              Write the weights of a checkpoint as safetensors.\n"
         return text
+
+
+def _with_network_of_weights(args: Sequence[str]) -> list[str]:
+    """Put the network that ``--model.weights`` are of behind all configurations, so that it need not be said again.
+
+    The other arguments still have the last word: on the estimator of motion, say.
+    """
+    args = list(args)
+    asked, behind = None, 1
+    for n, word in enumerate(args):
+        option, equals, value = word.partition("=")
+        if not equals:
+            value = args[n + 1] if n + 1 < len(args) else ""
+        if option in ("-c", "--config"):
+            behind = n + (1 if equals else 2)
+            asked = _weights_in(value) or asked
+        elif option in ("--model.weights", "--model.init_args.weights"):
+            asked = value
+    if not asked:
+        return args
+    try:
+        found = read_weights(asked)
+    except (OSError, ValueError) as error:
+        raise InputError(str(error)) from error
+    network = _class_and_arguments(found.settings)
+    if found.motion:
+        network["init_args"]["motion"] = _class_and_arguments(found.motion)
+    overlay = json.dumps({"model": {"network": network}})
+    return [*args[:behind], "--config", overlay, *args[behind:]]
+
+
+def _class_and_arguments(settings: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "class_path": settings["class"],
+        "init_args": {name: value for name, value in settings.items() if name != "class"},
+    }
+
+
+def _weights_in(config: str) -> str | None:
+    """Return what a file of configuration says about weights; whether it is one at all is the parser's affair."""
+    try:
+        model = yaml.safe_load(Path(config).read_text())["model"]
+        return model.get("weights") or model["init_args"].get("weights")
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, yaml.YAMLError):
+        return None
 
 
 class Command(LightningCLI):
@@ -77,6 +127,9 @@ class Command(LightningCLI):
             "data.init_args.flow_times",
             lambda frames, window: (window // 2, frames - 1 - window // 2),
         )
+
+    def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:  # noqa: D102
+        self.config = parser.parse_args(_with_network_of_weights(sys.argv[1:] if args is None else args))
 
     def before_instantiate_classes(self) -> None:
         """Turn ``--ckpt_path best`` and ``last`` into files, and keep a run from being written over."""
@@ -164,10 +217,40 @@ def main(args: Sequence[str] | None = None, command: type[Command] = Command) ->
             from lightning_modules.sweep.cli import sweep
 
             sweep(rest)
+        elif verb == "trade":
+            from lightning_modules.trade.cli import trade
+
+            trade(rest)
+        elif verb == "export":
+            export(rest)
         else:
             run(args, command)
     except (InputError, SpikeFileError, CheckpointMismatchError) as error:
         sys.exit(f"lightning: {error}")
+
+
+def export(args: Sequence[str]) -> None:
+    """Write the weights of a checkpoint as a file of safetensors.
+
+    Args:
+        args: what was typed after ``lightning export``.
+
+    Raises:
+        InputError: no such checkpoint, or a damaged one; or a name of another kind of file.
+    """
+    parser = argparse.ArgumentParser(
+        prog="lightning export",
+        description="Write the weights of a checkpoint as a file of safetensors that knows what network it is of, for "
+        "lightning predict --model.weights FILE and CSCSR.from_pretrained(FILE).",
+    )
+    parser.add_argument("checkpoint", help="checkpoint of lightning fit")
+    parser.add_argument("-o", "--output", required=True, metavar="FILE", help="name.safetensors")
+    asked = parser.parse_args(args)
+    try:
+        write_weights(read_weights(asked.checkpoint), asked.output)
+    except (OSError, ValueError) as error:
+        raise InputError(str(error)) from error
+    print(f"{asked.output}: {Path(asked.output).stat().st_size / 2**20:.1f} MiB")
 
 
 def run(args: Sequence[str] | None, command: type[Command]) -> Command:

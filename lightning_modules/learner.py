@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from inspect import signature
 from typing import Any, ClassVar
 
 from pytorch_lightning import Callback, LightningModule
 from pytorch_lightning.cli import LRSchedulerCallable, OptimizerCallable
 from torch import nn
 
-
-class CheckpointMismatchError(ValueError):
-    """A checkpoint of another network than the one of this run."""
+from lightning_modules.pretrained import check_settings, motion_of, settings_of
 
 
 class Learner(LightningModule):
@@ -48,16 +45,8 @@ class Learner(LightningModule):
         }
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:  # noqa: D102
-        checkpoint["network"] = {"class": type(self.network).__name__, **self.network.settings}
+        checkpoint["network"] = settings_of(self.network)
+        checkpoint["motion"] = motion_of(self.network)
 
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse weights of another network: scale, say, is in no parameter, and would go unnoticed."""
-        here = {"class": type(self.network).__name__, **self.network.settings}
-        # an argument that is younger than the checkpoint had the effect of its default
-        defaults = {name: parameter.default for name, parameter in signature(type(self.network)).parameters.items()}
-        there = {**defaults, **checkpoint.get("network", here)}
-        differing = [key for key in here if here[key] != there.get(key)]
-        if differing:
-            trained = ", ".join(f"{key}={there.get(key)}" for key in differing)
-            asked = ", ".join(f"{key}={here[key]}" for key in differing)
-            raise CheckpointMismatchError(f"the checkpoint was trained with {trained}; this run asks for {asked}")
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:  # noqa: D102
+        check_settings(self.network, checkpoint.get("network", {}), "the checkpoint")

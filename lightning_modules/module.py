@@ -12,6 +12,7 @@ from torch import Tensor
 from lightning_modules.callbacks import TestReport, ValidationPictures
 from lightning_modules.learner import Learner
 from lightning_modules.networks import ClassicalDecoder, Network
+from lightning_modules.pretrained import load_weights, read_weights, with_own_motion
 from lightning_modules.tiles import forward_in_tiles
 from spikekit import psnr, ssim
 
@@ -24,13 +25,15 @@ class SuperResolution(Learner):
     kind of estimator than this run's are passed over, and this run's stay as they were built.
 
     Args:
-        network: the network, such as CSCSR.
+        network: the network, such as CSCSR. ``lightning`` builds it as the weights want it, where some are given.
         optimizer: builds the optimizer from the parameters; the paper uses Adam at 1e-4.
         lr_scheduler: builds the schedule from the optimizer, counted in steps; the paper multiplies by 0.8 every 7500.
         tile: side of the tiles, in sensor pixels, in which ``predict`` works through a large recording; 0 for none.
         flow: the motion that training uses. "scene" is that of the data, where they have it: the true one of analytic
             scenes, or that which the frames of a film were interpolated with. "estimated" is that of the network's own
             estimator, which learns as well unless it is frozen.
+        weights: what the network starts with: the name of weights that come with the package, such as ``x4-e``, a file
+            of safetensors, or a checkpoint of which only the weights are taken.
     """
 
     best = ("val/psnr", "max")
@@ -44,6 +47,7 @@ class SuperResolution(Learner):
         lr_scheduler: LRSchedulerCallable = lambda optimizer: torch.optim.lr_scheduler.StepLR(optimizer, 7500, 0.8),
         tile: int = 128,
         flow: Literal["scene", "estimated"] = "scene",
+        weights: str | None = None,
     ) -> None:
         super().__init__(network, {"pattern": network.pattern}, optimizer, lr_scheduler)
         if tile < 0 or tile % 2:
@@ -57,6 +61,8 @@ class SuperResolution(Learner):
             )
         self.tile = tile
         self.flow = flow
+        if weights is not None:
+            load_weights(network, read_weights(weights))
 
     def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:  # noqa: D102
         rgb = self.network(batch["spikes"], batch.get("flow") if self.flow == "scene" else None)
@@ -82,7 +88,7 @@ class SuperResolution(Learner):
             "TFP": ClassicalDecoder("tfp", *shared)(spikes),
             name: self.network(spikes),
         }
-        if "flow" in batch:
+        if "flow" in batch and not isinstance(self.network, ClassicalDecoder):
             pictures[f"{name}, true flow"] = self.network(spikes, batch["flow"])
         return pictures
 
@@ -92,9 +98,4 @@ class SuperResolution(Learner):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:  # noqa: D102
         super().on_load_checkpoint(checkpoint)
-        # estimators are exchanged freely: a network is trained with one and tested with all of them
-        weights, prefix = checkpoint["state_dict"], "network.motion."
-        ours = {f"{prefix}{name}": value for name, value in self.network.motion.state_dict().items()}
-        theirs = {name: value for name, value in weights.items() if name.startswith(prefix)}
-        if {name: value.shape for name, value in ours.items()} != {name: value.shape for name, value in theirs.items()}:
-            checkpoint["state_dict"] = {name: weights[name] for name in weights.keys() - theirs.keys()} | ours
+        checkpoint["state_dict"] = with_own_motion(checkpoint["state_dict"], self.network.motion, "network.")

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lightning_modules.motion.estimator import MotionEstimator, split_any_size
 from lightning_modules.motion.recurrent import RecurrentFlow
+from lightning_modules.pretrained import load_weights, read_weights
 from spikekit import spike_interval
 from spikekit.check import check_planes
 
@@ -45,14 +46,15 @@ class Spike2Flow(MotionEstimator):
         levels: scales of the correlations.
         radius: how far the correlations are looked up, in pixels of each scale.
         iterations: how often the flows are refined; any number serves, whatever was trained with.
-        weights: checkpoint of ``lightning fit -c configs/flow.yaml``; random weights when not given.
+        weights: ``"spike2flow"``, which comes with the package and is of the default size; a file of safetensors, or a
+            checkpoint of ``lightning fit -c configs/flow.yaml``. Random weights when not given.
         frozen: estimate without gradient, and never learn.
 
     Shape:
         As :class:`MotionEstimator`; spikes of at least 2 x 2 pixels.
 
     Raises:
-        FileNotFoundError: there is no such checkpoint.
+        FileNotFoundError: there are no such weights.
         ValueError: an argument that makes no sense, a file that is damaged or of another network; the message names it.
 
     Example:
@@ -111,7 +113,7 @@ class Spike2Flow(MotionEstimator):
         self.window, self.iterations, self.frozen = window, iterations, frozen
         self.network = RecurrentFlow(**self.settings)
         if weights is not None:
-            self._load(Path(weights))
+            load_weights(self, read_weights(weights))
         if frozen:
             self.requires_grad_(False)
 
@@ -154,26 +156,6 @@ class Spike2Flow(MotionEstimator):
         centers = torch.tensor([round(middle + (last - middle) * k / 3) for k in range(4)])
         frames = centers[:, None] + torch.arange(self.window) - self.window // 2
         return intervals[:, :, frames.clamp(0, spikes.shape[1] - 1).to(spikes.device)]
-
-    def _load(self, path: Path) -> None:
-        if not path.is_file():
-            raise FileNotFoundError(f"{path}: no such checkpoint")
-        try:
-            checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-            settings, weights = dict(checkpoint["network"]), dict(checkpoint["state_dict"])
-        except Exception as error:
-            said = (str(error).splitlines() or [""])[0]
-            raise ValueError(f"{path}: not a checkpoint of lightning fit ({type(error).__name__}: {said})") from error
-        ours = {"class": type(self).__name__, **self.settings}
-        differing = [key for key in ours if settings.get(key) != ours[key]]
-        if differing:
-            trained = ", ".join(f"{key}={settings.get(key)}" for key in differing)
-            asked = ", ".join(f"{key}={ours[key]}" for key in differing)
-            raise ValueError(f"{path}: was trained with {trained}; this network has {asked}")
-        try:
-            self.load_state_dict({name.removeprefix("network."): value for name, value in weights.items()})
-        except RuntimeError as error:
-            raise ValueError(f"{path}: weights that do not fit ({str(error).splitlines()[-1].strip()})") from error
 
     def extra_repr(self) -> str:  # noqa: D102
         return f"iterations={self.iterations}, frozen={self.frozen}"

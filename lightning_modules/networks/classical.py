@@ -5,13 +5,15 @@ from __future__ import annotations
 from typing import Literal
 
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
+from lightning_modules.motion import ZeroFlow
+from lightning_modules.networks.network import Network
 from spikekit import bayer_pattern, demosaic, tfi, tfp
 from spikekit.check import check_planes, check_positive, check_scale
 
 
-class ClassicalDecoder(nn.Module):
+class ClassicalDecoder(Network):
     r"""TFI or TFP of the middle frame, demosaicing, bicubic enlargement; the baseline that every network must beat.
 
     Args:
@@ -20,6 +22,7 @@ class ClassicalDecoder(nn.Module):
         pattern: Bayer phase.
         alpha: gain of the camera, what a white pixel receives per clock in thresholds; the result is divided by it.
         window: frames that TFP averages, odd.
+        frames: spike frames N of a clip, odd.
 
     Shape:
         - Input: spikes :math:`(B, N, H, W)`, any real dtype
@@ -38,19 +41,29 @@ class ClassicalDecoder(nn.Module):
         pattern: str = "RGGB",
         alpha: float = 0.4,
         window: int = 41,
+        frames: int = 41,
     ) -> None:
-        super().__init__()
         check_scale(scale)
         check_positive("alpha", alpha)
         if method not in ("tfi", "tfp"):
             raise ValueError(f"method: expected 'tfi' or 'tfp', got {method!r}")
+        if min(frames, window) < 1 or frames % 2 == 0 or window % 2 == 0:
+            raise ValueError(f"frames, window: expected odd numbers, got {frames} and {window}")
+        settings = {
+            "method": method,
+            "scale": scale,
+            "pattern": bayer_pattern(pattern),
+            "alpha": alpha,
+            "window": window,
+            "frames": frames,
+        }
+        super().__init__(settings, (frames // 2,) * 3, ZeroFlow())
         self.method = method
-        self.scale = scale
-        self.pattern = bayer_pattern(pattern)
         self.alpha = alpha
         self.window = window
 
-    def forward(self, spikes: Tensor) -> Tensor:  # noqa: D102
+    def forward(self, spikes: Tensor, flow: Tensor | None = None) -> Tensor:
+        """Return rgb; a flow changes nothing."""
         check_planes("spikes", spikes, 4, "(B, N, H, W)")
         decoded = tfi(spikes) if self.method == "tfi" else tfp(spikes, self.window)
         raw = decoded[:, spikes.shape[1] // 2] / self.alpha

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
+from lightning_modules import motion as estimators
 from lightning_modules.motion import ClassicalFlow, MotionEstimator
+from lightning_modules.pretrained import load_weights, read_weights
 
 
 class Network(nn.Module):
@@ -36,6 +39,37 @@ class Network(nn.Module):
         self.pattern: str = settings["pattern"]
         self.flow_times = flow_times
         self.motion = ClassicalFlow() if motion is None else motion
+
+    @classmethod
+    def from_pretrained(cls, weights: str | Path, motion: MotionEstimator | None = None) -> Self:
+        """Build the network that weights are of, and load them.
+
+        Args:
+            weights: the name of weights that come with the package, such as ``"x4-e"``; a file of safetensors; or a
+                checkpoint of ``lightning fit``.
+            motion: estimator that is asked where no flow is given; when not given, the one inside the weights, or
+                :class:`lightning_modules.motion.ClassicalFlow` where none is.
+
+        Returns:
+            The network, in evaluation mode, on the CPU.
+
+        Raises:
+            FileNotFoundError: neither a file nor the name of one; the message says which names there are.
+            ValueError: a file that is damaged, or of another kind of network.
+        """
+        found = read_weights(weights)
+        settings, inside = dict(found.settings), dict(found.motion)
+        kind = settings.pop("class", None)
+        if kind != cls.__name__:
+            raise ValueError(f"{weights}: expected weights of {cls.__name__}, got those of {kind}")
+        try:
+            if motion is None and inside:
+                motion = getattr(estimators, inside.pop("class"))(**inside)
+            network = cls(**settings, motion=motion)
+        except (AttributeError, TypeError) as error:
+            raise ValueError(f"{weights}: written by another version of this package ({error})") from error
+        load_weights(network, found)
+        return network.eval()
 
     def estimate_flow(self, spikes: Tensor) -> Tensor:
         """Flows from the middle to the first and to the last time point, (B, 2, 2, H, W), in sensor pixels."""

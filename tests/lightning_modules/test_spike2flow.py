@@ -292,14 +292,14 @@ def test_weights_plug_into_cscsr(frozen, tmp_path):
 
 
 def test_files_that_hold_no_weights_for_it(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"nowhere.ckpt: no such checkpoint"):
+    with pytest.raises(FileNotFoundError, match=r"nowhere.ckpt: neither a file of weights nor the name"):
         Spike2Flow(weights=tmp_path / "nowhere.ckpt")
     damaged = checkpoint(tmp_path / "damaged.ckpt", Spike2Flow(**TINY))
     damaged.write_bytes(damaged.read_bytes()[:-2000])
     with pytest.raises(ValueError, match=r"damaged.ckpt: not a checkpoint"):
         Spike2Flow(**TINY, weights=damaged)
     other = checkpoint(tmp_path / "other.ckpt", Spike2Flow(**TINY))
-    with pytest.raises(ValueError, match=r"other.ckpt: was trained with hidden=4; this network has hidden=6"):
+    with pytest.raises(ValueError, match=r"other.ckpt was trained with hidden=4; this run asks for hidden=6"):
         Spike2Flow(**{**TINY, "hidden": 6}, weights=other)
     short = checkpoint(tmp_path / "short.ckpt", Spike2Flow(**TINY), state_dict={})
     with pytest.raises(ValueError, match=r"short.ckpt: weights that do not fit"):

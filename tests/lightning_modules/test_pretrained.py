@@ -1,0 +1,171 @@
+"""Weights in files, from Python and as they are typed."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from safetensors.torch import load_file, save_file
+
+from lightning_modules.cli import main
+from lightning_modules.module import SuperResolution
+from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
+from lightning_modules.networks import CSCSR, ClassicalDecoder
+from lightning_modules.pretrained import read_weights, shipped_weights, write_weights
+from spikekit import read_picture, write_spikes
+
+TINY = {"scale": 2, "width": 4, "representation_width": 4, "features": 1, "stages": 1, "end_blocks": 1, "skip": True}
+FLOW_TINY = {"window": 5, "widths": (4,), "features": 4, "hidden": 4, "correlation": (4, 4), "motion": 4, "head": 4}
+SPIKES = torch.rand(1, 41, 8, 10, generator=torch.Generator().manual_seed(0)) < 0.3
+
+
+def network(**changes):
+    torch.manual_seed(0)
+    made = CSCSR(**{**TINY, **changes})
+    torch.nn.init.normal_(made.reconstruction.rgb.weight, std=0.1)  # the skip begins with zeros, as any network would
+    return made
+
+
+def checkpoint(path, module):
+    content = {"state_dict": module.state_dict()}
+    module.on_save_checkpoint(content)
+    torch.save(content, path)
+    return path
+
+
+@pytest.fixture(name="file")
+def _file(tmp_path):
+    trained = checkpoint(tmp_path / "trained.ckpt", SuperResolution(network()))
+    main(["export", str(trained), "-o", str(tmp_path / "trained.safetensors")])
+    return tmp_path / "trained.safetensors"
+
+
+def test_export_and_from_pretrained(file, capsys):
+    for source in (file, str(file), file.with_suffix(".ckpt")):
+        read = CSCSR.from_pretrained(source)
+        assert not read.training
+        assert isinstance(read.motion, ClassicalFlow)
+        assert torch.equal(read(SPIKES), network()(SPIKES))
+    assert isinstance(CSCSR.from_pretrained(file, motion=ZeroFlow()).motion, ZeroFlow)
+
+
+@pytest.mark.parametrize("suffix", [".ckpt", ".safetensors"])
+def test_learned_motion_is_part_of_the_weights(tmp_path, suffix):
+    made = network(motion=Spike2Flow(**FLOW_TINY))
+    path = checkpoint(tmp_path / "moved.ckpt", SuperResolution(made))
+    if suffix == ".safetensors":
+        write_weights(read_weights(path), path.with_suffix(suffix))
+    read = CSCSR.from_pretrained(path.with_suffix(suffix))
+    assert isinstance(read.motion, Spike2Flow)
+    assert torch.equal(read(SPIKES), made(SPIKES))
+    with_other = CSCSR.from_pretrained(path.with_suffix(suffix), motion=ZeroFlow())
+    assert torch.equal(with_other(SPIKES), made(SPIKES, torch.zeros(1, 2, 2, 8, 10)))
+
+
+def test_weights_of_something_else(file, tmp_path):
+    with pytest.raises(ValueError, match="expected weights of ClassicalDecoder, got those of CSCSR"):
+        ClassicalDecoder.from_pretrained(file)
+    with pytest.raises(ValueError, match=r"trained with scale=2, width=4; this run asks for scale=4, width=8"):
+        SuperResolution(network(scale=4, width=8), weights=str(file))
+    with pytest.raises(FileNotFoundError, match=r"x9-z: neither a file .* nor .* in the package \(.*spike2flow"):
+        CSCSR.from_pretrained("x9-z")
+    plain = tmp_path / "plain.safetensors"
+    save_file(load_file(file), plain)
+    with pytest.raises(ValueError, match=r"plain.safetensors: does not say what network it is of"):
+        CSCSR.from_pretrained(plain)
+    tensors, said = load_file(file), {"network": json.dumps({"class": "CSCSR", **network().settings}), "motion": "{}"}
+    tensors["reconstruction.rgb.weight"] = tensors["reconstruction.rgb.weight"][:1].clone()
+    save_file(tensors, plain, said)
+    with pytest.raises(ValueError, match=r"plain.safetensors: weights that do not fit .*rgb.weight"):
+        CSCSR.from_pretrained(plain)
+    save_file(tensors, plain, {**said, "network": json.dumps({"class": "CSCSR", "of_next_year": 1})})
+    with pytest.raises(ValueError, match="of_next_year"):
+        CSCSR.from_pretrained(plain)
+    with pytest.raises(ValueError, match=r"ends in .safetensors"):
+        write_weights(read_weights(file), tmp_path / "file.bin")
+
+
+@pytest.mark.parametrize("suffix", [".ckpt", ".safetensors"])
+@pytest.mark.parametrize("length", [0, 5, 1000, -1])
+def test_damaged_files_say_so_in_one_line(file, suffix, length, capsys):
+    path = file.with_suffix(suffix)
+    path.write_bytes(path.read_bytes()[:length])
+    for args in (["predict", "--model.weights", str(path)], ["export", str(path), "-o", "other.safetensors"]):
+        with pytest.raises(SystemExit) as stopped:
+            main(args)
+        assert str(stopped.value).startswith(f"lightning: {path}: not a ")
+        assert str(stopped.value).count("\n") == 0
+
+
+def test_loading_runs_no_code(tmp_path):
+    class Harmful:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "harmed"),)
+
+    for name in ("file.ckpt", "file.safetensors"):
+        torch.save({"network": {"class": "CSCSR"}, "state_dict": {}, "other": Harmful()}, tmp_path / name)
+        with pytest.raises(ValueError, match=name):
+            CSCSR.from_pretrained(tmp_path / name)
+    assert not (tmp_path / "harmed").exists()
+
+
+def test_shipped_weights_are_what_their_names_and_cards_say():
+    assert "spike2flow" in shipped_weights()
+    for name, path in shipped_weights().items():
+        assert path.stat().st_size < 16 * 2**20
+        assert path.with_suffix(".md").is_file(), f"{name} has no card"
+        found = read_weights(name)
+        if name == "spike2flow":
+            Spike2Flow(weights=name)
+            continue
+        assert found.settings["class"] == "CSCSR"
+        assert name.startswith(f"x{found.settings['scale']}-")
+        assert CSCSR.from_pretrained(name).settings == {k: v for k, v in found.settings.items() if k != "class"}
+
+
+def predict(*args, cwd):
+    """From elsewhere: nothing but the package and the file of weights is to be needed."""
+    command = [sys.executable, "-m", "lightning_modules", "predict", *map(str, args), "--trainer.accelerator", "cpu"]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, cwd=cwd)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["argument", "configuration"])
+def test_predict_needs_nothing_but_weights(file, how, tmp_path):
+    write_spikes(tmp_path / "clip.dat", SPIKES[0])
+    recording = ["--data", "Recording", "--data.path", "clip.dat", "--data.height", "8", "--data.width", "10"]
+    if how == "argument":
+        args = ["--model.weights", file.name]
+    else:
+        (tmp_path / "own.yaml").write_text(yaml.safe_dump({"model": {"weights": file.name}}))
+        args = ["-c", "own.yaml"]
+    done = predict(*args, *recording, "-o", "out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    expected = network()(SPIKES)[0].clamp(0, 1)
+    assert (read_picture(tmp_path / "out" / "frame_000020.png") - expected).abs().max() < 0.51 / 255
+    moved = predict(*args, "--model.network.motion", "ZeroFlow", *recording, "-o", "still", cwd=tmp_path)
+    assert moved.returncode == 0, moved.stderr
+    assert "ZeroFlow" not in done.stderr
+    still = network()(SPIKES, torch.zeros(1, 2, 2, 8, 10))[0].clamp(0, 1)
+    assert (read_picture(tmp_path / "still" / "frame_000020.png") - still).abs().max() < 0.51 / 255
+    refused = predict(*args, "--model.network.width", "8", *recording, "-o", "no", cwd=tmp_path)
+    assert refused.returncode == 1
+    assert refused.stderr.endswith("was trained with width=4; this run asks for width=8\n")
+
+
+@pytest.mark.slow
+def test_fit_goes_on_from_weights_and_data_follow_them(file, tmp_path):
+    x4 = Path(__file__).parents[2] / "configs" / "x4.yaml"
+    (tmp_path / "tiny.yaml").write_text(
+        "data: {init_args: {patch: 8, val_patch: 8, train_clips: 4, val_clips: 1, workers: 0}}\n"
+        "trainer: {max_steps: 1, check_val_every_n_epoch: 1}\n"
+    )
+    args = ["-c", x4, "-c", tmp_path / "tiny.yaml", "--model.weights", file, "--model.optimizer.lr", "1e-12"]
+    main(["fit", *map(str, args), "-o", str(tmp_path / "run")])
+    after = CSCSR.from_pretrained(tmp_path / "run" / "checkpoints" / "last.ckpt")
+    assert after.scale == 2
+    torch.testing.assert_close(after(SPIKES), network()(SPIKES))
