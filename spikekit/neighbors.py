@@ -134,12 +134,19 @@ def _insert(best: list[tuple[Tensor, Tensor]], distance: Tensor, index: Tensor, 
         best.append((distance, index))
 
 
+def _search_and_weigh(
+    products: list[Product], neighbors: int, width: int, cell: Tensor, part: Tensor
+) -> tuple[Tensor, Tensor]:
+    index = _search(products, neighbors, width, cell, part)
+    return index, _weigh(index, width, cell, part)
+
+
 @lru_cache(maxsize=8)
-def _table(key: _Key, neighbors: int, steps: int) -> PositionTable:
+def _table(key: _Key, neighbors: int, steps: int, dtype: torch.dtype) -> PositionTable:
     bits, height, width, device = key
     known = np.frombuffer(bits, dtype=bool).reshape(height, width)
-    search = partial(_search, _products((bits, height, width, "cpu"), neighbors), neighbors, width)
-    return PositionTable(known, neighbors, steps, search, device)
+    search = partial(_search_and_weigh, _products((bits, height, width, "cpu"), neighbors), neighbors, width)
+    return PositionTable(known, neighbors, steps, search, dtype, device)
 
 
 def _weigh(index: Tensor, width: int, cell: Tensor, part: Tensor) -> Tensor:
@@ -161,7 +168,7 @@ def _nearest_known(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tu
         flow: (N, 2, H, W), float32 or float64, finite and less than 2^30.
         mask: (H, W).
         neighbors: how many known pixels to weigh, K.
-        steps: positions per pixel and axis of a table that is asked instead of the exact search; 0: no table.
+        steps: positions per pixel and axis that flow is rounded to, so that a table can be asked; 0: no rounding.
 
     Returns:
         Index, int64, and weight, in the dtype of ``flow``: both (N, K, H W), the nearest first. Where fewer pixels
@@ -169,9 +176,9 @@ def _nearest_known(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tu
     """
     count, _, height, width = flow.shape
     if steps:
-        find = _table(_key(mask), neighbors, steps).find
+        find = _table(_key(mask), neighbors, steps, flow.dtype).find
     else:
-        find = partial(_search, products_of(mask, neighbors), neighbors, width)
+        find = partial(_search_and_weigh, products_of(mask, neighbors), neighbors, width)
     # double, so that what is nearer does not depend on rounding
     double = torch.float32 if flow.device.type == "mps" else torch.float64
     plane = height * width
@@ -185,8 +192,7 @@ def _nearest_known(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tu
         pixel = torch.arange(begin, begin + moved.shape[1], device=flow.device) % plane
         cell, part = torch.stack([pixel % width, pixel // width]) + whole.long(), moved - whole
         chunk = slice(begin, begin + size)
-        index[:, chunk] = find(cell, part)
-        weight[:, chunk] = _weigh(index[:, chunk], width, cell, part)
+        index[:, chunk], weight[:, chunk] = find(cell, part)
     shape = neighbors, count, plane
     return index.reshape(shape).movedim(0, 1).contiguous(), weight.reshape(shape).movedim(0, 1).contiguous()
 
@@ -203,7 +209,7 @@ def _(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, T
 @nearest_known.register_kernel("cpu")
 def _(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
     if steps:
-        return cpu_warp.nearest_in_table(flow, _table(_key(mask), neighbors, steps))
+        return cpu_warp.nearest_in_table(flow, _table(_key(mask), neighbors, steps, flow.dtype))
     if neighbors == 4:
         products = products_of(mask, neighbors)
         if len(products) <= 2 and all(len(table) == 4 for product in products for table in product):
@@ -221,6 +227,17 @@ register_on_gpu(nearest_known, _on_gpu)
 fold_into_batch(nearest_known, 1)
 
 
+def _rounded(flow: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+    """Return the flow that a table stands for, with the gradient of what was rounded, and where it is not cut."""
+    height, width = flow.shape[-2:]
+    y, x = (torch.arange(length, device=flow.device, dtype=flow.dtype) for length in (height, width))
+    pixel = torch.stack([x.expand(height, width), y[:, None].expand(height, width)])
+    last = pixel[:, -1:, -1:] + 0.5
+    cut = (flow.detach() + pixel).clamp(min=-0.5).minimum(last) - pixel
+    inside = (flow.detach() + pixel).ge(-0.5) & (flow.detach() + pixel).le(last)
+    return flow + ((cut * steps).round() / steps - flow.detach()), inside
+
+
 class _NearestKnown(torch.autograd.Function):
     """:func:`nearest_known` with the derivative of the weights in the flow."""
 
@@ -234,12 +251,16 @@ class _NearestKnown(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, int, int], output: tuple[Tensor, Tensor]) -> None:
         index, weight = output
         ctx.mark_non_differentiable(index)
+        ctx.steps = inputs[3]
         ctx.save_for_backward(inputs[0], index, weight)
 
     @staticmethod
     def backward(ctx: Any, _: Tensor, grad: Tensor) -> tuple[Tensor, None, None, None]:
         flow, index, weight = ctx.saved_tensors
         _, _, height, width = flow.shape
+        inside = 1
+        if ctx.steps:
+            flow, inside = _rounded(flow, ctx.steps)
         whole = flow.detach().round()
         part = (flow - whole).flatten(2)
         pixel = torch.arange(height * width, device=flow.device)
@@ -253,7 +274,8 @@ class _NearestKnown(torch.autograd.Function):
         near = first * (others * (grad[:, :1] - grad[:, 1:])).sum(dim=1, keepdim=True)
         far = others * (grad[:, 1:] - (weight * grad).sum(dim=1, keepdim=True))
         factor = torch.cat([near, far], dim=1) / torch.where(square < torch.finfo(flow.dtype).tiny, 1, square)
-        return torch.stack([(factor * dx).sum(dim=1), (factor * dy).sum(dim=1)], dim=1).reshape(flow.shape), *[None] * 3
+        result = torch.stack([(factor * dx).sum(dim=1), (factor * dy).sum(dim=1)], dim=1).reshape(flow.shape)
+        return result * inside, *[None] * 3
 
 
 def idw_neighbors(flow: Tensor, mask: Tensor, neighbors: int = 4, steps: int | None = None) -> tuple[Tensor, Tensor]:
@@ -263,7 +285,7 @@ def idw_neighbors(flow: Tensor, mask: Tensor, neighbors: int = 4, steps: int | N
         flow: (N, 2, H, W), floating.
         mask: (H, W); a pixel is known where it is not 0.
         neighbors: how many known pixels to weigh, K.
-        steps: positions per pixel and axis of the table to look them up in; None: exact.
+        steps: positions per pixel and axis that flow is rounded to, so that a table can be asked; None: exact.
 
     Returns:
         Flat indices, int64, and weights, in the dtype of ``flow`` but float32 at least: both (N, K, H W). The weights

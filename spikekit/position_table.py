@@ -1,4 +1,4 @@
-"""A table of the nearest known pixels for positions that are rounded to fractions of a pixel."""
+"""A table of the nearest known pixels, and their weights, for positions rounded to fractions of a pixel."""
 
 from __future__ import annotations
 
@@ -51,13 +51,15 @@ class TableAxis:
 
 
 class PositionTable:
-    """The nearest known pixels of all rounded positions of a mask with a period.
+    """The nearest known pixels of all rounded positions of a mask with a period, and their weights.
 
     Args:
         known: the mask, bool.
         neighbors: how many pixels are kept for a position.
         steps: positions per pixel and axis.
-        search: finds flat indices (neighbors, n) for pixels (2, n), (x, y), and offsets (2, n), on the CPU.
+        search: finds flat indices and weights, both (neighbors, n), for pixels (2, n), (x, y), and offsets (2, n), on
+            the CPU.
+        dtype: of the weights.
         device: of the mask.
 
     Raises:
@@ -69,7 +71,8 @@ class PositionTable:
         known: np.ndarray,
         neighbors: int,
         steps: int,
-        search: Callable[[Tensor, Tensor], Tensor],
+        search: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
+        dtype: torch.dtype,
         device: str,
     ) -> None:
         height, self.width = known.shape
@@ -87,14 +90,17 @@ class PositionTable:
         cell = torch.stack([x.repeat(len(y)), y.repeat_interleave(len(x))])
         part = torch.stack([x_offset.repeat(len(y)), y_offset.repeat_interleave(len(x))])
         parts = zip(cell.split(_CHUNK, dim=1), part.split(_CHUNK, dim=1), strict=True)
-        nearest = torch.cat([search(*pair).int() for pair in parts], dim=1)
+        found = [(index.int(), weight.to(dtype)) for index, weight in (search(*pair) for pair in parts)]
+        nearest, weight = (torch.cat(kind, dim=1) for kind in zip(*found, strict=True))
         self.shift = (nearest - (cell[1] * self.width + cell[0])).int().to(device)  # from the pixel to its neighbours
+        self.weight = weight.to(device)
 
-    def find(self, cell: Tensor, part: Tensor) -> Tensor:
-        """Flat indices (neighbors, n) for cell + part, (2, n)."""
+    def find(self, cell: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
+        """Flat indices and weights, both (neighbors, n), for cell + part, (2, n)."""
         column, x = self.columns.find(cell[0], part[0])
         row, y = self.rows.find(cell[1], part[1])
-        return self.shift.index_select(1, row * self.columns_length + column) + (y * self.width + x)
+        place = row * self.columns_length + column
+        return self.shift.index_select(1, place) + (y * self.width + x), self.weight.index_select(1, place)
 
 
 def _period(known: np.ndarray) -> int:

@@ -93,17 +93,16 @@ def flow_warp_idw(
         Differentiable in the features and in the flow, twice; the neighbours themselves are constants. On a known
         pixel the gradient with respect to the flow, a cone's tip, is 0, and so it is where the flow is not finite.
 
-        With ``steps`` the neighbours are looked up in a table of that many positions per pixel and axis, made once
-        for a mask: those of the nearest such position, weighed by their distance to the position itself. It differs
-        from the exact search only in the choice between pixels that are nearly equally far. Outside the image the
-        neighbours are those of the nearest position on its edge.
+        With ``steps`` the flow is rounded to that many positions per pixel and axis, and positions outside the image
+        are moved to its edge, so that neighbours and weights can be looked up in a table, made once for a mask. The
+        gradient is that of the rounded flow, 0 where a position was moved.
 
     Args:
         features: :math:`(*, C, H, W)`, floating.
         flow: :math:`(*, 2, H, W)`.
         mask: :math:`(H, W)`; a pixel is known where it is not 0. The tables of a mask are kept between calls.
         neighbors: how many known pixels to weigh.
-        steps: positions per pixel and axis of an approximate search, such as 16; None for the exact one.
+        steps: positions per pixel and axis that the flow is rounded to, such as 16; None for the exact search.
 
     Returns:
         As ``features``, also in memory: channels-last features give a channels-last result.

@@ -154,41 +154,35 @@ def nearest_four(flow: Tensor, products: list[tuple[Tensor, Tensor]]) -> tuple[T
 
 
 def nearest_in_table(flow: Tensor, table: PositionTable) -> tuple[Tensor, Tensor]:
-    """Nearest pixels of rounded positions, from a table, and the weights that they have at the exact ones."""
+    """Nearest pixels of rounded positions, and their weights, from a table."""
     count, _, height, width = flow.shape
     plane, neighbors = height * width, len(table.shift)
     index, weight = _new((count, neighbors, plane), torch.int64), _new((count, neighbors, plane), flow.dtype)
-    moved, shift = flow.detach().flatten(2).numpy(), table.shift.numpy()
-    pixel_x, pixel_y = np.tile(np.arange(1.0 * width), height), np.repeat(np.arange(1.0 * height), width)
+    moved, shift, share = flow.detach().flatten(2).numpy(), table.shift.numpy(), table.weight.numpy()
+    pixels = np.arange(plane, dtype=np.int32)
+    pixel_x, pixel_y = pixels % width, pixels // width
     for images in _slices(count, max(_TILE // plane, 1)):
         for piece in _slices(plane, _TILE):
-            column, x, x_cell, x_part = _on_table(moved[images, 0, piece], pixel_x[piece], table.columns)
-            row, y, y_cell, y_part = _on_table(moved[images, 1, piece], pixel_y[piece], table.rows)
-            place, pixel = (row * table.columns_length + column).astype(np.intp), y * width + x
-            flats, distances = [], []
-            for shift_k in shift:
-                flat = shift_k.take(place) + pixel
-                row = np.floor(flat / width)
-                dx, dy = (flat - row * width - x_cell) - x_part, (row - y_cell) - y_part
-                flats.append(flat)
-                distances.append(np.sqrt((dx * dx + dy * dy).astype(moved.dtype)))
-            ratios = [
-                np.divide(distances[0], distance, out=np.zeros_like(distance), where=flat != flats[0])
-                for flat, distance in zip(flats[1:], distances[1:], strict=True)
-            ]
-            _store(index[images, :, piece], weight[images, :, piece], flats, ratios)
+            place, pixel = _on_table(moved[images, 0, piece], pixel_x[piece], table.columns)
+            row, y = _on_table(moved[images, 1, piece], pixel_y[piece], table.rows)
+            place += row * np.int32(table.columns_length)
+            pixel += y * np.int32(width)
+            for k in range(neighbors):
+                np.add(shift[k].take(place), pixel, out=index.numpy()[images, k, piece])
+                weight.numpy()[images, k, piece] = share[k].take(place)
     return index, weight
 
 
-def _on_table(flow: np.ndarray, pixel: np.ndarray, axis: TableAxis) -> tuple[np.ndarray, ...]:
-    """Return where a coordinate is in the table, the pixel that it is looked up from, and its two parts."""
-    flow = flow.astype(np.float64)
-    whole = np.rint(flow)
-    part = flow - whole
+def _on_table(flow: np.ndarray, pixel: np.ndarray, axis: TableAxis) -> tuple[np.ndarray, np.ndarray]:
+    """Return where a coordinate is in the table, and the pixel that it is looked up from, both int32."""
+    reach = axis.length + 1.0  # farther away nothing changes, and steps would not fit
+    step = np.rint(np.maximum(np.minimum(flow, reach), -reach) * axis.steps).astype(np.int32)
+    whole = (step + np.int32(axis.steps // 2)) // np.int32(axis.steps)
     cell = whole + pixel
-    inside = np.maximum(np.minimum(cell, axis.length - 1.0), 0.0)
-    offset = np.maximum(np.minimum((cell - inside) + part, 0.5), -0.5) * axis.steps
-    return axis.place.numpy().take(inside.astype(np.intp)) + np.rint(offset), inside, cell, part
+    inside = np.maximum(np.minimum(cell, np.int32(axis.length - 1)), np.int32(0))
+    offset = step - (whole - (cell - inside)) * np.int32(axis.steps)
+    offset = np.maximum(np.minimum(offset, np.int32(axis.half)), np.int32(-axis.half))
+    return axis.place.numpy().take(inside).astype(np.int32) + offset, inside
 
 
 def _slices(length: int, size: int) -> Iterator[slice]:
