@@ -145,8 +145,12 @@ def _search_and_weigh(
 def _table(key: _Key, neighbors: int, steps: int, dtype: torch.dtype) -> PositionTable:
     bits, height, width, device = key
     known = np.frombuffer(bits, dtype=bool).reshape(height, width)
-    search = partial(_search_and_weigh, _products((bits, height, width, "cpu"), neighbors), neighbors, width)
-    return PositionTable(known, neighbors, steps, search, dtype, device)
+    return PositionTable(known, neighbors, steps, _search_in, dtype, device)
+
+
+def _search_in(known: np.ndarray, neighbors: int, cell: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
+    products = _products((known.tobytes(), *known.shape, "cpu"), neighbors)
+    return _search_and_weigh(products, neighbors, known.shape[1], cell, part)
 
 
 def _weigh(index: Tensor, width: int, cell: Tensor, part: Tensor) -> Tensor:

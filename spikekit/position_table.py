@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -10,6 +12,8 @@ from torch import Tensor
 
 _CHUNK = 1 << 15  # positions that are searched at a time
 _LARGEST = 1 << 23  # positions of a table: 128 MiB of four neighbours
+
+Search = Callable[[np.ndarray, int, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 class TableAxis:
@@ -29,7 +33,9 @@ class TableAxis:
         self.half = (steps + 1) // 2  # rounded positions on either side of a pixel
         pixel = np.arange(length)
         place = pixel
+        self.short = length  # of the shortest axis that looks the same from every pixel
         if length > 2 * margin + period:
+            self.short = 2 * margin + period + (length - 2 * margin) % period
             inner = np.s_[margin : length - margin]
             place = np.where(pixel < margin, pixel, pixel - (length - 2 * margin - period))
             place[inner] = margin + (pixel[inner] - margin) % period
@@ -57,8 +63,8 @@ class PositionTable:
         known: the mask, bool.
         neighbors: how many pixels are kept for a position.
         steps: positions per pixel and axis.
-        search: finds flat indices and weights, both (neighbors, n), for pixels (2, n), (x, y), and offsets (2, n), on
-            the CPU.
+        search: finds flat indices and weights, both (neighbors, n), in a mask, given as bool, for pixels (2, n), (x, y),
+            and offsets (2, n), on the CPU.
         dtype: of the weights.
         device: of the mask.
 
@@ -67,33 +73,25 @@ class PositionTable:
     """
 
     def __init__(
-        self,
-        known: np.ndarray,
-        neighbors: int,
-        steps: int,
-        search: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
-        dtype: torch.dtype,
-        device: str,
+        self, known: np.ndarray, neighbors: int, steps: int, search: Search, dtype: torch.dtype, device: str
     ) -> None:
         height, self.width = known.shape
         period = _period(known), _period(known.T)
         margin = _margin(known, period, neighbors)
         self.rows = TableAxis(height, period[0], margin, steps, device)
         self.columns = TableAxis(self.width, period[1], margin, steps, device)
-        (y, y_offset), (x, x_offset) = self.rows.positions(), self.columns.positions()
-        if len(y) * len(x) > _LARGEST:
+        positions = math.prod(len(axis.first) * (2 * axis.half + 1) for axis in (self.rows, self.columns))
+        if positions > _LARGEST:
             raise ValueError(
                 f"mask: expected a pattern that repeats along rows and columns, got one whose table of steps={steps} "
-                f"would have {len(y) * len(x)} positions"
+                f"would have {positions} positions"
             )
-        self.columns_length = len(x)
-        cell = torch.stack([x.repeat(len(y)), y.repeat_interleave(len(x))])
-        part = torch.stack([x_offset.repeat(len(y)), y_offset.repeat_interleave(len(x))])
-        parts = zip(cell.split(_CHUNK, dim=1), part.split(_CHUNK, dim=1), strict=True)
-        found = [(index.int(), weight.to(dtype)) for index, weight in (search(*pair) for pair in parts)]
-        nearest, weight = (torch.cat(kind, dim=1) for kind in zip(*found, strict=True))
-        self.shift = (nearest - (cell[1] * self.width + cell[0])).int().to(device)  # from the pixel to its neighbours
-        self.weight = weight.to(device)
+        # masks of all sizes share what is found in the smallest that has the same borders
+        small = known[: self.rows.short, : self.columns.short]
+        y, x, weight = _search_all(small.tobytes(), small.shape, period, margin, neighbors, steps, search)
+        self.columns_length = len(self.columns.first) * (2 * self.columns.half + 1)
+        self.shift = (y * self.width + x).to(device)  # from the pixel to its neighbours
+        self.weight = weight.to(dtype).to(device)
 
     def find(self, cell: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
         """Flat indices and weights, both (neighbors, n), for cell + part, (2, n)."""
@@ -101,6 +99,24 @@ class PositionTable:
         row, y = self.rows.find(cell[1], part[1])
         place = row * self.columns_length + column
         return self.shift.index_select(1, place) + (y * self.width + x), self.weight.index_select(1, place)
+
+
+@lru_cache(maxsize=8)
+def _search_all(
+    bits: bytes, size: tuple[int, int], period: tuple[int, int], margin: int, neighbors: int, steps: int, search: Search
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Rows and columns from the pixel of every position to its neighbours, int32, and their weights."""
+    known = np.frombuffer(bits, bool).reshape(size)
+    (y, y_offset), (x, x_offset) = (
+        TableAxis(length, repeat, margin, steps, "cpu").positions() for length, repeat in zip(size, period, strict=True)
+    )
+    cell = torch.stack([x.repeat(len(y)), y.repeat_interleave(len(x))])
+    part = torch.stack([x_offset.repeat(len(y)), y_offset.repeat_interleave(len(x))])
+    parts = zip(cell.split(_CHUNK, dim=1), part.split(_CHUNK, dim=1), strict=True)
+    found = [search(known, neighbors, *pair) for pair in parts]
+    index, weight = (torch.cat(kind, dim=1) for kind in zip(*found, strict=True))
+    row = index // size[1]
+    return (row - cell[1]).int(), (index - row * size[1] - cell[0]).int(), weight
 
 
 def _period(known: np.ndarray) -> int:
