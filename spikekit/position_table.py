@@ -63,8 +63,8 @@ class PositionTable:
         known: the mask, bool.
         neighbors: how many pixels are kept for a position.
         steps: positions per pixel and axis.
-        search: finds flat indices and weights, both (neighbors, n), in a mask, given as bool, for pixels (2, n), (x, y),
-            and offsets (2, n), on the CPU.
+        search: finds flat indices and weights, both (neighbors, n), in a mask, for pixels (2, n), (x, y), and offsets
+            (2, n), on the CPU.
         dtype: of the weights.
         device: of the mask.
 
