@@ -33,7 +33,7 @@ def plot(rows: Sequence[Row], path: Path) -> None:
     else:
         values = {row.variant: list(row.scores(name).values()) for row in rows}
         title = "PSNR (dB)" if name == "psnr" else name
-    low, high, step = _axis([v for row in values.values() for v in row] + list(papers.values()))
+    low, high, step = axis([v for row in values.values() for v in row] + list(papers.values()))
 
     font = ImageFont.load_default(12 * _ZOOM)
     left = 24 + max(int(font.getlength(row.variant)) for row in rows) // _ZOOM
@@ -93,7 +93,7 @@ def _paper_gap(row: Row, rows: Sequence[Row]) -> float | None:
     return row.paper - full.paper
 
 
-def _axis(values: Sequence[float]) -> tuple[float, float, float]:
+def axis(values: Sequence[float]) -> tuple[float, float, float]:
     """Return ends and spacing of an axis with round numbers, about five of them."""
     low, high = min(values), max(values)
     span = max(high - low, 0.01)

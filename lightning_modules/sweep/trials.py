@@ -92,7 +92,7 @@ def make_trials(
             short = key.rpartition(".")[2]
             groups.append([(f"{short}={value}", choice) for value, choice in zip(values, choices, strict=True)])
     base = _resolve(common, "")
-    names = _names(base)
+    names = argument_names(base)
     trials = []
     for combination in itertools.product(*groups):
         labels = tuple(label for label, _ in combination) or (Path(configs[-1]).stem,)
@@ -120,18 +120,25 @@ def _key_and_values(setting: str) -> tuple[str, list[str]]:
     return key.removeprefix("--"), split
 
 
-class _Resolver(Command):
-    """Parses and builds what ``lightning fit`` would, to find mistakes; trains nothing and writes nothing."""
+class Rehearsal(Command):
+    """Parses and builds what a verb would, to find mistakes, which are raised; runs nothing and writes nothing."""
 
-    @staticmethod
-    def subcommands() -> dict[str, set[str]]:
-        return {"fit": Command.subcommands()["fit"]}
+    verb = "test"
 
-    def init_parser(self, **kwargs: Any) -> Any:
+    @classmethod
+    def subcommands(cls) -> dict[str, set[str]]:
+        """One verb, so that only its parser is built."""
+        return {cls.verb: Command.subcommands()[cls.verb]}
+
+    def init_parser(self, **kwargs: Any) -> Any:  # noqa: D102
         return super().init_parser(**kwargs, exit_on_error=False)
 
-    def parse_arguments(self, parser: Any, args: Any) -> None:
-        self.config = parser.parse_args(args)
+    def _run_subcommand(self, subcommand: str) -> None:
+        pass
+
+
+class _Resolver(Rehearsal):
+    verb = "fit"
 
     def _set_seed(self) -> None:
         pass
@@ -142,23 +149,36 @@ class _Resolver(Command):
     def instantiate_trainer(self, **kwargs: Any) -> None:
         """None: the machine that trains may be another one."""
 
-    def _run_subcommand(self, subcommand: str) -> None:
-        pass
-
 
 def _resolve(args: Sequence[str], trial: str, names: Sequence[str] = ()) -> dict[str, Any]:
     try:
         command = run(["fit", *args], _Resolver)
     except (ArgumentError, InputError) as error:
-        unknown = [word[2:].partition("=")[0] for word in args if word.startswith("--")]
-        unknown = [key for key in unknown if names and key not in names]
-        raise InputError(trial + _reason(str(error)) + _suggestion(unknown, names)) from error
-    config = yaml.safe_load(command.parser.dump(command.config, skip_none=False))["fit"]
+        raise InputError(trial + mistake(error, args, names)) from error
+    config = resolved(command)
     if config["trainer"]["devices"] not in ("auto", 1, "1"):
         raise InputError(f"{trial}trainer.devices: expected 1, the one of a trial, got {config['trainer']['devices']}")
     config["trainer"]["devices"] = 1
     # not part of what the trial is
     return {key: value for key, value in config.items() if key not in ("ckpt_path", "weights_only")}
+
+
+def resolved(command: Rehearsal) -> dict[str, Any]:
+    """Return the whole configuration of a verb, as plain values."""
+    return yaml.safe_load(command.parser.dump(command.config, skip_none=False))[command.verb]
+
+
+def mistake(error: Exception, args: Sequence[str], names: Sequence[str]) -> str:
+    """Return in one line what is wrong with arguments.
+
+    Args:
+        error: what was raised on them.
+        args: they.
+        names: of all arguments that there are, of which the one that was meant is looked for.
+    """
+    unknown = [word[2:].partition("=")[0] for word in args if word.startswith("--")]
+    unknown = [key for key in unknown if names and key not in names]
+    return _reason(str(error)) + _suggestion(unknown, names)
 
 
 def _reason(message: str) -> str:
@@ -185,7 +205,7 @@ def _suggestion(unknown: Sequence[str], names: Sequence[str]) -> str:
     return ""
 
 
-def _names(config: dict[str, Any]) -> list[str]:
+def argument_names(config: dict[str, Any]) -> list[str]:
     """Return the keys of a configuration as they are typed: those of the objects in it have no ``init_args``."""
     return sorted({key.replace(".init_args", "") for key, _ in flatten(config)})
 

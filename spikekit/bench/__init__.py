@@ -187,7 +187,7 @@ def _header(device: torch.device, unit: str, size: str) -> str:
     # what a result costs depends on whether the heap keeps its pages
     heap = [f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith("MALLOC_")]
     lines = [
-        f"machine  {_cpu_name()}, {os.cpu_count()} cores, {torch.get_num_threads()} threads used",
+        f"machine  {cpu_name()}, {os.cpu_count()} cores, {torch.get_num_threads()} threads used",
         f"torch    {torch.__version__}, Python {platform.python_version()}, {platform.system()}"
         + "".join(f", {setting}" for setting in heap),
         f"time     {unit}; size {size}, seed {SEED}",
@@ -197,7 +197,8 @@ def _header(device: torch.device, unit: str, size: str) -> str:
     return "\n".join(lines)
 
 
-def _cpu_name() -> str:
+def cpu_name() -> str:
+    """Return what the processor calls itself."""
     with suppress(OSError, AttributeError):
         return re.search(r"^model name\s*:\s*(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)[1]  # type: ignore[index]
     return platform.processor() or platform.machine()

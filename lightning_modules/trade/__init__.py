@@ -1,0 +1,1 @@
+"""``lightning trade``: what every setting costs and what it is worth, measured side by side."""

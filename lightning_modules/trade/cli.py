@@ -1,0 +1,138 @@
+"""The verb ``lightning trade``."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from lightning_modules.cli import InputError
+from lightning_modules.trade.measure import Row, measure, running
+from lightning_modules.trade.plot import plot
+from lightning_modules.trade.runner import CannotRunError, Runner, make_runner
+from lightning_modules.trade.settings import Setting, read_setting, usual_settings
+from lightning_modules.trade.table import COLUMNS, markdown, write_csv
+from spikekit.arguments import whole
+
+_OUTPUT, _ROUNDS = Path("runs/trade"), 9
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"trade: {message}")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="lightning trade",
+        allow_abbrev=False,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        usage="lightning trade -c CONFIG [-c OVERLAY ...] [arguments of lightning test] [--setting SETTING ...] "
+        "[--rounds N] [-o DIR]",
+        description="Measure what every setting costs and what it is worth, on this machine and these scenes.",
+        epilog=f"""\
+A setting is arguments of `lightning test`, put behind those that all settings share. Its pictures are those of
+`lightning predict`, tiles and tolerance included, on the test clips; a network of fewer frames than the shared
+arguments give the clips takes those in the middle. All settings are parsed and built before the first one runs. One
+that cannot run here, for want of a file, say, is reported as a row, and the others go on. Time is taken in one process
+and in turns: every setting once in every round, on the same clip.
+
+The result is trade.md, trade.csv and trade.png, with the Pareto front of time and PSNR, and for every row the command
+that measures it alone.
+
+columns:
+{COLUMNS}
+
+examples:
+  lightning trade -c configs/x4.yaml
+  lightning trade -c configs/x4.yaml -c configs/data/films.yaml --data.root DIR
+  lightning trade -c configs/x4.yaml -c configs/quick.yaml --ckpt_path runs/quick/checkpoints/best.ckpt
+  lightning trade -c configs/x4.yaml --setting "--model.weights x4-e" --setting "mine: -c my.yaml --ckpt_path my.ckpt"
+""",
+    )
+    parser.add_argument(
+        "--setting",
+        action="append",
+        default=[],
+        metavar="SETTING",
+        help="'ARGS' or 'NAME: ARGS'; given again, one more. Without any: the networks whose weights come with the "
+        "package, or that of --ckpt_path or --model.weights; variants of the first of them; the decoders",
+    )
+    parser.add_argument(
+        "--rounds", type=whole(1), default=_ROUNDS, metavar="N", help=f"timings of every setting; default {_ROUNDS}"
+    )
+    parser.add_argument("-o", "--output", type=Path, default=_OUTPUT, metavar="DIR", help=f"default: {_OUTPUT}")
+    return parser
+
+
+def trade(args: Sequence[str]) -> None:
+    """Run the verb.
+
+    Args:
+        args: what was typed after ``lightning trade``.
+
+    Raises:
+        InputError: what was asked for cannot be; or nothing of it can run.
+    """
+    asked, shared = _parser().parse_known_args(args)
+    given = [read_setting(text) for text in asked.setting]
+    try:
+        base = Runner(shared)
+    except CannotRunError as error:
+        raise InputError(f"trade: {error}") from error
+    settings = given or usual_settings(base.network.scale, _own_weights(base))
+    names = [setting.name for setting in settings]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"trade: two settings are called {twice!r}; 'NAME: ARGS' gives them names")
+    rows = [_row(setting, shared, base) for setting in settings]
+    _check_any(rows)
+    try:
+        asked.output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{asked.output}: cannot be made ({error.strerror})") from error
+    for row in rows:
+        if row.reason is not None:
+            print(f"{row.setting.name} cannot run: {row.reason}", flush=True)
+    timed = measure(rows, base.data.test_dataloader(), asked.rounds)
+    _check_any(rows)
+    commands = [_command(setting, shared, asked) for setting in settings]
+    text = markdown(rows, commands, timed)
+    (asked.output / "trade.md").write_text(text)
+    write_csv(rows, commands, timed, asked.output / "trade.csv")
+    plot(rows, asked.output / "trade.png")
+    print(f"\n{text}")
+    print(", ".join(str(path) for path in sorted(asked.output.glob("trade.*"))))
+
+
+def _own_weights(base: Runner) -> list[str]:
+    """Options by which the shared arguments give weights to the network."""
+    given = {
+        "--ckpt_path": base.config["ckpt_path"],
+        "--model.weights": base.config["model"]["init_args"].get("weights"),
+    }
+    return [option for option, value in given.items() if value is not None]
+
+
+def _row(setting: Setting, shared: Sequence[str], base: Runner) -> Row:
+    try:
+        return Row(setting, make_runner(shared, setting.args, base))
+    except InputError as error:
+        raise InputError(f"{setting.name}: {error}") from error
+    except CannotRunError as error:
+        return Row(setting, reason=str(error))
+
+
+def _check_any(rows: Sequence[Row]) -> None:
+    if not running(rows):
+        raise InputError(f"trade: nothing can run; {rows[0].setting.name}: {rows[0].reason}")
+
+
+def _command(setting: Setting, shared: Sequence[str], asked: argparse.Namespace) -> str:
+    """What measures a setting alone, into a folder of its own."""
+    folder = asked.output / re.sub(r"[^\w.=+-]+", "_", setting.name).strip("_")
+    rounds = [] if asked.rounds == _ROUNDS else ["--rounds", str(asked.rounds)]
+    return shlex.join(["lightning", "trade", *shared, *rounds, "-o", str(folder), "--setting", setting.text])

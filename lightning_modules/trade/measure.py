@@ -1,0 +1,170 @@
+"""Measuring: every setting on the same clips, first for its quality, then in turns for its time."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader
+from torch.utils.flop_counter import FlopCounterMode
+
+from lightning_modules.trade.energy import energy_meter, energy_per_call
+from lightning_modules.trade.runner import Runner
+from lightning_modules.trade.settings import Setting
+from spikekit import psnr, ssim
+from spikekit.arguments import one_line, progress
+from spikekit.bench.measure import Timer, peak_memory, timer_of
+
+
+@dataclass
+class Row:
+    """What is known of a setting.
+
+    Args:
+        setting: which one.
+        runner: it, ready to run; None if it cannot be made.
+        reason: why it cannot run; None if it can.
+        psnr: dB, of every clip.
+        ssim: of every clip.
+        seconds: of one clip, which is one frame, round by round.
+        memory: MiB, by how much a clip raises the memory in use; None where that is not to be had.
+        macs: multiplications of convolutions and matrices, by sensor pixel.
+        joules: by frame; None where that is not to be had.
+    """
+
+    setting: Setting
+    runner: Runner | None = None
+    reason: str | None = None
+    psnr: list[float] = field(default_factory=list)
+    ssim: list[float] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    memory: float | None = None
+    macs: float | None = None
+    joules: float | None = None
+
+    @property
+    def parameters(self) -> int:
+        """Weights of the network and of its estimator of motion."""
+        return sum(parameter.numel() for parameter in self.runner.network.parameters())
+
+
+@dataclass(frozen=True)
+class Timed:
+    """How time was taken.
+
+    Args:
+        clips: how many clips took turns.
+        size: theirs, (H, W) in sensor pixels.
+        rounds: how often every setting was timed.
+        unit: what was counted.
+    """
+
+    clips: int
+    size: tuple[int, int]
+    rounds: int
+    unit: str
+
+
+def measure(rows: Sequence[Row], scenes: DataLoader, rounds: int) -> Timed:
+    """Fill in the rows of what can run; what fails on the way gets a reason, and the others go on.
+
+    All settings see a clip before the next one is made. That also warms them up. Then they are timed, see
+    :func:`time_in_turns`, on the clips that are of one size with the first. Time does not contain the way of the
+    spikes to the device.
+
+    Args:
+        rows: of settings that can run.
+        scenes: clips with their truth.
+        rounds: how often a setting is timed.
+    """
+    kept: list[Tensor] = []
+    total = len(scenes.dataset)
+    for clip in progress(_clips(scenes), total, "clips", length=lambda _: 1):
+        if len(kept) < rounds and (not kept or clip["spikes"].shape == kept[0].shape):
+            kept.append(clip["spikes"])
+        for row in running(rows):
+            _attempt(row, lambda row=row, clip=clip: _score(row, clip))
+    for row in running(rows):
+        _attempt(row, lambda row=row: _weigh(row, kept[0]))
+    rows = running(rows)
+    time_in_turns(rows, kept, rounds)
+    units = dict.fromkeys(_timer(row)[1] for row in rows)
+    return Timed(len(kept), tuple(kept[0].shape[-2:]), rounds, ", ".join(units))
+
+
+def running(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows of what can run, as far as is known."""
+    return [row for row in rows if row.reason is None]
+
+
+def time_in_turns(rows: Sequence[Row], clips: Sequence[Tensor], rounds: int) -> None:
+    """Time all rows once in every round, on the round's clip, each round beginning with the next row.
+
+    What else the machine does, and what a clip asks for, then falls on all of them alike, and no row is always the
+    first of its round.
+
+    Args:
+        rows: their ``seconds`` are added to.
+        clips: spikes (1, N, H, W), which take turns.
+        rounds: how many.
+    """
+    for turn in progress(range(rounds), rounds, "rounds of timing", length=lambda _: 1):
+        first = turn % max(1, len(rows))
+        for row in [*rows[first:], *rows[:first]]:
+            spikes = clips[turn % len(clips)].to(row.runner.device)
+            timer, _ = _timer(row)
+            row.seconds.append(timer(lambda row=row, spikes=spikes: row.runner(spikes), 1))
+
+
+def _timer(row: Row) -> tuple[Timer, str]:
+    return timer_of(row.runner.device, torch.get_num_threads())
+
+
+def _clips(scenes: DataLoader) -> Iterator[dict[str, Tensor]]:
+    """One by one, as a recording has them: what a batch takes depends on its size."""
+    for batch in scenes:
+        for n in range(len(batch["spikes"])):
+            yield {name: value[n : n + 1] for name, value in batch.items()}
+
+
+def _attempt(row: Row, work: Callable[[], None]) -> None:
+    try:
+        work()
+    except Exception as error:  # the others are worth their rows
+        row.reason = f"{type(error).__name__}: {one_line(error)[:200]}"
+        row.runner = None  # its memory
+
+
+def _score(row: Row, clip: dict[str, Tensor]) -> None:
+    rgb = row.runner(clip["spikes"].to(row.runner.device))
+    truth = clip["rgb"].to(rgb.device)
+    row.psnr += psnr(rgb, truth).tolist()
+    row.ssim += ssim(rgb, truth).tolist()
+
+
+def _weigh(row: Row, spikes: Tensor) -> None:
+    """Memory, work and energy of one clip."""
+    device = row.runner.device
+    spikes = spikes.to(device)
+    with FlopCounterMode(display=False) as counter:
+        row.runner(spikes)
+    row.macs = counter.get_total_flops() / 2 / (spikes.shape[-2] * spikes.shape[-1])
+    gc.collect()
+    row.memory = peak_memory(lambda: row.runner(spikes), device)
+    meter = energy_meter(device)
+    if meter is not None:
+        row.joules = energy_per_call(lambda: row.runner(spikes).cpu(), meter)
+
+
+def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
+    """Return the first quartile, the median, and the third.
+
+    Example:
+        >>> quartiles([4.0, 1.0, 2.0, 3.0, 5.0])
+        (2.0, 3.0, 4.0)
+    """
+    return tuple(float(value) for value in np.quantile(values, [0.25, 0.5, 0.75]))

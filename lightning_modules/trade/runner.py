@@ -1,0 +1,143 @@
+"""A setting made ready to run: built as ``lightning test`` would build it, and run as ``lightning predict`` would."""
+
+from __future__ import annotations
+
+import logging
+from argparse import ArgumentError
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from pytorch_lightning import LightningDataModule, LightningModule
+from pytorch_lightning.utilities.exceptions import MisconfigurationException
+from torch import Tensor
+
+from lightning_modules.cli import InputError, run
+from lightning_modules.pretrained import load_weights, read_weights
+from lightning_modules.sweep.trials import Rehearsal, argument_names, mistake, resolved
+from spikekit.arguments import one_line
+
+# What the clips of a test do not depend on; and frames, as a network of fewer gets the middle of the clips of all.
+_WITHOUT_EFFECT = ("patch", "train_clips", "batch_size", "workers", "frames", "flow_times")
+
+
+class CannotRunError(RuntimeError):
+    """A setting that makes sense, and that cannot run here."""
+
+
+class _Test(Rehearsal):
+    def instantiate_trainer(self, **kwargs: Any) -> Any:
+        trainer = super().instantiate_trainer(devices=1, **kwargs)
+        asked = self.config[self.verb].trainer.precision
+        if asked == "16-mixed" and trainer.precision != asked:  # Lightning only warns
+            raise MisconfigurationException(f"{asked}: not on this device, Lightning has {trainer.precision} instead")
+        return trainer
+
+
+class Runner:
+    """A network, its precision and its device.
+
+    Args:
+        args: of ``lightning test``, in the order in which they are typed.
+        names: arguments that there are, to guess which one was meant.
+
+    Attributes:
+        network: with its weights.
+        device: where it runs.
+        data: the scenes of the configuration, set up for a test.
+        config: the whole configuration, as plain values.
+
+    Raises:
+        InputError: arguments that make no sense.
+        CannotRunError: a file is missing, or the machine lacks what is asked for.
+    """
+
+    def __init__(self, args: Sequence[str], names: Sequence[str] = ()) -> None:
+        with _quiet():
+            command = _built(args, names)
+        trainer, module = command.trainer, command.model
+        if type(module).predict_step is LightningModule.predict_step:
+            raise InputError(f"expected a model that makes pictures, got {type(module).__name__}")
+        if type(command.datamodule).test_dataloader is LightningDataModule.test_dataloader:
+            raise InputError(f"expected scenes whose truth is known, got {type(command.datamodule).__name__}")
+        self.config = resolved(command)
+        self.data = command.datamodule
+        self.device = trainer.strategy.root_device
+        self.precision = trainer.precision_plugin
+        self.module = self.precision.convert_module(module).to(self.device).eval()
+        self.network = module.network
+
+    @property
+    def scenes(self) -> dict[str, Any]:
+        """What says which scenes the clips of the test show."""
+        data = self.config["data"]
+        arguments = {key: value for key, value in data["init_args"].items() if key not in _WITHOUT_EFFECT}
+        linked = {name: self.network.settings[name] for name in ("scale", "alpha")}
+        return {"class": data["class_path"], **arguments, **linked}
+
+    def __call__(self, spikes: Tensor) -> Tensor:
+        """Return what ``lightning predict`` makes of a clip: rgb (1, 3, s H, s W), in [0, 1].
+
+        Args:
+            spikes: (1, N, H, W), on the device; of more frames than the network takes, those in the middle.
+        """
+        first = (spikes.shape[1] - self.network.frames) // 2
+        batch = {"spikes": spikes[:, first : first + self.network.frames]}
+        with torch.inference_mode(), self.precision.predict_step_context():
+            return self.module.predict_step(self.precision.convert_input(batch), 0)
+
+
+def make_runner(shared: Sequence[str], args: Sequence[str], base: Runner) -> Runner:
+    """Build a setting, and see that it runs on the scenes of all the others.
+
+    Args:
+        shared: arguments of all settings.
+        args: its own.
+        base: what the shared arguments make by themselves.
+
+    Raises:
+        InputError: arguments that make no sense, or that ask for other scenes.
+        CannotRunError: a file is missing, or the machine lacks what is asked for.
+    """
+    runner = Runner([*shared, *args], argument_names(base.config))
+    if runner.scenes != base.scenes:
+        key = next(key for key in base.scenes if runner.scenes.get(key) != base.scenes[key])
+        got = f"got {runner.scenes.get(key)}; what goes for all stands outside of --setting"
+        raise InputError(f"data.{key}: expected {base.scenes[key]}, the same scenes for all, {got}")
+    frames = base.network.frames
+    if runner.network.frames > frames:
+        raise InputError(f"frames: expected at most the {frames} of the clips, got {runner.network.frames}")
+    return runner
+
+
+def _built(args: Sequence[str], names: Sequence[str]) -> _Test:
+    try:
+        command = run(["test", *args], _Test)
+        path = command.config[command.verb].ckpt_path
+        if path:
+            load_weights(command.model.network, read_weights(path))
+    except ArgumentError as error:
+        raise InputError(mistake(error, args, names)) from error
+    except MisconfigurationException as error:
+        raise CannotRunError(one_line(error)) from error
+    except ValueError as error:
+        kind = CannotRunError if any(isinstance(cause, OSError) for cause in _causes(error)) else InputError
+        raise kind(str(error)) from error
+    return command
+
+
+def _causes(error: BaseException) -> Iterator[BaseException]:
+    while error.__cause__ is not None:
+        error = error.__cause__
+        yield error
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep Lightning from saying for every setting anew what machine this is."""
+    logging.disable(logging.INFO)
+    try:
+        yield
+    finally:
+        logging.disable(logging.NOTSET)

@@ -1,0 +1,153 @@
+"""The table of a trade, as CSV and as Markdown, with the machine that it holds for and the command of every row."""
+
+from __future__ import annotations
+
+import csv
+import os
+import platform
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import mean
+
+import torch
+
+from lightning_modules.trade.measure import Row, Timed, quartiles, running
+from lightning_modules.trade.pareto import pareto_front
+from spikekit.bench import cpu_name
+
+#: what the columns mean, for the table and for ``--help``
+COLUMNS = """\
+PSNR, SSIM  spikekit.psnr and spikekit.ssim of every test clip, averaged; the network estimates its motion itself
+ms a frame  one clip, one picture: median of the rounds, and its quartiles; without reading the clip
+ratio       the same time over that of the first row, round by round: median. Other machines are nearer in this column
+MiB         by how much a clip raises the memory in use at its worst moment
+parameters  weights, with those of a learned estimator of motion
+MAC a pixel multiplications of convolutions and matrices by sensor pixel, those of a learned estimator included; not
+            counted: the search along the motion, classical motion, decoding, whatever is done element by element
+J a frame   energy of the whole device, whoever uses it: NVML on GPUs (with nvidia-ml-py), RAPL on CPUs, if readable
+front       nothing else here is as fast and as good"""
+
+_FIGURES = [
+    "psnr", "ssim", "ms", "ms_q1", "ms_q3", "ratio", "ratio_q1", "ratio_q3", "mib", "parameters", "macs", "joules"
+]  # fmt: skip
+
+
+def figures(rows: Sequence[Row]) -> list[dict[str, float | None]]:
+    """Return what was measured, a dictionary a row; an empty one where a setting could not run."""
+    measured = running(rows)
+    found = []
+    for row in rows:
+        if row.reason is not None:
+            found.append({})
+            continue
+        ratios = [ours / max(first, 1e-9) for ours, first in zip(row.seconds, measured[0].seconds, strict=True)]
+        (ms_q1, ms, ms_q3), (ratio_q1, ratio, ratio_q3) = (
+            quartiles([1e3 * seconds for seconds in row.seconds]),
+            quartiles(ratios),
+        )
+        values = [
+            mean(row.psnr), mean(row.ssim), ms, ms_q1, ms_q3, ratio, ratio_q1, ratio_q3,
+            row.memory, row.parameters, row.macs, row.joules,
+        ]  # fmt: skip
+        found.append(dict(zip(_FIGURES, values, strict=True)))
+    return found
+
+
+def front(rows: Sequence[Row]) -> list[int]:
+    """Return which rows are on the Pareto front of time and PSNR, fastest first."""
+    shown = figures(rows)
+    there = [n for n, values in enumerate(shown) if values]
+    found = pareto_front([shown[n]["ms"] for n in there], [shown[n]["psnr"] for n in there])
+    return [there[n] for n in found]
+
+
+def machine(rows: Sequence[Row], timed: Timed) -> str:
+    """Return, line by line, on what and how it was measured."""
+    devices = dict.fromkeys(row.runner.device for row in running(rows))
+    gpus = [torch.cuda.get_device_name(device) for device in devices if device.type == "cuda"]
+    clips, (height, width) = timed.clips, timed.size
+    scored = len(running(rows)[0].psnr)
+    return "\n".join(
+        [
+            f"machine  {', '.join([*gpus, cpu_name()])}, {_count(os.cpu_count(), 'core')}, "
+            f"{_count(torch.get_num_threads(), 'thread')}",
+            f"torch    {torch.__version__}, Python {platform.python_version()}, {platform.system()}",
+            f"quality  mean of {_count(scored, 'clip')}",
+            f"time     {timed.unit}; {_count(clips, 'clip')} of {height} x {width} sensor pixels in turns, "
+            f"{_count(timed.rounds, 'round')}",
+        ]
+    )
+
+
+def markdown(rows: Sequence[Row], commands: Sequence[str], timed: Timed) -> str:
+    """Return the table as Markdown.
+
+    Args:
+        rows: measured ones, and those that could not run.
+        commands: what a user types for each of them.
+        timed: how time was taken.
+    """
+    shown, best = figures(rows), front(rows)
+    energy = any(row.joules is not None for row in rows)
+    header = ["", "setting", "PSNR (dB)", "SSIM", "ms a frame", "ratio", "MiB", "parameters", "MAC a pixel"]
+    header += ["J a frame"] * energy + ["front"]
+    lines = [header, ["---"] * len(header)]
+    for n, (row, values) in enumerate(zip(rows, shown, strict=True)):
+        if not values:
+            lines.append([str(n + 1), row.setting.name, *[""] * (len(header) - 2)])
+            continue
+        cells = [
+            f"{values['psnr']:.2f}",
+            f"{values['ssim']:.4f}",
+            f"{values['ms']:.4g} ({values['ms_q1']:.4g} .. {values['ms_q3']:.4g})",
+            f"{values['ratio']:.3g}",
+            _text(values["mib"], ".1f"),
+            f"{values['parameters']:,}",
+            f"{values['macs']:,.0f}",
+            *[_text(values["joules"], ".3g")] * energy,
+            "x" if n in best else "",
+        ]
+        lines.append([str(n + 1), row.setting.name, *cells])
+    table = "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |" for cells in lines)
+    failed = [f"{row.setting.name} cannot run: {row.reason}" for row in rows if row.reason is not None]
+    typed = "\n".join(f"# {n + 1}\n{command}" for n, command in enumerate(commands))
+    parts = [
+        f"```text\n{machine(rows, timed)}\n```", table, *failed, f"```text\n{COLUMNS}\n```", f"```sh\n{typed}\n```"
+    ]  # fmt: skip
+    return "\n\n".join(parts) + "\n"
+
+
+def write_csv(rows: Sequence[Row], commands: Sequence[str], timed: Timed, path: Path) -> None:
+    """Write a row a setting, with its arguments, the size of the clips, and the command that measures it alone.
+
+    A table in this form comes with the weights, for :mod:`lightning_modules.speed` to choose from.
+    """
+    height, width = timed.size
+    best = front(rows)
+    with open(path, "w", newline="") as file:
+        writer = csv.DictWriter(
+            file, ["setting", *_FIGURES, "height", "width", "front", "arguments", "command", "failed"]
+        )
+        writer.writeheader()
+        for n, (row, values, command) in enumerate(zip(rows, figures(rows), commands, strict=True)):
+            writer.writerow(
+                {
+                    "setting": row.setting.name,
+                    **{name: _text(value, ".10g") for name, value in values.items()},
+                    "height": height,
+                    "width": width,
+                    "front": int(n in best) if values else "",
+                    "arguments": shlex.join(row.setting.args),
+                    "command": command,
+                    "failed": row.reason,
+                }
+            )
+
+
+def _text(value: float | None, form: str) -> str:
+    return "" if value is None else format(value, form)
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
