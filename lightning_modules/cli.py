@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import re
 import sys
@@ -12,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from jsonargparse import ArgumentParser
 from pytorch_lightning import Callback, LightningDataModule, LightningModule, Trainer
 from pytorch_lightning.callbacks import LearningRateMonitor, ModelCheckpoint
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI
 from pytorch_lightning.loggers import TensorBoardLogger
 
+from lightning_modules.arguments import WEIGHTS, behind_configurations, options, with_network_of_weights
 from lightning_modules.callbacks import PredictionPictures
 from lightning_modules.data import FilmScenes, Recording, StillScenes
 from lightning_modules.flow_training import FlowTraining
@@ -27,7 +26,8 @@ from lightning_modules.module import SuperResolution
 from lightning_modules.motion import Spike2Flow
 from lightning_modules.networks import CSCSR
 from lightning_modules.pretrained import CheckpointMismatchError, read_weights, write_weights
-from spikekit import SpikeFileError
+from lightning_modules.speed import SPEEDS, choose
+from spikekit import SpikeFileError, spikes_shape
 
 #: classes whose arguments ``--help`` lists, by the option that names them
 CHOICES = (
@@ -62,49 +62,21 @@ class Parser(LightningArgumentParser):
         return text
 
 
-def _with_network_of_weights(args: Sequence[str]) -> list[str]:
-    """Put the network that ``--model.weights`` are of behind all configurations, so that it need not be said again.
-
-    The other arguments still have the last word: on the estimator of motion, say.
-    """
-    args = list(args)
-    asked, behind = None, 1
-    for n, word in enumerate(args):
-        option, equals, value = word.partition("=")
-        if not equals:
-            value = args[n + 1] if n + 1 < len(args) else ""
-        if option in ("-c", "--config"):
-            behind = n + (1 if equals else 2)
-            asked = _weights_in(value) or asked
-        elif option in ("--model.weights", "--model.init_args.weights"):
-            asked = value
-    if not asked:
-        return args
+def _with_choice(parser: LightningArgumentParser, args: Sequence[str]) -> list[str]:
+    """Put in the setting that ``--speed`` or ``--budget`` asks for, and say which."""
+    given = next((option for _, option, _ in options(args) if option in (*WEIGHTS, "--ckpt_path")), None)
+    if given:
+        raise InputError(f"--speed and --budget: choose from the weights of the package, got {given} as well")
+    verb, *rest = args
+    parsed = parser.parse_args([verb, "--config", '{"model": {"network": {"class_path": "CSCSR"}}}', *rest])[verb]
+    recording = parsed.data.get("init_args", {})
     try:
-        found = read_weights(asked)
-    except (OSError, ValueError) as error:
+        size = spikes_shape(*(recording.get(name) for name in ("path", "height", "width")))[1:]
+        choice = choose(parsed.model.init_args.network.init_args.scale, parsed.speed, parsed.budget, size)
+    except (OSError, TypeError, ValueError) as error:
         raise InputError(str(error)) from error
-    network = _class_and_arguments(found.settings)
-    if found.motion:
-        network["init_args"]["motion"] = _class_and_arguments(found.motion)
-    overlay = json.dumps({"model": {"network": network}})
-    return [*args[:behind], "--config", overlay, *args[behind:]]
-
-
-def _class_and_arguments(settings: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "class_path": settings["class"],
-        "init_args": {name: value for name, value in settings.items() if name != "class"},
-    }
-
-
-def _weights_in(config: str) -> str | None:
-    """Return what a file of configuration says about weights; whether it is one at all is the parser's affair."""
-    try:
-        model = yaml.safe_load(Path(config).read_text())["model"]
-        return model.get("weights") or model["init_args"].get("weights")
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, yaml.YAMLError):
-        return None
+    print(choice, flush=True)
+    return behind_configurations(args, choice.args)
 
 
 class Command(LightningCLI):
@@ -129,7 +101,29 @@ class Command(LightningCLI):
         )
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:  # noqa: D102
-        self.config = parser.parse_args(_with_network_of_weights(sys.argv[1:] if args is None else args))
+        args = sys.argv[1:] if args is None else list(args)
+        if any(option in ("--speed", "--budget") for _, option, _ in options(args)):
+            args = _with_choice(parser, args)
+        try:
+            args = with_network_of_weights(args)
+        except (OSError, ValueError) as error:
+            raise InputError(str(error)) from error
+        self.config = parser.parse_args(args)
+
+    def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> LightningArgumentParser:
+        parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
+        if subcommand == "predict":
+            parser.add_argument(
+                "--speed",
+                choices=list(SPEEDS),
+                help="Weights of the package and how they are used: the best; the fastest at most 0.1 dB (balanced) or "
+                "0.5 dB (fast) below it, as measured by lightning trade; the fastest.",
+            )
+            parser.add_argument(
+                "--budget",
+                help="Instead, what a frame may take, such as 40ms or 200MB: the best that fits, by the same table.",
+            )
+        return parser
 
     def before_instantiate_classes(self) -> None:
         """Turn ``--ckpt_path best`` and ``last`` into files, and keep a run from being written over."""

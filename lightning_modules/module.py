@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+import math
+from typing import Any, Literal, Self
 
 import torch
 import torch.nn.functional as F
 from pytorch_lightning.cli import LRSchedulerCallable, OptimizerCallable
 from torch import Tensor
 
+from lightning_modules.arguments import make_module
 from lightning_modules.callbacks import TestReport, ValidationPictures
 from lightning_modules.learner import Learner
 from lightning_modules.networks import ClassicalDecoder, Network
 from lightning_modules.pretrained import load_weights, read_weights, with_own_motion
+from lightning_modules.speed import choose
 from lightning_modules.tiles import forward_in_tiles
 from spikekit import psnr, ssim
 
@@ -29,6 +32,8 @@ class SuperResolution(Learner):
         optimizer: builds the optimizer from the parameters; the paper uses Adam at 1e-4.
         lr_scheduler: builds the schedule from the optimizer, counted in steps; the paper multiplies by 0.8 every 7500.
         tile: side of the tiles, in sensor pixels, in which ``predict`` works through a large recording; 0 for none.
+        tolerance: by how many dB the PSNR of a picture may be expected to fall when ``predict`` looks at the clip first
+            and does only what each part of it needs; 0 for everything everywhere.
         flow: the motion that training uses. "scene" is that of the data, where they have it: the true one of analytic
             scenes, or that which the frames of a film were interpolated with. "estimated" is that of the network's own
             estimator, which learns as well unless it is frozen.
@@ -46,12 +51,15 @@ class SuperResolution(Learner):
         optimizer: OptimizerCallable = lambda parameters: torch.optim.Adam(parameters, lr=1e-4),
         lr_scheduler: LRSchedulerCallable = lambda optimizer: torch.optim.lr_scheduler.StepLR(optimizer, 7500, 0.8),
         tile: int = 128,
+        tolerance: float = 0.0,
         flow: Literal["scene", "estimated"] = "scene",
         weights: str | None = None,
     ) -> None:
         super().__init__(network, {"pattern": network.pattern}, optimizer, lr_scheduler)
         if tile < 0 or tile % 2:
             raise ValueError(f"tile: expected an even number of sensor pixels, or 0 for no tiles, got {tile}")
+        if not 0 <= tolerance < math.inf:
+            raise ValueError(f"tolerance: expected 0 dB or more, got {tolerance}")
         if flow not in ("scene", "estimated"):
             raise ValueError(f"flow: expected 'scene' or 'estimated', got {flow!r}")
         fusion = network.settings.get("motion_fusion", "joint")
@@ -60,9 +68,44 @@ class SuperResolution(Learner):
                 f"flow: expected 'estimated' with motion_fusion {fusion!r}, the scene's is one for all colours"
             )
         self.tile = tile
+        self.tolerance = tolerance
         self.flow = flow
         if weights is not None:
             load_weights(network, read_weights(weights))
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        scale: int = 4,
+        speed: str | None = None,
+        budget: str | None = None,
+        size: tuple[int, int] = (250, 400),
+    ) -> Self:
+        """Build what ``lightning predict --speed`` or ``--budget`` would, from the weights of the package.
+
+        Args:
+            scale: super-resolution factor.
+            speed: see :func:`lightning_modules.speed.choose`; without a budget ``"best"`` when not given.
+            budget: likewise.
+            size: of a frame, (H, W) in sensor pixels, which a budget depends on.
+
+        Returns:
+            The module, in evaluation mode: called with spikes it returns pictures.
+
+        Raises:
+            ValueError: an unknown speed, a budget that nothing fits, a scale without weights.
+
+        Example:
+            >>> SuperResolution.from_pretrained(speed="fastest")(torch.ones(1, 41, 16, 16)).shape
+            torch.Size([1, 3, 64, 64])
+        """
+        if budget is None and speed is None:
+            speed = "best"
+        return make_module(cls, choose(scale, speed, budget, size).args).eval()
+
+    def forward(self, spikes: Tensor) -> Tensor:
+        """Return the picture of the middle of a clip, tile by tile: (B, N, H, W) to (B, 3, s H, s W), in [0, 1]."""
+        return forward_in_tiles(self.network, spikes, self.tile, self.tolerance).clamp(0, 1)
 
     def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:  # noqa: D102
         rgb = self.network(batch["spikes"], batch.get("flow") if self.flow == "scene" else None)
@@ -94,7 +137,7 @@ class SuperResolution(Learner):
 
     def predict_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:
         """Return rgb (B, 3, s H, s W), clamped to [0, 1]."""
-        return forward_in_tiles(self.network, batch["spikes"], self.tile).clamp(0, 1)
+        return self(batch["spikes"])
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:  # noqa: D102
         super().on_load_checkpoint(checkpoint)

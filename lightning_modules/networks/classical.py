@@ -62,7 +62,7 @@ class ClassicalDecoder(Network):
         self.alpha = alpha
         self.window = window
 
-    def forward(self, spikes: Tensor, flow: Tensor | None = None) -> Tensor:
+    def forward(self, spikes: Tensor, flow: Tensor | Literal[0] | None = None) -> Tensor:
         """Return rgb; a flow changes nothing."""
         check_planes("spikes", spikes, 4, "(B, N, H, W)")
         decoded = tfi(spikes) if self.method == "tfi" else tfp(spikes, self.window)

@@ -25,7 +25,7 @@ class Network(nn.Module):
 
     Shape:
         - Input: spikes :math:`(B, N, H, W)`; optionally flow :math:`(B, 2, 2, H, W)`, from the middle to the first
-          and to the last time point, in sensor pixels
+          and to the last time point, in sensor pixels, or 0 where nothing moves
         - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
     """
 

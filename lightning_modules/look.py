@@ -1,0 +1,168 @@
+"""A look at a clip before a network runs: what every part of the picture would lose by less work."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from kornia.filters import filter2d_separable, get_gaussian_kernel1d
+from torch import Tensor
+
+from spikekit import bayer_mask
+from spikekit.check import check_planes
+
+#: sensor pixels along the side of a cell, the smallest part that is looked at by itself
+CELL = 16
+
+# Squared errors per squared statistic, all in units of a white pixel, fitted on embedded scenes with size E at x4 and
+# rounded to the side that spends more; ``python -m lightning_modules.savings`` holds what they predict against truth.
+_FLAT = 2.5  # added by the smooth picture, per texture
+_GRAINY = 0.3  # added by the smooth picture, per grain that a network would average away
+_BLURRED = 0.08  # added by the smooth picture, per change
+_STILL = 0.05  # added by a network that is told that nothing moves, per change
+_TEXTURED = 1.5  # left by the network itself, per texture
+_MOVED = 0.02  # left by the network itself, per change
+_FAINT = 1e-4  # left by the network itself, everywhere: 40 dB, beyond which nothing is gained
+_GRAIN = 1e-4  # grain that the network leaves as well
+
+_REMOVED = 0.4  # share of a pixel's own noise that smoothing removes
+_LEVELS, _PHASES = 1024, 32  # how finely the noise of the sensor is tabulated
+
+
+class Look(NamedTuple):
+    """What was seen of clips, cell by cell.
+
+    Args:
+        picture: smooth ``rgb`` :math:`(B, 3, s H, s W)`, all that flat parts need.
+        flat: squared error that a cell gets where ``picture`` stands for the network's, :math:`(B, h, w)`, summed over
+            its sensor pixels; a white pixel is 1.
+        still: likewise, where the network is told that nothing moves; at most ``flat``.
+        error: squared error of the network itself, :math:`(B)`, summed over the clip.
+    """
+
+    picture: Tensor
+    flat: Tensor
+    still: Tensor
+    error: Tensor
+
+
+@lru_cache(maxsize=4)
+def _weights(frames: int) -> Tensor:
+    """Two weighted sums over time, (2, N): the mean, and the change from the beginning to the end.
+
+    Both begin and end at zero: an integrate-and-fire pixel rounds from spike to spike, and what it rounds away now it
+    adds later, so that weights which change slowly cancel most of it. Equal weights leave five times the noise.
+    """
+    phase = 2 * math.pi * (torch.arange(frames) + 0.5) / frames
+    return torch.stack([1 - phase.cos(), 2 * math.pi * phase.sin()]) / frames
+
+
+@lru_cache(maxsize=4)
+def _noise(frames: int) -> Tensor:
+    """Variance of mean and change where light is constant, (2, levels): any initial charge, light from 0 to 1."""
+    light = (torch.arange(_LEVELS) + 0.5) / _LEVELS
+    charge = (torch.arange(_PHASES) + 0.5) / _PHASES
+    spikes = (charge[:, None, None] + light[:, None] * torch.arange(frames + 1)).floor().diff(dim=-1)
+    return (spikes @ _weights(frames).T).var(dim=0, correction=0).T.contiguous()
+
+
+def look(spikes: Tensor, scale: int, pattern: str, alpha: float) -> Look:
+    r"""Look at texture, brightness and motion of clips.
+
+    Two weighted sums over the frames say nearly all: the mean light of every pixel, and its change from the beginning
+    to the end. Texture is what smoothing takes away from the mean; grain, the noise of the mean, is large where it is
+    dark. Both and the change count only as far as they exceed what an ideal sensor shows of constant light. More
+    noise, as of a real sensor, looks like texture and motion, and is given to the network.
+
+    Args:
+        spikes: :math:`(B, N, H, W)`, zeros and ones, any real dtype.
+        scale: super-resolution factor s.
+        pattern: Bayer phase.
+        alpha: light of a white pixel per clock, in thresholds.
+
+    Returns:
+        What was seen, in cells of ``CELL`` sensor pixels, those at the right and at the bottom cut off.
+
+    Raises:
+        ValueError: not (B, N, H, W).
+
+    Example:
+        >>> seen = look(torch.ones(1, 41, 20, 40), scale=2, pattern="RGGB", alpha=1.0)
+        >>> seen.picture.shape, seen.flat.shape, bool(seen.picture.sub(1).abs().max() < 1e-5)
+        (torch.Size([1, 3, 40, 80]), torch.Size([1, 2, 3]), True)
+    """
+    check_planes("spikes", spikes, 4, "(B, N, H, W)")
+    with torch.autocast(spikes.device.type, enabled=False):
+        return _look(spikes, scale, pattern, alpha)
+
+
+def _look(spikes: Tensor, scale: int, pattern: str, alpha: float) -> Look:
+    frames, height, width = spikes.shape[-3:]
+    light, change = torch.einsum("kn,bnhw->kbhw", _weights(frames).to(spikes.device), spikes.float()).unsqueeze(2)
+    mask = bayer_mask(height, width, pattern, device=spikes.device, dtype=light.dtype)
+    rgb, wide = _smooth(light, mask, 1.0), _smooth(light, mask, 2.0)
+
+    table = _noise(frames).to(spikes.device)
+    level = ((wide * mask).sum(dim=1, keepdim=True) * _LEVELS).long().clamp(0, _LEVELS - 1)
+    grain, jitter = table[0][level], table[1][level]
+    texture = (light - (rgb * mask).sum(dim=1, keepdim=True)).square() - _REMOVED * grain
+    # pixels that rest are trusted more; in the dark, or near a third of the threshold, a pixel beats slowly by itself
+    around = F.max_pool1d(table[1:], _LEVELS // 16 + 1, 1, _LEVELS // 32)[0]
+    trust = 1 / (around[(light * _LEVELS).long().clamp(0, _LEVELS - 1)] + 1e-3 * alpha**2)
+
+    area = _sum(torch.ones_like(light))
+    texture, grain = (_sum(part).clamp(min=0) / alpha**2 for part in (texture, grain))
+    motion = (_sum((change.square() - jitter) * trust) / _sum(trust)).clamp(min=0) * area / alpha**2
+    flat = _FLAT * texture + _GRAINY * (grain - _GRAIN * area).clamp(min=0) + _BLURRED * motion
+    error = _TEXTURED * texture + _MOVED * motion + _FAINT * area
+    if scale > 1:
+        rgb = F.interpolate(rgb, scale_factor=scale, mode="bicubic", align_corners=False)
+    return Look(rgb / alpha, flat[:, 0], _STILL * motion[:, 0], error.sum(dim=(1, 2, 3)))
+
+
+def required(seen: Look, tolerance: float) -> tuple[Tensor, Tensor]:
+    r"""Which cells need the network, and which of them its motion.
+
+    What adds least to the squared error is left out first, until the PSNR of the whole picture is expected to have
+    fallen by the tolerance:
+
+    .. math:: \Delta E \le (10^{tolerance / 10} - 1) \, E
+
+    So a larger tolerance never asks for more. Of several clips the one that needs most says what is done.
+
+    Args:
+        seen: by :func:`look`.
+        tolerance: in dB, above 0.
+
+    Returns:
+        ``network`` and ``motion``, booleans (h, w) on the CPU; motion only where the network is.
+
+    Example:
+        >>> seen = look(torch.ones(1, 41, 32, 32), scale=2, pattern="RGGB", alpha=1.0)
+        >>> [cells.any().item() for cells in required(seen, 0.1)]
+        [False, False]
+    """
+    flat, still = seen.flat.flatten(1), seen.still.flatten(1)
+    added, order = torch.cat([still, flat], dim=1).sort(dim=1)
+    spent = torch.cat([still, flat - still], dim=1).gather(1, order).cumsum(dim=1)
+    fits = spent <= (10 ** (tolerance / 10) - 1) * seen.error[:, None]
+    # everything that adds less than the first that does not fit
+    limit = added.where(~fits, torch.inf).amin(dim=1)[:, None, None]
+    network, motion = (cells.ge(limit).any(dim=0).cpu() for cells in (seen.flat, seen.still))
+    return network, motion
+
+
+def _smooth(light: Tensor, mask: Tensor, sigma: float) -> Tensor:
+    """Gaussian mean of the known pixels of every colour: (B, 1, H, W) to (B, 3, H, W)."""
+    kernel = get_gaussian_kernel1d(2 * math.ceil(3 * sigma) + 1, sigma, device=light.device, dtype=light.dtype)
+    known = torch.cat([light * mask, mask[None]])
+    blurred = filter2d_separable(known, kernel, kernel, border_type="constant")
+    return blurred[:-1] / blurred[-1:]
+
+
+def _sum(plane: Tensor) -> Tensor:
+    """Sums over cells: (B, 1, H, W) to (B, 1, h, w)."""
+    return F.avg_pool2d(plane, CELL, ceil_mode=True, divisor_override=1)

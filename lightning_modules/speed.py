@@ -1,0 +1,118 @@
+"""From a wish, how fast or within which budget, to a setting: read off the table that comes with the weights."""
+
+from __future__ import annotations
+
+import csv
+import re
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+
+_FOLDER = Path(__file__).parent / "weights"
+
+#: how far a speed may be below the best, in dB of the table
+SPEEDS = {"fastest": float("inf"), "fast": 0.5, "balanced": 0.1, "best": 0.0}
+
+_UNITS = {
+    "ms": ("ms", 1.0),
+    "s": ("ms", 1e3),
+    "MB": ("mib", 1e6 / 2**20),
+    "GB": ("mib", 1e9 / 2**20),
+    "MiB": ("mib", 1.0),
+    "GiB": ("mib", 1024.0),
+}
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A setting that was measured.
+
+    Args:
+        name: what it is called.
+        args: arguments of ``lightning predict`` that make it.
+        psnr: dB, on the clips of the table.
+        below: dB below the best of the table.
+        ms: expected for a frame, on the machine of the table.
+        mib: memory, expected for a frame.
+    """
+
+    name: str
+    args: tuple[str, ...]
+    psnr: float
+    below: float
+    ms: float
+    mib: float
+
+    def __str__(self) -> str:
+        cost = f"about {self.ms:.3g} ms and {self.mib:.3g} MiB a frame on the machine of the table"
+        return f"{self.name}: {cost}, {self.below:.2f} dB below the best"
+
+
+def choices(scale: int, size: tuple[int, int]) -> list[Choice]:
+    """Return all settings of the table for a scale, fastest first.
+
+    Time and memory are taken to grow with the number of pixels.
+
+    Args:
+        scale: super-resolution factor.
+        size: of a frame, (H, W) in sensor pixels.
+
+    Raises:
+        ValueError: no table comes with the package for this scale.
+    """
+    path = _FOLDER / f"x{scale}.csv"
+    if not path.is_file():
+        there = ", ".join(sorted(path.stem for path in _FOLDER.glob("x*.csv"))) or "none"
+        raise ValueError(f"scale: expected one that was measured ({there}), got {scale}")
+    with open(path, newline="") as file:
+        rows = [row for row in csv.DictReader(file) if not row["failed"]]
+    best = max(float(row["psnr"]) for row in rows)
+    found = []
+    for row in rows:
+        pixels = size[0] * size[1] / (int(row["height"]) * int(row["width"]))
+        psnr, ms, mib = (float(row[name]) for name in ("psnr", "ms", "mib"))
+        args = tuple(shlex.split(row["arguments"]))
+        found.append(Choice(row["setting"], args, psnr, best - psnr, ms * pixels, mib * pixels))
+    return sorted(found, key=lambda choice: choice.ms)
+
+
+def choose(
+    scale: int, speed: str | None = None, budget: str | None = None, size: tuple[int, int] = (250, 400)
+) -> Choice:
+    """Pick the setting that serves best.
+
+    Args:
+        scale: super-resolution factor.
+        speed: ``"best"``; ``"balanced"`` and ``"fast"``, the fastest at most 0.1 and 0.5 dB below it; ``"fastest"``.
+        budget: instead, what a frame may take: a time, such as ``"40ms"``, or memory, such as ``"200MB"``. Of what fits
+            it is the best.
+        size: of a frame, (H, W) in sensor pixels, which a budget depends on.
+
+    Raises:
+        ValueError: an unknown speed, a budget that cannot be read or that nothing fits, a scale without a table.
+
+    Example:
+        >>> choose(4, "fastest").ms <= choose(4, "best").ms
+        True
+        >>> choose(4, budget="1h")
+        Traceback (most recent call last):
+            ...
+        ValueError: budget: expected a time or memory, such as 40ms, 2s, 200MB or 1GiB, got '1h'
+    """
+    if (speed is None) == (budget is None):
+        raise ValueError(f"speed, budget: expected one of them, got {speed!r} and {budget!r}")
+    found = choices(scale, size)
+    if speed is not None:
+        if speed not in SPEEDS:
+            raise ValueError(f"speed: expected one of {', '.join(SPEEDS)}, got {speed!r}")
+        return next(choice for choice in found if choice.below <= SPEEDS[speed])
+    read = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([a-zA-Z]+)\s*", budget)
+    if read is None or read[2] not in _UNITS:
+        raise ValueError(f"budget: expected a time or memory, such as 40ms, 2s, 200MB or 1GiB, got {budget!r}")
+    what, unit = _UNITS[read[2]]
+    limit = float(read[1]) * unit
+    fitting = [choice for choice in found if getattr(choice, what) <= limit]
+    if not fitting:
+        least = min(found, key=lambda choice: getattr(choice, what))
+        raise ValueError(f"budget: nothing fits {budget} for {size[0]} x {size[1]} sensor pixels; least takes {least}")
+    return max(fitting, key=lambda choice: choice.psnr)

@@ -1,0 +1,140 @@
+"""Settings by what they may cost, from Python and as they are typed."""
+
+import csv
+import sys
+
+import pytest
+import torch
+
+from lightning_modules import speed
+from lightning_modules.cli import main
+from lightning_modules.module import SuperResolution
+from lightning_modules.motion import ZeroFlow
+from lightning_modules.networks import CSCSR, ClassicalDecoder
+from lightning_modules.pretrained import shipped_weights
+from lightning_modules.speed import SPEEDS, choices, choose
+from spikekit import read_picture, write_spikes
+
+HEADER = ["setting", "psnr", "ms", "mib", "height", "width", "arguments", "failed"]
+DECODER = "--model.network ClassicalDecoder --model.network.scale 3 --model.network.method"
+ROWS = [
+    ("all", 30.0, 400, 80, 40, 50, "--model.weights {weights}", ""),
+    ("small tiles", 30.0, 500, 20, 40, 50, "--model.weights {weights} --model.tile 16", ""),
+    ("no motion", 29.92, 200, 70, 40, 50, "--model.weights {weights} --model.network.motion ZeroFlow", ""),
+    ("tfp", 29.6, 10, 5, 40, 50, f"{DECODER} tfp", ""),
+    ("tfi", 25.0, 4, 2, 40, 50, f"{DECODER} tfi", ""),
+    ("broken", "", "", "", 40, 50, "--model.weights nowhere", "there is none"),
+]
+
+
+@pytest.fixture(autouse=True)
+def _argv(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["lightning"])
+
+
+@pytest.fixture(name="table")
+def _table(tmp_path, monkeypatch):
+    network = CSCSR(3, width=4, representation_width=4, features=1, stages=1, end_blocks=1)
+    module = SuperResolution(network)
+    content = {"state_dict": module.state_dict()}
+    module.on_save_checkpoint(content)
+    torch.save(content, tmp_path / "tiny.ckpt")
+    with open(tmp_path / "x3.csv", "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(HEADER)
+        for row in ROWS:
+            writer.writerow([str(cell).format(weights=tmp_path / "tiny.ckpt") for cell in row])
+    monkeypatch.setattr(speed, "_FOLDER", tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"), [("best", "all"), ("balanced", "no motion"), ("fast", "tfp"), ("fastest", "tfi")]
+)
+def test_speeds(table, name, expected):
+    assert choose(3, name).name == expected
+
+
+@pytest.mark.parametrize(
+    ("budget", "size", "expected"),
+    [
+        ("400ms", (40, 50), "all"),
+        ("0.4s", (40, 50), "all"),
+        ("399 ms", (40, 50), "no motion"),
+        ("399ms", (20, 50), "all"),
+        ("399ms", (80, 100), "tfp"),
+        ("20MiB", (40, 50), "small tiles"),
+        ("20MB", (40, 50), "tfp"),
+        ("1GB", (40, 50), "all"),
+    ],
+)
+def test_budgets_grow_with_the_frame(table, budget, size, expected):
+    assert choose(3, budget=budget, size=size).name == expected
+
+
+def test_what_it_says(table):
+    said = str(choose(3, "fast", size=(80, 50)))
+    assert said == "tfp: about 20 ms and 10 MiB a frame on the machine of the table, 0.40 dB below the best"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"speed": "quick"}, "speed: expected one of fastest, fast, balanced, best, got 'quick'"),
+        ({}, "expected one of them"),
+        ({"speed": "fast", "budget": "1s"}, "expected one of them"),
+        ({"budget": "40"}, "budget: expected a time or memory"),
+        ({"budget": "-1ms"}, "budget: expected a time or memory"),
+        ({"budget": "1ms"}, "nothing fits 1ms for 250 x 400 sensor pixels; least takes tfi: about 200 ms"),
+        ({"budget": "1MB"}, "nothing fits 1MB for 250 x 400 sensor pixels; least takes tfi"),
+        ({"scale": 7, "speed": "fast"}, r"scale: expected one that was measured \(x3\), got 7"),
+    ],
+)
+def test_wishes_that_cannot_be(table, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        choose(**{"scale": 3, **arguments})
+
+
+def test_modules_of_a_speed(table):
+    best, balanced, fast = (SuperResolution.from_pretrained(3, name) for name in ("best", "balanced", "fast"))
+    assert isinstance(fast.network, ClassicalDecoder)
+    assert isinstance(balanced.network.motion, ZeroFlow)
+    assert not best.training
+    spikes = torch.rand(2, 41, 8, 10) < 0.3
+    expected = CSCSR.from_pretrained(table / "tiny.ckpt")(spikes).clamp(0, 1)
+    torch.testing.assert_close(best(spikes), expected)
+    assert torch.equal(SuperResolution.from_pretrained(3)(spikes), best(spikes))
+    assert SuperResolution.from_pretrained(3, budget="20MiB", size=(40, 50)).tile == 16
+
+
+@pytest.mark.slow
+def test_predict_at_a_speed(table, tmp_path, capsys):
+    spikes = torch.rand(41, 8, 10) < 0.3
+    write_spikes(tmp_path / "clip.dat", spikes)
+    recording = ["--data", "Recording", "--data.path", str(tmp_path / "clip.dat"), "--data.height", "8",
+                 "--data.width", "10", "--model.network.scale", "3", "-o"]  # fmt: skip
+    for wish, method in (["--speed", "fastest"], "tfi"), (["--budget=1ms"], "tfp"), (["--budget", "9ms"], None):
+        main(["predict", *wish, *recording, str(tmp_path / "out")])
+        assert "on the machine of the table" in capsys.readouterr().out
+        made = ClassicalDecoder(method, 3) if method else CSCSR.from_pretrained(table / "tiny.ckpt", ZeroFlow())
+        picture = made(spikes[None])[0].clamp(0, 1)
+        assert (read_picture(tmp_path / "out" / "frame_000020.png") - picture).abs().max() < 0.51 / 255
+    for wish, message in (
+        (["--budget", "1us"], "budget: expected a time or memory"),
+        (["--speed", "best", "--model.weights", "x4-e"], "choose from the weights of the package, got --model.weights"),
+    ):
+        with pytest.raises(SystemExit) as stopped:
+            main(["predict", *wish, *recording, str(tmp_path / "out")])
+        assert message in str(stopped.value)
+        assert "\n" not in str(stopped.value)
+
+
+def test_tables_of_the_package():
+    names = {name for name in shipped_weights() if name.startswith("x")}
+    for scale in sorted({int(name[1 : name.index("-")]) for name in names}):
+        found = choices(scale, (250, 400))
+        assert {choice.args[1] for choice in found if choice.args[0] == "--model.weights"} <= names
+        assert [choose(scale, name).ms for name in SPEEDS] == sorted(choose(scale, name).ms for name in SPEEDS)
+        for choice in found:  # what predict and Python can do alike
+            assert all(word.startswith("--model.") for word in choice.args if word.startswith("-")), choice
+            SuperResolution.from_pretrained(scale, budget=f"{choice.ms}ms")
