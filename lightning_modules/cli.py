@@ -117,7 +117,7 @@ class Command(LightningCLI):
                 "--speed",
                 choices=list(SPEEDS),
                 help="Weights of the package and how they are used: the best; the fastest at most 0.1 dB (balanced) or "
-                "0.5 dB (fast) below it, as measured by lightning trade; the fastest.",
+                "1 dB (fast) below it, as measured by lightning trade; the fastest.",
             )
             parser.add_argument(
                 "--budget",

@@ -5,13 +5,13 @@ from __future__ import annotations
 import csv
 import re
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 _FOLDER = Path(__file__).parent / "weights"
 
 #: how far a speed may be below the best, in dB of the table
-SPEEDS = {"fastest": float("inf"), "fast": 0.5, "balanced": 0.1, "best": 0.0}
+SPEEDS = {"fastest": float("inf"), "fast": 1.0, "balanced": 0.1, "best": 0.005}
 
 _UNITS = {
     "ms": ("ms", 1.0),
@@ -49,7 +49,7 @@ class Choice:
 
 
 def choices(scale: int, size: tuple[int, int]) -> list[Choice]:
-    """Return all settings of the table for a scale, fastest first.
+    """Return the settings of the table for a scale that are arguments of the model alone, fastest first.
 
     Time and memory are taken to grow with the number of pixels.
 
@@ -66,13 +66,15 @@ def choices(scale: int, size: tuple[int, int]) -> list[Choice]:
         raise ValueError(f"scale: expected one that was measured ({there}), got {scale}")
     with open(path, newline="") as file:
         rows = [row for row in csv.DictReader(file) if not row["failed"]]
-    best = max(float(row["psnr"]) for row in rows)
     found = []
     for row in rows:
-        pixels = size[0] * size[1] / (int(row["height"]) * int(row["width"]))
-        psnr, ms, mib = (float(row[name]) for name in ("psnr", "ms", "mib"))
         args = tuple(shlex.split(row["arguments"]))
-        found.append(Choice(row["setting"], args, psnr, best - psnr, ms * pixels, mib * pixels))
+        if all(word.startswith("--model.") for word in args if word.startswith("-")):  # a precision is the Trainer's
+            pixels = size[0] * size[1] / (int(row["height"]) * int(row["width"]))
+            psnr, ms, mib = (float(row[name]) for name in ("psnr", "ms", "mib"))
+            found.append(Choice(row["setting"], args, psnr, 0.0, ms * pixels, mib * pixels))
+    best = max(choice.psnr for choice in found)
+    found = [replace(choice, below=best - choice.psnr) for choice in found]
     return sorted(found, key=lambda choice: choice.ms)
 
 
@@ -83,7 +85,8 @@ def choose(
 
     Args:
         scale: super-resolution factor.
-        speed: ``"best"``; ``"balanced"`` and ``"fast"``, the fastest at most 0.1 and 0.5 dB below it; ``"fastest"``.
+        speed: ``"best"``, ``"balanced"`` and ``"fast"``, the fastest at most 0.005, 0.1 and 1 dB below the most exact,
+            or ``"fastest"``.
         budget: instead, what a frame may take: a time, such as ``"40ms"``, or memory, such as ``"200MB"``. Of what fits
             it is the best.
         size: of a frame, (H, W) in sensor pixels, which a budget depends on.

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from lightning_modules.look import CELL, look, required
+from lightning_modules.motion import ZeroFlow
 from lightning_modules.networks import Network
 
 #: sensor pixels around a tile that are computed and thrown away; beyond what CSCSR sees of its neighbourhood
@@ -42,18 +43,22 @@ def forward_in_tiles(network: Network, spikes: Tensor, tile: int, tolerance: flo
     height, width = spikes.shape[-2:]
     if not tile or max(height, width) <= tile:
         return network(spikes)
-    flow, s = network.estimate_flow(spikes), network.scale
+    flow, s = _motion(network, spikes), network.scale
     rgb = None
     for top in range(0, height, tile):
         for left in range(0, width, tile):
             y, x = max(top - HALO, 0), max(left - HALO, 0)
             rows, columns = slice(y, top + tile + HALO), slice(x, left + tile + HALO)
-            part = network(spikes[..., rows, columns], flow[..., rows, columns])
+            part = network(spikes[..., rows, columns], flow[..., rows, columns] if isinstance(flow, Tensor) else flow)
             part = part[..., s * (top - y) :, s * (left - x) :][..., : s * tile, : s * tile]
             if rgb is None:
                 rgb = part.new_empty(*part.shape[:-2], s * height, s * width)
             rgb[..., s * top : s * (top + tile), s * left : s * (left + tile)] = part
     return rgb
+
+
+def _motion(network: Network, spikes: Tensor) -> Tensor | Literal[0]:
+    return 0 if isinstance(network.motion, ZeroFlow) else network.estimate_flow(spikes)
 
 
 class Box(NamedTuple):
@@ -106,11 +111,11 @@ def _forward_where_needed(network: Network, spikes: Tensor, tile: int, tolerance
     if moving:
         tops, lefts, bottoms, rights = zip(*moving, strict=True)
         around = Box(min(tops), min(lefts), max(bottoms), max(rights))
-        flow = network.estimate_flow(around.of(spikes))
+        flow = _motion(network, around.of(spikes))
     rgb = seen.picture
     for box, moves in boxes.items():
         outer, inner = box.grown(NEAR, height, width), box.grown(BLEND, height, width)
-        part = network(outer.of(spikes), outer.of(flow, around[:2]) if moves else 0)
+        part = network(outer.of(spikes), outer.of(flow, around[:2]) if moves and isinstance(flow, Tensor) else 0)
         rows, columns = (
             _ramp(begin, end, inner_begin, inner_end, s, rgb)
             for begin, end, inner_begin, inner_end in zip(box[:2], box[2:], inner[:2], inner[2:], strict=True)

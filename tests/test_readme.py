@@ -7,9 +7,11 @@ README = (Path(__file__).parents[1] / "README.md").read_text()
 
 
 def test_the_python_runs_and_gradients_reach_the_scene():
-    (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    trained, own = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
     names: dict = {}
-    exec(code, names)
+    exec(trained, names)
+    assert names["rgb"].shape == (1, 3, 96, 128)
+    exec(own, names)
     assert names["moved"].shape == (1, 1, 16, 16)
     assert names["scene"].grad.isfinite().all()
     assert names["scene"].grad.abs().sum() > 0

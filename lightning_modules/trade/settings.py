@@ -70,7 +70,6 @@ _VARIANTS = [
     ("tiles of 64", "--model.tile 64"),
     ("tolerance 0.1 dB", "--model.tolerance 0.1"),
     ("tolerance 0.5 dB", "--model.tolerance 0.5"),
-    ("no motion, tolerance 0.5 dB", "--model.network.motion ZeroFlow --model.tolerance 0.5"),
 ]  # fmt: skip
 
 _SPIKE2FLOW = "--model.network.motion Spike2Flow --model.network.motion.weights spike2flow"
