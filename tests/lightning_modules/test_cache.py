@@ -83,6 +83,14 @@ def _write(folder, rounds, size):
         cache.store(clip_key(n=n % 3), arrays(seed=n % 3, size=size))
 
 
+def _wait_for_a_new_file(folder, writer):
+    """However busy the machine is."""
+    before = set(folder.glob("*"))
+    while not set(folder.glob("*")) - before:
+        assert writer.is_alive()
+        time.sleep(0.001)
+
+
 FORK = get_context("fork")  # a new interpreter would take seconds to come to the point
 
 
@@ -92,7 +100,8 @@ def test_killed_writers_leave_nothing_that_is_believed(tmp_path):
     for _ in range(25):
         writer = FORK.Process(target=_write, args=(tmp_path, 10**6, 200_000))
         writer.start()
-        time.sleep(rng.uniform(0.01, 0.1))
+        _wait_for_a_new_file(tmp_path / "unfinished", writer)
+        time.sleep(rng.choice([0, 0.001, 0.01, 0.05]))
         os.kill(writer.pid, signal.SIGKILL)
         writer.join()
         unfinished = max(unfinished, len(list((tmp_path / "unfinished").iterdir())))
