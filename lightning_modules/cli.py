@@ -40,6 +40,8 @@ CHOICES = (
     ("data", Recording),
 )
 
+_NO_RECORDING = "predict: expected a recording: --data Recording --data.path FILE"
+
 
 class InputError(ValueError):
     """Something that the user gave and that cannot be used; shown as one line."""
@@ -70,10 +72,12 @@ def _with_choice(parser: LightningArgumentParser, args: Sequence[str]) -> list[s
     verb, *rest = args
     parsed = parser.parse_args([verb, "--config", '{"model": {"network": {"class_path": "CSCSR"}}}', *rest])[verb]
     recording = parsed.data.get("init_args", {})
+    if not recording.get("path"):
+        raise InputError(_NO_RECORDING)
     try:
         size = spikes_shape(*(recording.get(name) for name in ("path", "height", "width")))[1:]
         choice = choose(parsed.model.init_args.network.init_args.scale, parsed.speed, parsed.budget, size)
-    except (OSError, TypeError, ValueError) as error:
+    except (OSError, ValueError) as error:
         raise InputError(str(error)) from error
     print(choice, flush=True)
     return behind_configurations(args, choice.args)
@@ -179,7 +183,7 @@ class Command(LightningCLI):
         if type(self.model).predict_step is LightningModule.predict_step:
             raise InputError(f"predict: expected a model that makes pictures, got {type(self.model).__name__}")
         if type(self.datamodule).predict_dataloader is LightningDataModule.predict_dataloader:
-            raise InputError("predict: expected a recording: --data Recording --data.path FILE")
+            raise InputError(_NO_RECORDING)
 
 
 def _check_agreement(model: Learner, data: LightningDataModule) -> None:

@@ -236,10 +236,10 @@ def _rounded(flow: Tensor, steps: int) -> tuple[Tensor, Tensor]:
     height, width = flow.shape[-2:]
     y, x = (torch.arange(length, device=flow.device, dtype=flow.dtype) for length in (height, width))
     pixel = torch.stack([x.expand(height, width), y[:, None].expand(height, width)])
-    last = pixel[:, -1:, -1:] + 0.5
-    cut = (flow.detach() + pixel).clamp(min=-0.5).minimum(last) - pixel
-    inside = (flow.detach() + pixel).ge(-0.5) & (flow.detach() + pixel).le(last)
-    return flow + ((cut * steps).round() / steps - flow.detach()), inside
+    position = flow.detach() + pixel
+    moved = position.clamp(min=-0.5).minimum(pixel[:, -1:, -1:] + 0.5)
+    rounded = ((moved - pixel) * steps).round() / steps
+    return flow + (rounded - flow.detach()), moved == position
 
 
 class _NearestKnown(torch.autograd.Function):

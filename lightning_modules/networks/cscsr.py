@@ -60,7 +60,7 @@ class CSCSR(Network):
         alpha: gain of the camera, what a white pixel receives per clock in thresholds; only the skip divides by it.
         neighbors: known pixels that the temporal pixel search weighs.
         steps: positions per pixel of the picture, along each axis, that the search rounds motion to, which makes it
-            three to five times faster on a CPU; 0 for the exact search. Weights serve with any.
+            faster on a CPU; 0 for the exact search. Weights serve with any.
         motion: estimator that is asked where no flow is given; when not given,
             :class:`lightning_modules.motion.ClassicalFlow`.
         representation: features of a time point: ``"bssr"`` learns them; ``"spikes"``, without BSSR (A), averages the

@@ -128,6 +128,8 @@ def test_predict_at_a_speed(table, tmp_path, capsys):
             main(["predict", *wish, *recording, str(tmp_path / "out")])
         assert message in str(stopped.value)
         assert "\n" not in str(stopped.value)
+    with pytest.raises(SystemExit, match="expected a recording: --data Recording"):
+        main(["predict", "--speed", "fast", "--data", "StillScenes", "-o", str(tmp_path / "out")])
 
 
 def test_tables_of_the_package():
