@@ -211,6 +211,9 @@ class CSCSR(Network):
         for part in self.representation:
             if isinstance(part, SpikeRepresentation):
                 part.start_at_the_mean()
+        for part in self.refinement:
+            if isinstance(part, TimeFusion):
+                part.start_at_the_mean(self.fold**2)
         if self.skip:
             nn.init.zeros_(self.reconstruction.rgb.weight)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor, nn
 
 from lightning_modules.networks.layers import ConvBlock, conv
@@ -44,3 +45,20 @@ class TimeFusion(nn.Sequential):
 
     def __init__(self, times: int, features: int, width: int) -> None:
         super().__init__(nn.Flatten(1, 2), conv(times * features, width))
+        self.times = times
+
+    @torch.no_grad()
+    def start_at_the_mean(self, pixels: int) -> None:
+        """Set weights, so that the first channels are the means over time of the first feature.
+
+        A single linear layer of random weights would have to find them behind the noise of every time point: training
+        then rests on a plateau, for longer or shorter as the seed has it.
+
+        Args:
+            pixels: temporal pixels in which the first feature comes, the first channels of every time point.
+        """
+        weight = self[1].weight.unflatten(1, (self.times, -1))
+        means = min(pixels, len(weight))
+        weight[:means] = 0
+        for pixel in range(means):
+            weight[pixel, :, pixel, 1, 1] = 1 / self.times

@@ -143,6 +143,15 @@ def test_representation_starts_at_the_mean_of_the_window(global_perception):
         torch.testing.assert_close(represent(plane)[:, :, :1], WindowMeans(11, 3)(plane))
 
 
+@pytest.mark.parametrize(("resolution", "means"), [("output", 1), ("sensor", 4)])
+def test_fusion_of_times_starts_at_the_mean(resolution, means):
+    network = CSCSR(2, **TINY | {"features": 3, "width": 6}, refinement=False, resolution=resolution)
+    pixels = torch.rand(2, 11, 3 * means, 5, 6)
+    for fuse in network.refinement:
+        torch.testing.assert_close(fuse(pixels)[:, :means], pixels[:, :, :means].mean(dim=1))
+        assert fuse[1].weight[means:].abs().min() > 0
+
+
 def test_skip_starts_at_a_smooth_classical_picture():
     """Equal to the classical one where the scene is plain, and without its zipper at edges."""
     spikes = torch.ones(1, 41, 12, 12)
