@@ -313,7 +313,9 @@ class Tfi(nn.Module):
         return f"max_range={self.max_range}" + (f", dtype={self.dtype}" if self.dtype else "")
 
 
-def tfp(spikes: Tensor, window: int, max_range: float = 1.0, *, dtype: torch.dtype | None = None) -> Tensor:
+def tfp(
+    spikes: Tensor, window: int, max_range: float = 1.0, *, order: int = 1, dtype: torch.dtype | None = None
+) -> Tensor:
     r"""Texture from playback: light as the mean number of spikes in a window around every frame.
 
     .. math:: R_n = \frac{\delta}{w} \sum_{|i - n| \le (w - 1) / 2} S_i
@@ -323,10 +325,15 @@ def tfp(spikes: Tensor, window: int, max_range: float = 1.0, *, dtype: torch.dty
         that exist, so a window longer than the clip is legal. Linear in the spikes, and differentiable as such; sums
         run in float32 or wider.
 
+        An integrate-and-fire pixel is a delta-sigma modulator of first order: what it rounds away now it adds later.
+        A plain mean makes no use of that. Means of means do: three of 13 frames see 37 and leave far less noise than
+        one of 41, and less motion blur, since the frames far from n count for little.
+
     Args:
         spikes: :math:`(*, T, H, W)`, zeros and ones, any real dtype.
         window: number of frames, odd.
         max_range: :math:`\delta`, the value of a pixel that fires at every clock.
+        order: how often the mean is taken; the result then sees ``order * (window - 1) + 1`` frames.
         dtype: that of the result; that of ``spikes`` where it is floating, else torch's default type. ``torch.uint8``
             makes pictures: rounded to the nearest whole number, cut to 0 .. 255, without a gradient.
 
@@ -335,22 +342,29 @@ def tfp(spikes: Tensor, window: int, max_range: float = 1.0, *, dtype: torch.dty
 
     Raises:
         TypeError: ``spikes`` is not a tensor of real numbers, ``dtype`` neither floating nor uint8.
-        ValueError: fewer than three dimensions, an empty clip, an even window or one below 1, ``max_range`` not
-            above 0.
+        ValueError: fewer than three dimensions, an empty clip, an even window or one below 1, an order below 1,
+            ``max_range`` not above 0.
 
     Example:
         >>> spikes = torch.tensor([1, 0, 0, 1]).reshape(4, 1, 1)
         >>> tfp(spikes, 3).flatten().tolist()
         [0.5, 0.333..., 0.333..., 0.5]
+        >>> tfp(torch.eye(5)[2].reshape(5, 1, 1), 3, order=2)[2].item()  # weights 1, 2, 3, 2, 1 of 9
+        0.333...
 
     Reference:
-        Dong et al., CVPR 2024, eq. (6); Zhu et al., ICME 2019.
+        Dong et al., CVPR 2024, eq. (6); Zhu et al., ICME 2019. ``order``: the sinc^k filter of Candy, IEEE
+        Transactions on Communications, 1986, which wants one order more than the modulator has.
     """
     check_planes("spikes", spikes, 3, "(*, T, H, W)")
-    window = _check_window(window)
+    window, order = _check_window(window), check_whole("order", order)
     check_positive("max_range", max_range)
     check_dtype(dtype, torch.uint8)
-    return _Tfp.apply(spikes, window, float(max_range), dtype or default_float(spikes), False)
+    dtype = dtype or default_float(spikes)
+    between = torch.float64 if dtype == torch.float64 else torch.float32
+    for _ in range(order - 1):
+        spikes = _Tfp.apply(spikes, window, 1.0, between, False)
+    return _Tfp.apply(spikes, window, float(max_range), dtype, False)
 
 
 def _check_window(window: int) -> int:
@@ -372,17 +386,22 @@ class Tfp(nn.Module):
         1.0
     """
 
-    def __init__(self, window: int, max_range: float = 1.0, *, dtype: torch.dtype | None = None) -> None:
+    def __init__(
+        self, window: int, max_range: float = 1.0, *, order: int = 1, dtype: torch.dtype | None = None
+    ) -> None:
         super().__init__()
         _check_window(window)
+        check_whole("order", order)
         check_positive("max_range", max_range)
         check_dtype(dtype, torch.uint8)
         self.window = window
         self.max_range = max_range
+        self.order = order
         self.dtype = dtype
 
     def forward(self, spikes: Tensor) -> Tensor:  # noqa: D102
-        return tfp(spikes, self.window, self.max_range, dtype=self.dtype)
+        return tfp(spikes, self.window, self.max_range, order=self.order, dtype=self.dtype)
 
     def extra_repr(self) -> str:  # noqa: D102
-        return f"window={self.window}, max_range={self.max_range}" + (f", dtype={self.dtype}" if self.dtype else "")
+        text = f"window={self.window}, max_range={self.max_range}, order={self.order}"
+        return text + (f", dtype={self.dtype}" if self.dtype else "")

@@ -10,7 +10,7 @@ from torch import Tensor
 from lightning_modules.motion import ZeroFlow
 from lightning_modules.networks.network import Network
 from spikekit import bayer_pattern, demosaic, tfi, tfp
-from spikekit.check import check_planes, check_positive, check_scale
+from spikekit.check import check_planes, check_positive, check_scale, check_whole
 
 
 class ClassicalDecoder(Network):
@@ -22,6 +22,7 @@ class ClassicalDecoder(Network):
         pattern: Bayer phase.
         alpha: gain of the camera, what a white pixel receives per clock in thresholds; the result is divided by it.
         window: frames that TFP averages, odd.
+        order: how often it does, see :func:`spikekit.tfp`.
         frames: spike frames N of a clip, odd.
 
     Shape:
@@ -41,6 +42,7 @@ class ClassicalDecoder(Network):
         pattern: str = "RGGB",
         alpha: float = 0.4,
         window: int = 41,
+        order: int = 1,
         frames: int = 41,
     ) -> None:
         check_scale(scale)
@@ -55,17 +57,19 @@ class ClassicalDecoder(Network):
             "pattern": bayer_pattern(pattern),
             "alpha": alpha,
             "window": window,
+            "order": check_whole("order", order),
             "frames": frames,
         }
         super().__init__(settings, (frames // 2,) * 3, ZeroFlow())
         self.method = method
         self.alpha = alpha
         self.window = window
+        self.order = order
 
     def forward(self, spikes: Tensor, flow: Tensor | Literal[0] | None = None) -> Tensor:
         """Return rgb; a flow changes nothing."""
         check_planes("spikes", spikes, 4, "(B, N, H, W)")
-        decoded = tfi(spikes) if self.method == "tfi" else tfp(spikes, self.window)
+        decoded = tfi(spikes) if self.method == "tfi" else tfp(spikes, self.window, order=self.order)
         raw = decoded[:, spikes.shape[1] // 2] / self.alpha
         rgb = demosaic(raw, self.pattern)
         if self.scale > 1:
@@ -73,4 +77,5 @@ class ClassicalDecoder(Network):
         return rgb
 
     def extra_repr(self) -> str:  # noqa: D102
-        return f"method={self.method!r}, scale={self.scale}, alpha={self.alpha}, window={self.window}"
+        text = f"method={self.method!r}, scale={self.scale}, alpha={self.alpha}"
+        return text if self.method == "tfi" else f"{text}, window={self.window}, order={self.order}"

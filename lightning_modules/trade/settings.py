@@ -78,7 +78,7 @@ _LEARNED = [("Spike2Flow", _SPIKE2FLOW), ("Spike2Flow, once", f"{_SPIKE2FLOW} --
 _DECODER = "--model.network ClassicalDecoder --model.network.method"
 _DECODERS = [
     ("TFP 41", f"{_DECODER} tfp --model.network.window 41"),
-    ("TFP 21", f"{_DECODER} tfp --model.network.window 21"),
+    ("TFP 13, order 3", f"{_DECODER} tfp --model.network.window 13 --model.network.order 3"),
     ("TFI", f"{_DECODER} tfi"),
 ]
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.autograd import gradcheck, gradgradcheck
 
-from spikekit import spike_interval, tfi, tfp
+from spikekit import Tfp, spike_integrate_fire, spike_interval, tfi, tfp
 
 DTYPES = [torch.float64, torch.float32, torch.bfloat16, torch.float16]
 
@@ -172,6 +172,40 @@ def test_tfp(frames, window, max_range):
     assert torch.equal(tfp(torch.from_numpy(spikes[1]), window), tfp(torch.from_numpy(spikes), window)[1])
 
 
+@pytest.mark.parametrize(("order", "window"), [(2, 3), (3, 13), (3, 25), (5, 1)])
+def test_tfp_of_higher_order_is_a_mean_of_means(order, window):
+    spikes = streams(41)
+    expected = spikes
+    for _ in range(order - 1):
+        expected = over_pixels(lambda stream: tfp_loop(stream, window, 1.0), expected)
+    expected = over_pixels(lambda stream: tfp_loop(stream, window, 255.0), expected)
+    for dtype in (torch.bool, *DTYPES):
+        got = tfp(torch.from_numpy(spikes).to(dtype), window, 255.0, order=order)
+        assert got.dtype == (dtype if dtype.is_floating_point else torch.get_default_dtype())
+        eps = max(torch.finfo(got.dtype).eps, torch.finfo(torch.float32).eps * order)
+        np.testing.assert_allclose(got.double().numpy(), expected, rtol=2 * eps, atol=255 * eps)
+    light = torch.from_numpy(spikes)
+    byte = tfp(light, window, 255, order=order, dtype=torch.uint8)
+    assert torch.equal(byte, tfp(light, window, 255.0, order=order).round().to(torch.uint8))
+    assert torch.equal(Tfp(window, 255.0, order=order)(light), tfp(light, window, 255.0, order=order))
+
+
+def test_tfp_of_third_order_cancels_what_pixels_round_away():
+    """Constant light, any initial charge: a third of the noise of the mean over as many frames."""
+    light = torch.linspace(0.1, 0.9, 97, dtype=torch.float64)
+    charge = torch.linspace(0, 1, 33, dtype=torch.float64)[:-1, None].expand(-1, 97)
+    spikes, _ = spike_integrate_fire(light.expand(41, 32, -1), charge=charge)
+    noise = [(tfp(spikes, window, order=order)[20] - light).square().mean() for window, order in ((37, 1), (13, 3))]
+    assert noise[1] < 0.1 * noise[0]
+
+
+@pytest.mark.parametrize("order", [0, -1, 1.5, True])
+def test_tfp_refuses_an_order(order):
+    for make in (lambda: tfp(torch.zeros(3, 1, 1), 3, order=order), lambda: Tfp(3, order=order)):
+        with pytest.raises(ValueError, match="order: expected a whole number >= 1"):
+            make()
+
+
 def test_tfp_counts_uint8_past_255():
     for dtype in (torch.uint8, torch.bool):
         assert torch.allclose(tfp(torch.ones(600, 1, 1, dtype=dtype), 601), torch.ones(1))
@@ -229,6 +263,7 @@ def test_tfp_is_linear():
 def test_tfp_gradcheck(frames, window):
     spikes = torch.rand(frames, 1, 2, dtype=torch.float64, requires_grad=True)
     assert gradcheck(lambda s: tfp(s, window, 2.0), spikes)
+    assert gradcheck(lambda s: tfp(s, window, 2.0, order=3), spikes)
 
 
 def test_memory_layouts():
