@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal, NamedTuple
 
 import torch
@@ -11,10 +12,15 @@ from lightning_modules.look import CELL, look, required
 from lightning_modules.motion import ZeroFlow
 from lightning_modules.networks import Network
 
-#: sensor pixels around a tile that are computed and thrown away; beyond what CSCSR sees of its neighbourhood
-HALO = 24
-#: the same, and how far two parts are blended into each other, where a tolerance is given
-NEAR, BLEND = 12, 4
+#: sensor pixels around a tile that are computed and thrown away, beside those that motion reaches over: what shipped
+#: networks see beyond them changes a picture by less than float32 rounds
+HALO = 12
+#: motion that is followed over the edge of a tile, in sensor pixels; what moves further is searched inside
+FAR = 48
+#: sensor pixels around the tiles that move in which motion is estimated, where a tolerance is given
+AROUND = 24
+#: how far two parts are blended into each other, where a tolerance is given
+BLEND = 4
 
 
 @torch.no_grad()
@@ -44,16 +50,15 @@ def forward_in_tiles(network: Network, spikes: Tensor, tile: int, tolerance: flo
     if not tile or max(height, width) <= tile:
         return network(spikes)
     flow, s = _motion(network, spikes), network.scale
-    rgb = None
+    whole, rgb = Box(0, 0, height, width), None
     for top in range(0, height, tile):
         for left in range(0, width, tile):
-            y, x = max(top - HALO, 0), max(left - HALO, 0)
-            rows, columns = slice(y, top + tile + HALO), slice(x, left + tile + HALO)
-            part = network(spikes[..., rows, columns], flow[..., rows, columns] if isinstance(flow, Tensor) else flow)
-            part = part[..., s * (top - y) :, s * (left - x) :][..., : s * tile, : s * tile]
+            box = Box(top, left, top + tile, left + tile).grown(0, whole)
+            outer = box.grown(_reach(flow, box, whole), whole)
+            part = network(outer.of(spikes), outer.of(flow) if isinstance(flow, Tensor) else flow)
             if rgb is None:
                 rgb = part.new_empty(*part.shape[:-2], s * height, s * width)
-            rgb[..., s * top : s * (top + tile), s * left : s * (left + tile)] = part
+            box.of(rgb, scale=s).copy_(box.of(part, outer[:2], s))
     return rgb
 
 
@@ -69,15 +74,23 @@ class Box(NamedTuple):
     bottom: int
     right: int
 
-    def grown(self, margin: int, height: int, width: int) -> Box:
-        """Return the box with a margin, inside a clip."""
-        top, left = max(self.top - margin, 0), max(self.left - margin, 0)
-        return Box(top, left, min(self.bottom + margin, height), min(self.right + margin, width))
+    def grown(self, margin: int, frame: Box) -> Box:
+        """Return the box with a margin, cut off at the edges of a frame."""
+        outer = self.top - margin, self.left - margin, self.bottom + margin, self.right + margin
+        return Box(*map(max, outer[:2], frame[:2]), *map(min, outer[2:], frame[2:]))
 
     def of(self, planes: Tensor, corner: tuple[int, int] = (0, 0), scale: int = 1) -> Tensor:
         """Return this part of planes that begin at a corner and have ``scale`` pixels for one."""
         rows = slice(scale * (self.top - corner[0]), scale * (self.bottom - corner[0]))
         return planes[..., rows, scale * (self.left - corner[1]) : scale * (self.right - corner[1])]
+
+
+def _reach(flow: Tensor | Literal[0], box: Box, frame: Box) -> int:
+    """How much around a box of a frame a network has to see: even, as the Bayer phase is kept."""
+    if not isinstance(flow, Tensor):
+        return HALO
+    near = box.grown(HALO, frame).of(flow, frame[:2])
+    return HALO + 2 * math.ceil(near.nan_to_num().abs().amax().clamp(max=FAR).item() / 2)
 
 
 def _around(cells: Tensor) -> Box:
@@ -106,16 +119,20 @@ def _forward_where_needed(network: Network, spikes: Tensor, tile: int, tolerance
     cells = required(seen, tolerance)
     boxes = _boxes(*cells, max(tile // CELL, 1) if tile else max(cells[0].shape))
     boxes = {Box(*(CELL * side for side in box)): moves for box, moves in boxes.items()}
-    moving = [box.grown(NEAR, height, width) for box, moves in boxes.items() if moves]
-    flow = None
-    if moving:
-        tops, lefts, bottoms, rights = zip(*moving, strict=True)
-        around = Box(min(tops), min(lefts), max(bottoms), max(rights))
+    whole, flow = Box(0, 0, height, width), 0
+    if any(boxes.values()):
+        tops, lefts, bottoms, rights = zip(*(box for box, moves in boxes.items() if moves), strict=True)
+        around = Box(min(tops), min(lefts), max(bottoms), max(rights)).grown(AROUND, whole)
         flow = _motion(network, around.of(spikes))
     rgb = seen.picture
     for box, moves in boxes.items():
-        outer, inner = box.grown(NEAR, height, width), box.grown(BLEND, height, width)
-        part = network(outer.of(spikes), outer.of(flow, around[:2]) if moves and isinstance(flow, Tensor) else 0)
+        if moves and isinstance(flow, Tensor):
+            outer = box.grown(_reach(flow, box, around), around)
+            part = network(outer.of(spikes), outer.of(flow, around[:2]))
+        else:
+            outer = box.grown(HALO, whole)
+            part = network(outer.of(spikes), 0)
+        inner = box.grown(BLEND, whole)
         rows, columns = (
             _ramp(begin, end, inner_begin, inner_end, s, rgb)
             for begin, end, inner_begin, inner_end in zip(box[:2], box[2:], inner[:2], inner[2:], strict=True)

@@ -58,11 +58,13 @@ def read_setting(text: str) -> Setting:
     return Setting(named[1].strip() if named else shlex.join(args), args)
 
 
-#: what is tried on a network: behind its name, and behind its arguments
+#: what is tried on every network: behind its name, and behind its arguments
+_STILL = [("no motion", "--model.network.motion ZeroFlow")]
+
+#: what is tried on the first, besides
 _VARIANTS = [
     ("exact search", "--model.network.steps 0"),
     ("search steps 4", "--model.network.steps 4"),
-    ("no motion", "--model.network.motion ZeroFlow"),
     ("motion radius 5", "--model.network.motion ClassicalFlow --model.network.motion.radius 5"),
     ("bf16-true", "--trainer.precision bf16-true"),
     ("bf16-mixed", "--trainer.precision bf16-mixed"),
@@ -86,8 +88,8 @@ _DECODERS = [
 def usual_settings(scale: int, own: Sequence[str] = ()) -> list[Setting]:
     """Return what is measured where nothing else is asked for.
 
-    The networks whose weights come with the package, as they are; then the first of them, faster and more exact; then
-    the decoders without learning.
+    The networks whose weights come with the package, as they are; then the same without motion, and the first of them
+    faster and more exact in other ways; then the decoders without learning.
 
     Args:
         scale: super-resolution factor.
@@ -102,8 +104,8 @@ def usual_settings(scale: int, own: Sequence[str] = ()) -> list[Setting]:
     learned = _LEARNED if "spike2flow" in shipped else []
     variants = [
         Setting(f"{network.name}, {name}", [*network.args, *shlex.split(args)])
-        for network in networks[:1]
-        for name, args in [*learned, *_VARIANTS]
+        for place, network in enumerate(networks)
+        for name, args in ([*learned, *_STILL, *_VARIANTS] if place == 0 else _STILL)
     ]
     without = [word for option in own for word in (option, "null")]
     return networks + variants + [Setting(name, [*shlex.split(args), *without]) for name, args in _DECODERS]

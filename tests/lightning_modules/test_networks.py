@@ -181,11 +181,15 @@ def test_bfloat16_keeps_the_picture_in_float32():
     assert (half - exact).abs().max() < 0.05 * exact.abs().max()
 
 
-def test_tiles_change_nothing():
+@pytest.mark.parametrize("motion", [0, 1, 15, torch.nan])
+def test_tiles_change_nothing(motion):
+    """However far it moves: a tile sees what comes into it."""
     network = CSCSR(2, **TINY, skip=True)
     with torch.no_grad():
         network.reconstruction.rgb.weight.normal_(std=0.1)
     spikes, flow = clip(1, 70, 58)
+    flow = flow * motion
+    flow[..., 0, :32, :] += 9 * motion
     network.estimate_flow = lambda _: flow
     torch.testing.assert_close(forward_in_tiles(network, spikes, 32), network(spikes, flow), rtol=0, atol=1e-5)
 
