@@ -10,6 +10,7 @@ import secrets
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -20,6 +21,7 @@ from torch import Tensor
 from spikekit import bench, extremes, simulate_cli, view_cli
 from spikekit.arguments import UsageError, one_line, positive, whole
 from spikekit.cfa import PATTERNS
+from spikekit.decoders import tfp
 from spikekit.demosaic import demosaic
 from spikekit.files import iter_spikes
 from spikekit.keyframe import search
@@ -71,6 +73,8 @@ def decode(args: argparse.Namespace) -> None:
     """Write the picture of one frame, or of many, reading only as much around each as the method needs."""
     if args.window is not None and (args.method != "tfp" or args.window % 2 == 0):
         raise UsageError(f"--window: expected an odd number, with --method tfp, got {args.window} with {args.method}")
+    if args.order > 1 and args.method != "tfp":
+        raise UsageError(f"--order: expected --method tfp, got {args.order} with {args.method}")
     if args.output.is_dir():
         raise ValueError(f"{args.output}: expected a picture to write, got a folder")
     recording = open_recording(args)
@@ -79,7 +83,8 @@ def decode(args: argparse.Namespace) -> None:
     if len(chosen) > 1 and _NUMBER not in str(args.output):
         raise UsageError(f"--output: expected {_NUMBER} in the name of {len(chosen)} pictures, got {args.output}")
 
-    reach = (args.window or TFP_WINDOW) // 2 if args.method == "tfp" else TFI_REACH
+    window = args.window or TFP_WINDOW
+    reach = args.order * (window // 2) if args.method == "tfp" else TFI_REACH
     key = chosen[len(chosen) // 2]
     alpha = args.alpha or recording.alpha
     white, scaling = _white(alpha, recording, key, reach)
@@ -88,7 +93,13 @@ def decode(args: argparse.Namespace) -> None:
         for done, (n, plane) in enumerate(_windows(recording, chosen, reach)):
             if show:
                 print(f"\r{done} of {len(chosen)} pictures", end="", file=sys.stderr, flush=True)
-            raw = _decode_frame(args.method, plane, n, *_span(n, reach, frames)) / white
+            first, last = _span(n, reach, frames)
+            if args.method == "tfi":
+                raw = torch.from_numpy(search(plane, n, range(first, last + 1))).float().reciprocal()
+            else:
+                weights = _weights(last + 1 - first, n - first, window, args.order)
+                raw = torch.from_numpy(sum(map(np.multiply, map(plane, range(first, last + 1)), weights))).float()
+            raw = raw / white
             path = Path(str(args.output).replace(_NUMBER, f"{n:0{len(str(frames - 1))}}"))
             picture = raw if recording.pattern is None else demosaic(raw, recording.pattern)
             _write(path, recording.show(picture, known=alpha is not None))
@@ -177,6 +188,14 @@ def _parser() -> argparse.ArgumentParser:
         metavar="W",
         help=f"frames that tfp averages, odd, the frame in their middle, fewer at the ends of the recording; "
         f"{TFP_WINDOW} if not given",
+    )
+    verb.add_argument(
+        "--order",
+        type=whole(1),
+        default=1,
+        metavar="K",
+        help="how often tfp takes the mean: --window 13 --order 3 sees 37 frames, with less noise and less blur than a "
+        "window of 37; 1 if not given",
     )
     verb.add_argument(
         "--alpha",
@@ -272,12 +291,12 @@ def _windows(recording: Recording, chosen: range, reach: int) -> Iterator[tuple[
         yield n, plane
 
 
-def _decode_frame(method: str, plane: _Plane, frame: int, first: int, last: int) -> Tensor:
-    """Decode one frame from those between the first and the last."""
-    if method == "tfi":
-        return torch.from_numpy(search(plane, frame, range(first, last + 1))).float().reciprocal()
-    total = sum(map(plane, range(first, last + 1)), start=np.float32(0))
-    return torch.from_numpy(total / np.float32(last + 1 - first))
+@lru_cache(maxsize=4)
+def _weights(frames: int, at: int, window: int, order: int) -> tuple[float, ...]:
+    """Weights of frames in the mean, or the mean of means, at one of them."""
+    pixel = torch.zeros(frames, 1, 1, dtype=torch.float64, requires_grad=True)
+    (weights,) = torch.autograd.grad(tfp(pixel, window, order=order)[at].sum(), pixel)
+    return tuple(weights.flatten().tolist())
 
 
 def _counts(recording: Recording, start: int, frames: int) -> Tensor:

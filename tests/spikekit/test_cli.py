@@ -157,7 +157,10 @@ def test_decode(clip, tmp_path, capsys, method, least):
     assert psnr(read_picture(out)[:, 1:], light[:, 1:] / 0.5) > least
 
 
-@pytest.mark.parametrize(("method", "words"), [("tfi", []), ("tfp", []), ("tfp", ["--window", "5"])])
+@pytest.mark.parametrize(
+    ("method", "words"),
+    [("tfi", []), ("tfp", []), ("tfp", ["--window", "5"]), ("tfp", ["--window", "13", "--order", "3"])],
+)
 @pytest.mark.parametrize("frame", [0, 3, 250, 498, 499])
 def test_decode_reads_what_it_needs(tmp_path, method, words, frame):
     """The picture of a frame is that of the whole recording, for pixels that fire within the span."""
@@ -182,7 +185,8 @@ def test_decode_reads_what_it_needs(tmp_path, method, words, frame):
         )
         == 0
     )
-    whole = tfi(spikes) if method == "tfi" else tfp(spikes, 5 if words else 41)
+    window, order = map(int, (*words[1::2], 1)[:2]) if words else (41, 1)
+    whole = tfi(spikes) if method == "tfi" else tfp(spikes, window, order=order)
     assert torch.equal((read_picture(out)[0] * 255).round(), (whole[frame] * 255).round())
 
 
@@ -191,6 +195,7 @@ def test_decode_reads_what_it_needs(tmp_path, method, words, frame):
     [
         (["--method", "tfp"], [(499_980, 41)]),
         (["--method", "tfp", "--window", "1", "--frame", "7"], [(7, 1)]),
+        (["--method", "tfp", "--window", "5", "--order", "3", "--frame", "100"], [(94, 13)]),
         (["--method", "tfi", "--frame", "999999"], [(999_799, 201)]),
         (["--method", "tfp", "--frame", "100:140:10"], [(80, 71)]),
         (["--method", "tfp", "--window", "5", "--frame", "100:140:20"], [(98, 5), (118, 5)]),
@@ -369,6 +374,10 @@ def test_decode_darkness(tmp_path, capsys):
             "odd number, with --method tfp, got 4",
         ),
         (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--window", "5"], "with --method tfp, got 5 with tfi"),
+        (
+            ["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--order", "3"],
+            "expected --method tfp, got 3 with tfi",
+        ),
         (
             ["decode", "a.dat", "-o", "a.dat", "--method", "tfi"],
             "ends in .png, .jpg, .jpeg, .bmp, .tif, .tiff, got a.dat",
