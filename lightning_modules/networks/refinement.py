@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lightning_modules.networks.layers import ConvBlock, conv
@@ -27,8 +28,16 @@ class FeatureRefinement(nn.Module):
         self.residual = nn.Sequential(ConvBlock(times * features, width), conv(width, width))
 
     def forward(self, pixels: Tensor) -> Tensor:  # noqa: D102
-        residual = pixels - pixels.mean(dim=1, keepdim=True)
-        return self.base(pixels.flatten(1, 2)) + self.residual(residual.flatten(1, 2))
+        (base, _), base_end = self.base
+        (residual, _), residual_end = self.residual
+        # the mean is taken off the weights, which are few, not off the pixels, and both branches run as one
+        weight = residual.weight.unflatten(1, (pixels.shape[1], -1))
+        weight = (weight - weight.mean(dim=1, keepdim=True)).flatten(1, 2)
+        seen = F.conv2d(
+            pixels.flatten(1, 2), torch.cat([base.weight, weight]), torch.cat([base.bias, residual.bias]), padding=1
+        )
+        ends = torch.cat([base_end.weight, residual_end.weight], dim=1)
+        return F.conv2d(seen.relu_(), ends, base_end.bias + residual_end.bias, padding=1)
 
 
 class TimeFusion(nn.Sequential):

@@ -5,6 +5,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks import CSCSR, ClassicalDecoder
+from lightning_modules.networks.refinement import FeatureRefinement
 from lightning_modules.networks.representation import WindowMeans
 from lightning_modules.tiles import forward_in_tiles
 from spikekit import bayer_mask, linear_motion, mosaic, psnr, spike_integrate_fire, split_colors
@@ -147,6 +148,16 @@ def test_representation_starts_at_the_mean_of_the_window(global_perception):
     spikes = clip()[0].float()
     for represent, plane in zip(network.representation, split_colors(spikes, "RGGB"), strict=True):
         torch.testing.assert_close(represent(plane)[:, :, :1], WindowMeans(11, 3)(plane))
+
+
+def test_refinement_looks_at_what_deviates_from_the_mean():
+    """Section 4.3: a base layer of everything, and a residual layer of what is left without the mean over time."""
+    refine, pixels = FeatureRefinement(5, 3, 4).double(), torch.rand(2, 5, 3, 6, 7, dtype=torch.float64)
+    residual = pixels - pixels.mean(dim=1, keepdim=True)
+    expected = refine.base(pixels.flatten(1, 2)) + refine.residual(residual.flatten(1, 2))
+    torch.testing.assert_close(refine(pixels), expected)
+    got, wanted = (torch.autograd.grad(out.square().sum(), refine.parameters()) for out in (refine(pixels), expected))
+    torch.testing.assert_close(got, wanted)
 
 
 @pytest.mark.parametrize(("resolution", "means"), [("output", 1), ("sensor", 4)])
