@@ -11,7 +11,7 @@ from lightning_modules.motion.estimator import MotionEstimator, split_any_size
 from spikekit import tfp, upsample_flow
 from spikekit.check import check_planes
 
-_BLUR = 0.7  # of the pictures, in Bayer cells
+_BLUR = 0.5  # of the pictures, in Bayer cells
 
 
 class ClassicalFlow(MotionEstimator):

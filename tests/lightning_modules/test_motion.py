@@ -68,7 +68,7 @@ def test_flows_of_the_sites_are_in_bayer_cells_and_in_the_order_of_split_bayer(s
         weights = torch.stack([weights[max(n - 6, 0) : n + 7].mean(dim=0) for n in range(41)])
     clock = weights @ torch.arange(41.0)
     pictures = torch.einsum("kn,sbnhw->ksbhw", weights[[20, 30]], sites.float())
-    blur = torch.exp(-(torch.arange(-2.0, 3) ** 2) / (2 * 0.7**2))
+    blur = torch.exp(-(torch.arange(-2.0, 3) ** 2) / (2 * 0.5**2))
     blur = blur[:, None] * blur / blur.sum() ** 2
     padded = torch.nn.functional.pad(pictures.flatten(0, 1), (2, 2, 2, 2), "replicate")
     middle, last = torch.conv2d(padded.flatten(0, 1)[:, None], blur[None, None]).reshape(pictures.shape)
