@@ -6,7 +6,7 @@ import csv
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from pytorch_lightning import Callback, LightningModule, Trainer
@@ -14,7 +14,8 @@ from pytorch_lightning.loggers import TensorBoardLogger
 from torch import Tensor
 
 from lightning_modules.networks import ClassicalDecoder
-from spikekit import panel, psnr, ssim, write_picture
+from lightning_modules.quality import measures, why_no_lpips
+from spikekit import panel, write_picture
 
 _MOST_TABLES = 20
 
@@ -54,8 +55,9 @@ class ValidationPictures(Callback):
 class TestReport(Callback):
     """Print one table of a test, every method on the same clips, and write ``test.csv`` and ``test.png``.
 
-    PSNR and SSIM as :func:`spikekit.psnr` and :func:`spikekit.ssim`, averaged over clips. Data that name their clips,
-    in ``test_names``, get a table for each of them, too, where they are no more than 20.
+    PSNR and SSIM as :func:`spikekit.psnr` and :func:`spikekit.ssim`, averaged over clips, and LPIPS where it is to be
+    had, see :mod:`lightning_modules.quality`. Data that name their clips, in ``test_names``, get a table for each of
+    them, too, where they are no more than 20.
 
     Args:
         output: the folder that they are written to.
@@ -64,20 +66,26 @@ class TestReport(Callback):
 
     __test__ = False  # not a test for pytest
 
-    #: column of ``test.csv``, heading of the table, and how many digits the table shows
-    measures: ClassVar[list[tuple[str, str, int]]] = [("psnr", "PSNR (dB)", 2), ("ssim", "SSIM", 4)]
-
     def __init__(self, output: str | Path, clips: int = 6) -> None:
         self.output = Path(output)
         self.clips = clips
+
+    def columns(self) -> list[tuple[str, str, int]]:
+        """Columns of ``test.csv``, their headings in the table, and how many digits it shows."""
+        return [(measure.name, measure.heading, measure.digits) for measure in measures()]
 
     def score(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, list[tuple[float, ...]]]:
         """Return the measures of every clip of a batch, by method."""
         truth = batch["rgb"]
         return {
-            method: list(zip(psnr(rgb, truth).tolist(), ssim(rgb, truth).tolist(), strict=True))
+            method: list(zip(*(measure.of(rgb, truth).tolist() for measure in measures()), strict=True))
             for method, rgb in outputs.items()
         }
+
+    def missing(self) -> str | None:
+        """Return what was not measured, and why."""
+        why = why_no_lpips()
+        return f"LPIPS not measured: {why}" if why else None
 
     def rows(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> list[list[Tensor]]:
         """Return the pictures of every clip of a batch: one of every method, and the truth."""
@@ -112,18 +120,19 @@ class TestReport(Callback):
                 table += ["", *self._lines(name, {method: scores[clip] for method, scores in self._scores.items()})]
         with open(self.output / "test.csv", "w", newline="") as file:
             writer = csv.writer(file)
-            writer.writerow(["method", "clip", *(column for column, _, _ in self.measures)])
+            writer.writerow(["method", "clip", *(column for column, _, _ in self.columns())])
             for method, scores in self._scores.items():
                 writer.writerows([method, n, *map(_rounded, score)] for n, score in zip(names, scores, strict=True))
                 writer.writerow([method, "mean", *map(_rounded, means[method])])
         write_picture(self.output / "test.png", panel(self._rows))
-        print("\n".join(["", *table, ""]))  # noqa: T201
+        missing = self.missing()
+        print("\n".join(["", *table, "", *([missing] if missing else [])]))  # noqa: T201
         print(f"{self.output / 'test.csv'}, {self.output / 'test.png'} (columns: {', '.join(self._scores)}, truth)")  # noqa: T201
 
     def _lines(self, heading: str, scores: dict[str, Sequence[float]]) -> list[str]:
-        lines = [" " * 24 + "".join(f"{title:>10}" for _, title, _ in self.measures) + f"   {heading}"]
+        lines = [" " * 24 + "".join(f"{title:>10}" for _, title, _ in self.columns()) + f"   {heading}"]
         for method, values in scores.items():
-            columns = zip(values, self.measures, strict=True)
+            columns = zip(values, self.columns(), strict=True)
             lines.append(f"{method:24}" + "".join(f"{value:10.{digits}f}" for value, (_, _, digits) in columns))
         return lines
 

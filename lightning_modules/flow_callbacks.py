@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 from pytorch_lightning import LightningModule
 from torch import Tensor
@@ -39,12 +39,16 @@ class FlowReport(TestReport):
         clips: how many clips the picture shows.
     """
 
-    measures: ClassVar[list[tuple[str, str, int]]] = [
-        ("epe", "EPE (px)", 3),
-        ("over_1px", ">1 px (%)", 2),
-        ("outliers", "out (%)", 2),
-        ("milliseconds", "ms/clip", 1),
-    ]
+    def columns(self) -> list[tuple[str, str, int]]:  # noqa: D102
+        return [
+            ("epe", "EPE (px)", 3),
+            ("over_1px", ">1 px (%)", 2),
+            ("outliers", "out (%)", 2),
+            ("milliseconds", "ms/clip", 1),
+        ]
+
+    def missing(self) -> None:
+        """Nothing is missing."""
 
     def score(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, list[tuple[float, ...]]]:  # noqa: D102
         truth = batch["flow"]

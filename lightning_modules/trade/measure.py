@@ -12,10 +12,10 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 from torch.utils.flop_counter import FlopCounterMode
 
+from lightning_modules.quality import measures
 from lightning_modules.trade.energy import energy_meter, energy_per_call
 from lightning_modules.trade.runner import Runner
 from lightning_modules.trade.settings import Setting
-from spikekit import psnr, ssim
 from spikekit.arguments import one_line, progress
 from spikekit.bench.measure import Timer, peak_memory, timer_of
 
@@ -30,6 +30,7 @@ class Row:
         reason: why it cannot run; None if it can.
         psnr: dB, of every clip.
         ssim: of every clip.
+        lpips: of every clip; empty where it is not to be had.
         seconds: of one clip, which is one frame, round by round.
         memory: MiB, by how much a clip raises the memory in use; None where that is not to be had.
         macs: multiplications of convolutions and matrices, by sensor pixel.
@@ -41,6 +42,7 @@ class Row:
     reason: str | None = None
     psnr: list[float] = field(default_factory=list)
     ssim: list[float] = field(default_factory=list)
+    lpips: list[float] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
     memory: float | None = None
     macs: float | None = None
@@ -142,8 +144,8 @@ def _attempt(row: Row, work: Callable[[], None]) -> None:
 def _score(row: Row, clip: dict[str, Tensor]) -> None:
     rgb = row.runner(clip["spikes"].to(row.runner.device))
     truth = clip["rgb"].to(rgb.device)
-    row.psnr += psnr(rgb, truth).tolist()
-    row.ssim += ssim(rgb, truth).tolist()
+    for measure in measures():
+        getattr(row, measure.name).extend(measure.of(rgb, truth).tolist())
 
 
 def _weigh(row: Row, spikes: Tensor) -> None:

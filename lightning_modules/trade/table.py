@@ -12,6 +12,7 @@ from statistics import mean
 
 import torch
 
+from lightning_modules.quality import why_no_lpips
 from lightning_modules.trade.measure import Row, Timed, quartiles, running
 from lightning_modules.trade.pareto import pareto_front
 from spikekit.bench import cpu_name
@@ -19,6 +20,7 @@ from spikekit.bench import cpu_name
 #: what the columns mean, for the table and for ``--help``
 COLUMNS = """\
 PSNR, SSIM  spikekit.psnr and spikekit.ssim of every test clip, averaged; the network estimates its motion itself
+LPIPS       likewise, with AlexNet's features, where torchvision and its weights are to be had
 ms a frame  one clip, one picture: median of the rounds, and its quartiles; without reading the clip
 ratio       the same time over that of the first row, round by round: median. Other machines are nearer in this column
 MiB         by how much a clip raises the memory in use at its worst moment
@@ -29,7 +31,8 @@ J a frame   energy of the whole device, whoever uses it: NVML on GPUs (with nvid
 front       nothing else here is as fast and as good"""
 
 _FIGURES = [
-    "psnr", "ssim", "ms", "ms_q1", "ms_q3", "ratio", "ratio_q1", "ratio_q3", "mib", "parameters", "macs", "joules"
+    "psnr", "ssim", "lpips", "ms", "ms_q1", "ms_q3", "ratio", "ratio_q1", "ratio_q3",
+    "mib", "parameters", "macs", "joules",
 ]  # fmt: skip
 
 
@@ -47,8 +50,8 @@ def figures(rows: Sequence[Row]) -> list[dict[str, float | None]]:
             quartiles(ratios),
         )
         values = [
-            mean(row.psnr), mean(row.ssim), ms, ms_q1, ms_q3, ratio, ratio_q1, ratio_q3,
-            row.memory, row.parameters, row.macs, row.joules,
+            mean(row.psnr), mean(row.ssim), mean(row.lpips) if row.lpips else None,
+            ms, ms_q1, ms_q3, ratio, ratio_q1, ratio_q3, row.memory, row.parameters, row.macs, row.joules,
         ]  # fmt: skip
         found.append(dict(zip(_FIGURES, values, strict=True)))
     return found
@@ -90,7 +93,9 @@ def markdown(rows: Sequence[Row], commands: Sequence[str], timed: Timed) -> str:
     """
     shown, best = figures(rows), front(rows)
     energy = any(row.joules is not None for row in rows)
-    header = ["", "setting", "PSNR (dB)", "SSIM", "ms a frame", "ratio", "MiB", "parameters", "MAC a pixel"]
+    perceived = any(row.lpips for row in rows)
+    header = ["", "setting", "PSNR (dB)", "SSIM", *["LPIPS"] * perceived]
+    header += ["ms a frame", "ratio", "MiB", "parameters", "MAC a pixel"]
     header += ["J a frame"] * energy + ["front"]
     lines = [header, ["---"] * len(header)]
     for n, (row, values) in enumerate(zip(rows, shown, strict=True)):
@@ -100,6 +105,7 @@ def markdown(rows: Sequence[Row], commands: Sequence[str], timed: Timed) -> str:
         cells = [
             f"{values['psnr']:.2f}",
             f"{values['ssim']:.4f}",
+            *[_text(values["lpips"], ".4f")] * perceived,
             f"{values['ms']:.4g} ({values['ms_q1']:.4g} .. {values['ms_q3']:.4g})",
             f"{values['ratio']:.3g}",
             _text(values["mib"], ".1f"),
@@ -110,11 +116,12 @@ def markdown(rows: Sequence[Row], commands: Sequence[str], timed: Timed) -> str:
         ]
         lines.append([str(n + 1), row.setting.name, *cells])
     table = "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |" for cells in lines)
+    why = why_no_lpips()
+    missing = [f"LPIPS not measured: {why}"] if why else []
     failed = [f"{row.setting.name} cannot run: {row.reason}" for row in rows if row.reason is not None]
     typed = "\n".join(f"# {n + 1}\n{command}" for n, command in enumerate(commands))
-    parts = [
-        f"```text\n{machine(rows, timed)}\n```", table, *failed, f"```text\n{COLUMNS}\n```", f"```sh\n{typed}\n```"
-    ]  # fmt: skip
+    notes = [*missing, *failed, f"```text\n{COLUMNS}\n```", f"```sh\n{typed}\n```"]
+    parts = [f"```text\n{machine(rows, timed)}\n```", table, *notes]
     return "\n\n".join(parts) + "\n"
 
 
