@@ -46,6 +46,7 @@ def _table(tmp_path, monkeypatch):
         for row in ROWS:
             writer.writerow([str(cell).format(weights=tmp_path / "tiny.ckpt") for cell in row])
     monkeypatch.setattr(speed, "_FOLDER", tmp_path)
+    monkeypatch.setattr(speed, "pace", lambda scale: 1.0)
     return tmp_path
 
 
@@ -71,6 +72,31 @@ def test_speeds(table, name, expected):
 )
 def test_budgets_grow_with_the_frame(table, budget, size, expected):
     assert choose(3, budget=budget, size=size).name == expected
+
+
+@pytest.mark.parametrize(("here", "expected"), [(2.0, "no motion"), (0.1, "all"), (50.0, "tfi")])
+def test_a_budget_of_time_is_one_of_this_machine(table, monkeypatch, here, expected):
+    monkeypatch.setattr(speed, "pace", lambda scale: here)
+    choice = choose(3, budget="400ms", size=(40, 50))
+    assert choice.name == expected
+    assert choice.ms == here * {"no motion": 200, "all": 400, "tfi": 4}[expected]
+    assert f"on this machine, which takes {here:.2g} times as long as that of the table" in str(choice)
+    assert choose(3, budget="1GB", size=(40, 50)).ms == 400  # memory is the same here
+
+
+def test_pace_is_measured_on_the_first_setting(table, monkeypatch):
+    """A frame takes four times what the quarter of a clip takes, over the 400 ms of the table."""
+    monkeypatch.undo()
+    monkeypatch.setattr(speed, "_FOLDER", table)
+    clock = iter(range(100))
+    monkeypatch.setattr(speed, "perf_counter", lambda: float(next(clock)))
+    sizes = []
+    run = SuperResolution.forward
+    monkeypatch.setattr(
+        SuperResolution, "forward", lambda self, spikes: sizes.append(spikes.shape) or run(self, spikes)
+    )
+    assert speed.pace(3) == 4 * 1000 / 400
+    assert set(sizes) == {(1, 41, 20, 25)}
 
 
 def test_what_it_says(table):
@@ -116,7 +142,7 @@ def test_predict_at_a_speed(table, tmp_path, capsys):
                  "--data.width", "10", "--model.network.scale", "3", "-o"]  # fmt: skip
     for wish, method in (["--speed", "fastest"], "tfi"), (["--budget=1ms"], "tfp"), (["--budget", "9ms"], None):
         main(["predict", *wish, *recording, str(tmp_path / "out")])
-        assert "on the machine of the table" in capsys.readouterr().out
+        assert ("machine of the table" if "--speed" in wish else "on this machine") in capsys.readouterr().out
         made = ClassicalDecoder(method, 3) if method else CSCSR.from_pretrained(table / "tiny.ckpt", ZeroFlow())
         picture = made(spikes[None])[0].clamp(0, 1)
         assert (read_picture(tmp_path / "out" / "frame_000020.png") - picture).abs().max() < 0.51 / 255
@@ -132,7 +158,8 @@ def test_predict_at_a_speed(table, tmp_path, capsys):
         main(["predict", "--speed", "fast", "--data", "StillScenes", "-o", str(tmp_path / "out")])
 
 
-def test_tables_of_the_package():
+def test_tables_of_the_package(monkeypatch):
+    monkeypatch.setattr(speed, "pace", lambda scale: 1.0)
     names = {name for name in shipped_weights() if name.startswith("x")}
     for scale in sorted({int(name[1 : name.index("-")]) for name in names}):
         found = choices(scale, (250, 400))
