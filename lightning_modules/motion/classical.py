@@ -73,7 +73,8 @@ class ClassicalFlow(MotionEstimator):
         clock = torch.arange(frames, dtype=torch.float64).reshape(-1, 1, 1)
         before, now, after = tfp(clock, window, order=3)[seen].flatten().tolist()
         stretch = (first - middle) / (before - now), (last - middle) / (after - now)
-        smooth = gaussian_blur2d(pictures.flatten(0, 1), 5, (_BLUR, _BLUR), border_type="replicate")
+        with torch.autocast(spikes.device.type, enabled=False):
+            smooth = gaussian_blur2d(pictures.flatten(0, 1), 5, (_BLUR, _BLUR), border_type="replicate")
         return smooth.unflatten(0, pictures.shape[:2]), stretch
 
     def _estimate(self, pictures: Tensor) -> tuple[Tensor, Tensor]:

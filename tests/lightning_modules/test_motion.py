@@ -42,6 +42,15 @@ def test_time_reversed_swaps_the_flows():
         assert (flow - other).norm(dim=1)[..., 8:-8, 8:-8].mean() < 0.2
 
 
+def test_precision_of_a_network_is_not_that_of_motion():
+    spikes = moving((0.2, -0.1))
+    expected = ClassicalFlow()(spikes, TIMES, "RGGB")
+    with torch.autocast("cpu", torch.bfloat16):
+        got = ClassicalFlow()(spikes, TIMES, "RGGB")
+    assert all(torch.equal(flow, other) for flow, other in zip(got, expected, strict=True))
+    assert all(flow.isfinite().all() for flow in ClassicalFlow()(spikes.bfloat16(), TIMES, "RGGB"))
+
+
 @pytest.mark.parametrize("size", [(33, 35), (5, 4), (3, 3)])
 def test_any_size(size):
     for estimator in (ClassicalFlow(), ZeroFlow()):
