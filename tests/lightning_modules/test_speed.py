@@ -166,4 +166,4 @@ def test_tables_of_the_package(monkeypatch):
         assert {choice.args[1] for choice in found if choice.args[0] == "--model.weights"} <= names
         assert [choose(scale, name).ms for name in SPEEDS] == sorted(choose(scale, name).ms for name in SPEEDS)
         for choice in found:
-            SuperResolution.from_pretrained(scale, budget=f"{choice.ms:.6f}1ms")
+            SuperResolution.from_pretrained(scale, budget=f"{choice.ms + 0.001:.6f}ms")
