@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
 from lightning_modules.motion.estimator import MotionEstimator, split_any_size
@@ -63,7 +62,7 @@ class ClassicalFlow(MotionEstimator):
 
     @staticmethod
     def _decode(spikes: Tensor, times: tuple[int, int, int], pattern: str) -> tuple[Tensor, tuple[float, float]]:
-        """Three smooth pictures of every sub-stream, (4, B, 3, h, w), and what stretches their flows to the times."""
+        """Three pictures of every sub-stream, (4, B, 3, h, w), and what stretches their flows to the times."""
         check_planes("spikes", spikes, 4, "(B, N, H, W)")
         frames, (first, middle, last) = spikes.shape[1], times
         window, away = 2 * max((frames - 1) // 6, 1) + 1, max(frames // 4, 1)
@@ -73,19 +72,18 @@ class ClassicalFlow(MotionEstimator):
         clock = torch.arange(frames, dtype=torch.float64).reshape(-1, 1, 1)
         before, now, after = tfp(clock, window, order=3)[seen].flatten().tolist()
         stretch = (first - middle) / (before - now), (last - middle) / (after - now)
-        with torch.autocast(spikes.device.type, enabled=False):
-            smooth = gaussian_blur2d(pictures.flatten(0, 1), 5, (_BLUR, _BLUR), border_type="replicate")
-        return smooth.unflatten(0, pictures.shape[:2]), stretch
+        return pictures, stretch
 
     def _estimate(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
         """Flows from the middle one of three grey pictures, (B, 3, h, w), to the others, each (B, 2, h, w)."""
+        from skimage.filters import gaussian
         from skimage.registration import optical_flow_ilk
 
         def estimate(middle: np.ndarray, other: np.ndarray) -> Tensor:
             down, right = optical_flow_ilk(middle, other, radius=self.radius, gaussian=True, dtype=np.float32)
             return torch.from_numpy(np.stack([right, down]))
 
-        clips = pictures.cpu().numpy()
+        clips = gaussian(pictures.cpu().numpy(), (0, 0, _BLUR, _BLUR), mode="nearest")
         to_first, to_last = (torch.stack([estimate(clip[1], clip[i]) for clip in clips]) for i in (0, 2))
         return to_first.to(pictures.device), to_last.to(pictures.device)
 

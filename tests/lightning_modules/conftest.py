@@ -4,11 +4,24 @@ import numpy as np
 import pytest
 from skimage import io
 
+from lightning_modules.networks.refinement import FeatureRefinement
+
 
 @pytest.fixture
 def configs():
     """The folder of configurations, which is not part of the installed packages."""
     return Path(__file__).parents[2] / "configs"
+
+
+@pytest.fixture(name="plain_refinement")
+def _plain_refinement(monkeypatch):
+    """FR layer by layer, as it is written in the paper, for what counts the work of layers."""
+
+    def forward(self, pixels):
+        residual = pixels - pixels.mean(dim=1, keepdim=True)
+        return self.base(pixels.flatten(1, 2)) + self.residual(residual.flatten(1, 2))
+
+    monkeypatch.setattr(FeatureRefinement, "forward", forward)
 
 
 def _write_film(folder, count, size=(32, 48), name="{:08d}.png", seed=0, first=0):

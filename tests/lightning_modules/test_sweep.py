@@ -270,6 +270,7 @@ def test_a_trial_that_fails_is_reported_and_the_others_go_on(typed, overlays, tm
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("plain_refinement")
 def test_flops_pay_for_steps(typed, overlays, tmp_path):
     words = [*typed[1:], "-c", str(overlays / "cosine.yaml")]
     [trial] = make_trials([words[0], words[2], words[4]], [], [], [], {"flops": 1e9}, tmp_path)

@@ -142,6 +142,7 @@ def test_the_command_of_a_row_measures_it_again(traded):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("plain_refinement")
 def test_work_and_weights_are_counted(traded):
     rows = rows_of(traded)
     network = CSCSR(**WIDTHS)
