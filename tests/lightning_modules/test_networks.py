@@ -56,6 +56,7 @@ def test_time_points_are_those_of_the_paper():
 
 
 def test_every_parameter_learns():
+    torch.manual_seed(0)
     spikes, flow = clip()
     network = CSCSR(2, **TINY)
     network(spikes, flow).square().mean().backward()
