@@ -83,9 +83,8 @@ class TestReport(Callback):
         }
 
     def missing(self) -> str | None:
-        """Return what was not measured, and why."""
-        why = why_no_lpips()
-        return f"LPIPS not measured: {why}" if why else None
+        """Return in a line what was not measured, and why."""
+        return why_no_lpips()
 
     def rows(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> list[list[Tensor]]:
         """Return the pictures of every clip of a batch: one of every method, and the truth."""

@@ -47,13 +47,13 @@ def measures() -> list[Measure]:
 
 
 def why_no_lpips() -> str | None:
-    """Return what LPIPS lacks here, or None. Nothing is downloaded unasked."""
+    """Return in a line what LPIPS lacks here, or None. Nothing is downloaded unasked."""
     weights = Path(torch.hub.get_dir()) / "checkpoints" / _ALEXNET
     if find_spec("torchvision") is None:
-        return "expected torchvision, which is not installed"
+        return "LPIPS not measured: expected torchvision, which is not installed"
     if not weights.is_file():
         fetch = "python -c 'import torchvision; torchvision.models.alexnet(weights=\"DEFAULT\")' fetches it"
-        return f"expected the weights of AlexNet in {weights}, got none; {fetch}"
+        return f"LPIPS not measured: expected the weights of AlexNet in {weights}, got none; {fetch}"
     return None
 
 

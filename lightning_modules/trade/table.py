@@ -116,11 +116,10 @@ def markdown(rows: Sequence[Row], commands: Sequence[str], timed: Timed) -> str:
         ]
         lines.append([str(n + 1), row.setting.name, *cells])
     table = "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |" for cells in lines)
-    why = why_no_lpips()
-    missing = [f"LPIPS not measured: {why}"] if why else []
+    missing = why_no_lpips()
     failed = [f"{row.setting.name} cannot run: {row.reason}" for row in rows if row.reason is not None]
     typed = "\n".join(f"# {n + 1}\n{command}" for n, command in enumerate(commands))
-    notes = [*missing, *failed, f"```text\n{COLUMNS}\n```", f"```sh\n{typed}\n```"]
+    notes = [*([missing] if missing else []), *failed, f"```text\n{COLUMNS}\n```", f"```sh\n{typed}\n```"]
     parts = [f"```text\n{machine(rows, timed)}\n```", table, *notes]
     return "\n\n".join(parts) + "\n"
 

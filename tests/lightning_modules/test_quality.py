@@ -63,7 +63,7 @@ def test_what_lpips_lacks(torchvision, monkeypatch):
     assert f"weights of AlexNet in {torchvision}, got none" in quality.why_no_lpips()
     monkeypatch.delitem(sys.modules, "torchvision")
     monkeypatch.setattr(quality, "find_spec", lambda name: None)
-    assert quality.why_no_lpips() == "expected torchvision, which is not installed"
+    assert quality.why_no_lpips() == "LPIPS not measured: expected torchvision, which is not installed"
     assert [measure.of for measure in quality.measures()] == [psnr, ssim]
 
 

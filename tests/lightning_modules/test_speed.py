@@ -12,7 +12,7 @@ from lightning_modules.module import SuperResolution
 from lightning_modules.motion import ZeroFlow
 from lightning_modules.networks import CSCSR, ClassicalDecoder
 from lightning_modules.pretrained import shipped_weights
-from lightning_modules.speed import SPEEDS, choices, choose
+from lightning_modules.speed import SPEEDS, choices, choose, pace
 from spikekit import read_picture, write_spikes
 
 HEADER = ["setting", "psnr", "ms", "mib", "height", "width", "arguments", "failed"]
@@ -84,18 +84,21 @@ def test_a_budget_of_time_is_one_of_this_machine(table, monkeypatch, here, expec
     assert choose(3, budget="1GB", size=(40, 50)).ms == 400  # memory is the same here
 
 
-def test_pace_is_measured_on_the_first_setting(table, monkeypatch):
+@pytest.mark.usefixtures("table")
+def test_pace_is_measured_on_the_first_setting(monkeypatch):
     """A frame takes four times what the quarter of a clip takes, over the 400 ms of the table."""
-    monkeypatch.undo()
-    monkeypatch.setattr(speed, "_FOLDER", table)
-    clock = iter(range(100))
-    monkeypatch.setattr(speed, "perf_counter", lambda: float(next(clock)))
+
+    def timer(work, number):
+        work()
+        return 1.0
+
+    monkeypatch.setattr(speed, "timer_of", lambda device, threads: (timer, "a second whatever it does"))
     sizes = []
     run = SuperResolution.forward
     monkeypatch.setattr(
         SuperResolution, "forward", lambda self, spikes: sizes.append(spikes.shape) or run(self, spikes)
     )
-    assert speed.pace(3) == 4 * 1000 / 400
+    assert pace(3) == 4 * 1000 / 400
     assert set(sizes) == {(1, 41, 20, 25)}
 
 
