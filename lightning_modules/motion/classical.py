@@ -1,6 +1,8 @@
-"""Motion without weights: Lucas and Kanade's, on decoded pictures."""
+"""Motion without weights: TV-L1, on decoded pictures."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import torch
@@ -14,18 +16,20 @@ _BLUR = 0.5  # of the pictures, in Bayer cells
 
 
 class ClassicalFlow(MotionEstimator):
-    r"""Iterative Lucas-Kanade (scikit-image) on decoded pictures: no weights, runs on the CPU.
+    r"""TV-L1 optical flow (scikit-image) on decoded pictures: no weights, runs on the CPU.
 
     The clip is decoded in its middle and a quarter of it before and after, by means of third order that see nearly all
-    of it, see :func:`spikekit.tfp`: noise harms Lucas and Kanade's estimate more than what moves meanwhile. The flows
-    are then stretched to the times that are asked for, as motion is taken to be linear. Each 2 x 2 Bayer cell is
-    averaged to one grey pixel, so that the noise of the four colours is averaged *before* motion is estimated;
-    averaging four flows afterwards, as eq. (7) does with a learned estimator, was less accurate here and four times
-    the work. Of scikit-image's two estimators this one bears the noise better than TV-L1; kornia has no dense flow
+    of it, see :func:`spikekit.tfp`: noise harms the estimate more than what moves meanwhile. As motion is taken to be
+    linear, both flows are those of one velocity, the mean of what the earlier and the later picture tell. Each 2 x 2
+    Bayer cell is averaged to one grey pixel, so that the noise of the four colours is averaged *before* motion is
+    estimated; averaging four flows afterwards, as eq. (7) does with a learned estimator, was less accurate here and
+    four times the work. Of scikit-image's two estimators this one keeps the edges of motion; kornia has no dense flow
     estimator without weights.
 
     Args:
-        radius: of the Gaussian-weighted window, in Bayer cells.
+        attachment: how much the flow follows the pictures rather than being smooth. It is weighed against firing rates,
+            so that the noise of a dark scene counts for as little as it is.
+        warps: how often each of the pyramid's levels is warped; fewer are faster, and lose large motion.
 
     Shape:
         As :class:`MotionEstimator`; no gradient.
@@ -36,56 +40,58 @@ class ClassicalFlow(MotionEstimator):
         (torch.Size([1, 2, 16, 16]), 0.0)
 
     Reference:
-        Le Besnerais and Champagnat, Dense optical flow by iterative local window registration, ICIP 2005.
+        Zach, Pock and Bischof, A duality based approach for realtime TV-L1 optical flow, DAGM 2007.
     """
 
-    def __init__(self, radius: int = 10) -> None:
+    def __init__(self, attachment: float = 30.0, warps: int = 5) -> None:
         super().__init__()
-        if radius < 1:
-            raise ValueError(f"radius: expected 1 or more, got {radius}")
-        self.radius = radius
+        if not 0 < attachment < math.inf:
+            raise ValueError(f"attachment: expected a positive number, got {attachment}")
+        if warps < 1:
+            raise ValueError(f"warps: expected 1 or more, got {warps}")
+        self.attachment, self.warps = attachment, warps
 
     @torch.no_grad()
     def channel_flows(  # noqa: D102
         self, spikes: Tensor, times: tuple[int, int, int], pattern: str
     ) -> tuple[Tensor, Tensor]:
-        sites, stretch = self._decode(spikes, times, pattern)
-        flows = self._estimate(sites.flatten(0, 1))
-        return tuple(by * flow.unflatten(0, sites.shape[:2]) for flow, by in zip(flows, stretch, strict=True))
+        sites, clock = self._decode(spikes, times[1], pattern)
+        velocity = self._estimate(sites.flatten(0, 1), clock).unflatten(0, sites.shape[:2])
+        return velocity * (times[0] - times[1]), velocity * (times[2] - times[1])
 
     @torch.no_grad()
     def forward(self, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> tuple[Tensor, Tensor]:  # noqa: D102
         height, width = spikes.shape[-2:]
-        sites, stretch = self._decode(spikes, times, pattern)
-        flows = self._estimate(sites.mean(dim=0))
-        return tuple(by * upsample_flow(flow, 2)[..., :height, :width] for flow, by in zip(flows, stretch, strict=True))
+        sites, clock = self._decode(spikes, times[1], pattern)
+        velocity = upsample_flow(self._estimate(sites.mean(dim=0), clock), 2)[..., :height, :width]
+        return velocity * (times[0] - times[1]), velocity * (times[2] - times[1])
 
     @staticmethod
-    def _decode(spikes: Tensor, times: tuple[int, int, int], pattern: str) -> tuple[Tensor, tuple[float, float]]:
-        """Three pictures of every sub-stream, (4, B, 3, h, w), and what stretches their flows to the times."""
+    def _decode(spikes: Tensor, middle: int, pattern: str) -> tuple[Tensor, list[float]]:
+        """Three pictures of every sub-stream, (4, B, 3, h, w), and the times that they show."""
         check_planes("spikes", spikes, 4, "(B, N, H, W)")
-        frames, (first, middle, last) = spikes.shape[1], times
+        frames = spikes.shape[1]
         window, away = 2 * max((frames - 1) // 6, 1) + 1, max(frames // 4, 1)
         seen = [max(middle - away, 0), middle, min(middle + away, frames - 1)]
         pictures = split_any_size(tfp(spikes, window, order=3, dtype=torch.float32)[:, seen], pattern)
         # where the mean is cut by the ends of the clip, it stands for a later or an earlier time
         clock = torch.arange(frames, dtype=torch.float64).reshape(-1, 1, 1)
-        before, now, after = tfp(clock, window, order=3)[seen].flatten().tolist()
-        stretch = (first - middle) / (before - now), (last - middle) / (after - now)
-        return pictures, stretch
+        return pictures, tfp(clock, window, order=3)[seen].flatten().tolist()
 
-    def _estimate(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
-        """Flows from the middle one of three grey pictures, (B, 3, h, w), to the others, each (B, 2, h, w)."""
+    def _estimate(self, pictures: Tensor, clock: list[float]) -> Tensor:
+        """Velocity (B, 2, h, w), in pixels a frame, of three grey pictures (B, 3, h, w) that show those times."""
         from skimage.filters import gaussian
-        from skimage.registration import optical_flow_ilk
+        from skimage.registration import optical_flow_tvl1
 
-        def estimate(middle: np.ndarray, other: np.ndarray) -> Tensor:
-            down, right = optical_flow_ilk(middle, other, radius=self.radius, gaussian=True, dtype=np.float32)
-            return torch.from_numpy(np.stack([right, down]))
+        def velocity(clip: np.ndarray, other: int) -> np.ndarray:
+            down, right = optical_flow_tvl1(
+                clip[1], clip[other], attachment=self.attachment, num_warp=self.warps, dtype=np.float32
+            )
+            return np.stack([right, down]) / (clock[other] - clock[1])
 
         clips = gaussian(pictures.cpu().numpy(), (0, 0, _BLUR, _BLUR), mode="nearest")
-        to_first, to_last = (torch.stack([estimate(clip[1], clip[i]) for clip in clips]) for i in (0, 2))
-        return to_first.to(pictures.device), to_last.to(pictures.device)
+        velocities = np.stack([(velocity(clip, 0) + velocity(clip, 2)) / 2 for clip in clips])
+        return torch.from_numpy(velocities).to(pictures)
 
     def extra_repr(self) -> str:  # noqa: D102
-        return f"radius={self.radius}"
+        return f"attachment={self.attachment}, warps={self.warps}"

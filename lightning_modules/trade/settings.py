@@ -65,7 +65,7 @@ _STILL = [("no motion", "--model.network.motion ZeroFlow")]
 _VARIANTS = [
     ("exact search", "--model.network.steps 0"),
     ("search steps 4", "--model.network.steps 4"),
-    ("motion radius 5", "--model.network.motion ClassicalFlow --model.network.motion.radius 5"),
+    ("motion of 1 warp", "--model.network.motion ClassicalFlow --model.network.motion.warps 1"),
     ("bf16-true", "--trainer.precision bf16-true"),
     ("bf16-mixed", "--trainer.precision bf16-mixed"),
     ("no tiles", "--model.tile 0"),

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import torch
-from skimage.registration import optical_flow_ilk
+from skimage.registration import optical_flow_tvl1
 
 from lightning_modules.motion import ClassicalFlow, MotionEstimator, ZeroFlow
 from spikekit import mosaic, spike_integrate_fire, split_bayer
@@ -59,9 +59,34 @@ def test_any_size(size):
             assert flow.isfinite().all()
 
 
-def test_wrong_radius():
-    with pytest.raises(ValueError, match="radius"):
-        ClassicalFlow(radius=0)
+@pytest.mark.parametrize("wrong", [{"attachment": 0.0}, {"attachment": float("nan")}, {"warps": 0}])
+def test_wrong_argument(wrong):
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))}: expected"):
+        ClassicalFlow(**wrong)
+
+
+def test_motion_keeps_its_edge():
+    texture = torch.rand(1, 1, 12, 16, generator=torch.Generator().manual_seed(0))
+    texture = torch.nn.functional.interpolate(texture, size=(5 * 48, 5 * 64), mode="bilinear")
+    light = torch.cat([texture.roll(clock - 20, dims=-1) for clock in range(41)])  # a fifth of a sensor pixel a frame
+    light[..., : 5 * 24, :] = texture[..., : 5 * 24, :]
+    spikes = spike_integrate_fire(0.4 * torch.nn.functional.avg_pool2d(light.squeeze(1), 5))[0]
+    to_first, to_last = ClassicalFlow()(spikes[None], TIMES, "RGGB")
+    right = to_last[0, 0, :, 8:-8]
+    assert right[:20].abs().mean() < 0.3
+    assert (right[28:] - 3).abs().mean() < 0.3
+    assert torch.equal(to_first, -to_last)
+
+
+def test_scene_without_contrast_is_still():
+    for level in (0, 1):
+        assert all(not flow.any() for flow in ClassicalFlow()(torch.full((1, 41, 16, 16), level), TIMES, "RGGB"))
+
+
+def test_few_frames():
+    for frames, times in ((5, (0, 2, 4)), (3, (0, 1, 2))):
+        spikes = moving((0.2, 0.0))[:, 20 - frames // 2 : 21 + frames // 2]
+        assert all(flow.isfinite().all() for flow in ClassicalFlow()(spikes, times, "RGGB"))
 
 
 @pytest.mark.parametrize("size", [(32, 40), (33, 35)])
@@ -76,17 +101,18 @@ def test_flows_of_the_sites_are_in_bayer_cells_and_in_the_order_of_split_bayer(s
     for _ in range(3):
         weights = torch.stack([weights[max(n - 6, 0) : n + 7].mean(dim=0) for n in range(41)])
     clock = weights @ torch.arange(41.0)
-    pictures = torch.einsum("kn,sbnhw->ksbhw", weights[[20, 30]], sites.float())
+    seen = [10, 20, 30]
+    pictures = torch.einsum("kn,sbnhw->ksbhw", weights[seen], sites.float())
     blur = torch.exp(-(torch.arange(-2.0, 3) ** 2) / (2 * 0.5**2))
     blur = blur[:, None] * blur / blur.sum() ** 2
     padded = torch.nn.functional.pad(pictures.flatten(0, 1), (2, 2, 2, 2), "replicate")
-    middle, last = torch.conv2d(padded.flatten(0, 1)[:, None], blur[None, None]).reshape(pictures.shape)
+    pictures = torch.conv2d(padded.flatten(0, 1)[:, None], blur[None, None]).reshape(pictures.shape).numpy()
     for site in range(4):
-        down, right = optical_flow_ilk(
-            middle[site, 1].numpy(), last[site, 1].numpy(), radius=10, gaussian=True, dtype="float32"
-        )
-        expected = torch.from_numpy(np.stack([right, down])) * 15 / (clock[30] - clock[20])
-        torch.testing.assert_close(flows[1][site, 1], expected, rtol=1e-3, atol=1e-3)
+        velocity = 0
+        for k in (0, 2):
+            down, right = optical_flow_tvl1(pictures[1, site, 1], pictures[k, site, 1], attachment=30, dtype="float32")
+            velocity += torch.from_numpy(np.stack([right, down])) / (clock[seen[k]] - clock[20]) / 2
+        torch.testing.assert_close(flows[1][site, 1], velocity * 15, rtol=1e-3, atol=1e-3)
 
 
 def spike_sites(spikes, pattern):
