@@ -23,7 +23,7 @@ from spikekit.demosaic import Demosaic, demosaic
 from spikekit.files import SpikeFileError, iter_spikes, read_spikes, spikes_shape, write_spikes
 from spikekit.film import Film, FilmClip
 from spikekit.interpolate import Between, Blend, FlowInterpolation, Still
-from spikekit.keyframe import spike_interval_at, tfi_at
+from spikekit.keyframe import spike_interval_at, tfi_at, tfp_at
 from spikekit.metrics import psnr, ssim
 from spikekit.motion import JointFlow, LinearMotion, UpsampleFlow, joint_flow, linear_motion, upsample_flow
 from spikekit.noise import SensorNoise, SpikeChange
@@ -108,6 +108,7 @@ __all__ = [
     "tfi",
     "tfi_at",
     "tfp",
+    "tfp_at",
     "unpack_spikes",
     "upsample_flow",
     "write_picture",

@@ -10,7 +10,6 @@ import secrets
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -21,10 +20,9 @@ from torch import Tensor
 from spikekit import bench, extremes, simulate_cli, view_cli
 from spikekit.arguments import UsageError, one_line, positive, whole
 from spikekit.cfa import PATTERNS
-from spikekit.decoders import tfp
 from spikekit.demosaic import demosaic
 from spikekit.files import iter_spikes
-from spikekit.keyframe import search
+from spikekit.keyframe import search, tfp_weights
 from spikekit.pictures import write_picture
 from spikekit.recording import Recording, add_arguments, open_recording, white_rate
 from spikekit.video import PICTURE_ENDINGS
@@ -97,7 +95,7 @@ def decode(args: argparse.Namespace) -> None:
             if args.method == "tfi":
                 raw = torch.from_numpy(search(plane, n, range(first, last + 1))).float().reciprocal()
             else:
-                weights = _weights(last + 1 - first, n - first, window, args.order)
+                weights = tfp_weights(frames, n, window, args.order)[1]
                 raw = torch.from_numpy(sum(map(np.multiply, map(plane, range(first, last + 1)), weights))).float()
             raw = raw / white
             path = Path(str(args.output).replace(_NUMBER, f"{n:0{len(str(frames - 1))}}"))
@@ -289,14 +287,6 @@ def _windows(recording: Recording, chosen: range, reach: int) -> Iterator[tuple[
             held[k % len(held)] = next(stream).numpy()
         stop = last + 1
         yield n, plane
-
-
-@lru_cache(maxsize=4)
-def _weights(frames: int, at: int, window: int, order: int) -> tuple[float, ...]:
-    """Weights of frames in the mean, or the mean of means, at one of them."""
-    pixel = torch.zeros(frames, 1, 1, dtype=torch.float64, requires_grad=True)
-    (weights,) = torch.autograd.grad(tfp(pixel, window, order=order)[at].sum(), pixel)
-    return tuple(weights.flatten().tolist())
 
 
 def _counts(recording: Recording, start: int, frames: int) -> Tensor:

@@ -357,7 +357,7 @@ def tfp(
         Transactions on Communications, 1986, which wants one order more than the modulator has.
     """
     check_planes("spikes", spikes, 3, "(*, T, H, W)")
-    window, order = _check_window(window), check_whole("order", order)
+    window, order = check_window(window), check_whole("order", order)
     check_positive("max_range", max_range)
     check_dtype(dtype, torch.uint8)
     dtype = dtype or default_float(spikes)
@@ -367,7 +367,8 @@ def tfp(
     return _Tfp.apply(spikes, window, float(max_range), dtype, False)
 
 
-def _check_window(window: int) -> int:
+def check_window(window: int) -> int:
+    """Return a window, checked."""
     window = check_whole("window", window)
     if window % 2 == 0:
         raise ValueError(f"window: expected an odd number of frames, got {window}")
@@ -390,7 +391,7 @@ class Tfp(nn.Module):
         self, window: int, max_range: float = 1.0, *, order: int = 1, dtype: torch.dtype | None = None
     ) -> None:
         super().__init__()
-        _check_window(window)
+        check_window(window)
         check_whole("order", order)
         check_positive("max_range", max_range)
         check_dtype(dtype, torch.uint8)

@@ -1,15 +1,16 @@
-"""The interval decoder at one frame: look outwards from it, and stop when every pixel has its spikes."""
+"""The decoders at one frame, for the work of the few frames around it that decide it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from itertools import accumulate
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from spikekit.check import check_dtype, check_index, check_planes, check_positive, default_float
-from spikekit.decoders import cast_light, interval_dtype
+from spikekit.check import check_dtype, check_index, check_planes, check_positive, check_whole, default_float
+from spikekit.decoders import cast_light, check_window, interval_dtype
 
 
 @torch.library.custom_op("spikekit::spike_interval_at", mutates_args=())
@@ -186,9 +187,91 @@ def tfi_at(spikes: Tensor, frame: int, max_range: float = 1.0, *, dtype: torch.d
     return cast_light(rate, dtype)
 
 
+def tfp_at(
+    spikes: Tensor,
+    frame: int,
+    window: int,
+    max_range: float = 1.0,
+    *,
+    order: int = 1,
+    dtype: torch.dtype | None = None,
+) -> Tensor:
+    r"""Texture from playback at one frame, the key frame: one weighted sum of the frames that it sees.
+
+    .. math:: R_n = \delta \sum_k w_k S_{n + k}, \quad \sum_k w_k = 1
+
+    Convention:
+        ``tfp(spikes, window, max_range, order=order, dtype=dtype)[..., frame, :, :]``, to rounding; sums run in
+        float32 or wider. Linear in the spikes, and differentiable as such.
+
+    Args:
+        spikes: :math:`(*, T, H, W)`, zeros and ones, any real dtype.
+        frame: n, from 0 to T - 1.
+        window: number of frames of the mean, odd.
+        max_range: :math:`\delta`, the value of a pixel that fires at every clock.
+        order: how often the mean is taken, see :func:`spikekit.tfp`.
+        dtype: of the result, floating or uint8; that of ``spikes`` where it is floating, else torch's default type.
+
+    Returns:
+        Raw intensities :math:`(*, H, W)`.
+
+    Raises:
+        TypeError: ``spikes`` is not a tensor of real numbers, ``frame`` no whole number, ``dtype`` neither floating
+            nor uint8.
+        ValueError: fewer than three dimensions, an empty clip, a frame that is not in it, an even window or one below
+            1, an order below 1, ``max_range`` not above 0.
+
+    Example:
+        >>> tfp_at(torch.tensor([0, 1, 0, 1]).reshape(4, 1, 1), 2, 3)
+        tensor([[0.6667]])
+
+    Reference:
+        Dong et al., CVPR 2024, eq. (6); Zhu et al., ICME 2019.
+    """
+    frame = _check_frame(spikes, frame)
+    window, order = check_window(window), check_whole("order", order)
+    check_positive("max_range", max_range)
+    check_dtype(dtype, torch.uint8)
+    dtype = dtype or default_float(spikes)
+    first, weights = tfp_weights(spikes.shape[-3], frame, window, order)
+    between = torch.float64 if torch.float64 in (dtype, spikes.dtype) else torch.float32
+    light = spikes[..., first, :, :].to(between) * (max_range * weights[0])
+    for n, weight in enumerate(weights[1:], first + 1):  # frame by frame: what is larger than the result costs more
+        light.add_(spikes[..., n, :, :], alpha=max_range * weight)
+    return cast_light(light, dtype)
+
+
+def tfp_weights(frames: int, frame: int, window: int, order: int) -> tuple[int, list[float]]:
+    """Find what the mean of means at one frame of a clip is a sum of.
+
+    Args:
+        frames: of the clip.
+        frame: where the mean is taken.
+        window: frames of a mean, odd.
+        order: how often it is taken.
+
+    Returns:
+        The first frame that counts, and the weights of it and those that follow.
+    """
+    half = window // 2
+    first, last = max(frame - order * half, 0), min(frame + order * half, frames - 1)
+    seen = range(first, last + 1)
+    weights = [float(n == frame) for n in seen]
+    for _ in range(order):
+        shares = [w / (min(n + half, frames - 1) - max(n - half, 0) + 1) for n, w in zip(seen, weights, strict=True)]
+        total = [0.0, *accumulate(shares)]
+        weights = [total[min(n + half, last) - first + 1] - total[max(n - half, first) - first] for n in seen]
+    return first, weights
+
+
 def _interval(spikes: Tensor, frame: int) -> Tensor:
+    frame = _check_frame(spikes, frame)
+    return _spike_interval_at(spikes.detach(), frame)
+
+
+def _check_frame(spikes: Tensor, frame: int) -> int:
     check_planes("spikes", spikes, 3, "(*, T, H, W)")
     frame = check_index("frame", frame)
     if not 0 <= frame < spikes.shape[-3]:
         raise ValueError(f"frame: expected 0 .. {spikes.shape[-3] - 1}, got {frame}")
-    return _spike_interval_at(spikes.detach(), frame)
+    return frame

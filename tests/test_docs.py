@@ -37,6 +37,7 @@ WITHOUT_MODULE = [
     "simulate_spikes",
     "spike_interval_at",
     "tfi_at",
+    "tfp_at",
     "unpack_spikes",
 ]
 OPERATORS = [name for name in FUNCTIONS if camel(name) in MODULES] + WITHOUT_MODULE

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lightning_modules.motion.estimator import MotionEstimator, split_any_size
-from spikekit import tfp, upsample_flow
+from spikekit import tfp_at, upsample_flow
 from spikekit.check import check_planes
 
 _BLUR = 0.5  # of the pictures, in Bayer cells
@@ -73,10 +73,10 @@ class ClassicalFlow(MotionEstimator):
         frames = spikes.shape[1]
         window, away = 2 * max((frames - 1) // 6, 1) + 1, max(frames // 4, 1)
         seen = [max(middle - away, 0), middle, min(middle + away, frames - 1)]
-        pictures = split_any_size(tfp(spikes, window, order=3, dtype=torch.float32)[:, seen], pattern)
+        raw = torch.stack([tfp_at(spikes, n, window, order=3, dtype=torch.float32) for n in seen], dim=1)
         # where the mean is cut by the ends of the clip, it stands for a later or an earlier time
         clock = torch.arange(frames, dtype=torch.float64).reshape(-1, 1, 1)
-        return pictures, tfp(clock, window, order=3)[seen].flatten().tolist()
+        return split_any_size(raw, pattern), [tfp_at(clock, n, window, order=3).item() for n in seen]
 
     def _estimate(self, pictures: Tensor, clock: list[float]) -> Tensor:
         """Velocity (B, 2, h, w), in pixels a frame, of three grey pictures (B, 3, h, w) that show those times."""

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lightning_modules.motion import ZeroFlow
 from lightning_modules.networks.network import Network
-from spikekit import bayer_pattern, demosaic, tfi, tfp
+from spikekit import bayer_pattern, demosaic, tfi_at, tfp_at
 from spikekit.check import check_planes, check_positive, check_scale, check_whole
 
 
@@ -69,9 +69,9 @@ class ClassicalDecoder(Network):
     def forward(self, spikes: Tensor, flow: Tensor | Literal[0] | None = None) -> Tensor:
         """Return rgb; a flow changes nothing."""
         check_planes("spikes", spikes, 4, "(B, N, H, W)")
-        decoded = tfi(spikes) if self.method == "tfi" else tfp(spikes, self.window, order=self.order)
-        raw = decoded[:, spikes.shape[1] // 2] / self.alpha
-        rgb = demosaic(raw, self.pattern)
+        n = spikes.shape[1] // 2
+        raw = tfi_at(spikes, n) if self.method == "tfi" else tfp_at(spikes, n, self.window, order=self.order)
+        rgb = demosaic(raw / self.alpha, self.pattern)
         if self.scale > 1:
             rgb = F.interpolate(rgb, scale_factor=self.scale, mode="bicubic", align_corners=False)
         return rgb

@@ -17,7 +17,7 @@ from lightning_modules.networks.network import Network
 from lightning_modules.networks.reconstruction import ColorCorrelation, EarlyFusion, SeparateColors
 from lightning_modules.networks.refinement import FeatureRefinement, TimeFusion
 from lightning_modules.networks.representation import IntervalRepresentation, SpikeRepresentation, WindowMeans
-from spikekit import bayer_mask, bayer_pattern, demosaic, flow_warp_idw, linear_motion, split_colors, tfp
+from spikekit import bayer_mask, bayer_pattern, demosaic, flow_warp_idw, linear_motion, split_colors, tfp_at
 from spikekit.check import check_planes, check_scale
 from spikekit.gather import Gather
 from spikekit.neighbors import idw_neighbors
@@ -294,7 +294,7 @@ class CSCSR(Network):
 
     def _base(self, spikes: Tensor) -> Tensor:
         """TFP of the whole clip, demosaiced, smoothed, enlarged."""
-        raw = tfp(spikes, self.frames)[:, self.frames // 2] / self.alpha
+        raw = tfp_at(spikes, self.frames // 2, self.frames) / self.alpha
         # zero at the Nyquist frequency, where demosaicing leaves a zipper that training would have to undo first
         binomial = raw.new_tensor([[0.25, 0.5, 0.25]])
         smooth = filter2d_separable(demosaic(raw, self.pattern), binomial, binomial)

@@ -69,6 +69,15 @@ def tfp(spikes: Tensor, window: int) -> Tensor:
     )
 
 
+def tfp_frame(spikes: Tensor, n: int, window: int, order: int) -> Tensor:
+    """One picture, far from the ends of the clip: the means of all windows that it sees, order after order."""
+    reach = order * (window // 2)
+    seen = spikes[n - reach : n + reach + 1].float()
+    for _ in range(order - 1):
+        seen = seen.unfold(0, window, 1).mean(-1)
+    return seen.mean(0)
+
+
 def integrate_fire(light: Tensor) -> Tensor:
     """Integrate, compare, subtract; the gradient goes straight through where the light is in the linear range."""
     charge = torch.zeros_like(light[0])

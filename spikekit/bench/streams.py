@@ -13,7 +13,7 @@ from spikekit.bench import peers, plain
 from spikekit.bench.case import SEED, Case, Other, Setup, floats, sizes
 from spikekit.decoders import spike_interval, tfi, tfp
 from spikekit.files import read_spikes, write_spikes
-from spikekit.keyframe import tfi_at
+from spikekit.keyframe import tfi_at, tfp_at
 from spikekit.packing import pack_spikes, unpack_spikes
 from spikekit.sensor import spike_integrate_fire
 
@@ -184,6 +184,25 @@ def _tfp(setup: Setup) -> Iterator[Case]:
     )
 
 
+def _tfp_at(setup: Setup) -> Iterator[Case]:
+    clip = setup.spikes(setup.size.clip)
+    middle = len(clip) // 2
+    for window, order in ((2 * middle + 1, 1), (2 * (middle // 3) + 1, 3)):
+        yield Case(
+            f"uint8 {sizes(clip)} -> float32, the middle frame, w = {window}, order {order}",
+            partial(tfp_at, clip, middle, window, order=order),
+            clip[0].numel(),
+            clip.numel(),
+            4 * clip[0].numel(),
+            [
+                Other(
+                    "plain torch",
+                    lambda window=window, order=order: partial(plain.tfp_frame, clip, middle, window, order),
+                )
+            ],
+        )
+
+
 def _spike_integrate_fire(setup: Setup) -> Iterator[Case]:
     light = setup.light(setup.size.frames)
 
@@ -254,5 +273,6 @@ CASES = {
     "tfi": _tfi,
     "tfi_at": _tfi_at,
     "tfp": _tfp,
+    "tfp_at": _tfp_at,
     "spike_integrate_fire": _spike_integrate_fire,
 }

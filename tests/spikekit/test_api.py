@@ -18,7 +18,8 @@ PUBLIC = """
     VideoError VideoFrames bayer_mask bayer_pattern bayer_sites bin_to_sensor camera decode_in_chunks demosaic
     flow_to_rgb flow_warp flow_warp_idw iter_spikes joint_flow linear_motion merge_bayer mosaic pack_spikes panel psnr
     read_picture read_spikes read_video simulate_spikes spike_integrate_fire spike_interval spike_interval_at
-    spikes_shape split_bayer split_colors ssim tfi tfi_at tfp unpack_spikes upsample_flow write_picture write_spikes
+    spikes_shape split_bayer split_colors ssim tfi tfi_at tfp tfp_at unpack_spikes upsample_flow write_picture
+    write_spikes
 """.split()  # noqa: SIM905
 
 SPIKES = (torch.rand(2, 9, 4, 6, generator=torch.Generator().manual_seed(1)) < 0.4).double()

@@ -6,8 +6,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spikekit import spike_interval, tfi
-from spikekit.keyframe import _spike_interval_at, search, spike_interval_at, tfi_at
+from spikekit import spike_interval, spike_interval_at, tfi, tfi_at, tfp, tfp_at
+from spikekit.keyframe import _spike_interval_at, search, tfp_weights
 
 
 def interval_by_hand(fired, n):
@@ -124,3 +124,81 @@ def test_bad_range_and_dtype():
     with pytest.raises(TypeError, match="dtype"):
         tfi_at(torch.ones(5, 4, 4), 0, dtype=torch.int32)
     assert tfi_at(torch.ones(5, 4, 4), np.int64(2)).unique().tolist() == [1]
+
+
+def mean_by_hand(values, n, window, order):
+    """The mean of means of one pixel at frame n, as it is said: the mean of what the order before it gives."""
+    around = range(max(n - window // 2, 0), min(n + window // 2 + 1, len(values)))
+    return sum(mean_by_hand(values, k, window, order - 1) if order > 1 else values[k] for k in around) / len(around)
+
+
+@given(st.integers(1, 20), st.integers(0, 6), st.integers(1, 3), st.data())
+def test_mean_against_one_pixel_at_a_time(frames, half, order, data):
+    frame = data.draw(st.integers(0, frames - 1))
+    values = torch.rand(frames, 1, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(frames))
+    got = tfp_at(values, frame, 2 * half + 1, order=order).flatten()
+    for pixel in range(2):
+        assert got[pixel].item() == pytest.approx(
+            mean_by_hand(values[:, 0, pixel].tolist(), frame, 2 * half + 1, order)
+        )
+
+
+@pytest.mark.parametrize("window", [1, 5, 11, 61])
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_mean_equals_that_frame_of_the_whole(window, order):
+    spikes = torch.rand(2, 3, 30, 4, 5, generator=torch.Generator().manual_seed(0)) < 0.3
+    for dtype in (torch.bool, torch.uint8, torch.int32, torch.float16, torch.bfloat16, torch.float32, torch.float64):
+        for frame in (0, 1, 14, 29):
+            got = tfp_at(spikes.to(dtype), frame, window, 0.3, order=order)
+            whole = tfp(spikes.to(dtype), window, 0.3, order=order)[..., frame, :, :]
+            torch.testing.assert_close(got, whole, rtol=max(1e-6, torch.finfo(whole.dtype).eps), atol=1e-7)
+    picture = tfp_at(spikes, 14, window, 255.0, order=order, dtype=torch.uint8).int()
+    assert (picture - tfp(spikes, window, 255.0, order=order, dtype=torch.uint8)[..., 14, :, :].int()).abs().max() <= 1
+
+
+def test_mean_is_linear_with_its_weights_as_gradient():
+    light = torch.rand(9, 2, 2, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda values: tfp_at(values, 2, 5, 1.5, order=2), light)
+    (gradient,) = torch.autograd.grad(tfp_at(light, 2, 5, order=2).sum(), light)
+    first, weights = tfp_weights(9, 2, 5, 2)
+    assert first == 0
+    assert gradient[:7, 0, 0].tolist() == pytest.approx(weights)
+    assert not gradient[7:].any()
+    assert sum(weights) == pytest.approx(1)
+
+
+def test_mean_of_a_pixel_that_always_fires_is_exact_at_the_extremes():
+    """A whole recording in one mean, half precision, a range near the end of the type."""
+    spikes = torch.ones(70_001, 1, 2, dtype=torch.uint8)
+    assert tfp_at(spikes, 35_000, 2001, order=2).sub(1).abs().max() <= 2e-6
+    assert tfp_at(spikes[:2001].half(), 1000, 2001).tolist() == [[1, 1]]
+    assert tfp_at(spikes[:41], 20, 41, 6e4, dtype=torch.float16).tolist() == [[60000, 60000]]
+    assert not tfp_at(torch.zeros(41, 1, 2), 20, 13, order=3).any()
+
+
+def test_mean_compiles_maps_and_takes_no_spikes_that_it_does_not_see():
+    spikes = torch.rand(2, 41, 4, 6)
+    expected = tfp_at(spikes, 20, 13, order=3)
+    torch.compiler.reset()
+    compiled = torch.compile(lambda values: tfp_at(values, 20, 13, order=3), fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(compiled(spikes), expected)
+    torch.testing.assert_close(torch.func.vmap(lambda values: tfp_at(values, 20, 13, order=3))(spikes), expected)
+    spikes[:, [0, 1, 39, 40]] = torch.nan  # 37 are seen
+    assert tfp_at(spikes, 20, 13, order=3).equal(expected)
+
+
+@pytest.mark.parametrize(
+    ("args", "error", "message"),
+    [
+        ((torch.ones(3, 3), 0, 3), ValueError, "spikes"),
+        ((torch.ones(5, 2, 2), 5, 3), ValueError, r"frame: expected 0 \.\. 4, got 5"),
+        ((torch.ones(5, 2, 2), 1.5, 3), TypeError, "frame"),
+        ((torch.ones(5, 2, 2), 1, 4), ValueError, "window: expected an odd number"),
+        ((torch.ones(5, 2, 2), 1, 3, 0.0), ValueError, "max_range"),
+    ],
+)
+def test_mean_says_what_is_wrong(args, error, message):
+    with pytest.raises(error, match=message):
+        tfp_at(*args)
+    with pytest.raises(ValueError, match="order"):
+        tfp_at(torch.ones(5, 2, 2), 1, 3, order=0)
