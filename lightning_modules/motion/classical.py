@@ -6,25 +6,26 @@ import math
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from lightning_modules.motion.estimator import MotionEstimator, split_any_size
-from spikekit import tfp_at, upsample_flow
+from spikekit import tfp_at
 from spikekit.check import check_planes
 
-_BLUR = 0.5  # of the pictures, in Bayer cells
+_BLUR = 0.5  # of the pictures of a site, in Bayer cells
 
 
 class ClassicalFlow(MotionEstimator):
     r"""TV-L1 optical flow (scikit-image) on decoded pictures: no weights, runs on the CPU.
 
     The clip is decoded in its middle and a quarter of it before and after, by means of third order that see nearly all
-    of it, see :func:`spikekit.tfp`: noise harms the estimate more than what moves meanwhile. As motion is taken to be
-    linear, both flows are those of one velocity, the mean of what the earlier and the later picture tell. Each 2 x 2
-    Bayer cell is averaged to one grey pixel, so that the noise of the four colours is averaged *before* motion is
-    estimated; averaging four flows afterwards, as eq. (7) does with a learned estimator, was less accurate here and
-    four times the work. Of scikit-image's two estimators this one keeps the edges of motion; kornia has no dense flow
-    estimator without weights.
+    of it, see :func:`spikekit.tfp_at`: noise harms the estimate more than what moves meanwhile. As motion is taken to
+    be linear, both flows are those of one velocity, the mean of what the earlier and the later picture tell. The joint
+    flow is estimated on grey pictures of the sensor's size, each pixel the mean of the cells that it is part of, so
+    that the noise of the four sites is averaged *before* motion is estimated; averaging four flows afterwards, as
+    eq. (7) does with a learned estimator, was less accurate here. Of scikit-image's two estimators this one keeps the
+    edges of motion; kornia has no dense flow estimator without weights.
 
     Args:
         attachment: how much the flow follows the pictures rather than being smooth. It is weighed against firing rates,
@@ -55,32 +56,23 @@ class ClassicalFlow(MotionEstimator):
     def channel_flows(  # noqa: D102
         self, spikes: Tensor, times: tuple[int, int, int], pattern: str
     ) -> tuple[Tensor, Tensor]:
-        sites, clock = self._decode(spikes, times[1], pattern)
-        velocity = self._estimate(sites.flatten(0, 1), clock).unflatten(0, sites.shape[:2])
+        from skimage.filters import gaussian
+
+        raw, clock = _decode(spikes, times[1])
+        sites = split_any_size(raw, pattern)
+        blurred = gaussian(sites.cpu().numpy(), (0, 0, 0, _BLUR, _BLUR), mode="nearest")
+        velocity = torch.stack([self._velocity(pictures, clock) for pictures in blurred]).to(raw)
         return velocity * (times[0] - times[1]), velocity * (times[2] - times[1])
 
     @torch.no_grad()
     def forward(self, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> tuple[Tensor, Tensor]:  # noqa: D102
-        height, width = spikes.shape[-2:]
-        sites, clock = self._decode(spikes, times[1], pattern)
-        velocity = upsample_flow(self._estimate(sites.mean(dim=0), clock), 2)[..., :height, :width]
+        raw, clock = _decode(spikes, times[1])
+        grey = F.avg_pool2d(F.avg_pool2d(F.pad(raw, (1, 1, 1, 1), "reflect"), 2, 1), 2, 1)
+        velocity = self._velocity(grey.cpu().numpy(), clock).to(raw)
         return velocity * (times[0] - times[1]), velocity * (times[2] - times[1])
 
-    @staticmethod
-    def _decode(spikes: Tensor, middle: int, pattern: str) -> tuple[Tensor, list[float]]:
-        """Three pictures of every sub-stream, (4, B, 3, h, w), and the times that they show."""
-        check_planes("spikes", spikes, 4, "(B, N, H, W)")
-        frames = spikes.shape[1]
-        window, away = 2 * max((frames - 1) // 6, 1) + 1, max(frames // 4, 1)
-        seen = [max(middle - away, 0), middle, min(middle + away, frames - 1)]
-        raw = torch.stack([tfp_at(spikes, n, window, order=3, dtype=torch.float32) for n in seen], dim=1)
-        # where the mean is cut by the ends of the clip, it stands for a later or an earlier time
-        clock = torch.arange(frames, dtype=torch.float64).reshape(-1, 1, 1)
-        return split_any_size(raw, pattern), [tfp_at(clock, n, window, order=3).item() for n in seen]
-
-    def _estimate(self, pictures: Tensor, clock: list[float]) -> Tensor:
-        """Velocity (B, 2, h, w), in pixels a frame, of three grey pictures (B, 3, h, w) that show those times."""
-        from skimage.filters import gaussian
+    def _velocity(self, pictures: np.ndarray, clock: list[float]) -> Tensor:
+        """Velocity (B, 2, h, w), in pixels a frame, of three pictures (B, 3, h, w) that show those times."""
         from skimage.registration import optical_flow_tvl1
 
         def velocity(clip: np.ndarray, other: int) -> np.ndarray:
@@ -89,9 +81,19 @@ class ClassicalFlow(MotionEstimator):
             )
             return np.stack([right, down]) / (clock[other] - clock[1])
 
-        clips = gaussian(pictures.cpu().numpy(), (0, 0, _BLUR, _BLUR), mode="nearest")
-        velocities = np.stack([(velocity(clip, 0) + velocity(clip, 2)) / 2 for clip in clips])
-        return torch.from_numpy(velocities).to(pictures)
+        return torch.from_numpy(np.stack([(velocity(clip, 0) + velocity(clip, 2)) / 2 for clip in pictures]))
 
     def extra_repr(self) -> str:  # noqa: D102
         return f"attachment={self.attachment}, warps={self.warps}"
+
+
+def _decode(spikes: Tensor, middle: int) -> tuple[Tensor, list[float]]:
+    """Three raw pictures (B, 3, H, W), and the times that they show."""
+    check_planes("spikes", spikes, 4, "(B, N, H, W)")
+    frames = spikes.shape[1]
+    window, away = 2 * max((frames - 1) // 6, 1) + 1, max(frames // 4, 1)
+    seen = [max(middle - away, 0), middle, min(middle + away, frames - 1)]
+    raw = torch.stack([tfp_at(spikes, n, window, order=3, dtype=torch.float32) for n in seen], dim=1)
+    # where the mean is cut by the ends of the clip, it stands for a later or an earlier time
+    clock = torch.arange(frames, dtype=torch.float64).reshape(-1, 1, 1)
+    return raw, [tfp_at(clock, n, window, order=3).item() for n in seen]

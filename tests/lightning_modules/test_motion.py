@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import convolve1d
 from skimage.registration import optical_flow_tvl1
 
 from lightning_modules.motion import ClassicalFlow, MotionEstimator, ZeroFlow
-from spikekit import mosaic, spike_integrate_fire, split_bayer
+from spikekit import mosaic, spike_integrate_fire, split_bayer, tfp_at
 
 TIMES = (5, 20, 35)
 
@@ -113,6 +114,29 @@ def test_flows_of_the_sites_are_in_bayer_cells_and_in_the_order_of_split_bayer(s
             down, right = optical_flow_tvl1(pictures[1, site, 1], pictures[k, site, 1], attachment=30, dtype="float32")
             velocity += torch.from_numpy(np.stack([right, down])) / (clock[seen[k]] - clock[20]) / 2
         torch.testing.assert_close(flows[1][site, 1], velocity * 15, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "GBRG"])
+def test_joint_flow_is_that_of_grey_pictures(pattern):
+    spikes, clock = moving((0.2, -0.1), pattern=pattern), torch.arange(41.0).reshape(41, 1, 1)
+    binomial, grey, when = [0.25, 0.5, 0.25], [], []
+    for n in (10, 20, 30):
+        rows = convolve1d(tfp_at(spikes[0].float(), n, 13, order=3).numpy(), binomial, 0, mode="mirror")
+        grey.append(convolve1d(rows, binomial, 1, mode="mirror"))
+        when.append(tfp_at(clock, n, 13, order=3).item())
+    velocity = 0
+    for k in (0, 2):
+        down, right = optical_flow_tvl1(grey[1], grey[k], attachment=30, dtype="float32")
+        velocity += torch.from_numpy(np.stack([right, down])) / (when[k] - when[1]) / 2
+    torch.testing.assert_close(ClassicalFlow()(spikes, TIMES, pattern)[1][0], velocity * 15, rtol=1e-3, atol=1e-2)
+
+
+def test_mosaic_without_motion_is_no_motion():
+    """The filter array stands still while the scene moves: what is left of it would hold the flow back."""
+    colour = torch.tensor([0.9, 0.3, 0.1])[:, None, None].expand(3, 24, 24)
+    light = 0.4 * mosaic(colour, "RGGB").expand(41, 24, 24)
+    grey = ClassicalFlow()(spike_integrate_fire(light, charge=torch.rand(24, 24))[0][None], TIMES, "RGGB")
+    assert all(flow.abs().max() < 0.3 for flow in grey)
 
 
 def spike_sites(spikes, pattern):
