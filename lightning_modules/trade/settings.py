@@ -59,13 +59,15 @@ def read_setting(text: str) -> Setting:
 
 
 #: what is tried on every network: behind its name, and behind its arguments
-_STILL = [("no motion", "--model.network.motion ZeroFlow")]
+_EFFORT = [
+    ("motion of 1 warp", "--model.network.motion ClassicalFlow --model.network.motion.warps 1"),
+    ("no motion", "--model.network.motion ZeroFlow"),
+]
 
 #: what is tried on the first, besides
 _VARIANTS = [
     ("exact search", "--model.network.steps 0"),
     ("search steps 4", "--model.network.steps 4"),
-    ("motion of 1 warp", "--model.network.motion ClassicalFlow --model.network.motion.warps 1"),
     ("bf16-true", "--trainer.precision bf16-true"),
     ("bf16-mixed", "--trainer.precision bf16-mixed"),
     ("no tiles", "--model.tile 0"),
@@ -88,8 +90,8 @@ _DECODERS = [
 def usual_settings(scale: int, own: Sequence[str] = ()) -> list[Setting]:
     """Return what is measured where nothing else is asked for.
 
-    The networks whose weights come with the package, as they are; then the same without motion, and the first of them
-    faster and more exact in other ways; then the decoders without learning.
+    The networks whose weights come with the package, as they are; then the same with less effort for motion and with
+    none, and the first of them faster and more exact in other ways; then the decoders without learning.
 
     Args:
         scale: super-resolution factor.
@@ -105,7 +107,7 @@ def usual_settings(scale: int, own: Sequence[str] = ()) -> list[Setting]:
     variants = [
         Setting(f"{network.name}, {name}", [*network.args, *shlex.split(args)])
         for place, network in enumerate(networks)
-        for name, args in ([*learned, *_STILL, *_VARIANTS] if place == 0 else _STILL)
+        for name, args in ([*learned, *_EFFORT, *_VARIANTS] if place == 0 else _EFFORT)
     ]
     without = [word for option in own for word in (option, "null")]
     return networks + variants + [Setting(name, [*shlex.split(args), *without]) for name, args in _DECODERS]
