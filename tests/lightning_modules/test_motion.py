@@ -162,3 +162,9 @@ def test_joint_flow_is_the_mean_of_the_sites_in_sensor_pixels(size):
     expected = torch.tensor([8.0, 12]).reshape(1, 2, 1, 1).expand(3, 2, *size)
     assert to_last.equal(expected)
     assert to_first.equal(-expected)
+
+
+def test_more_warps_follow_more_motion():
+    spikes, truth = moving((0.25, -0.2)), 15 * torch.tensor([0.25, -0.2]).reshape(1, 2, 1, 1)
+    error = [(ClassicalFlow(warps=warps)(spikes, TIMES, "RGGB")[1] - truth).norm(dim=1).mean() for warps in (1, 5)]
+    assert error[1] < 0.8 * error[0], error
