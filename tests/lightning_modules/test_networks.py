@@ -8,7 +8,7 @@ from lightning_modules.networks import CSCSR, ClassicalDecoder
 from lightning_modules.networks.refinement import FeatureRefinement
 from lightning_modules.networks.representation import WindowMeans
 from lightning_modules.tiles import forward_in_tiles
-from spikekit import bayer_mask, linear_motion, mosaic, psnr, spike_integrate_fire, split_colors
+from spikekit import bayer_mask, demosaic, linear_motion, mosaic, psnr, spike_integrate_fire, split_colors, tfi, tfp
 
 TINY = {"width": 4, "representation_width": 4, "features": 2, "stages": 2, "blocks": 1, "end_blocks": 1}
 
@@ -215,6 +215,15 @@ def test_classical_decoder_finds_the_colour_of_a_plain_scene(method, pattern):
     spikes, _ = spike_integrate_fire(light)
     decoded = ClassicalDecoder(method, 2, pattern, alpha=0.5)(spikes)
     assert psnr(decoded, rgb.expand_as(decoded)).item() > 30
+
+
+@pytest.mark.parametrize(
+    ("method", "settings"), [("tfi", {}), ("tfp", {"window": 13}), ("tfp", {"window": 13, "order": 3})]
+)
+def test_classical_decoder_shows_the_middle_of_the_clip(method, settings):
+    spikes, _ = clip(2)
+    raw = {"tfi": tfi, "tfp": tfp}[method](spikes, **settings)[:, 20]
+    torch.testing.assert_close(ClassicalDecoder(method, 1, **settings)(spikes), demosaic(raw / 0.4))
 
 
 @pytest.mark.parametrize(
