@@ -52,6 +52,7 @@ class ClassicalFlow(MotionEstimator):
             raise ValueError(f"warps: expected 1 or more, got {warps}")
         self.attachment, self.warps = attachment, warps
 
+    @torch.compiler.disable(reason="scikit-image is not for a compiler")
     @torch.no_grad()
     def channel_flows(  # noqa: D102
         self, spikes: Tensor, times: tuple[int, int, int], pattern: str
@@ -64,6 +65,7 @@ class ClassicalFlow(MotionEstimator):
         velocity = torch.stack([self._velocity(pictures, clock) for pictures in blurred]).to(raw)
         return velocity * (times[0] - times[1]), velocity * (times[2] - times[1])
 
+    @torch.compiler.disable(reason="scikit-image is not for a compiler")
     @torch.no_grad()
     def forward(self, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> tuple[Tensor, Tensor]:  # noqa: D102
         raw, clock = _decode(spikes, times[1])

@@ -52,6 +52,17 @@ def test_precision_of_a_network_is_not_that_of_motion():
     assert all(flow.isfinite().all() for flow in ClassicalFlow()(spikes.bfloat16(), TIMES, "RGGB"))
 
 
+@pytest.mark.parametrize("estimate", ["forward", "channel_flows"])
+def test_a_compiler_keeps_out(estimate):
+    spikes = moving((0.2, -0.1))
+    flow = ClassicalFlow()
+
+    def mean(spikes):
+        return sum(part.mean() for part in getattr(flow, estimate)(spikes, TIMES, "RGGB"))
+
+    assert torch.compile(mean, backend="eager")(spikes) == mean(spikes)
+
+
 @pytest.mark.parametrize("size", [(33, 35), (5, 4), (3, 3)])
 def test_any_size(size):
     for estimator in (ClassicalFlow(), ZeroFlow()):
