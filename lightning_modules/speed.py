@@ -17,6 +17,9 @@ _FOLDER = Path(__file__).parent / "weights"
 #: how far a speed may be below the best, in dB of the table
 SPEEDS = {"fastest": float("inf"), "fast": 1.0, "balanced": 0.1, "best": 0.005}
 
+#: times this close cannot be told apart, and the better setting is picked
+_AS_FAST = 1.1
+
 _UNITS = {
     "ms": ("ms", 1.0),
     "s": ("ms", 1e3),
@@ -120,7 +123,7 @@ def choose(
     Args:
         scale: super-resolution factor.
         speed: ``"best"``, ``"balanced"`` and ``"fast"``, the fastest at most 0.005, 0.1 and 1 dB below the most exact,
-            or ``"fastest"``.
+            or ``"fastest"``; of those within 10 % of its time the most exact.
         budget: instead, what a frame may take: a time, such as ``"40ms"``, or memory, such as ``"200MB"``. Of what fits
             it is the best.
         size: of a frame, (H, W) in sensor pixels, which a budget depends on.
@@ -142,7 +145,8 @@ def choose(
     if speed is not None:
         if speed not in SPEEDS:
             raise ValueError(f"speed: expected one of {', '.join(SPEEDS)}, got {speed!r}")
-        return next(choice for choice in found if choice.below <= SPEEDS[speed])
+        near = [choice for choice in found if choice.below <= SPEEDS[speed]]
+        return max((choice for choice in near if choice.ms <= _AS_FAST * near[0].ms), key=lambda choice: choice.psnr)
     read = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([a-zA-Z]+)\s*", budget)
     if read is None or read[2] not in _UNITS:
         raise ValueError(f"budget: expected a time or memory, such as 40ms, 2s, 200MB or 1GiB, got {budget!r}")

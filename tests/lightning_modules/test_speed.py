@@ -23,6 +23,7 @@ ROWS = [
     ("no motion", 29.92, 200, 70, 40, 50, "--model.weights {weights} --model.network.motion ZeroFlow", ""),
     ("tfp", 29.6, 10, 5, 40, 50, f"{DECODER} tfp", ""),
     ("tfi", 25.0, 4, 2, 40, 50, f"{DECODER} tfi", ""),
+    ("tfp 5", 24.0, 3.8, 3, 40, 50, f"{DECODER} tfp --model.network.window 5", ""),
     ("bf16", 30.1, 300, 60, 40, 50, "--model.weights {weights} --trainer.precision bf16-true", ""),
     ("broken", "", "", "", 40, 50, "--model.weights nowhere", "there is none"),
 ]
@@ -115,7 +116,7 @@ def test_what_it_says(table):
         ({"speed": "fast", "budget": "1s"}, "expected one of them"),
         ({"budget": "40"}, "budget: expected a time or memory"),
         ({"budget": "-1ms"}, "budget: expected a time or memory"),
-        ({"budget": "1ms"}, "nothing fits 1ms for 250 x 400 sensor pixels; least takes tfi: about 200 ms"),
+        ({"budget": "1ms"}, "nothing fits 1ms for 250 x 400 sensor pixels; least takes tfp 5: about 190 ms"),
         ({"budget": "1MB"}, "nothing fits 1MB for 250 x 400 sensor pixels; least takes tfi"),
         ({"scale": 7, "speed": "fast"}, r"scale: expected one that was measured \(x3\), got 7"),
     ],
