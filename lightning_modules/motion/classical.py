@@ -10,22 +10,26 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lightning_modules.motion.estimator import MotionEstimator, split_any_size
-from spikekit import tfp_at
+from spikekit import flow_warp, tfp_at
 from spikekit.check import check_planes
 
 _BLUR = 0.5  # of the pictures of a site, in Bayer cells
+_NEAR = 2.0  # around a pixel where it is asked whether motion is linear, in pixels
+_PART = 1.25, 1.75  # how many times more different pictures are where flows begin to part, and where they have
+_UNSEEN = 1e-6  # squared difference of two pictures that says nothing, in firing rates
 
 
 class ClassicalFlow(MotionEstimator):
     r"""TV-L1 optical flow (scikit-image) on decoded pictures: no weights, runs on the CPU.
 
     The clip is decoded in its middle and a quarter of it before and after, by means of third order that see nearly all
-    of it, see :func:`spikekit.tfp_at`: noise harms the estimate more than what moves meanwhile. As motion is taken to
-    be linear, both flows are those of one velocity, the mean of what the earlier and the later picture tell. The joint
-    flow is estimated on grey pictures of the sensor's size, each pixel the mean of the cells that it is part of, so
-    that the noise of the four sites is averaged *before* motion is estimated; averaging four flows afterwards, as
-    eq. (7) does with a learned estimator, was less accurate here. Of scikit-image's two estimators this one keeps the
-    edges of motion; kornia has no dense flow estimator without weights.
+    of it, see :func:`spikekit.tfp_at`: noise harms the estimate more than what moves meanwhile. Motion is taken to be
+    linear, so that both flows are those of one velocity, the mean of what the earlier and the later picture tell; they
+    part where that leaves the pictures clearly more different than a velocity each does. The joint flow is estimated
+    on grey pictures of the sensor's size, each pixel the mean of the cells that it is part of, so that the noise of the
+    four sites is averaged *before* motion is estimated; averaging four flows afterwards, as eq. (7) does with a learned
+    estimator, was less accurate here. Of scikit-image's two estimators this one keeps the edges of motion; kornia has
+    no dense flow estimator without weights.
 
     Args:
         attachment: how much the flow follows the pictures rather than being smooth. It is weighed against firing rates,
@@ -62,28 +66,33 @@ class ClassicalFlow(MotionEstimator):
         raw, clock = _decode(spikes, times[1])
         sites = split_any_size(raw, pattern)
         blurred = gaussian(sites.cpu().numpy(), (0, 0, 0, _BLUR, _BLUR), mode="nearest")
-        velocity = torch.stack([self._velocity(pictures, clock) for pictures in blurred]).to(raw)
-        return velocity * (times[0] - times[1]), velocity * (times[2] - times[1])
+        before, after = torch.stack([self._velocities(pictures, clock) for pictures in blurred], dim=1).to(raw)
+        return before * (times[0] - times[1]), after * (times[2] - times[1])
 
     @torch.compiler.disable(reason="scikit-image is not for a compiler")
     @torch.no_grad()
     def forward(self, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> tuple[Tensor, Tensor]:  # noqa: D102
         raw, clock = _decode(spikes, times[1])
         grey = F.avg_pool2d(F.avg_pool2d(F.pad(raw, (1, 1, 1, 1), "reflect"), 2, 1), 2, 1)
-        velocity = self._velocity(grey.cpu().numpy(), clock).to(raw)
-        return velocity * (times[0] - times[1]), velocity * (times[2] - times[1])
+        before, after = self._velocities(grey.cpu().numpy(), clock).to(raw)
+        return before * (times[0] - times[1]), after * (times[2] - times[1])
 
-    def _velocity(self, pictures: np.ndarray, clock: list[float]) -> Tensor:
-        """Velocity (B, 2, h, w), in pixels a frame, of three pictures (B, 3, h, w) that show those times."""
+    def _velocities(self, pictures: np.ndarray, clock: list[float]) -> Tensor:
+        """Velocities before and after the middle, (2, B, 2, h, w), in pixels a frame, of pictures (B, 3, h, w)."""
         from skimage.registration import optical_flow_tvl1
 
-        def velocity(clip: np.ndarray, other: int) -> np.ndarray:
-            down, right = optical_flow_tvl1(
-                clip[1], clip[other], attachment=self.attachment, num_warp=self.warps, dtype=np.float32
-            )
-            return np.stack([right, down]) / (clock[other] - clock[1])
-
-        return torch.from_numpy(np.stack([(velocity(clip, 0) + velocity(clip, 2)) / 2 for clip in pictures]))
+        away = clock[0] - clock[1], clock[2] - clock[1]
+        found = []
+        for clip in pictures:
+            flows = [
+                optical_flow_tvl1(clip[1], other, attachment=self.attachment, num_warp=self.warps, dtype=np.float32)
+                for other in (clip[0], clip[2])
+            ]
+            own = np.stack([flow[::-1] / frames for flow, frames in zip(flows, away, strict=True)])
+            one = own.mean(axis=0, keepdims=True)
+            bent = np.interp(_unlike(clip, one, away) / (_unlike(clip, own, away) + _UNSEEN), _PART, (0, 1))
+            found.append(one + bent.astype(np.float32) * (own - one))
+        return torch.from_numpy(np.stack(found, axis=1))
 
     def extra_repr(self) -> str:  # noqa: D102
         return f"attachment={self.attachment}, warps={self.warps}"
@@ -99,3 +108,13 @@ def _decode(spikes: Tensor, middle: int) -> tuple[Tensor, list[float]]:
     # where the mean is cut by the ends of the clip, it stands for a later or an earlier time
     clock = torch.arange(frames, dtype=torch.float64).reshape(-1, 1, 1)
     return raw, [tfp_at(clock, n, window, order=3).item() for n in seen]
+
+
+def _unlike(clip: np.ndarray, velocities: np.ndarray, away: tuple[float, float]) -> np.ndarray:
+    """Squared difference (h, w) of the middle picture from both others where these velocities see them."""
+    from skimage.filters import gaussian
+
+    others = torch.from_numpy(clip[::2, None])
+    flows = torch.from_numpy(velocities) * others.new_tensor(away).reshape(2, 1, 1, 1)
+    error = (flow_warp(others, flows).numpy() - clip[1]) ** 2
+    return gaussian(error.sum(axis=(0, 1)), _NEAR, mode="nearest")
