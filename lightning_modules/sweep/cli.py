@@ -48,7 +48,8 @@ failed ones are tried again, the others go on from their last checkpoint. A fold
 refused.
 
 The result is sweep.md, sweep.csv and sweep.png: a row a variant, mean and spread over seeds, the difference from J or
-from the first row, and the paper's Table 3 for rows named after its letters. Every trial lies in a folder of its own:
+from the first row, and the paper's Table 3 for overlays of a folder `ablation`. Every trial lies in a folder of its
+own:
   lightning test -c runs/sweep/c-s-seed1/trial.yaml --ckpt_path last
 
 examples:

@@ -51,7 +51,7 @@ class Row:
         """PSNR that the paper reports for it."""
         scales = {result["network"].get("scale") for result in self.results.values()}
         table = TABLE_3.get(scales.pop(), {}) if len(scales) == 1 else {}
-        return next((table[label.upper()] for label in self.labels if label.upper() in table), None)
+        return table.get(self.trials[0].letter)
 
 
 def own_scores(result: dict[str, Any]) -> dict[str, float]:

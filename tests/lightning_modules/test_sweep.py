@@ -126,7 +126,18 @@ def test_every_combination_has_a_name_and_a_configuration(overlays, tmp_path):
         assert trial.config["trainer"]["max_steps"] == 5
         assert trial.config["data"]["init_args"]["brightness"] == [0.5, 0.8]
         assert trial.config["output"] == str(trial.folder)
+        assert trial.letter == variant.upper()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_size_e_is_not_the_variant_e(overlays, tmp_path):
+    """Both are called e."""
+    sizes, variants = ([CONFIGS / folder / "e.yaml"] for folder in ("size", "ablation"))
+    for over, letter in ([sizes], ""), ([variants], "E"), ([sizes, [CONFIGS / "ablation/a.yaml"]], "A"):
+        [trial] = make_trials([CONFIGS / "x4.yaml"], over, [], [], {"steps": 5}, tmp_path)
+        assert trial.letter == letter
+        row = Row([trial], {None: {"network": {"scale": 4}}})
+        assert row.paper == {"E": 26.66, "A": 28.57}.get(letter)
 
 
 @pytest.mark.slow
@@ -467,7 +478,7 @@ def test_ray_runs_trials(typed, overlays, tmp_path, monkeypatch):
 
 def test_the_plot_has_what_is_there(tmp_path):
     def row(label, *psnr):
-        trials = [Trial((label,), seed, tmp_path, {}, {}) for seed in range(2)]
+        trials = [Trial((label,), seed, tmp_path, {}, {}, label.upper()) for seed in range(2)]
         found = {"method": "CSCSR", "network": {"scale": 4}}
         results = {seed: {**found, "metrics": {"CSCSR": {"psnr": value}}} for seed, value in enumerate(psnr)}
         return Row(trials, results, {} if psnr else {0: "killed"})
