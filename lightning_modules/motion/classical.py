@@ -34,7 +34,8 @@ class ClassicalFlow(MotionEstimator):
     Args:
         attachment: how much the flow follows the pictures rather than being smooth. It is weighed against firing rates,
             so that the noise of a dark scene counts for as little as it is.
-        warps: how often each of the pyramid's levels is warped; fewer are faster, and lose large motion.
+        tolerance: what the flow may still change by, in pixels, root mean square: a level of the pyramid is then done,
+            and a scene that moves little costs little.
 
     Shape:
         As :class:`MotionEstimator`; no gradient.
@@ -48,13 +49,13 @@ class ClassicalFlow(MotionEstimator):
         Zach, Pock and Bischof, A duality based approach for realtime TV-L1 optical flow, DAGM 2007.
     """
 
-    def __init__(self, attachment: float = 30.0, warps: int = 5) -> None:
+    def __init__(self, attachment: float = 30.0, tolerance: float = 0.1) -> None:
         super().__init__()
         if not 0 < attachment < math.inf:
             raise ValueError(f"attachment: expected a positive number, got {attachment}")
-        if warps < 1:
-            raise ValueError(f"warps: expected 1 or more, got {warps}")
-        self.attachment, self.warps = attachment, warps
+        if not 0 <= tolerance < math.inf:
+            raise ValueError(f"tolerance: expected 0 or more pixels, got {tolerance}")
+        self.attachment, self.tolerance = attachment, tolerance
 
     @torch.compiler.disable(reason="scikit-image is not for a compiler")
     @torch.no_grad()
@@ -85,7 +86,9 @@ class ClassicalFlow(MotionEstimator):
         found = []
         for clip in pictures:
             flows = [
-                optical_flow_tvl1(clip[1], other, attachment=self.attachment, num_warp=self.warps, dtype=np.float32)
+                optical_flow_tvl1(
+                    clip[1], other, attachment=self.attachment, tol=self.tolerance**2, dtype=np.float32
+                )
                 for other in (clip[0], clip[2])
             ]
             own = np.stack([flow[::-1] / frames for flow, frames in zip(flows, away, strict=True)])
@@ -95,7 +98,7 @@ class ClassicalFlow(MotionEstimator):
         return torch.from_numpy(np.stack(found, axis=1))
 
     def extra_repr(self) -> str:  # noqa: D102
-        return f"attachment={self.attachment}, warps={self.warps}"
+        return f"attachment={self.attachment}, tolerance={self.tolerance}"
 
 
 def _decode(spikes: Tensor, middle: int) -> tuple[Tensor, list[float]]:

@@ -60,7 +60,7 @@ def read_setting(text: str) -> Setting:
 
 #: what is tried on every network: behind its name, and behind its arguments
 _EFFORT = [
-    ("motion of 1 warp", "--model.network.motion ClassicalFlow --model.network.motion.warps 1"),
+    ("coarse motion", "--model.network.motion ClassicalFlow --model.network.motion.tolerance 0.2"),
     ("no motion", "--model.network.motion ZeroFlow"),
 ]
 

@@ -71,7 +71,7 @@ def test_any_size(size):
             assert flow.isfinite().all()
 
 
-@pytest.mark.parametrize("wrong", [{"attachment": 0.0}, {"attachment": float("nan")}, {"warps": 0}])
+@pytest.mark.parametrize("wrong", [{"attachment": 0.0}, {"attachment": float("nan")}, {"tolerance": -0.1}, {"tolerance": float("inf")}])
 def test_wrong_argument(wrong):
     with pytest.raises(ValueError, match=f"{next(iter(wrong))}: expected"):
         ClassicalFlow(**wrong)
@@ -120,7 +120,7 @@ def test_few_frames():
 @pytest.mark.parametrize("size", [(32, 40), (33, 35)])
 def test_flows_of_the_sites_are_in_bayer_cells_and_in_the_order_of_split_bayer(size):
     spikes = moving((0.2, -0.1), *size, "GRBG").repeat(2, 1, 1, 1)
-    estimator = ClassicalFlow()
+    estimator = ClassicalFlow(tolerance=0.01)
     flows = estimator.channel_flows(spikes, TIMES, "GRBG")
     sites = spike_sites(spikes, "GRBG")
     for flow in flows:
@@ -156,7 +156,7 @@ def test_joint_flow_is_that_of_grey_pictures(pattern):
     for k in (0, 2):
         down, right = optical_flow_tvl1(grey[1], grey[k], attachment=30, dtype="float32")
         velocity += torch.from_numpy(np.stack([right, down])) / (when[k] - when[1]) / 2
-    to_first, to_last = ClassicalFlow()(spikes, TIMES, pattern)
+    to_first, to_last = ClassicalFlow(tolerance=0.01)(spikes, TIMES, pattern)
     torch.testing.assert_close((to_last - to_first)[0] / 2, velocity * 15, rtol=1e-3, atol=1e-2)
 
 
@@ -164,7 +164,7 @@ def test_mosaic_without_motion_is_no_motion():
     """The filter array stands still while the scene moves: what is left of it would hold the flow back."""
     colour = torch.tensor([0.9, 0.3, 0.1])[:, None, None].expand(3, 24, 24)
     light = 0.4 * mosaic(colour, "RGGB").expand(41, 24, 24)
-    grey = ClassicalFlow()(spike_integrate_fire(light, charge=torch.rand(24, 24))[0][None], TIMES, "RGGB")
+    grey = ClassicalFlow(tolerance=0.01)(spike_integrate_fire(light, charge=torch.rand(24, 24))[0][None], TIMES, "RGGB")
     assert all(flow.abs().max() < 0.3 for flow in grey)
 
 
@@ -193,7 +193,21 @@ def test_joint_flow_is_the_mean_of_the_sites_in_sensor_pixels(size):
     assert to_first.equal(-expected)
 
 
-def test_more_warps_follow_more_motion():
-    spikes, truth = moving((0.25, -0.2)), 15 * torch.tensor([0.25, -0.2]).reshape(1, 2, 1, 1)
-    error = [(ClassicalFlow(warps=warps)(spikes, TIMES, "RGGB")[1] - truth).norm(dim=1).mean() for warps in (1, 5)]
-    assert error[1] < 0.8 * error[0], error
+def test_effort_follows_motion(monkeypatch):
+    from skimage.registration import _optical_flow
+
+    warped, warp = [], _optical_flow.warp
+    monkeypatch.setattr(_optical_flow, "warp", lambda *args, **options: warped.append(0) or warp(*args, **options))
+
+    def effort(velocity, tolerance):
+        warped.clear()
+        truth = 15 * torch.tensor(velocity).reshape(1, 2, 1, 1)
+        error = (ClassicalFlow(tolerance=tolerance)(moving(velocity), TIMES, "RGGB")[1] - truth).norm(dim=1).mean()
+        return len(warped), error / truth.norm()
+
+    (still, _), (slow, _), (fast, error), (all_of_it, _) = (
+        effort(velocity, tolerance)
+        for velocity, tolerance in [((0.0, 0.0), 0.1), ((0.04, 0.03), 0.1), ((0.25, -0.2), 0.1), ((0.25, -0.2), 0.0)]
+    )
+    assert still <= slow < fast < all_of_it, (still, slow, fast, all_of_it)
+    assert error < 0.1, error
