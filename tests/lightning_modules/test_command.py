@@ -197,7 +197,7 @@ def test_the_paper_is_the_default(configs, capsys):
     assert model["lr_scheduler"]["init_args"]["gamma"] == 0.8
 
 
-@pytest.mark.parametrize("overlay", ["quick", "size/e", "size/t", "size/s", "size/m", "size/l"])
+@pytest.mark.parametrize("overlay", ["quick", "size/d", "size/e", "size/t", "size/s", "size/m", "size/l"])
 @pytest.mark.parametrize("scale", [2, 3, 4])
 def test_overlays_build(overlay, scale, configs):
     base, over = (

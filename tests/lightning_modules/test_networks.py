@@ -26,13 +26,14 @@ def clip(batch=1, height=12, width=16, seed=0):
         ("s", 165_801, 1.9),
         ("m", 726_447, 9.3),
         ("l", 2_832_251, 43),
+        ("d", 1_320_742, 1.79),
         ("e", 1_080_294, 1.55),
         ("t", 300_963, 0.36),
     ],
 )
 def test_parameters_and_work_of_the_sizes(size, parameters, mmac, configs):
     settings = yaml.safe_load((configs / f"size/{size}.yaml").read_text())["model"]["network"]["init_args"]
-    for scale in (4,) if size in "et" else (2, 3, 4):  # E and T see scale x scale pixels as channels
+    for scale in (4,) if size in "det" else (2, 3, 4):  # D, E and T see scale x scale pixels as channels
         network = CSCSR(scale, **settings)
         assert sum(p.numel() for p in network.parameters()) == parameters
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
