@@ -2,8 +2,9 @@ import pytest
 import torch
 
 from lightning_modules.module import SuperResolution
-from lightning_modules.motion import MotionEstimator
+from lightning_modules.motion import MotionEstimator, ZeroFlow
 from lightning_modules.networks import CSCSR, ClassicalDecoder
+from lightning_modules.pretrained import shipped_weights
 from lightning_modules.tiles import AROUND, HALO, forward_in_tiles
 from spikekit.scene import Layer, Motion, Scene
 from spikekit.simulate import simulate_spikes
@@ -70,6 +71,14 @@ def test_without_a_tolerance_nothing_is_new():
     assert forward_in_tiles(network, spikes, 64).equal(expected)
     assert forward_in_tiles(network, spikes, 64, 0.0).equal(expected)
     assert forward_in_tiles(network, spikes, 0).equal(whole)
+
+
+@pytest.mark.parametrize("name", [name for name in shipped_weights() if name.startswith("x")])
+def test_shipped_networks_see_no_further_than_the_halo(name):
+    network = CSCSR.from_pretrained(name, motion=ZeroFlow())
+    spikes = mixed()[..., :128]
+    with torch.no_grad():
+        torch.testing.assert_close(forward_in_tiles(network, spikes, 64), network(spikes), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("settings", [{}, {"neighbors": 3}, {"resolution": "sensor"}, {"representation": "interval"}])
