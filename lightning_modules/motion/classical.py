@@ -86,9 +86,7 @@ class ClassicalFlow(MotionEstimator):
         found = []
         for clip in pictures:
             flows = [
-                optical_flow_tvl1(
-                    clip[1], other, attachment=self.attachment, tol=self.tolerance**2, dtype=np.float32
-                )
+                optical_flow_tvl1(clip[1], other, attachment=self.attachment, tol=self.tolerance**2, dtype=np.float32)
                 for other in (clip[0], clip[2])
             ]
             own = np.stack([flow[::-1] / frames for flow, frames in zip(flows, away, strict=True)])

@@ -71,7 +71,9 @@ def test_any_size(size):
             assert flow.isfinite().all()
 
 
-@pytest.mark.parametrize("wrong", [{"attachment": 0.0}, {"attachment": float("nan")}, {"tolerance": -0.1}, {"tolerance": float("inf")}])
+@pytest.mark.parametrize(
+    "wrong", [{"attachment": 0.0}, {"attachment": float("nan")}, {"tolerance": -0.1}, {"tolerance": float("inf")}]
+)
 def test_wrong_argument(wrong):
     with pytest.raises(ValueError, match=f"{next(iter(wrong))}: expected"):
         ClassicalFlow(**wrong)
