@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 
 _FOLDER = Path(__file__).parent / "weights"
@@ -100,7 +100,8 @@ def write_weights(weights: Weights, path: str | Path) -> None:
         raise ValueError(f"{path}: expected a name that ends in .safetensors")
     path.parent.mkdir(parents=True, exist_ok=True)
     tensors = {name: value.contiguous() for name, value in weights.tensors.items()}
-    save_file(tensors, path, {"network": json.dumps(weights.settings), "motion": json.dumps(weights.motion)})
+    # save_file leaves a file that nobody else may read
+    path.write_bytes(save(tensors, {"network": json.dumps(weights.settings), "motion": json.dumps(weights.motion)}))
 
 
 def settings_of(network: nn.Module) -> dict[str, Any]:

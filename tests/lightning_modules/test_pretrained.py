@@ -53,6 +53,12 @@ def test_export_and_from_pretrained(file, capsys):
     assert isinstance(CSCSR.from_pretrained(file, motion=ZeroFlow()).motion, ZeroFlow)
 
 
+@pytest.mark.skipif(os.name != "posix", reason="modes of files are those of POSIX")
+def test_others_may_read_what_was_exported(file):
+    (file.parent / "any").touch()
+    assert file.stat().st_mode == (file.parent / "any").stat().st_mode
+
+
 @pytest.mark.parametrize("suffix", [".ckpt", ".safetensors"])
 def test_learned_motion_is_part_of_the_weights(tmp_path, suffix):
     made = network(motion=Spike2Flow(**FLOW_TINY))
