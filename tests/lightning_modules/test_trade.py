@@ -173,7 +173,7 @@ def test_usual_settings_all_run_on_weights_of_ones_own(shared, checkpoint, tmp_p
     assert [name for name, row in rows.items() if row["failed"]] == []
     psnr = {name: float(row["psnr"]) for name, row in rows.items()}
     assert psnr["own weights"] == pytest.approx(psnr["own weights, tiles of 64"], abs=1e-4)  # a clip of 12 is in one
-    motions = "own weights", "own weights, motion of 1 warp", "own weights, no motion"
+    motions = "own weights", "own weights, coarse motion", "own weights, no motion"
     assert len({psnr[name] for name in (*motions, "TFI", "TFP 41", "TFP 13, order 3")}) == 6
 
 
