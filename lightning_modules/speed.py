@@ -60,7 +60,9 @@ class Choice:
 def choices(scale: int, size: tuple[int, int]) -> list[Choice]:
     """Return the settings of the table for a scale that are arguments of the model alone, fastest first.
 
-    Time and memory are taken to grow with the number of pixels.
+    Time and memory are taken to grow with the number of pixels; times are the table's ratios, taken times that of its
+    first setting. A setting without tiles is left out: on recordings larger than the table's clips its memory has no
+    bound, and on the clips themselves it is the first one.
 
     Args:
         scale: super-resolution factor.
@@ -73,10 +75,11 @@ def choices(scale: int, size: tuple[int, int]) -> list[Choice]:
     found = []
     for row in rows:
         args = tuple(shlex.split(row["arguments"]))
-        if all(word.startswith("--model.") for word in args if word.startswith("-")):  # a precision is the Trainer's
+        of_the_model = all(word.startswith("--model.") for word in args if word.startswith("-"))  # precision is not
+        if of_the_model and "--model.tile 0" not in row["arguments"]:
             pixels = size[0] * size[1] / (int(row["height"]) * int(row["width"]))
-            psnr, ms, mib = (float(row[name]) for name in ("psnr", "ms", "mib"))
-            found.append(Choice(row["setting"], args, psnr, 0.0, ms * pixels, mib * pixels))
+            psnr, ratio, mib = (float(row[name]) for name in ("psnr", "ratio", "mib"))
+            found.append(Choice(row["setting"], args, psnr, 0.0, ratio * float(rows[0]["ms"]) * pixels, mib * pixels))
     best = max(choice.psnr for choice in found)
     found = [replace(choice, below=best - choice.psnr) for choice in found]
     return sorted(found, key=lambda choice: choice.ms)
