@@ -16,7 +16,7 @@ from lightning_modules.speed import SPEEDS, choices, choose, pace
 from spikekit import read_picture, write_spikes
 
 HEADER = ["setting", "psnr", "ratio", "mib", "height", "width", "arguments", "failed", "ms"]
-DECODER = "--model.network ClassicalDecoder --model.network.scale 3 --model.network.method"
+DECODER = "--model.network ClassicalDecoder --model.network.method"
 ROWS = [
     ("all", 30.0, 400, 80, 40, 50, "--model.weights {weights}", ""),
     ("no tiles", 30.0, 350, 20, 40, 50, "--model.weights {weights} --model.tile 0", ""),
@@ -173,4 +173,5 @@ def test_tables_of_the_package(monkeypatch):
         assert {choice.args[1] for choice in found if choice.args[0] == "--model.weights"} <= names
         assert [choose(scale, name).ms for name in SPEEDS] == sorted(choose(scale, name).ms for name in SPEEDS)
         for choice in found:
-            SuperResolution.from_pretrained(scale, budget=f"{choice.ms + 0.001:.6f}ms")
+            module = SuperResolution.from_pretrained(scale, budget=f"{choice.ms + 0.001:.6f}ms")
+            assert module.network.scale == scale
