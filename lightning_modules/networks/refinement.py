@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lightning_modules.networks.layers import ConvBlock, conv
+from lightning_modules.networks.layers import ConvBlock, channels_last, conv
 
 
 class FeatureRefinement(nn.Module):
@@ -34,7 +34,10 @@ class FeatureRefinement(nn.Module):
         weight = residual.weight.unflatten(1, (pixels.shape[1], -1))
         weight = (weight - weight.mean(dim=1, keepdim=True)).flatten(1, 2)
         seen = F.conv2d(
-            pixels.flatten(1, 2), torch.cat([base.weight, weight]), torch.cat([base.bias, residual.bias]), padding=1
+            channels_last(pixels.flatten(1, 2)),
+            torch.cat([base.weight, weight]),
+            torch.cat([base.bias, residual.bias]),
+            padding=1,
         )
         ends = torch.cat([base_end.weight, residual_end.weight], dim=1)
         return F.conv2d(seen.relu_(), ends, base_end.bias + residual_end.bias, padding=1)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lightning_modules.networks.layers import ConvBlock, ResBlock, conv
+from lightning_modules.networks.layers import ConvBlock, ResBlock, channels_last, conv
 from spikekit import tfi
 
 
@@ -57,10 +58,15 @@ class SpikeRepresentation(nn.Module):
     def forward(self, spikes: Tensor) -> Tensor:  # noqa: D102
         windows = spikes.unfold(1, self.window, self.stride).movedim(-1, 2)
         batch, times = windows.shape[:2]
-        seen = self.local(windows.flatten(0, 1))
+        local = self.local(channels_last(windows.flatten(0, 1)))
+        (fuse, relu), block, last = self.fuse
+        weight = fuse.weight.split(local.shape[1], dim=1)
+        seen = F.conv2d(local, weight[0], fuse.bias, padding=1)
         if self.whole is not None:
-            seen = torch.cat([seen, self.whole(spikes).repeat_interleave(times, dim=0)], dim=1)
-        return self.fuse(seen).unflatten(0, (batch, times))
+            # what is seen of the whole clip is the same at all times: it is convolved once, apart
+            whole = F.conv2d(self.whole(channels_last(spikes)), weight[1], padding=1)
+            seen.unflatten(0, (batch, times)).add_(whole.unsqueeze(1))
+        return last(block(relu(seen))).contiguous().unflatten(0, (batch, times))
 
 
 class WindowMeans(nn.Module):
