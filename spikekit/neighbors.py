@@ -148,6 +148,11 @@ def _table(key: _Key, neighbors: int, steps: int, dtype: torch.dtype) -> Positio
     return PositionTable(known, neighbors, steps, _search_in, dtype, device)
 
 
+def table_of(mask: Tensor, neighbors: int, steps: int, dtype: torch.dtype) -> PositionTable:
+    """Return the table of a mask, with weights in ``dtype``, kept between calls."""
+    return _table(_key(mask), neighbors, steps, dtype)
+
+
 def _search_in(known: np.ndarray, neighbors: int, cell: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
     products = _products((known.tobytes(), *known.shape, "cpu"), neighbors)
     return _search_and_weigh(products, neighbors, known.shape[1], cell, part)
@@ -180,7 +185,7 @@ def _nearest_known(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tu
     """
     count, _, height, width = flow.shape
     if steps:
-        find = _table(_key(mask), neighbors, steps, flow.dtype).find
+        find = table_of(mask, neighbors, steps, flow.dtype).find
     else:
         find = partial(_search_and_weigh, products_of(mask, neighbors), neighbors, width)
     # double, so that what is nearer does not depend on rounding
@@ -213,7 +218,7 @@ def _(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, T
 @nearest_known.register_kernel("cpu")
 def _(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
     if steps:
-        return cpu_warp.nearest_in_table(flow, _table(_key(mask), neighbors, steps, flow.dtype))
+        return cpu_warp.nearest_in_table(flow, table_of(mask, neighbors, steps, flow.dtype))
     if neighbors == 4:
         products = products_of(mask, neighbors)
         if len(products) <= 2 and all(len(table) == 4 for product in products for table in product):
@@ -242,29 +247,33 @@ def _rounded(flow: Tensor, steps: int) -> tuple[Tensor, Tensor]:
     return flow + (rounded - flow.detach()), moved == position
 
 
-class _NearestKnown(torch.autograd.Function):
+class NearestKnown(torch.autograd.Function):
     """:func:`nearest_known` with the derivative of the weights in the flow."""
 
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
+    def forward(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:  # noqa: D102
         return nearest_known(flow, mask, neighbors, steps)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, int, int], output: tuple[Tensor, Tensor]) -> None:
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:  # noqa: D102
         index, weight = output
         ctx.mark_non_differentiable(index)
         ctx.steps = inputs[3]
         ctx.save_for_backward(inputs[0], index, weight)
 
     @staticmethod
-    def backward(ctx: Any, _: Tensor, grad: Tensor) -> tuple[Tensor, None, None, None]:
-        flow, index, weight = ctx.saved_tensors
+    def backward(ctx: Any, _: Tensor, grad: Tensor) -> tuple[Tensor, None, None, None]:  # noqa: D102
+        return NearestKnown.of_flow(*ctx.saved_tensors, grad, ctx.steps), *[None] * 3
+
+    @staticmethod
+    def of_flow(flow: Tensor, index: Tensor, weight: Tensor, grad: Tensor, steps: int) -> Tensor:
+        """Derivative in the flow, from that in the weights."""
         _, _, height, width = flow.shape
         inside = 1
-        if ctx.steps:
-            flow, inside = _rounded(flow, ctx.steps)
+        if steps:
+            flow, inside = _rounded(flow, steps)
         whole = flow.detach().round()
         part = (flow - whole).flatten(2)
         pixel = torch.arange(height * width, device=flow.device)
@@ -279,7 +288,7 @@ class _NearestKnown(torch.autograd.Function):
         far = others * (grad[:, 1:] - (weight * grad).sum(dim=1, keepdim=True))
         factor = torch.cat([near, far], dim=1) / torch.where(square < torch.finfo(flow.dtype).tiny, 1, square)
         result = torch.stack([(factor * dx).sum(dim=1), (factor * dy).sum(dim=1)], dim=1).reshape(flow.shape)
-        return result * inside, *[None] * 3
+        return result * inside
 
 
 def idw_neighbors(flow: Tensor, mask: Tensor, neighbors: int = 4, steps: int | None = None) -> tuple[Tensor, Tensor]:
@@ -296,4 +305,4 @@ def idw_neighbors(flow: Tensor, mask: Tensor, neighbors: int = 4, steps: int | N
         are differentiable in the flow. Where fewer pixels are known, the nearest is repeated with weight 0.
     """
     flow = finite(flow.to(torch.promote_types(flow.dtype, torch.float32)))
-    return _NearestKnown.apply(flow, mask, neighbors, steps or 0)
+    return NearestKnown.apply(flow, mask, neighbors, steps or 0)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from spikekit.check import check_planes, check_whole
 from spikekit.gather import Gather
 from spikekit.neighbors import finite, idw_neighbors
+from spikekit.table_warp import in_one_go, warp_by_table
 
 
 def _check_warp(name: str, image: Tensor, flow: Tensor) -> None:
@@ -129,8 +130,12 @@ def flow_warp_idw(
     neighbors = check_whole("neighbors", neighbors)
     steps = None if steps is None else check_whole("steps", steps)
     dtype = torch.promote_types(features.dtype, flow.dtype)
-    index, weight = idw_neighbors(flow.reshape(-1, 2, height, width).to(dtype), mask, neighbors, steps)
+    flow = flow.reshape(-1, 2, height, width).to(dtype)
     values = features.reshape(-1, features.shape[-3], height * width)
+    if steps and in_one_go(values):
+        flow = flow.to(torch.promote_types(dtype, torch.float32))
+        return warp_by_table(values, flow, mask, neighbors, steps).reshape(features.shape)
+    index, weight = idw_neighbors(flow, mask, neighbors, steps)
     return Gather.apply(values, index, weight).reshape(features.shape)
 
 

@@ -11,7 +11,7 @@ from kornia.filters import filter2d_separable
 from torch import Tensor, nn
 
 from lightning_modules.motion import MotionEstimator, ZeroFlow
-from lightning_modules.networks.layers import ResBlock
+from lightning_modules.networks.layers import ResBlock, fold
 from lightning_modules.networks.motion_fusion import assembled_motion, independent_motion, joint_motion
 from lightning_modules.networks.network import Network
 from lightning_modules.networks.reconstruction import ColorCorrelation, EarlyFusion, SeparateColors
@@ -241,7 +241,7 @@ class CSCSR(Network):
             pixels = map(self._search, features, offsets, self._mask(height, width, spikes.device))
         else:
             pixels = map(self._enlarge, features)
-        pixels = (F.pixel_unshuffle(part.flatten(0, 1), self.fold).unflatten(0, part.shape[:2]) for part in pixels)
+        pixels = (fold(part.flatten(1, 2), self.fold) for part in pixels)
         rgb = self.reconstruction([refine(part) for refine, part in zip(self.refinement, pixels, strict=True)])
         return rgb + self._base(spikes) if self.skip else rgb
 

@@ -11,6 +11,13 @@ def channels_last(planes: Tensor) -> Tensor:
     return planes.contiguous(memory_format=torch.channels_last)
 
 
+def fold(planes: Tensor, size: int) -> Tensor:
+    """(B, C, size H, size W) to (B, C size^2, H, W) as ``pixel_unshuffle``, with the channels side by side."""
+    batch, channels, height, width = planes.shape
+    blocks = planes.reshape(batch, channels, height // size, size, width // size, size).permute(0, 2, 4, 1, 3, 5)
+    return channels_last(blocks.flatten(3).movedim(-1, 1))
+
+
 def conv(inputs: int, outputs: int) -> nn.Conv2d:
     """3 x 3 convolution that keeps the size."""
     return nn.Conv2d(inputs, outputs, 3, padding=1)

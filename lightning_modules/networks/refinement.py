@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lightning_modules.networks.layers import ConvBlock, channels_last, conv
+from lightning_modules.networks.layers import ConvBlock, conv
 
 
 class FeatureRefinement(nn.Module):
@@ -18,12 +18,13 @@ class FeatureRefinement(nn.Module):
         width: channels of the result.
 
     Shape:
-        - Input: temporal-pixel features :math:`(B, T, features, H, W)`
+        - Input: temporal-pixel features, one time point after another, :math:`(B, T features, H, W)`
         - Output: :math:`(B, width, H, W)`
     """
 
     def __init__(self, times: int, features: int, width: int) -> None:
         super().__init__()
+        self.times = times
         self.base = nn.Sequential(ConvBlock(times * features, width), conv(width, width))
         self.residual = nn.Sequential(ConvBlock(times * features, width), conv(width, width))
 
@@ -31,19 +32,15 @@ class FeatureRefinement(nn.Module):
         (base, _), base_end = self.base
         (residual, _), residual_end = self.residual
         # the mean is taken off the weights, which are few, not off the pixels, and both branches run as one
-        weight = residual.weight.unflatten(1, (pixels.shape[1], -1))
+        weight = residual.weight.unflatten(1, (self.times, -1))
         weight = (weight - weight.mean(dim=1, keepdim=True)).flatten(1, 2)
-        seen = F.conv2d(
-            channels_last(pixels.flatten(1, 2)),
-            torch.cat([base.weight, weight]),
-            torch.cat([base.bias, residual.bias]),
-            padding=1,
-        )
+        weight, bias = torch.cat([base.weight, weight]), torch.cat([base.bias, residual.bias])
+        seen = F.conv2d(pixels, weight, bias, padding=1)
         ends = torch.cat([base_end.weight, residual_end.weight], dim=1)
         return F.conv2d(seen.relu_(), ends, base_end.bias + residual_end.bias, padding=1)
 
 
-class TimeFusion(nn.Sequential):
+class TimeFusion(nn.Conv2d):
     """No refinement (ablations F and G): one convolution over the features of all time points.
 
     Args:
@@ -56,7 +53,7 @@ class TimeFusion(nn.Sequential):
     """
 
     def __init__(self, times: int, features: int, width: int) -> None:
-        super().__init__(nn.Flatten(1, 2), conv(times * features, width))
+        super().__init__(times * features, width, 3, padding=1)
         self.times = times
 
     @torch.no_grad()
@@ -69,7 +66,7 @@ class TimeFusion(nn.Sequential):
         Args:
             pixels: temporal pixels in which the first feature comes, the first channels of every time point.
         """
-        weight = self[1].weight.unflatten(1, (self.times, -1))
+        weight = self.weight.unflatten(1, (self.times, -1))
         means = min(pixels, len(weight))
         weight[:means] = 0
         for pixel in range(means):

@@ -17,8 +17,10 @@ from spikekit.bench.case import Case, Other, Setup, floats, sizes
 from spikekit.bench.measure import Run
 from spikekit.cfa import bayer_mask, bin_to_sensor, mosaic, split_colors
 from spikekit.demosaic import demosaic
+from spikekit.gather import Gather
 from spikekit.metrics import ssim
 from spikekit.motion import linear_motion
+from spikekit.neighbors import idw_neighbors
 from spikekit.warp import flow_warp, flow_warp_idw
 
 
@@ -63,21 +65,28 @@ def _flow_warp_idw(setup: Setup) -> Iterator[Case]:
             others,
         )
 
-    def table(colour: str, mask: Tensor) -> Case:
-        exact = partial(_warp, flow_warp_idw, features, flow, None, mask=mask)
+    def table(colour: str, mask: Tensor, channels: int) -> Case:
+        values = features[:, :channels]
+        exact = partial(_warp, flow_warp_idw, values, flow, None, mask=mask)
         return replace(
             case(colour, mask, "NCHW", backward=False),
-            name=f"{colour}, {sizes(features)} NCHW, forward, steps = 16",
+            name=f"{colour}, {sizes(values)} NCHW, forward, steps = 16",
             run=partial(exact, steps=16),
-            others=[Other("without steps", lambda: exact, _values, 1 / 16, "an approximation: within 1/16, on noise")],
+            read=4 * (mask.mean().item() * values.numel() + flow.numel()),
+            written=4 * values.numel(),
+            others=[
+                Other("without steps", lambda: exact, _values, 1 / 16, "an approximation: within 1/16, on noise"),
+                Other("search, then gather", lambda: partial(_search_then_gather, values, flow, mask), _values),
+            ],
         )
 
     for layout in _LAYOUTS:
         for backward in (False, True):
             yield case("R", red, layout, backward)
             yield case("G", green, layout, backward)
-    yield table("R", red)
-    yield table("G", green)
+    for channels in dict.fromkeys((2, size.channels)):
+        yield table("R", red, channels)
+        yield table("G", green, channels)
 
 
 _LAYOUTS = {"NCHW": torch.contiguous_format, "channels-last": torch.channels_last}
@@ -95,6 +104,11 @@ def _warp(warp: Any, features: Tensor, flow: Tensor, grad: Tensor | None, **opti
     features, flow = features.detach().requires_grad_(), flow.detach().requires_grad_()
     result = warp(features, flow, **options)
     return (result.detach(), *torch.autograd.grad(result, (features, flow), grad))
+
+
+def _search_then_gather(features: Tensor, flow: Tensor, mask: Tensor) -> tuple[Tensor]:
+    """What runs where Numba is not installed."""
+    return (Gather.apply(features.flatten(2), *idw_neighbors(flow, mask, steps=16)).reshape(features.shape),)
 
 
 def _mosaic(setup: Setup) -> Iterator[Case]:

@@ -5,6 +5,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks import CSCSR, ClassicalDecoder
+from lightning_modules.networks.layers import fold
 from lightning_modules.networks.refinement import FeatureRefinement
 from lightning_modules.networks.representation import SpikeRepresentation, WindowMeans
 from lightning_modules.tiles import forward_in_tiles
@@ -177,13 +178,22 @@ def test_representation_starts_at_the_mean_of_the_window(global_perception):
         torch.testing.assert_close(represent(plane)[:, :, :1], WindowMeans(11, 3)(plane))
 
 
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_fold_is_pixel_unshuffle(size):
+    planes = torch.rand(1, 5, 2 * size, 4 * size)
+    folded = fold(planes, size)
+    assert torch.equal(folded, torch.nn.functional.pixel_unshuffle(planes, size))
+    assert folded.stride() == folded.contiguous(memory_format=torch.channels_last).stride()
+
+
 def test_refinement_looks_at_what_deviates_from_the_mean():
     """Section 4.3: a base layer of everything, and a residual layer of what is left without the mean over time."""
     refine, pixels = FeatureRefinement(5, 3, 4).double(), torch.rand(2, 5, 3, 6, 7, dtype=torch.float64)
     residual = pixels - pixels.mean(dim=1, keepdim=True)
     expected = refine.base(pixels.flatten(1, 2)) + refine.residual(residual.flatten(1, 2))
-    torch.testing.assert_close(refine(pixels), expected)
-    got, wanted = (torch.autograd.grad(out.square().sum(), refine.parameters()) for out in (refine(pixels), expected))
+    refined = refine(pixels.flatten(1, 2))
+    torch.testing.assert_close(refined, expected)
+    got, wanted = (torch.autograd.grad(out.square().sum(), refine.parameters()) for out in (refined, expected))
     torch.testing.assert_close(got, wanted)
 
 
@@ -192,7 +202,7 @@ def test_fusion_of_times_starts_at_the_mean(resolution, means):
     network = CSCSR(2, **TINY | {"features": 3, "width": 6}, refinement=False, resolution=resolution)
     pixels = torch.rand(2, 11, 3 * means, 5, 6)
     for fuse in network.refinement:
-        torch.testing.assert_close(fuse(pixels)[:, :means], pixels[:, :, :means].mean(dim=1))
+        torch.testing.assert_close(fuse(pixels.flatten(1, 2))[:, :means], pixels[:, :, :means].mean(dim=1))
         assert fuse[1].weight[means:].abs().min() > 0
 
 
