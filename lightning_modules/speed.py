@@ -76,8 +76,6 @@ def choices(scale: int, size: tuple[int, int]) -> list[Choice]:
     for row in rows:
         args = tuple(shlex.split(row["arguments"]))
         of_the_model = all(word.startswith("--model.") for word in args if word.startswith("-"))  # precision is not
-        if "--model.weights" not in args:  # which know their scale; a decoder took it from the scenes of the table
-            args += "--model.network.scale", str(scale)
         if of_the_model and "--model.tile 0" not in row["arguments"]:
             pixels = size[0] * size[1] / (int(row["height"]) * int(row["width"]))
             psnr, ratio, mib = (float(row[name]) for name in ("psnr", "ratio", "mib"))

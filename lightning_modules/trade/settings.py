@@ -109,5 +109,6 @@ def usual_settings(scale: int, own: Sequence[str] = ()) -> list[Setting]:
         for place, network in enumerate(networks)
         for name, args in ([*learned, *_EFFORT, *_VARIANTS] if place == 0 else _EFFORT)
     ]
-    without = [word for option in own for word in (option, "null")]
-    return networks + variants + [Setting(name, [*shlex.split(args), *without]) for name, args in _DECODERS]
+    # weights know their scale, decoders are told it: the arguments of a row are to serve without the configuration
+    rest = ["--model.network.scale", str(scale), *(word for option in own for word in (option, "null"))]
+    return networks + variants + [Setting(name, [*shlex.split(args), *rest]) for name, args in _DECODERS]
