@@ -188,7 +188,7 @@ def test_usual_settings_are_those_of_the_weights_that_are_shipped(monkeypatch):
     assert settings["x4-s, no motion"][:2] == ["--model.weights", "x4-s"]
     assert len([name for name in settings if name.startswith("x4-s")]) == 3
     assert not [name for name in settings if name.startswith("x2")]
-    assert settings["TFI"][-1] == "tfi"
+    assert settings["TFI"][-3:] == ["tfi", "--model.network.scale", "4"]
     own = dict(usual_settings(4, ["--ckpt_path"]))
     assert own["own weights"] == []
     assert own["TFI"][-2:] == ["--ckpt_path", "null"]
