@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import os
-import platform
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ import torch
 from lightning_modules.quality import why_no_lpips
 from lightning_modules.trade.measure import Row, Timed, quartiles, running
 from lightning_modules.trade.pareto import pareto_front
-from spikekit.bench import cpu_name
+from spikekit.bench import cpu_name, software
 
 #: what the columns mean, for the table and for ``--help``
 COLUMNS = """\
@@ -75,7 +74,7 @@ def machine(rows: Sequence[Row], timed: Timed) -> str:
         [
             f"machine  {', '.join([*gpus, cpu_name()])}, {_count(os.cpu_count(), 'core')}, "
             f"{_count(torch.get_num_threads(), 'thread')}",
-            f"torch    {torch.__version__}, Python {platform.python_version()}, {platform.system()}",
+            software(),
             f"quality  mean of {_count(scored, 'clip')}",
             f"time     {timed.unit}; {_count(clips, 'clip')} of {height} x {width} sensor pixels in turns, "
             f"{_count(timed.rounds, 'round')}",

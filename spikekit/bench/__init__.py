@@ -16,6 +16,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import torch
@@ -188,8 +189,7 @@ def _header(device: torch.device, unit: str, size: str) -> str:
     heap = [f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith("MALLOC_")]
     lines = [
         f"machine  {cpu_name()}, {os.cpu_count()} cores, {torch.get_num_threads()} threads used",
-        f"torch    {torch.__version__}, Python {platform.python_version()}, {platform.system()}"
-        + "".join(f", {setting}" for setting in heap),
+        ", ".join([software(), *heap]),
         f"time     {unit}; size {size}, seed {SEED}",
     ]
     if device.type == "cuda":
@@ -202,6 +202,15 @@ def cpu_name() -> str:
     with suppress(OSError, AttributeError):
         return re.search(r"^model name\s*:\s*(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)[1]  # type: ignore[index]
     return platform.processor() or platform.machine()
+
+
+def software() -> str:
+    """Return, as a line, what times depend on."""
+    try:
+        numba = f"Numba {version('numba')}"
+    except PackageNotFoundError:
+        numba = "no Numba"
+    return f"torch    {torch.__version__}, {numba}, Python {platform.python_version()}, {platform.system()}"
 
 
 def _fenced(text: str, markdown: bool) -> str:

@@ -1,6 +1,7 @@
 import argparse
 import sys
 import time
+from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
 import pytest
@@ -194,6 +195,16 @@ def test_missing_peers_are_named(without_peers):
     missing = {row.note for row in without_peers if row.ratio is None and row.other}
     assert all(note.startswith("not installed") for note in missing)
     assert {name for name in PEERS if any(name in note for note in missing)} == PEERS
+
+
+def test_says_whether_numba_is_there(monkeypatch):
+    def missing(name):
+        raise PackageNotFoundError(name)
+
+    pytest.importorskip("numba", reason="Numba is not installed")
+    assert f"Numba {version('numba')}, Python" in bench.software()
+    monkeypatch.setattr(bench, "version", missing)
+    assert "no Numba, Python" in bench.software()
 
 
 @pytest.mark.parametrize("markdown", [False, True])
