@@ -36,7 +36,7 @@ def _look_up(flow, y, axes, row_place, column_place, place, pixel):
         moved_x, moved_y = flow[0, y, x], flow[1, y, x]
         step_x = np.int32(0 if np.isnan(moved_x) else np.rint(min(max(moved_x, -far_x), far_x) * steps))
         step_y = np.int32(0 if np.isnan(moved_y) else np.rint(min(max(moved_y, -far_y), far_y) * steps))
-        # whole divisions downwards, by multiplication, which processors do in rows
+        # floor division in floating point, which processors do many at a time
         whole_x = np.int32(np.floor((step_x + steps // 2 + 0.5) / steps))
         whole_y = np.int32(np.floor((step_y + steps // 2 + 0.5) / steps))
         cell_x, cell_y = whole_x + np.int32(x), whole_y + np.int32(y)
