@@ -19,8 +19,6 @@ from lightning_modules.networks.refinement import FeatureRefinement, TimeFusion
 from lightning_modules.networks.representation import IntervalRepresentation, SpikeRepresentation, WindowMeans
 from spikekit import bayer_mask, bayer_pattern, demosaic, flow_warp_idw, linear_motion, split_colors, tfp_at
 from spikekit.check import check_planes, check_scale
-from spikekit.gather import Gather
-from spikekit.neighbors import idw_neighbors
 
 _SEARCHED = 1 << 19  # positions that are searched in one go
 
@@ -272,14 +270,14 @@ class CSCSR(Network):
 
         Offsets of a single time point are those of all.
         """
+        how = {"neighbors": self.neighbors, "steps": self.steps or None}
         if offsets.shape[1] == 1:
-            index, weight = idw_neighbors(offsets[:, 0], mask, self.neighbors, self.steps)
             pixels = self._enlarge(features)
-            return Gather.apply(pixels.flatten(1, 2).flatten(2), index, weight).reshape(pixels.shape)
+            return flow_warp_idw(pixels.flatten(1, 2), offsets[:, 0], mask, **how).reshape(pixels.shape)
         # a few time points after the others: what the search needs on the way is many times its result
         few = max(1, _SEARCHED // (offsets.shape[-2] * offsets.shape[-1]))
         pixels = [
-            flow_warp_idw(self._enlarge(part), offset, mask, neighbors=self.neighbors, steps=self.steps or None)
+            flow_warp_idw(self._enlarge(part), offset, mask, **how)
             for part, offset in zip(features.flatten(0, 1).split(few), offsets.flatten(0, 1).split(few), strict=True)
         ]
         return torch.cat(pixels).unflatten(0, features.shape[:2])

@@ -95,11 +95,10 @@ def test_a_flow_of_0_searches_once(monkeypatch):
     from lightning_modules.networks import cscsr
 
     network, searched = CSCSR(2, **TINY), []
-    search = cscsr.idw_neighbors
+    warp = cscsr.flow_warp_idw
     monkeypatch.setattr(
-        cscsr, "idw_neighbors", lambda flow, *args: searched.append(tuple(flow.shape)) or search(flow, *args)
+        cscsr, "flow_warp_idw", lambda *args, **how: searched.append(tuple(args[1].shape)) or warp(*args, **how)
     )
-    monkeypatch.setattr(cscsr, "flow_warp_idw", None)
     spikes = torch.zeros(2, 41, 8, 8)
     network(spikes, 0).square().mean().backward()
     assert searched == [(2, 2, 16, 16)] * 3
