@@ -81,7 +81,7 @@ class CSCSR(Network):
         - Input: spikes :math:`(B, N, H, W)`, zeros and ones, any real dtype, any H and W of at least 3; optionally
           the flows from the middle to the first and to the last time point, :math:`(B, 2, 2, H, W)`, in sensor
           pixels, or those of R, G and B, :math:`(B, 3, 2, 2, H, W)`, or 0 where nothing moves: what flows of zeros
-          give, in about half the time
+          give, in less time
         - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
 
     Raises:
