@@ -16,7 +16,7 @@ from lightning_modules.learner import Learner
 from lightning_modules.networks import ClassicalDecoder, Network
 from lightning_modules.pretrained import load_weights, read_weights, with_own_motion
 from lightning_modules.speed import choose
-from lightning_modules.tiles import forward_in_tiles
+from lightning_modules.tiles import TILE, forward_in_tiles
 from spikekit import psnr, ssim
 
 
@@ -50,7 +50,7 @@ class SuperResolution(Learner):
         network: Network,
         optimizer: OptimizerCallable = lambda parameters: torch.optim.Adam(parameters, lr=1e-4),
         lr_scheduler: LRSchedulerCallable = lambda optimizer: torch.optim.lr_scheduler.StepLR(optimizer, 7500, 0.8),
-        tile: int = 128,
+        tile: int = TILE,
         tolerance: float = 0.0,
         flow: Literal["scene", "estimated"] = "scene",
         weights: str | None = None,

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import torch
 
+from lightning_modules.tiles import FAR, HALO, TILE
 from spikekit.bench.measure import timer_of
 
 _FOLDER = Path(__file__).parent / "weights"
@@ -60,9 +61,10 @@ class Choice:
 def choices(scale: int, size: tuple[int, int]) -> list[Choice]:
     """Return the settings of the table for a scale that are arguments of the model alone, fastest first.
 
-    Time and memory are taken to grow with the number of pixels; times are the table's ratios, taken times that of its
-    first setting. A setting without tiles is left out: on recordings larger than the table's clips its memory has no
-    bound, and on the clips themselves it is the first one.
+    Time is taken to grow with the number of pixels; times are the table's ratios, taken times that of its first
+    setting. Memory, too, until a tile is full and all that motion may reach over; beyond, a frame's own share grows,
+    such as its picture, which is what the leanest setting takes. A setting without tiles is left out: on recordings
+    larger than the table's clips its memory has no bound, and on the clips themselves it is the first one.
 
     Args:
         scale: super-resolution factor.
@@ -72,14 +74,19 @@ def choices(scale: int, size: tuple[int, int]) -> list[Choice]:
         ValueError: no table comes with the package for this scale.
     """
     rows = _table(scale)
+    frame = min(float(row["mib"]) for row in rows)
     found = []
     for row in rows:
         args = tuple(shlex.split(row["arguments"]))
         of_the_model = all(word.startswith("--model.") for word in args if word.startswith("-"))  # precision is not
         if of_the_model and "--model.tile 0" not in row["arguments"]:
-            pixels = size[0] * size[1] / (int(row["height"]) * int(row["width"]))
+            measured = int(row["height"]) * int(row["width"])
+            pixels = size[0] * size[1] / measured
+            tile = int(args[args.index("--model.tile") + 1]) if "--model.tile" in args else TILE
+            in_tile = min(pixels, (tile + 2 * (HALO + FAR)) ** 2 / measured)
             psnr, ratio, mib = (float(row[name]) for name in ("psnr", "ratio", "mib"))
-            found.append(Choice(row["setting"], args, psnr, 0.0, ratio * float(rows[0]["ms"]) * pixels, mib * pixels))
+            mib = frame * pixels + (mib - frame) * in_tile
+            found.append(Choice(row["setting"], args, psnr, 0.0, ratio * float(rows[0]["ms"]) * pixels, mib))
     best = max(choice.psnr for choice in found)
     found = [replace(choice, below=best - choice.psnr) for choice in found]
     return sorted(found, key=lambda choice: choice.ms)

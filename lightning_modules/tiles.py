@@ -12,6 +12,8 @@ from lightning_modules.look import CELL, look, required
 from lightning_modules.motion import ZeroFlow
 from lightning_modules.networks import Network
 
+#: side of a tile, in sensor pixels, where nothing else is asked for
+TILE = 128
 #: sensor pixels around a tile that are computed and thrown away, beside those that motion reaches over: what shipped
 #: networks see beyond them changes a picture by 2e-6 at most
 HALO = 12
