@@ -2,9 +2,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from skimage import io
-
-from lightning_modules.networks.refinement import FeatureRefinement
 
 
 @pytest.fixture
@@ -13,15 +12,18 @@ def configs():
     return Path(__file__).parents[2] / "configs"
 
 
-@pytest.fixture(name="plain_refinement")
-def _plain_refinement(monkeypatch):
-    """FR layer by layer, as it is written in the paper, for what counts the work of layers."""
+@pytest.fixture(name="convolutions")
+def _convolutions(monkeypatch):
+    """Every convolution that runs, as (multiplications, whether its input has a gradient)."""
+    seen, run = [], torch.nn.functional.conv2d
 
-    def forward(self, pixels):
-        times = pixels.unflatten(1, (self.times, -1))
-        return self.base(pixels) + self.residual((times - times.mean(dim=1, keepdim=True)).flatten(1, 2))
+    def conv2d(x, weight, *args, **options):
+        output = run(x, weight, *args, **options)
+        seen.append((weight[0].numel() * output.numel(), x.requires_grad))
+        return output
 
-    monkeypatch.setattr(FeatureRefinement, "forward", forward)
+    monkeypatch.setattr(torch.nn.functional, "conv2d", conv2d)
+    return seen
 
 
 def _write_film(folder, count, size=(32, 48), name="{:08d}.png", seed=0, first=0):

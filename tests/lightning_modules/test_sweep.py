@@ -281,8 +281,7 @@ def test_a_trial_that_fails_is_reported_and_the_others_go_on(typed, overlays, tm
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("plain_refinement")
-def test_flops_pay_for_steps(typed, overlays, tmp_path):
+def test_flops_pay_for_steps(typed, overlays, tmp_path, convolutions):
     words = [*typed[1:], "-c", str(overlays / "cosine.yaml")]
     [trial] = make_trials([words[0], words[2], words[4]], [], [], [], {"flops": 1e9}, tmp_path)
     trial.write()
@@ -292,18 +291,10 @@ def test_flops_pay_for_steps(typed, overlays, tmp_path):
 
     built = run(["fit", "-c", str(trial.folder / "trial.yaml")], _Resolver)
     batch = next(iter(built.datamodule.train_dataloader()))
-    count = 0
-
-    def add(layer, inputs, output):
-        nonlocal count
-        products = layer.weight[0].numel() * output.numel()
-        # forward, for the weights, and for what comes in where that was computed
-        count += 2 * products * (2 + inputs[0].requires_grad)
-
-    for layer in built.model.modules():
-        if isinstance(layer, torch.nn.Conv2d):
-            layer.register_forward_hook(add)
+    convolutions.clear()
     built.model.network(batch["spikes"], batch["flow"])
+    # forward, for the weights, and for what comes in where that was computed
+    count = sum(2 * products * (2 + computed) for products, computed in convolutions)
     counted = float(re.search(r"(\S+) FLOPs", text.read_text()).group(1))
     assert counted == pytest.approx(count, rel=1e-4)
     steps = int(1e9 / count)
