@@ -62,8 +62,8 @@ def choices(scale: int, size: tuple[int, int]) -> list[Choice]:
     """Return the settings of the table for a scale that are arguments of the model alone, fastest first.
 
     Time is taken to grow with the number of pixels; times are the table's ratios, taken times that of its first
-    setting. Memory, too, until a tile is full and all that motion may reach over; beyond, a frame's own share grows,
-    such as its picture, which is what the leanest setting takes. A setting without tiles is left out: on recordings
+    setting. Memory grows with them, too, until a tile is full, with all that motion may reach over; from there on only
+    by what the leanest setting takes, such as the picture itself. A setting without tiles is left out: on recordings
     larger than the table's clips its memory has no bound, and on the clips themselves it is the first one.
 
     Args:

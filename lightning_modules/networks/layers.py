@@ -12,7 +12,7 @@ def channels_last(planes: Tensor) -> Tensor:
 
 
 def fold(planes: Tensor, size: int) -> Tensor:
-    """(B, C, size H, size W) to (B, C size^2, H, W) as ``pixel_unshuffle``, with the channels side by side."""
+    """(B, C, size H, size W) to (B, C size^2, H, W) as ``pixel_unshuffle`` and :func:`channels_last` in one copy."""
     batch, channels, height, width = planes.shape
     blocks = planes.reshape(batch, channels, height // size, size, width // size, size).permute(0, 2, 4, 1, 3, 5)
     return channels_last(blocks.flatten(3).movedim(-1, 1))

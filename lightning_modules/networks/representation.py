@@ -66,7 +66,8 @@ class SpikeRepresentation(nn.Module):
             # what is seen of the whole clip is the same at all times: it is convolved once, apart
             whole = F.conv2d(self.whole(channels_last(spikes)), weight[1], padding=1)
             seen.unflatten(0, (batch, times)).add_(whole.unsqueeze(1))
-        return last(block(relu(seen))).contiguous().unflatten(0, (batch, times))
+        features = last(block(relu(seen))).contiguous()  # planes again, as the search along the motion reads them
+        return features.unflatten(0, (batch, times))
 
 
 class WindowMeans(nn.Module):
