@@ -5,29 +5,19 @@ What array operations would carry through memory, indices and weights of every p
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
+from spikekit.kernels.compiled import compiled, in_threads
 from spikekit.position_table import PositionTable
 
 _WORTH_THREADS = 1 << 16  # positions
 
 
-def _compiled(loop: Callable[..., Any]) -> Callable[..., Any]:
-    options = {"nogil": True, "error_model": "numpy"}
-    try:
-        return njit(loop, cache=True, **options)
-    except RuntimeError:  # no folder for the cache that can be written to
-        return njit(loop, **options)
-
-
-@_compiled
+@compiled
 def _look_up(flow, y, axes, row_place, column_place, place, pixel):
     """Where the positions of a row are in the table, and the pixels that they are looked up from."""
     height, width, steps, half, row_length = axes
@@ -48,7 +38,7 @@ def _look_up(flow, y, axes, row_place, column_place, place, pixel):
         pixel[x] = in_y * width + in_x
 
 
-@_compiled
+@compiled
 def _warp(planes, flow, axes, row_place, column_place, shift, weight, out, begin, end):
     """Rows ``begin`` to ``end`` of an image, planes (C, H W) to out (C, H, W)."""
     width = axes[1]
@@ -65,7 +55,7 @@ def _warp(planes, flow, axes, row_place, column_place, shift, weight, out, begin
                     row[x] += values[index[x]] * share[x]
 
 
-@_compiled
+@compiled
 def _unwarp(planes, flow, axes, row_place, column_place, shift, weight, out):
     """The transpose, planes (C, H, W) of an image to out (C, H W)."""
     height, width = axes[:2]
@@ -80,17 +70,6 @@ def _unwarp(planes, flow, axes, row_place, column_place, shift, weight, out):
                 row, sums = planes[c, y], out[c]
                 for x in range(width):
                     sums[index[x]] += row[x] * share[x]
-
-
-def _in_threads(loop: Callable[..., None], jobs: list[tuple[Any, ...]], positions: int) -> None:
-    threads = torch.get_num_threads()
-    if threads == 1 or positions < _WORTH_THREADS:
-        for job in jobs:
-            loop(*job)
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        for _ in pool.map(lambda job: loop(*job), jobs):
-            pass
 
 
 def _by_position(table: PositionTable) -> tuple[Any, ...]:
@@ -112,7 +91,7 @@ def warp(values: Tensor, flow: Tensor, table: PositionTable) -> Tensor:
         for n in range(count)
         for begin in range(0, height, rows)
     ]
-    _in_threads(_warp, jobs, count * height * width)
+    in_threads(_warp, jobs, worth=count * height * width >= _WORTH_THREADS)
     return torch.from_numpy(out).flatten(2)
 
 
@@ -125,5 +104,5 @@ def unwarp(grad: Tensor, flow: Tensor, table: PositionTable) -> Tensor:
     out = np.zeros((count, channels, height * width), moved.dtype)
     by_position = _by_position(table)
     jobs = [(planes[n], moved[n], *by_position, out[n]) for n in range(count)]
-    _in_threads(_unwarp, jobs, count * height * width)
+    in_threads(_unwarp, jobs, worth=count * height * width >= _WORTH_THREADS)
     return torch.from_numpy(out)

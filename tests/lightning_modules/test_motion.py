@@ -1,10 +1,8 @@
-import numpy as np
 import pytest
 import torch
 from scipy.ndimage import convolve1d
-from skimage.registration import optical_flow_tvl1
 
-from lightning_modules.motion import ClassicalFlow, MotionEstimator, ZeroFlow
+from lightning_modules.motion import ClassicalFlow, MotionEstimator, ZeroFlow, classical, tvl1
 from spikekit import mosaic, spike_integrate_fire, split_bayer, tfp_at
 
 TIMES = (5, 20, 35)
@@ -72,7 +70,7 @@ def test_any_size(size):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"attachment": 0.0}, {"attachment": float("nan")}, {"tolerance": -0.1}, {"tolerance": float("inf")}]
+    "wrong", [{"attachment": 0.0}, {"attachment": float("nan")}, {"warps": 0}, {"warps": 1.5}, {"warps": True}]
 )
 def test_wrong_argument(wrong):
     with pytest.raises(ValueError, match=f"{next(iter(wrong))}: expected"):
@@ -119,54 +117,76 @@ def test_few_frames():
         assert all(flow.isfinite().all() for flow in ClassicalFlow()(spikes, times, "RGGB"))
 
 
+def expected_flows(pictures, raw, clock, squared, border):
+    """Flows between decoded pictures (3, H, W), each half of the clip by itself where motion bends; here it does not.
+
+    ``squared`` are the weights of the raw pixels in a picture, along an axis, squared: noise adds up by them.
+    """
+    steps = torch.linspace(0, 1, 1025)[:-1]
+    noise = torch.from_numpy(classical._noise(13).numpy()[torch.searchsorted(steps, raw.mean(0), right=True) - 1])
+    for axis in range(2):
+        noise = torch.from_numpy(convolve1d(noise.numpy(), squared, axis, mode=border))
+    attachment = 80 / (1 + noise / 0.002**2)
+    times = torch.tensor([[clock[0] - clock[1], clock[2] - clock[1]]]) / (clock[2] - clock[0])
+    return tvl1.tvl1_flow(pictures[None, ::2], times, attachment[None])[0] / (clock[2] - clock[0]) * 15
+
+
 @pytest.mark.parametrize("size", [(32, 40), (33, 35)])
 def test_flows_of_the_sites_are_in_bayer_cells_and_in_the_order_of_split_bayer(size):
     spikes = moving((0.2, -0.1), *size, "GRBG").repeat(2, 1, 1, 1)
-    estimator = ClassicalFlow(tolerance=0.01)
-    flows = estimator.channel_flows(spikes, TIMES, "GRBG")
+    flows = ClassicalFlow().channel_flows(spikes, TIMES, "GRBG")
     sites = spike_sites(spikes, "GRBG")
     for flow in flows:
         assert flow.shape == (4, 2, 2, (size[0] + 1) // 2, (size[1] + 1) // 2)
     weights = torch.eye(41)
     for _ in range(3):
         weights = torch.stack([weights[max(n - 6, 0) : n + 7].mean(dim=0) for n in range(41)])
-    clock = weights @ torch.arange(41.0)
-    seen = [10, 20, 30]
-    pictures = torch.einsum("kn,sbnhw->ksbhw", weights[seen], sites.float())
+    clock, seen = (weights @ torch.arange(41.0)).tolist(), [10, 20, 30]
+    raw = torch.einsum("kn,sbnhw->sbkhw", weights[seen], sites.float())
     blur = torch.exp(-(torch.arange(-2.0, 3) ** 2) / (2 * 0.5**2))
-    blur = blur[:, None] * blur / blur.sum() ** 2
-    padded = torch.nn.functional.pad(pictures.flatten(0, 1), (2, 2, 2, 2), "replicate")
-    pictures = torch.conv2d(padded.flatten(0, 1)[:, None], blur[None, None]).reshape(pictures.shape).numpy()
+    blur = (blur / blur.sum()).numpy()
+    pictures = torch.from_numpy(convolve1d(convolve1d(raw.numpy(), blur, -1, mode="nearest"), blur, -2, mode="nearest"))
     for site in range(4):
-        velocity = 0
-        for k in (0, 2):
-            down, right = optical_flow_tvl1(pictures[1, site, 1], pictures[k, site, 1], attachment=30, dtype="float32")
-            velocity += torch.from_numpy(np.stack([right, down])) / (clock[seen[k]] - clock[20]) / 2
+        expected = expected_flows(pictures[site, 1], raw[site, 1], [clock[n] for n in seen], blur**2, "nearest")
         mean = (flows[1] - flows[0])[site, 1] / 2
-        torch.testing.assert_close(mean, velocity * 15, rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(mean, expected, rtol=1e-2, atol=2e-2)
 
 
 @pytest.mark.parametrize("pattern", ["RGGB", "GBRG"])
 def test_joint_flow_is_that_of_grey_pictures(pattern):
     spikes, clock = moving((0.2, -0.1), pattern=pattern), torch.arange(41.0).reshape(41, 1, 1)
-    binomial, grey, when = [0.25, 0.5, 0.25], [], []
+    binomial, raw, when = [0.25, 0.5, 0.25], [], []
     for n in (10, 20, 30):
-        rows = convolve1d(tfp_at(spikes[0].float(), n, 13, order=3).numpy(), binomial, 0, mode="mirror")
-        grey.append(convolve1d(rows, binomial, 1, mode="mirror"))
+        raw.append(tfp_at(spikes[0].float(), n, 13, order=3))
         when.append(tfp_at(clock, n, 13, order=3).item())
-    velocity = 0
-    for k in (0, 2):
-        down, right = optical_flow_tvl1(grey[1], grey[k], attachment=30, dtype="float32")
-        velocity += torch.from_numpy(np.stack([right, down])) / (when[k] - when[1]) / 2
-    to_first, to_last = ClassicalFlow(tolerance=0.01)(spikes, TIMES, pattern)
-    torch.testing.assert_close((to_last - to_first)[0] / 2, velocity * 15, rtol=1e-3, atol=1e-2)
+    raw = torch.stack(raw)
+    grey = torch.from_numpy(convolve1d(convolve1d(raw.numpy(), binomial, 1, mode="mirror"), binomial, 2, mode="mirror"))
+    expected = expected_flows(grey, raw, when, [0.0625, 0.25, 0.0625], "mirror")
+    to_first, to_last = ClassicalFlow()(spikes, TIMES, pattern)
+    torch.testing.assert_close((to_last - to_first)[0] / 2, expected, rtol=1e-2, atol=2e-2)
+
+
+@pytest.mark.parametrize("step", [3, 20, 46, 63, 102, 320, 512, 788])
+def test_noise_of_a_mean_is_that_of_an_ideal_pixel(step):
+    charge = (torch.arange(100_000, dtype=torch.float64) + 0.5) / 100_000
+    light = torch.full((41, 1, len(charge)), (step + 0.5) / 1024, dtype=torch.float64)
+    means = tfp_at(spike_integrate_fire(light, charge=charge.reshape(1, -1))[0].double(), 20, 13, order=3)
+    assert classical._noise(13)[step].item() == pytest.approx(means.var().item(), rel=1e-3)
+
+
+def test_dark_flicker_is_no_motion():
+    """A pixel that fires once in a clip says little of where it moves, and is not followed."""
+    light = torch.full((41, 48, 48), 0.02)
+    spikes = spike_integrate_fire(light, charge=torch.rand(48, 48, generator=torch.Generator().manual_seed(0)))[0][None]
+    far = ClassicalFlow(attachment=1e6)(spikes, TIMES, "RGGB")[1].norm(dim=1).mean()
+    assert ClassicalFlow()(spikes, TIMES, "RGGB")[1].norm(dim=1).mean() < 0.2 * far
 
 
 def test_mosaic_without_motion_is_no_motion():
     """The filter array stands still while the scene moves: what is left of it would hold the flow back."""
     colour = torch.tensor([0.9, 0.3, 0.1])[:, None, None].expand(3, 24, 24)
     light = 0.4 * mosaic(colour, "RGGB").expand(41, 24, 24)
-    grey = ClassicalFlow(tolerance=0.01)(spike_integrate_fire(light, charge=torch.rand(24, 24))[0][None], TIMES, "RGGB")
+    grey = ClassicalFlow()(spike_integrate_fire(light, charge=torch.rand(24, 24))[0][None], TIMES, "RGGB")
     assert all(flow.abs().max() < 0.3 for flow in grey)
 
 
@@ -195,21 +215,10 @@ def test_joint_flow_is_the_mean_of_the_sites_in_sensor_pixels(size):
     assert to_first.equal(-expected)
 
 
-def test_effort_follows_motion(monkeypatch):
-    from skimage.registration import _optical_flow
-
-    warped, warp = [], _optical_flow.warp
-    monkeypatch.setattr(_optical_flow, "warp", lambda *args, **options: warped.append(0) or warp(*args, **options))
-
-    def effort(velocity, tolerance):
-        warped.clear()
+def test_more_warps_are_more_exact():
+    def error(velocity, warps):
         truth = 15 * torch.tensor(velocity).reshape(1, 2, 1, 1)
-        error = (ClassicalFlow(tolerance=tolerance)(moving(velocity), TIMES, "RGGB")[1] - truth).norm(dim=1).mean()
-        return len(warped), error / truth.norm()
+        return (ClassicalFlow(warps=warps)(moving(velocity), TIMES, "RGGB")[1] - truth).norm(dim=1).mean().item()
 
-    (still, _), (slow, _), (fast, error), (all_of_it, _) = (
-        effort(velocity, tolerance)
-        for velocity, tolerance in [((0.0, 0.0), 0.1), ((0.04, 0.03), 0.1), ((0.25, -0.2), 0.1), ((0.25, -0.2), 0.0)]
-    )
-    assert still <= slow < fast < all_of_it, (still, slow, fast, all_of_it)
-    assert error < 0.1, error
+    once, twice, often = (error((0.25, -0.2), warps) for warps in (1, 2, 5))
+    assert once > 1.1 * twice > 1.1 * often, (once, twice, often)

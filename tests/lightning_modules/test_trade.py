@@ -164,8 +164,8 @@ def test_usual_settings_all_run_on_weights_of_ones_own(shared, checkpoint, tmp_p
     assert [name for name, row in rows.items() if row["failed"]] == []
     psnr = {name: float(row["psnr"]) for name, row in rows.items()}
     assert psnr["own weights"] == pytest.approx(psnr["own weights, tiles of 64"], abs=1e-4)  # a clip of 12 is in one
-    motions = "own weights", "own weights, coarse motion", "own weights, no motion"
-    assert len({psnr[name] for name in (*motions, "TFI", "TFP 41", "TFP 13, order 3")}) == 6
+    motions = "own weights", "own weights, no motion"
+    assert len({psnr[name] for name in (*motions, "TFI", "TFP 41", "TFP 13, order 3")}) == 5
 
 
 def test_usual_settings_are_those_of_the_weights_that_are_shipped(monkeypatch):
@@ -177,7 +177,7 @@ def test_usual_settings_are_those_of_the_weights_that_are_shipped(monkeypatch):
     assert "Spike2Flow" in settings["x4-e, Spike2Flow"]
     assert settings["x4-e, no motion"][:2] == ["--model.weights", "x4-e"]
     assert settings["x4-s, no motion"][:2] == ["--model.weights", "x4-s"]
-    assert len([name for name in settings if name.startswith("x4-s")]) == 3
+    assert len([name for name in settings if name.startswith("x4-s")]) == 2
     assert not [name for name in settings if name.startswith("x2")]
     assert settings["TFI"][-3:] == ["tfi", "--model.network.scale", "4"]
     own = dict(usual_settings(4, ["--ckpt_path"]))

@@ -1,0 +1,86 @@
+"""``python -m lightning_modules.motion``: motion without weights, beside what scikit-image has; error and time.
+
+Scenes whose flow is known, those of README's table of estimators; all estimate in turns, in one process.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from unittest import mock
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lightning_modules.data import StillScenes
+from lightning_modules.motion import ClassicalFlow, ZeroFlow, tvl1
+from spikekit.bench import cpu_name, software
+from spikekit.bench.measure import interleave, ratio, timer_of
+
+_TIMES = 5, 20, 35
+
+
+class ScikitImage(ClassicalFlow):
+    """The same pictures, given to scikit-image's TV-L1: a flow for each half of the clip, and their mean."""
+
+    def _velocities(self, pictures: Tensor, clock: Tensor, attachment: Tensor) -> Tensor:
+        from skimage.registration import optical_flow_tvl1
+
+        found = []
+        for before, middle, after in pictures.numpy():
+            flows = [
+                optical_flow_tvl1(middle, other, attachment=30, tol=0.01, dtype=np.float32)[::-1] / away
+                for other, away in ((before, float(clock[0] - clock[1])), (after, float(clock[2] - clock[1])))
+            ]
+            found.append(np.stack([sum(flows) / 2] * 2))
+        return torch.from_numpy(np.stack(found)).float()
+
+
+class WithoutNumba(ClassicalFlow):
+    """The same estimator in torch's operations."""
+
+    def _velocities(self, pictures: Tensor, clock: Tensor, attachment: Tensor) -> Tensor:
+        with mock.patch.object(tvl1, "_NUMBA", False):
+            return super()._velocities(pictures, clock, attachment)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(prog="python -m lightning_modules.motion", description=__doc__)
+    parser.add_argument("--clips", type=int, default=12, help="scenes")
+    parser.add_argument("--patch", type=int, default=48, help="side of a scene, in sensor pixels")
+    parser.add_argument("--motion", type=float, default=3.0, help="largest motion, in sensor pixels")
+    parser.add_argument("--root", help="folder of pictures; without it, held-out ones of scikit-image")
+    parser.add_argument("--rounds", type=int, default=5, help="timings of each")
+    args = parser.parse_args(arguments)
+    data = StillScenes(val_root=args.root, val_patch=args.patch, val_clips=args.clips, motion=args.motion, workers=0)
+    data.setup()
+    clips = [data.val_set[index] for index in range(args.clips)]
+    estimators = {
+        "ClassicalFlow": ClassicalFlow(),
+        "without Numba": WithoutNumba(),
+        "3 warps": ClassicalFlow(warps=3),
+        "1 warp": ClassicalFlow(warps=1),
+        "scikit-image's TV-L1": ScikitImage(),
+        "no motion": ZeroFlow(),
+    }
+    runs = {
+        name: lambda flow=flow: [torch.cat(flow(clip["spikes"][None], _TIMES, data.val_set.pattern)) for clip in clips]
+        for name, flow in estimators.items()
+    }
+    threads = torch.get_num_threads()
+    timer, counted = timer_of(torch.device("cpu"), threads)
+    times = interleave(runs, args.rounds, timer)
+    print(f"machine  {cpu_name()}, {threads} threads, {counted}, {args.rounds} rounds\n{software()}")  # noqa: T201
+    print("\n| estimator | end-point error (px) | ms a clip | time, ratio |\n|---|---|---|---|")  # noqa: T201
+    for name, run in runs.items():
+        errors = [(got - clip["flow"]).norm(dim=1).mean().item() for got, clip in zip(run(), clips, strict=True)]
+        taken = ratio(times[name], times["ClassicalFlow"])
+        spread = f"{taken.median:.2f} ({taken.least:.2f} to {taken.most:.2f})"
+        milliseconds = 1000 * float(np.median(times[name])) / len(clips)
+        print(f"| {name} | {sum(errors) / len(errors):.3f} | {milliseconds:.1f} | {spread} |")  # noqa: T201
+
+
+if __name__ == "__main__":
+    main()
