@@ -6,32 +6,22 @@ compiled, no index and no weight has to be kept, neither on the way nor for the 
 
 from __future__ import annotations
 
-from importlib import import_module
-from importlib.util import find_spec
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from spikekit.gather import Dot, fold_into_batch, weighted_gather, weighted_scatter
+from spikekit.kernels import loops
 from spikekit.kernels.layout import empty_like_layout, is_channels_last
 from spikekit.neighbors import NearestKnown, finite, nearest_known, table_of
 
-_NUMBA = find_spec("numba") is not None
 _MANY = 32  # channels: of so many, rows are gathered faster than planes
 
 
 def in_one_go(values: Tensor) -> bool:
     """Whether a loop can be compiled for (N, C, H W), and is worth it: for few planes on a CPU, by Numba."""
-    return _NUMBA and values.device.type == "cpu" and values.shape[1] < _MANY
-
-
-def _loops() -> Any:
-    """Return the module of compiled loops, imported when it is first needed; None without a Numba that works."""
-    try:
-        return import_module("spikekit.kernels.cpu_table") if _NUMBA else None
-    except ImportError:  # installed, but not made for the NumPy that is
-        return None
+    return loops.NUMBA and values.device.type == "cpu" and values.shape[1] < _MANY
 
 
 def _warp(values: Tensor, flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> Tensor:
@@ -51,10 +41,10 @@ def _operator(plain: Any, name: str) -> Any:
 
     @op.register_kernel("cpu")
     def _(values: Tensor, flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> Tensor:
-        loops = None if is_channels_last(values) else _loops()
-        if loops is None:
+        compiled = None if is_channels_last(values) else loops.import_loops("spikekit.kernels.cpu_table")
+        if compiled is None:
             return plain(values, flow, mask, neighbors, steps)
-        return getattr(loops, name)(values, flow, table_of(mask, neighbors, steps, flow.dtype)).to(values.dtype)
+        return getattr(compiled, name)(values, flow, table_of(mask, neighbors, steps, flow.dtype)).to(values.dtype)
 
     return op
 

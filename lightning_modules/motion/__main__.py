@@ -14,9 +14,10 @@ import torch
 from torch import Tensor
 
 from lightning_modules.data import StillScenes
-from lightning_modules.motion import ClassicalFlow, ZeroFlow, tvl1
+from lightning_modules.motion import ClassicalFlow, ZeroFlow
 from spikekit.bench import cpu_name, software
 from spikekit.bench.measure import interleave, ratio, timer_of
+from spikekit.kernels import loops
 
 _TIMES = 5, 20, 35
 
@@ -41,7 +42,7 @@ class WithoutNumba(ClassicalFlow):
     """The same estimator in torch's operations."""
 
     def _velocities(self, pictures: Tensor, clock: Tensor, attachment: Tensor) -> Tensor:
-        with mock.patch.object(tvl1, "_NUMBA", False):
+        with mock.patch.object(loops, "NUMBA", False):
             return super()._velocities(pictures, clock, attachment)
 
 

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from importlib.util import find_spec
-from typing import Any
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from spikekit import flow_warp
+from spikekit.kernels import loops
 
 SMOOTHINGS, ROUNDS = 2, 10  # steps towards a smooth flow in a round, and rounds in a warp
 COUPLING = 0.6  # how far the flow that the pictures want and the smooth one may part
 STEP = 0.15  # of the dual variable; converges up to a quarter
 
 _SMALLEST = 16  # pixels, the shorter side of the smallest picture that motion is looked for in
-_NUMBA = find_spec("numba") is not None
 
 
 @torch.no_grad()
@@ -56,22 +52,14 @@ def tvl1_flow(
     for smaller in sizes[1:]:
         levels.append(F.interpolate(levels[-1], smaller, mode="bilinear", antialias=True))
     flow = pictures.new_zeros(len(pictures), 2, *sizes[-1]) if start is None else start
-    loops = _loops() if pictures.device.type == "cpu" else None
-    improve = refine if loops is None else loops.refine
+    compiled = loops.import_loops("lightning_modules.motion.cpu_tvl1") if pictures.device.type == "cpu" else None
+    improve = refine if compiled is None else compiled.refine
     for level in reversed(levels):
         if flow.shape[-2:] != level.shape[-2:]:
             ratio = flow.new_tensor([new / old for new, old in zip(level.shape[:1:-1], flow.shape[:1:-1], strict=True)])
             flow = F.interpolate(flow, level.shape[-2:], mode="bilinear") * ratio.reshape(2, 1, 1)
         flow = improve(level[:, :2], times, level[:, 2] * COUPLING, flow, warps)
     return flow
-
-
-def _loops() -> Any:
-    """Return the module of compiled loops; None without a Numba that works."""
-    try:
-        return import_module("lightning_modules.motion.cpu_tvl1") if _NUMBA else None
-    except ImportError:
-        return None
 
 
 def refine(pictures: Tensor, times: Tensor, limit: Tensor, flow: Tensor, warps: int) -> Tensor:

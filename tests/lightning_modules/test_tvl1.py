@@ -3,11 +3,11 @@ import pytest
 import torch
 from skimage.registration import optical_flow_tvl1
 
-from lightning_modules.motion import tvl1
 from lightning_modules.motion.__main__ import main
 from lightning_modules.motion.tvl1 import refine, tvl1_flow
+from spikekit.kernels import loops
 
-needs_numba = pytest.mark.skipif(not tvl1._NUMBA, reason="needs Numba")
+needs_numba = pytest.mark.skipif(not loops.NUMBA, reason="needs Numba")
 
 FORWARD = torch.tensor([[0.0, 1.0]])
 
@@ -49,7 +49,8 @@ def test_compiled_loops_do_what_the_tensors_do(dtype, size):
     limit, flow = (torch.rand(3, *lead, *size, generator=generator, dtype=dtype) for lead in ((), (2,)))
     times = torch.tensor([[-0.5, 0.5], [0.0, 1.0], [-0.4, 0.6]])
     expected = refine(pictures, times, 40 * limit, flow, 3)
-    got = tvl1._loops().refine(pictures, times, 40 * limit, flow, 3)
+    compiled = loops.import_loops("lightning_modules.motion.cpu_tvl1")
+    got = compiled.refine(pictures, times, 40 * limit, flow, 3)
     assert got.dtype == dtype
     difference = (got - expected).abs()
     assert difference.mean() < (1e-12 if dtype == torch.float64 else 1e-4), difference.mean()
@@ -60,7 +61,7 @@ def test_compiled_loops_do_what_the_tensors_do(dtype, size):
 class TestBothPaths:
     @pytest.fixture(autouse=True)
     def path(self, monkeypatch, numba):
-        monkeypatch.setattr(tvl1, "_NUMBA", numba)
+        monkeypatch.setattr(loops, "NUMBA", numba)
 
     def test_a_batch_is_its_members(self):
         pictures = torch.cat([moved((0.1, 0.0)), moved((3.0, -2.0)), moved((0.0, 0.0))])

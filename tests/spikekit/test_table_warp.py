@@ -33,7 +33,7 @@ def plain(monkeypatch):
 
     def call(function, *args, **options):
         with monkeypatch.context() as without:
-            without.setattr(table_warp, "_NUMBA", False)
+            without.setattr("spikekit.kernels.loops.NUMBA", False)
             return function(*args, **options)
 
     return call
