@@ -3,6 +3,7 @@ import pytest
 import torch
 from skimage.registration import optical_flow_tvl1
 
+from lightning_modules.motion import tvl1
 from lightning_modules.motion.__main__ import main
 from lightning_modules.motion.tvl1 import refine, tvl1_flow
 from spikekit.kernels import loops
@@ -105,6 +106,13 @@ class TestBothPaths:
         pictures = moved((1.0, 0.0)).float()
         pictures[0, 0, 10, 10] = wrong
         assert tvl1_flow(pictures, FORWARD, steady(pictures)).shape == (1, 2, 48, 64)
+
+
+def test_a_flow_grows_with_the_pictures(monkeypatch):
+    monkeypatch.setattr(loops, "NUMBA", False)
+    monkeypatch.setattr(tvl1, "refine", lambda pictures, times, limit, flow, warps: flow + (flow.shape[-1] == 35))
+    flow = tvl1_flow(torch.rand(1, 2, 33, 70), FORWARD, torch.ones(1, 33, 70))
+    torch.testing.assert_close(flow[0, :, 0, 0], torch.tensor([70 / 35, 33 / 17]))
 
 
 def energy(pictures, flow, attachment):
