@@ -8,6 +8,7 @@ import torch
 from kornia.filters import filter2d_separable, gaussian_blur2d, get_gaussian_kernel1d
 from torch import Tensor
 
+from lightning_modules.flicker import flicker
 from lightning_modules.motion.estimator import MotionEstimator, split_any_size
 from lightning_modules.motion.tvl1 import tvl1_flow
 from spikekit import flow_warp, tfp_at
@@ -120,19 +121,10 @@ def _decode(spikes: Tensor, middle: int) -> tuple[Tensor, Tensor, int]:
 
 @lru_cache(maxsize=4)
 def _noise(window: int) -> Tensor:
-    r"""Variance of the mean of a pixel in constant light, by its firing rate r in (0, 1), in ``_RATES`` steps.
-
-    An ideal pixel fires where its charge passes a whole number: for a share r of all phases, and d frames later for the
-    same moved by d r. How much of both is the same says how the spikes go together.
-    """
+    """Variance of the mean of a pixel in constant light, by its firing rate."""
     frames = 3 * window
-    weights = tfp_at(torch.eye(frames, dtype=torch.float64).unsqueeze(1), frames // 2, window, order=_ORDER)[0]
-    apart = torch.arange(frames)
-    products = [weights[: frames - d] @ weights[d:] * (2 if d else 1) for d in apart.tolist()]
-    rate = (torch.arange(_RATES, dtype=torch.float64).unsqueeze(1) + 0.5) / _RATES
-    moved = (apart * rate) % 1
-    both = (rate - moved).clamp(min=0) + (moved + rate - 1).clamp(min=0)
-    return ((both - rate**2) @ torch.stack(products)).float()
+    impulses = torch.eye(frames, dtype=torch.float64).unsqueeze(1)
+    return flicker(tfp_at(impulses, frames // 2, window, order=_ORDER), _RATES)[0]
 
 
 def _unlike(pictures: Tensor, flows: Tensor) -> Tensor:

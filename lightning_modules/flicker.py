@@ -1,0 +1,33 @@
+"""How much weighted sums of spikes flicker where nothing changes: what an ideal sensor cannot know."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def flicker(weights: Tensor, levels: int) -> Tensor:
+    r"""Variance of weighted sums of a pixel's spikes in constant light, over all initial charges.
+
+    An ideal pixel fires where its charge passes a whole number: for a share r of all phases, r being the light, and
+    d frames later for as many, moved by d r around the circle. The share that is in both, less :math:`r^2`, is the
+    covariance of two spikes d frames apart.
+
+    Args:
+        weights: (K, N), K sums over N frames.
+        levels: how many values of light, the middles of as many equal parts of 0 to 1.
+
+    Returns:
+        (K, levels), float32.
+
+    Example:
+        >>> flicker(torch.ones(1, 1), 2)  # one spike, of probability 1 / 4 and 3 / 4
+        tensor([[0.1875, 0.1875]])
+    """
+    weights = weights.double()
+    frames = weights.shape[-1]
+    pairs = [(2 if apart else 1) * weights[:, : frames - apart] * weights[:, apart:] for apart in range(frames)]
+    light = (torch.arange(levels, dtype=torch.float64) + 0.5) / levels
+    moved = torch.arange(frames, dtype=torch.float64).unsqueeze(1) * light % 1
+    both = (light - moved).clamp(min=0) + (moved + light - 1).clamp(min=0)
+    return (torch.stack([pair.sum(dim=1) for pair in pairs], dim=1) @ (both - light**2)).float()

@@ -1,0 +1,24 @@
+import pytest
+import torch
+
+from lightning_modules.flicker import flicker
+from spikekit import spike_integrate_fire
+
+
+@pytest.mark.parametrize("frames", [1, 7, 41])
+def test_against_pixels_of_every_charge(frames):
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.rand(2, frames, generator=generator, dtype=torch.float64) - 0.3
+    got = flicker(weights, 64)
+    charge = (torch.arange(50_000, dtype=torch.float64) + 0.5) / 50_000
+    for level in (0, 1, 9, 20, 31, 40, 63):
+        light = torch.full((frames, 1, len(charge)), (level + 0.5) / 64, dtype=torch.float64)
+        spikes = spike_integrate_fire(light, charge=charge.unsqueeze(0))[0][:, 0].double()
+        torch.testing.assert_close(got[:, level].double(), (weights @ spikes).var(dim=1), rtol=2e-3, atol=1e-5)
+
+
+def test_a_window_of_whole_intervals_is_exact():
+    """Four frames of light 1/4 hold one spike, whatever the charge; of light 1/8 none or one."""
+    variance = flicker(torch.ones(1, 4), 256)[0]
+    assert variance[63:65].max() < 0.02
+    assert variance[31:33].min() > 0.2
