@@ -54,7 +54,7 @@ class ClassicalFlow(MotionEstimator):
         Zach, Pock and Bischof, A duality based approach for realtime TV-L1 optical flow, DAGM 2007.
     """
 
-    def __init__(self, attachment: float = 80.0, warps: int = 5) -> None:
+    def __init__(self, attachment: float = 120.0, warps: int = 5) -> None:
         super().__init__()
         check_positive("attachment", attachment)
         self.attachment, self.warps = attachment, check_whole("warps", warps)

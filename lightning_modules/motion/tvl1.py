@@ -10,7 +10,7 @@ from spikekit import flow_warp
 from spikekit.kernels import loops
 
 SMOOTHINGS, ROUNDS = 2, 10  # steps towards a smooth flow in a round, and rounds in a warp
-COUPLING = 0.6  # how far the flow that the pictures want and the smooth one may part
+COUPLING = 0.25  # how far the flow that the pictures want and the smooth one may part
 STEP = 0.15  # of the dual variable; converges up to a quarter
 
 _SMALLEST = 16  # pixels, the shorter side of the smallest picture that motion is looked for in
@@ -27,7 +27,7 @@ def tvl1_flow(
     r"""Motion v of which two pictures are two moments: :math:`I_0(x + t_0 v) = I_1(x + t_1 v)`.
 
     Least :math:`\int |\nabla v_x| + |\nabla v_y| + \lambda |I_1(x + t_1 v) - I_0(x + t_0 v)|`, from coarse pictures to
-    fine ones, linearized around what is known of v and solved alternately, :math:`\theta = 0.6` coupling the flow that
+    fine ones, linearized around what is known of v and solved alternately, :math:`\theta = 0.25` coupling the flow that
     follows the pictures to the smooth one. With the times 0 and 1 that is optical flow from the first picture to the
     second, with -1/2 and 1/2 that of the moment between.
 

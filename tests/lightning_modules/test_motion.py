@@ -126,7 +126,7 @@ def expected_flows(pictures, raw, clock, squared, border):
     noise = torch.from_numpy(classical._noise(13).numpy()[torch.searchsorted(steps, raw.mean(0), right=True) - 1])
     for axis in range(2):
         noise = torch.from_numpy(convolve1d(noise.numpy(), squared, axis, mode=border))
-    attachment = 80 / (1 + noise / 0.002**2)
+    attachment = 120 / (1 + noise / 0.002**2)
     times = torch.tensor([[clock[0] - clock[1], clock[2] - clock[1]]]) / (clock[2] - clock[0])
     return tvl1.tvl1_flow(pictures[None, ::2], times, attachment[None])[0] / (clock[2] - clock[0]) * 15
 
