@@ -89,7 +89,7 @@ def test_motion_keeps_its_edge():
     right = to_last[0, 0, :, 8:-8]
     assert right[:20].abs().mean() < 0.3
     assert (right[28:] - 3).abs().mean() < 0.3
-    assert (to_first + to_last).abs().mean() < 0.02
+    assert (to_first + to_last).abs().mean() < 0.03
 
 
 def test_flows_part_where_motion_bends():
@@ -148,8 +148,10 @@ def test_flows_of_the_sites_are_in_bayer_cells_and_in_the_order_of_split_bayer(s
     pictures = torch.from_numpy(convolve1d(convolve1d(raw.numpy(), blur, -1, mode="nearest"), blur, -2, mode="nearest"))
     for site in range(4):
         expected = expected_flows(pictures[site, 1], raw[site, 1], [clock[n] for n in seen], blur**2, "nearest")
-        mean = (flows[1] - flows[0])[site, 1] / 2
-        torch.testing.assert_close(mean, expected, rtol=1e-2, atol=2e-2)
+        to_first, to_last = (flow[site, 1] for flow in flows)
+        straight = (to_first + to_last).abs() < 1e-5
+        assert straight.float().mean() > 0.9
+        torch.testing.assert_close(to_last[straight], expected[straight], rtol=1e-2, atol=2e-2)
 
 
 @pytest.mark.parametrize("pattern", ["RGGB", "GBRG"])
