@@ -67,7 +67,7 @@ class ClassicalFlow(MotionEstimator):
     def forward(self, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> tuple[Tensor, Tensor]:  # noqa: D102
         return self._flows(spikes, times, pattern, by_site=False)
 
-    @torch.compiler.disable(reason="compiled already")
+    @torch.compiler.disable(reason="Numba compiles its loops")
     @torch.no_grad()
     def _flows(self, spikes: Tensor, times: tuple[int, int, int], pattern: str, by_site: bool) -> tuple[Tensor, Tensor]:
         check_planes("spikes", spikes, 4, "(B, N, H, W)")
