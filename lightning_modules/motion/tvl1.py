@@ -39,7 +39,7 @@ def tvl1_flow(
         warps: times that every level is linearized around what is known by then.
 
     Returns:
-        (B, 2, H, W), in pixels, order (x, y).
+        (B, 2, H, W), in pixels per unit of the times, order (x, y).
 
     Reference:
         Zach, Pock and Bischof, A duality based approach for realtime TV-L1 optical flow, DAGM 2007.
