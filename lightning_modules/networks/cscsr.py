@@ -53,6 +53,7 @@ class CSCSR(Network):
         stages: fusions of the colours.
         blocks: residual blocks of every colour before every fusion.
         end_blocks: residual blocks after the last fusion.
+        end_width: channels after the last fusion; when not given, ``width``.
         skip: learn what to add to a smooth, enlarged TFP picture instead of the picture itself. The paper has no
             such skip; with it training starts where the classical decoder ends.
         alpha: gain of the camera, what a white pixel receives per clock in thresholds; only the skip divides by it.
@@ -86,7 +87,8 @@ class CSCSR(Network):
 
     Raises:
         ValueError: sizes that do not fit each other, an unknown choice, or choices that would have no effect:
-            ``global_perception=False`` without BSSR, a ``motion_fusion`` without search.
+            ``global_perception=False`` without BSSR, a ``motion_fusion`` without search, an ``end_width`` of separate
+            colours.
 
     Example:
         >>> network = CSCSR(scale=2, width=8, representation_width=8, features=1, stages=1, end_blocks=1)
@@ -110,6 +112,7 @@ class CSCSR(Network):
         stages: int = 3,
         blocks: int = 1,
         end_blocks: int = 3,
+        end_width: int | None = None,
         skip: bool = False,
         alpha: float = 0.4,
         neighbors: int = 4,
@@ -129,7 +132,8 @@ class CSCSR(Network):
                 "frames, window, stride: expected odd frames and window, and a stride that divides frames - window, "
                 f"got {frames}, {window}, {stride}"
             )
-        if min(width, representation_width, features, stages, blocks, end_blocks, neighbors) < 1:
+        end = width if end_width is None else end_width
+        if min(width, representation_width, features, stages, blocks, end_blocks, end, neighbors) < 1:
             raise ValueError("widths, stages, blocks and neighbors: expected 1 or more of each")
         if steps < 0:
             raise ValueError(f"steps: expected 1 or more, or 0 for the exact search, got {steps}")
@@ -139,6 +143,8 @@ class CSCSR(Network):
             raise ValueError(
                 f"motion_fusion: expected joint without search, which asks for no motion, got {motion_fusion}"
             )
+        if end_width is not None and reconstruction == "separate":
+            raise ValueError(f"end_width: separate colours are never fused, expected none, got {end_width}")
         settings = {
             "scale": scale,
             "frames": frames,
@@ -151,6 +157,7 @@ class CSCSR(Network):
             "stages": stages,
             "blocks": blocks,
             "end_blocks": end_blocks,
+            "end_width": end_width,
             "skip": skip,
             "alpha": alpha,
             "neighbors": neighbors,
@@ -184,7 +191,8 @@ class CSCSR(Network):
             refine(len(times), part.features * self.fold**2, width) for part in self.representation
         )
         reconstruct = _choose("reconstruction", reconstruction, _RECONSTRUCTIONS)
-        self.reconstruction = reconstruct(width, stages, blocks, end_blocks, self.fold)
+        wider = {} if end_width is None else {"end_width": end_width}
+        self.reconstruction = reconstruct(width, stages, blocks, end_blocks, self.fold, **wider)
         self.skip = skip
         self.alpha = alpha
         self._initialize()

@@ -43,18 +43,24 @@ class ColorCorrelation(nn.Module):
         blocks: residual blocks of every colour in every stage.
         end_blocks: residual blocks after the last fusion.
         enlarge: how many times larger the picture is than the features.
+        end_width: channels after the last fusion; when not given, ``width``.
 
     Shape:
         - Input: features of R, G and B, each :math:`(B, width, H, W)`
         - Output: rgb :math:`(B, 3, enlarge H, enlarge W)`
     """
 
-    def __init__(self, width: int, stages: int, blocks: int, end_blocks: int, enlarge: int = 1) -> None:
+    def __init__(
+        self, width: int, stages: int, blocks: int, end_blocks: int, enlarge: int = 1, end_width: int | None = None
+    ) -> None:
         super().__init__()
+        end_width = end_width or width
         self.refine = nn.ModuleList(nn.ModuleList(res_blocks(width, blocks) for _ in range(3)) for _ in range(stages))
-        self.fuse = nn.ModuleList(ColorFusion((3 if stage == 0 else 4) * width, width) for stage in range(stages))
-        self.end = res_blocks(width, end_blocks)
-        self.rgb = ToRgb(width, enlarge)
+        inputs = [3 * width] + [4 * width] * (stages - 1)
+        outputs = [width] * (stages - 1) + [end_width]
+        self.fuse = nn.ModuleList(map(ColorFusion, inputs, outputs))
+        self.end = res_blocks(end_width, end_blocks)
+        self.rgb = ToRgb(end_width, enlarge)
 
     def forward(self, colors: list[Tensor]) -> Tensor:  # noqa: D102
         fused: list[Tensor] = []
@@ -94,21 +100,25 @@ class EarlyFusion(nn.Module):
     """Colours fused once, at the beginning (Fig. 6 c, ablation I).
 
     Args:
-        width: channels, of every colour and inside.
+        width: channels of every colour.
         stages: as of :class:`ColorCorrelation`, whose number of residual blocks is kept:
         blocks: 3 x stages x blocks of them
         end_blocks: and these, one after another.
         enlarge: as of :class:`ColorCorrelation`.
+        end_width: as of :class:`ColorCorrelation`.
 
     Shape:
         As :class:`ColorCorrelation`.
     """
 
-    def __init__(self, width: int, stages: int, blocks: int, end_blocks: int, enlarge: int = 1) -> None:
+    def __init__(
+        self, width: int, stages: int, blocks: int, end_blocks: int, enlarge: int = 1, end_width: int | None = None
+    ) -> None:
         super().__init__()
-        self.fuse = ColorFusion(3 * width, width)
-        self.refine = res_blocks(width, 3 * stages * blocks + end_blocks)
-        self.rgb = ToRgb(width, enlarge)
+        end_width = end_width or width
+        self.fuse = ColorFusion(3 * width, end_width)
+        self.refine = res_blocks(end_width, 3 * stages * blocks + end_blocks)
+        self.rgb = ToRgb(end_width, enlarge)
 
     def forward(self, colors: list[Tensor]) -> Tensor:  # noqa: D102
         fused = self.fuse(torch.cat(colors, dim=1))

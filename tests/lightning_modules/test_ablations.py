@@ -384,6 +384,8 @@ def test_the_reconstructions_have_equally_many_residual_blocks(end_blocks, confi
         ({"reconstruction": "a"}, "reconstruction: expected one of correlated, separate, early, got 'a'"),
         ({"representation": "spikes", "global_perception": False}, "global_perception: part of representation bssr"),
         ({"motion_fusion": "independent", "search": False}, "motion_fusion: expected joint without search"),
+        ({"end_width": 8, "reconstruction": "separate"}, "end_width: separate colours are never fused"),
+        ({"end_width": 0}, "widths, stages, blocks and neighbors: expected 1 or more"),
     ],
 )
 def test_wrong_arguments(arguments, message):

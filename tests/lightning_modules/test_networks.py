@@ -30,11 +30,12 @@ def clip(batch=1, height=12, width=16, seed=0):
         ("d", 1_320_742, 1.72),
         ("e", 1_080_294, 1.48),
         ("t", 300_963, 0.356),
+        ("w", 2_257_222, 2.66),
     ],
 )
 def test_parameters_and_work_of_the_sizes(size, parameters, mmac, configs):
     settings = yaml.safe_load((configs / f"size/{size}.yaml").read_text())["model"]["network"]["init_args"]
-    for scale in (4,) if size in "det" else (2, 3, 4):  # D, E and T see scale x scale pixels as channels
+    for scale in (4,) if size in "detw" else (2, 3, 4):  # D, E, T and W see scale x scale pixels as channels
         network = CSCSR(scale, **settings)
         assert sum(p.numel() for p in network.parameters()) == parameters
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
@@ -120,6 +121,18 @@ def test_features_at_sensor_resolution(scale, reconstruction):
     assert rgb.shape == (2, 3, scale * 9, scale * 7)
     rgb.square().mean().backward()
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in network.parameters())
+
+
+@pytest.mark.parametrize("reconstruction", ["correlated", "early"])
+def test_width_after_the_last_fusion(reconstruction):
+    torch.manual_seed(0)
+    network = CSCSR(2, **TINY, end_width=6, reconstruction=reconstruction)
+    spikes, flow = clip()
+    network(spikes, flow).square().mean().backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in network.parameters())
+    assert network.reconstruction.rgb.in_channels == 6
+    widths = {module.out_channels for module in network.reconstruction.modules() if isinstance(module, torch.nn.Conv2d)}
+    assert widths == ({4, 6, 3} if reconstruction == "correlated" else {6, 3})
 
 
 def test_features_at_sensor_resolution_are_where_the_sensor_has_them():
