@@ -31,9 +31,10 @@ class SuperResolution(Learner):
         network: the network, such as CSCSR. ``lightning`` builds it as the weights want it, where some are given.
         optimizer: builds the optimizer from the parameters; the paper uses Adam at 1e-4.
         lr_scheduler: builds the schedule from the optimizer, counted in steps; the paper multiplies by 0.8 every 7500.
-        tile: side of the tiles, in sensor pixels, in which ``predict`` works through a large recording; 0 for none.
-        tolerance: by how many dB the PSNR of a picture may be expected to fall when ``predict`` looks at the clip first
-            and does only what each part of it needs; 0 for everything everywhere.
+        tile: side of the tiles, in sensor pixels, in which ``predict`` and ``test`` work through large views; 0 for
+            none.
+        tolerance: by how many dB the PSNR of a picture may be expected to fall when ``predict`` and ``test`` look at
+            the clip first and do only what each part of it needs; 0 for everything everywhere.
         flow: the motion that training uses. "scene" is that of the data, where they have it: the true one of analytic
             scenes, or that which the frames of a film were interpolated with. "estimated" is that of the network's own
             estimator, which learns as well unless it is frozen.
@@ -103,9 +104,12 @@ class SuperResolution(Learner):
             speed = "best"
         return make_module(cls, choose(scale, speed, budget, size).args).eval()
 
-    def forward(self, spikes: Tensor) -> Tensor:
-        """Return the picture of the middle of a clip, tile by tile: (B, N, H, W) to (B, 3, s H, s W), in [0, 1]."""
-        return forward_in_tiles(self.network, spikes, self.tile, self.tolerance).clamp(0, 1)
+    def forward(self, spikes: Tensor, flow: Tensor | None = None) -> Tensor:
+        """Return the picture of the middle of a clip, tile by tile: (B, N, H, W) to (B, 3, s H, s W), in [0, 1].
+
+        The motion is ``flow``, (B, 2, 2, H, W), or else what the network's estimator sees.
+        """
+        return forward_in_tiles(self.network, spikes, self.tile, self.tolerance, flow).clamp(0, 1)
 
     def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:  # noqa: D102
         rgb = self.network(batch["spikes"], batch.get("flow") if self.flow == "scene" else None)
@@ -129,10 +133,10 @@ class SuperResolution(Learner):
         pictures = {
             "TFI": ClassicalDecoder("tfi", *shared)(spikes),
             "TFP": ClassicalDecoder("tfp", *shared)(spikes),
-            name: self.network(spikes),
+            name: self(spikes),
         }
         if "flow" in batch and not isinstance(self.network, ClassicalDecoder):
-            pictures[f"{name}, true flow"] = self.network(spikes, batch["flow"])
+            pictures[f"{name}, true flow"] = self(spikes, batch["flow"])
         return pictures
 
     def predict_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:

@@ -26,10 +26,12 @@ BLEND = 4
 
 
 @torch.no_grad()
-def forward_in_tiles(network: Network, spikes: Tensor, tile: int, tolerance: float = 0.0) -> Tensor:
+def forward_in_tiles(
+    network: Network, spikes: Tensor, tile: int, tolerance: float = 0.0, flow: Tensor | None = None
+) -> Tensor:
     r"""Run a network on tiles that overlap, and put the results together.
 
-    Motion is estimated once, on the whole clip.
+    Motion, where none is given, is estimated once, on the whole clip.
 
     With a tolerance the clip is looked at first, see :mod:`lightning_modules.look`, and every tile gets what it needs:
     a part without texture the smooth mean of all frames and no network, a tile without motion the network but no flow
@@ -42,16 +44,17 @@ def forward_in_tiles(network: Network, spikes: Tensor, tile: int, tolerance: flo
         tile: side of a tile in sensor pixels, even so that the Bayer phase is kept; 0 for no tiles. With a tolerance
             it is a multiple of the cells that are looked at, the next smaller one.
         tolerance: by how many dB the PSNR of the picture is expected to fall at most; 0 for everything everywhere.
+        flow: as the network takes it; when not given, the network's own estimate.
 
     Returns:
         rgb :math:`(B, 3, s H, s W)`.
     """
     if tolerance:
-        return _forward_where_needed(network, spikes, tile, tolerance)
+        return _forward_where_needed(network, spikes, tile, tolerance, flow)
     height, width = spikes.shape[-2:]
     if not tile or max(height, width) <= tile:
-        return network(spikes)
-    flow, s = _motion(network, spikes), network.scale
+        return network(spikes, flow)
+    flow, s = _motion(network, spikes) if flow is None else flow, network.scale
     whole, rgb = Box(0, 0, height, width), None
     for top in range(0, height, tile):
         for left in range(0, width, tile):
@@ -114,7 +117,9 @@ def _boxes(network: Tensor, motion: Tensor, tile: int) -> dict[Box, bool]:
     return boxes
 
 
-def _forward_where_needed(network: Network, spikes: Tensor, tile: int, tolerance: float) -> Tensor:
+def _forward_where_needed(
+    network: Network, spikes: Tensor, tile: int, tolerance: float, given: Tensor | None
+) -> Tensor:
     height, width = spikes.shape[-2:]
     s = network.scale
     seen = look(spikes, s, network.pattern, network.settings["alpha"])
@@ -125,7 +130,7 @@ def _forward_where_needed(network: Network, spikes: Tensor, tile: int, tolerance
     if any(boxes.values()):
         tops, lefts, bottoms, rights = zip(*(box for box, moves in boxes.items() if moves), strict=True)
         around = Box(min(tops), min(lefts), max(bottoms), max(rights)).grown(AROUND, whole)
-        flow = _motion(network, around.of(spikes))
+        flow = _motion(network, around.of(spikes)) if given is None else around.of(given)
     rgb = seen.picture
     for box, moves in boxes.items():
         if moves and isinstance(flow, Tensor):

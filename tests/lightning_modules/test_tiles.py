@@ -231,6 +231,30 @@ def test_predict_has_the_tolerance():
     assert len(calls) == 1
 
 
+@pytest.mark.parametrize("tolerance", [0.0, 0.01])
+@pytest.mark.parametrize("tile", [0, 64])
+def test_a_motion_that_is_given_takes_the_place_of_the_estimate(tile, tolerance):
+    network, _ = counted()
+    spikes = mixed()
+    flow = network.estimate_flow(spikes)
+    expected = forward_in_tiles(network, spikes, tile, tolerance)
+    network.motion.sizes.clear()
+    assert forward_in_tiles(network, spikes, tile, tolerance, flow).equal(expected)
+    assert not forward_in_tiles(network, spikes, tile, tolerance, -flow).equal(expected)
+    assert network.motion.sizes == []
+
+
+def test_test_shows_what_predict_would():
+    network, calls = counted()
+    batch = {"spikes": mixed(), "flow": torch.full((1, 2, 2, 64, 192), 0.5)}
+    module = SuperResolution(network, tile=64, tolerance=0.01)
+    pictures = module.test_step(batch, 0)
+    assert [size for size, _ in calls[:3]] == [size for size, _ in calls[3:]]  # three tiles, with either motion
+    assert [moves for _, moves in calls] == [False, True, False] * 2
+    assert pictures["CSCSR"].equal(module.predict_step(batch, 0))
+    assert not pictures["CSCSR"].equal(pictures["CSCSR, true flow"])
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_a_gpu_gives_the_same_picture():
     network, _ = counted()
