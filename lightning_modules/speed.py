@@ -21,6 +21,9 @@ SPEEDS = {"fastest": float("inf"), "fast": 1.0, "balanced": 0.1, "best": 0.005}
 #: times this close cannot be told apart, and the better setting is picked
 _AS_FAST = 1.1
 
+#: MiB a sensor pixel that an estimate of motion takes, which is made on the whole frame: ClassicalFlow's, measured
+_MOTION = 240 / 2**20
+
 _UNITS = {
     "ms": ("ms", 1.0),
     "s": ("ms", 1e3),
@@ -63,7 +66,7 @@ def choices(scale: int, size: tuple[int, int]) -> list[Choice]:
 
     Time is taken to grow with the number of pixels; times are the table's ratios, taken times that of its first
     setting. Memory grows with them, too, until a tile is full, with all that motion may reach over; from there on only
-    by what the leanest setting takes, such as the picture itself. A setting without tiles is left out: on recordings
+    by what the leanest setting takes, such as the picture itself, and by an estimate of motion. A setting without tiles is left out: on recordings
     larger than the table's clips its memory has no bound, and on the clips themselves it is the first one.
 
     Args:
@@ -85,7 +88,9 @@ def choices(scale: int, size: tuple[int, int]) -> list[Choice]:
             tile = int(args[args.index("--model.tile") + 1]) if "--model.tile" in args else TILE
             in_tile = min(pixels, (tile + 2 * (HALO + FAR)) ** 2 / measured)
             psnr, ratio, mib = (float(row[name]) for name in ("psnr", "ratio", "mib"))
-            mib = frame * pixels + (mib - frame) * in_tile
+            moves = "ZeroFlow" not in args and "ClassicalDecoder" not in args
+            everywhere = frame + moves * _MOTION * measured
+            mib = everywhere * pixels + (mib - everywhere) * in_tile
             found.append(Choice(row["setting"], args, psnr, 0.0, ratio * float(rows[0]["ms"]) * pixels, mib))
     best = max(choice.psnr for choice in found)
     found = [replace(choice, below=best - choice.psnr) for choice in found]

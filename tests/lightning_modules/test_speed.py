@@ -79,13 +79,16 @@ def test_budgets_grow_with_the_frame(table, budget, size, expected):
 
 
 @pytest.mark.usefixtures("table")
-def test_memory_beyond_a_tile_is_that_of_the_picture():
+def test_memory_beyond_a_tile_is_that_of_the_picture_and_of_motion():
     """2 MiB, the leanest setting's, of 40 x 50 pixels, and the rest times the pixels of the largest tile at most."""
+    motion = 240 * 2000 / 2**20
     for size, pixels in (((40, 50), 1), ((80, 100), 4), ((4000, 5000), 10_000)):
         found = {choice.name: choice.mib for choice in choices(3, size)}
         assert found["tfi"] == pytest.approx(2 * pixels)
-        assert found["all"] == pytest.approx(2 * pixels + 78 * min(pixels, 248**2 / 2000))
-        assert found["small tiles"] == pytest.approx(2 * pixels + 18 * min(pixels, 136**2 / 2000))
+        tile, small = min(pixels, 248**2 / 2000), min(pixels, 136**2 / 2000)
+        assert found["all"] == pytest.approx((2 + motion) * pixels + (78 - motion) * tile)
+        assert found["small tiles"] == pytest.approx((2 + motion) * pixels + (18 - motion) * small)
+        assert found["no motion"] == pytest.approx(2 * pixels + 68 * tile)
 
 
 @pytest.mark.parametrize(("here", "expected"), [(2.0, "no motion"), (0.1, "all"), (50.0, "tfi")])
