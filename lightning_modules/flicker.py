@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 
-def flicker(weights: Tensor, levels: int) -> Tensor:
+def flicker(weights: Tensor, light: Tensor) -> Tensor:
     r"""Variance of weighted sums of a pixel's spikes in constant light, over all initial charges.
 
     An ideal pixel fires where its charge passes a whole number: for a share r of all phases, r being the light, and
@@ -15,19 +15,18 @@ def flicker(weights: Tensor, levels: int) -> Tensor:
 
     Args:
         weights: (K, N), K sums over N frames.
-        levels: how many values of light, the middles of as many equal parts of 0 to 1.
+        light: (L), in thresholds a frame, from 0 to 1.
 
     Returns:
-        (K, levels), float32.
+        (K, L), float32.
 
     Example:
-        >>> flicker(torch.ones(1, 1), 2)  # one spike, of probability 1 / 4 and 3 / 4
-        tensor([[0.1875, 0.1875]])
+        >>> flicker(torch.ones(1, 1), torch.tensor([0.0, 0.25, 0.5]))  # one spike, of such a probability
+        tensor([[0.0000, 0.1875, 0.2500]])
     """
-    weights = weights.double()
+    weights, light = weights.double(), light.double()
     frames = weights.shape[-1]
     pairs = [(2 if apart else 1) * weights[:, : frames - apart] * weights[:, apart:] for apart in range(frames)]
-    light = (torch.arange(levels, dtype=torch.float64) + 0.5) / levels
     moved = torch.arange(frames, dtype=torch.float64).unsqueeze(1) * light % 1
     both = (light - moved).clamp(min=0) + (moved + light - 1).clamp(min=0)
     return (torch.stack([pair.sum(dim=1) for pair in pairs], dim=1) @ (both - light**2)).float()

@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from kornia.filters import filter2d_separable, get_gaussian_kernel1d
 from torch import Tensor
 
+from lightning_modules.flicker import flicker
 from spikekit import bayer_mask
 from spikekit.check import check_planes
 
@@ -29,7 +30,7 @@ _FAINT = 1e-4  # left by the network itself, everywhere: 40 dB, beyond which not
 _GRAIN = 1e-4  # grain that the network leaves as well
 
 _REMOVED = 0.4  # share of a pixel's own noise that smoothing removes
-_LEVELS, _PHASES = 1024, 32  # how finely the noise of the sensor is tabulated
+_LEVELS = 1024  # how finely the noise of the sensor is tabulated
 
 
 class Look(NamedTuple):
@@ -62,11 +63,8 @@ def _weights(frames: int) -> Tensor:
 
 @lru_cache(maxsize=4)
 def _noise(frames: int) -> Tensor:
-    """Variance of mean and change where light is constant, (2, levels): any initial charge, light from 0 to 1."""
-    light = (torch.arange(_LEVELS) + 0.5) / _LEVELS
-    charge = (torch.arange(_PHASES) + 0.5) / _PHASES
-    spikes = (charge[:, None, None] + light[:, None] * torch.arange(frames + 1)).floor().diff(dim=-1)
-    return (spikes @ _weights(frames).T).var(dim=0, correction=0).T.contiguous()
+    """Variance of mean and change where light is constant, (2, levels), from black, which has none, to 1."""
+    return flicker(_weights(frames), torch.linspace(0, 1, _LEVELS + 1))
 
 
 def look(spikes: Tensor, scale: int, pattern: str, alpha: float) -> Look:
@@ -106,12 +104,12 @@ def _look(spikes: Tensor, scale: int, pattern: str, alpha: float) -> Look:
     rgb, wide = _smooth(light, mask, 1.0), _smooth(light, mask, 2.0)
 
     table = _noise(frames).to(spikes.device)
-    level = ((wide * mask).sum(dim=1, keepdim=True) * _LEVELS).long().clamp(0, _LEVELS - 1)
+    level = _level((wide * mask).sum(dim=1, keepdim=True))
     grain, jitter = table[0][level], table[1][level]
     texture = (light - (rgb * mask).sum(dim=1, keepdim=True)).square() - _REMOVED * grain
     # pixels that rest are trusted more; in the dark, or near a third of the threshold, a pixel beats slowly by itself
     around = F.max_pool1d(table[1:], _LEVELS // 16 + 1, 1, _LEVELS // 32)[0]
-    trust = 1 / (around[(light * _LEVELS).long().clamp(0, _LEVELS - 1)] + 1e-3 * alpha**2)
+    trust = 1 / (around[_level(light)] + 1e-3 * alpha**2)
 
     area = _sum(torch.ones_like(light))
     texture, grain = (_sum(part).clamp(min=0) / alpha**2 for part in (texture, grain))
@@ -161,6 +159,11 @@ def _smooth(light: Tensor, mask: Tensor, sigma: float) -> Tensor:
     known = torch.cat([light * mask, mask[None]])
     blurred = filter2d_separable(known, kernel, kernel, border_type="constant")
     return blurred[:-1] / blurred[-1:]
+
+
+def _level(light: Tensor) -> Tensor:
+    """Place of light in the table of noise."""
+    return (light * _LEVELS).round().long().clamp(0, _LEVELS)
 
 
 def _sum(plane: Tensor) -> Tensor:

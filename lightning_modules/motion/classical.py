@@ -124,7 +124,8 @@ def _noise(window: int) -> Tensor:
     """Variance of the mean of a pixel in constant light, by its firing rate."""
     frames = 3 * window
     impulses = torch.eye(frames, dtype=torch.float64).unsqueeze(1)
-    return flicker(tfp_at(impulses, frames // 2, window, order=_ORDER), _RATES)[0]
+    rates = (torch.arange(_RATES) + 0.5) / _RATES
+    return flicker(tfp_at(impulses, frames // 2, window, order=_ORDER), rates)[0]
 
 
 def _unlike(pictures: Tensor, flows: Tensor) -> Tensor:
