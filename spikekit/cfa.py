@@ -6,7 +6,7 @@ import torch
 from kornia.color import CFA
 from torch import Tensor, nn
 
-from spikekit.check import check_planes, check_scale, check_whole
+from spikekit.check import check_planes, check_whole
 
 #: Bayer phases by name, read along the rows of the top-left 2 x 2 cell.
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
@@ -103,7 +103,7 @@ def bayer_mask(
     Reference:
         Dong et al., Super-Resolution Reconstruction from Bayer-Pattern Spike Streams, CVPR 2024, Fig. 5 (b).
     """
-    check_scale(scale)
+    scale = check_whole("scale", scale)
     height, width = check_whole("height", height), check_whole("width", width)
     rows = torch.arange(scale * height, device=device) // scale % 2
     columns = torch.arange(scale * width, device=device) // scale % 2
@@ -129,7 +129,7 @@ class BayerMask(nn.Module):
 
     def __init__(self, pattern: str | CFA = "RGGB", *, scale: int = 1) -> None:
         super().__init__()
-        check_scale(scale)
+        scale = check_whole("scale", scale)
         self.pattern = bayer_pattern(pattern)
         self.scale = scale
 
@@ -226,7 +226,7 @@ def bin_to_sensor(rgb: Tensor, pattern: str | CFA = "RGGB", *, scale: int) -> Te
         Dong et al., CVPR 2024, section 5.1: "accumulate signals of 4 pixels to generate the signal of one target
         pixel in the x2 case ... the 4 pixels come from one of the channels".
     """
-    check_scale(scale)
+    scale = check_whole("scale", scale)
     check_planes("rgb", rgb, 3, "(*, 3, H, W)", floating=scale > 1)
     channels, height, width = rgb.shape[-3:]
     if channels != 3 or height % scale or width % scale:
@@ -261,7 +261,7 @@ class BinToSensor(nn.Module):
 
     def __init__(self, pattern: str | CFA = "RGGB", *, scale: int) -> None:
         super().__init__()
-        check_scale(scale)
+        scale = check_whole("scale", scale)
         self.pattern = bayer_pattern(pattern)
         self.scale = scale
 

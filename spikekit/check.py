@@ -46,9 +46,14 @@ def check_positive(name: str, value: float) -> None:
     """Raise unless ``value`` is a finite number above zero.
 
     Raises:
+        TypeError: no number.
         ValueError: zero, negative, infinite or NaN.
     """
-    if not 0 < value < float("inf"):
+    try:
+        good = bool(0 < value < float("inf"))
+    except (TypeError, RuntimeError, ValueError):  # a tensor of many is none of them
+        raise TypeError(f"{name}: expected a finite number above 0, got {value!r}") from None
+    if not good:
         raise ValueError(f"{name}: expected a finite number above 0, got {value}")
 
 
@@ -75,15 +80,6 @@ def check_whole(name: str, value: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
         raise ValueError(f"{name}: expected a whole number >= 1, got {value!r}")
     return value
-
-
-def check_scale(scale: int) -> None:
-    """Raise unless ``scale`` is a whole number, 1 or more.
-
-    Raises:
-        ValueError: anything else.
-    """
-    check_whole("scale", scale)
 
 
 def default_float(value: Tensor) -> torch.dtype:

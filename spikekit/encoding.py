@@ -40,7 +40,7 @@ def gif_bytes(images: Iterable[Tensor], seconds: float) -> bytes:
 
     Args:
         images: (3, H, W) or (H, W) each, of one size, floating, [0, 1].
-        seconds: how long each is shown; a GIF counts in hundredths.
+        seconds: how long each is shown; a GIF counts in hundredths, from 0.02 to 655.35.
 
     Returns:
         The bytes of the file.
@@ -53,5 +53,6 @@ def gif_bytes(images: Iterable[Tensor], seconds: float) -> bytes:
 
     first, *others = (Image.fromarray(to_bytes(image).numpy()) for image in images)
     file = io.BytesIO()
-    first.save(file, "GIF", save_all=True, append_images=others, duration=max(20, round(1000 * seconds)), loop=0)
+    duration = round(min(max(1000 * seconds, 20), 655_350))
+    first.save(file, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
     return file.getvalue()

@@ -12,7 +12,7 @@ from kornia.color import CFA
 from torch import Tensor
 
 from spikekit.cfa import bayer_pattern, bin_to_sensor
-from spikekit.check import check_planes, check_positive, check_scale, check_whole
+from spikekit.check import check_planes, check_positive, check_whole
 from spikekit.interpolate import Blend, FlowInterpolation, Still
 from spikekit.interval import Interval
 from spikekit.noise import SensorNoise
@@ -89,7 +89,7 @@ class Film:
     ) -> None:
         if len(frames) == 0:
             raise ValueError("frames: expected at least one, got none")
-        check_scale(scale)
+        scale = check_whole("scale", scale)
         for name, value in (("alpha", alpha), ("tolerance", tolerance), ("step", step)):
             check_positive(name, value)
         self.frames, self.scale, self.pattern = frames, scale, bayer_pattern(pattern)

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spikekit.check import check_planes, check_scale
+from spikekit.check import check_planes, check_whole
 
 
 def _check_flow(name: str, flow: Tensor) -> None:
@@ -105,7 +105,7 @@ def upsample_flow(flow: Tensor, scale: int) -> Tensor:
         4.0
     """
     _check_flow("flow", flow)
-    check_scale(scale)
+    scale = check_whole("scale", scale)
     return flow if scale == 1 else _upsample(flow, scale).to(flow.dtype)
 
 
@@ -131,7 +131,7 @@ class UpsampleFlow(nn.Module):
 
     def __init__(self, scale: int) -> None:
         super().__init__()
-        check_scale(scale)
+        scale = check_whole("scale", scale)
         self.scale = scale
 
     def forward(self, flow: Tensor) -> Tensor:  # noqa: D102
@@ -179,7 +179,7 @@ def linear_motion(
         The offsets :math:`(*, T, 2, s \cdot H, s \cdot W)` in pixels of the fine grid, in the dtype of the flows.
 
     Raises:
-        TypeError: the flows are not floating-point tensors.
+        TypeError: the flows are not floating-point tensors, or the times no numbers.
         ValueError: the flows differ in size or have no two channels, no times, not first < middle < last, or a scale
             below 1.
 
@@ -198,7 +198,24 @@ def linear_motion(
             f"flow_to_first, flow_to_last: expected one size, got {tuple(flow_to_first.shape)} and "
             f"{tuple(flow_to_last.shape)}"
         )
-    times = [float(t) for t in times]
+    times, first, middle, last = _check_times(times, first, middle, last)
+    scale = check_whole("scale", scale)
+    to_first, to_last = _upsample(flow_to_first, scale), _upsample(flow_to_last, scale)
+    offsets = [
+        to_first * ((t - middle) / (first - middle)) if t < middle else to_last * ((t - middle) / (last - middle))
+        for t in times
+    ]
+    return torch.stack(offsets, dim=-4).to(torch.promote_types(flow_to_first.dtype, flow_to_last.dtype))
+
+
+def _check_times(
+    times: Sequence[float], first: float | None, middle: float | None, last: float | None
+) -> tuple[list[float], float, float, float]:
+    """Return all times, those that were not given as well."""
+    try:
+        times = [float(t) for t in times]
+    except (TypeError, ValueError):
+        raise TypeError(f"times: expected numbers, got {times!r}") from None
     if not times:
         raise ValueError("times: expected at least one time, got none")
     first = times[0] if first is None else first
@@ -206,13 +223,7 @@ def linear_motion(
     middle = (first + last) / 2 if middle is None else middle
     if not first < middle < last:
         raise ValueError(f"first, middle, last: expected rising times, got {first}, {middle}, {last}")
-    check_scale(scale)
-    to_first, to_last = _upsample(flow_to_first, scale), _upsample(flow_to_last, scale)
-    offsets = [
-        to_first * ((t - middle) / (first - middle)) if t < middle else to_last * ((t - middle) / (last - middle))
-        for t in times
-    ]
-    return torch.stack(offsets, dim=-4).to(torch.promote_types(flow_to_first.dtype, flow_to_last.dtype))
+    return times, first, middle, last
 
 
 class LinearMotion(nn.Module):
@@ -237,9 +248,9 @@ class LinearMotion(nn.Module):
         scale: int = 1,
     ) -> None:
         super().__init__()
-        check_scale(scale)
-        self.times = tuple(float(t) for t in times)
-        self.first, self.middle, self.last = first, middle, last
+        scale = check_whole("scale", scale)
+        times, self.first, self.middle, self.last = _check_times(times, first, middle, last)
+        self.times = tuple(times)
         self.scale = scale
 
     def forward(self, flow_to_first: Tensor, flow_to_last: Tensor) -> Tensor:  # noqa: D102

@@ -55,9 +55,10 @@ _key_of_mask = WeakTensorKeyDictionary()
 
 
 def _key(mask: Tensor) -> _Key:
-    """Return what to look up the tables of a mask by; the mask is read only where it is new or has changed."""
-    # inference tensors do not count their changes, so nothing is kept for them
-    version = None if mask.is_inference() else mask._version
+    """Return what to look up the tables of a mask by; a GPU is waited for only where it is new or has changed."""
+    # inference tensors do not count their changes, and memory on the CPU may be another's, such as NumPy's
+    uncounted = mask.is_inference() or mask.device.type == "cpu"
+    version = None if uncounted else mask._version
     kept, key = _key_of_mask.get(mask, (None, None))
     if version is None or version != kept:
         key = (mask.detach() != 0).cpu().numpy().tobytes(), *mask.shape, str(mask.device)
@@ -298,7 +299,7 @@ def idw_neighbors(flow: Tensor, mask: Tensor, neighbors: int = 4, steps: int | N
         flow: (N, 2, H, W), floating.
         mask: (H, W); a pixel is known where it is not 0.
         neighbors: how many known pixels to weigh, K.
-        steps: positions per pixel and axis that flow is rounded to, so that a table can be asked; None: exact.
+        steps: positions per pixel and axis that flow is rounded to, even, so that a table can be asked; None: exact.
 
     Returns:
         Flat indices, int64, and weights, in the dtype of ``flow`` but float32 at least: both (N, K, H W). The weights

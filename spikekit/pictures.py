@@ -16,6 +16,8 @@ from torch import Tensor
 
 from spikekit.check import check_planes, check_positive
 
+_FARTHEST = 1e9  # the length of what is infinite
+
 
 def read_picture(path: str | Path) -> Tensor:
     """Read a picture file as a colour image.
@@ -148,7 +150,7 @@ def flow_to_rgb(flow: Tensor, max_flow: float | None = None) -> Tensor:
 
     Convention:
         Flow in pixels, order (x, y), x right, y down. Red points right, and the hue turns clockwise on the screen.
-        Made for the eye: the gradient at zero flow is NaN.
+        NaN flow counts as 0, infinite flow as very far. Made for the eye: the gradient at zero flow is NaN.
 
     Args:
         flow: :math:`(*, 2, H, W)`, floating.
@@ -168,10 +170,13 @@ def flow_to_rgb(flow: Tensor, max_flow: float | None = None) -> Tensor:
     check_planes("flow", flow, 3, "(*, 2, H, W)", floating=True)
     if flow.shape[-3] != 2:
         raise ValueError(f"flow: expected (*, 2, H, W), got {tuple(flow.shape)}")
-    x, y = flow.unbind(-3)
-    length = torch.hypot(x, y)
     if max_flow is not None:
         check_positive("max_flow", max_flow)
-    longest = length.amax().clamp(min=1e-6) if max_flow is None else max_flow
+    wide = flow.to(torch.promote_types(flow.dtype, torch.float32))
+    x, y = wide.nan_to_num(0.0).clamp(-_FARTHEST, _FARTHEST).unbind(-3)
+    length = torch.hypot(x, y)
+    if max_flow is None:
+        max_flow = length.amax().clamp(min=1e-6) if length.numel() else 1.0
     hue = torch.atan2(y, x).remainder(2 * math.pi)
-    return hsv_to_rgb(torch.stack([hue, (length / longest).clamp(max=1), torch.ones_like(length)], dim=-3))
+    hsv = torch.stack([hue, (length / max_flow).clamp(max=1), torch.ones_like(length)], dim=-3)
+    return hsv_to_rgb(hsv).to(flow.dtype)

@@ -23,14 +23,14 @@ class TableAxis:
         length: pixels.
         period: after how many of them the mask repeats.
         margin: how near to a border a pixel is its own class.
-        steps: positions per pixel.
+        steps: positions per pixel, even, so that half a pixel, where the picture ends, is one.
         device: of the mask.
     """
 
     def __init__(self, length: int, period: int, margin: int, steps: int, device: str) -> None:
         self.length = length
         self.steps = steps
-        self.half = (steps + 1) // 2  # rounded positions on either side of a pixel
+        self.half = steps // 2  # rounded positions on either side of a pixel
         pixel = np.arange(length)
         place = pixel
         self.short = length  # of the shortest axis that looks the same from every pixel
@@ -62,7 +62,7 @@ class PositionTable:
     Args:
         known: the mask, bool.
         neighbors: how many pixels are kept for a position.
-        steps: positions per pixel and axis.
+        steps: positions per pixel and axis, even.
         search: finds flat indices and weights, both (neighbors, n), in a mask, for pixels (2, n), (x, y), and offsets
             (2, n), on the CPU.
         dtype: of the weights.

@@ -12,7 +12,7 @@ from kornia.color import CFA
 from torch import Tensor
 
 from spikekit.cfa import bayer_sites
-from spikekit.check import check_planes, check_positive, check_scale
+from spikekit.check import check_planes, check_positive, check_whole
 
 _CHUNK = 1 << 16  # positions sampled at a time: what they need stays in the cache
 
@@ -258,7 +258,7 @@ class Scene:
         return torch.arange(length, dtype=torch.float64, device=self.layers[0].picture.device)
 
     def _sensor(self, scale: int) -> tuple[int, int]:
-        check_scale(scale)
+        scale = check_whole("scale", scale)
         if self.height % scale or self.width % scale:
             raise ValueError(f"scale: expected a divisor of the view {self.height} x {self.width}, got {scale}")
         return self.height // scale, self.width // scale

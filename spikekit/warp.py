@@ -89,7 +89,8 @@ def flow_warp_idw(
         pixel. Positions are kept as a whole and a fractional part in float32 or wider, so that they are as exact at
         column 4000 as at column 0, in half precision too.
 
-        Unknown pixels are never read. NaN flow counts as 0, infinite flow as very far.
+        Unknown pixels are never read; known ones are to be finite, or what hits another known pixel may be NaN. NaN
+        flow counts as 0, infinite flow as very far.
 
         Differentiable in the features and in the flow, twice; the neighbours themselves are constants. On a known
         pixel the gradient with respect to the flow, a cone's tip, is 0, and so it is where the flow is not finite.
@@ -102,17 +103,20 @@ def flow_warp_idw(
     Args:
         features: :math:`(*, C, H, W)`, floating.
         flow: :math:`(*, 2, H, W)`.
-        mask: :math:`(H, W)`; a pixel is known where it is not 0. The tables of a mask are kept between calls.
+        mask: :math:`(H, W)`; a pixel is known where it is not 0. The tables of a mask are kept between calls; on a GPU
+            they are made anew where the mask counts a change, which one through ``mask.data`` does not.
         neighbors: how many known pixels to weigh.
-        steps: positions per pixel and axis that the flow is rounded to, such as 16; None for the exact search.
+        steps: positions per pixel and axis that the flow is rounded to, an even number such as 16; None for the exact
+            search.
 
     Returns:
         As ``features``, also in memory: channels-last features give a channels-last result.
 
     Raises:
         TypeError: features or flow are not floating-point tensors.
-        ValueError: sizes that do not fit each other, ``neighbors`` or ``steps`` below 1, a mask without a known pixel,
-            ``steps`` for a mask that does not repeat along rows and columns as those of a Bayer filter do.
+        ValueError: sizes that do not fit each other, ``neighbors`` below 1, ``steps`` that are odd or below 1, a mask
+            without a known pixel, ``steps`` for a large mask that does not repeat along rows and columns as those of a
+            Bayer filter do, whose table would be huge.
 
     Example:
         >>> features = torch.tensor([[[[1.0, 0.0, 5.0, 0.0]]]])
@@ -128,8 +132,7 @@ def flow_warp_idw(
     if not isinstance(mask, Tensor) or mask.shape != features.shape[-2:]:
         got = tuple(mask.shape) if isinstance(mask, Tensor) else type(mask).__name__
         raise ValueError(f"mask: expected {(height, width)} for features {tuple(features.shape)}, got {got}")
-    neighbors = check_whole("neighbors", neighbors)
-    steps = None if steps is None else check_whole("steps", steps)
+    neighbors, steps = _check_search(neighbors, steps)
     dtype = torch.promote_types(features.dtype, flow.dtype)
     flow = flow.reshape(-1, 2, height, width).to(dtype)
     values = features.reshape(-1, features.shape[-3], height * width)
@@ -138,6 +141,12 @@ def flow_warp_idw(
         return warp_by_table(values, flow, mask, neighbors, steps).reshape(features.shape)
     index, weight = idw_neighbors(flow, mask, neighbors, steps)
     return Gather.apply(values, index, weight).reshape(features.shape)
+
+
+def _check_search(neighbors: int, steps: int | None) -> tuple[int, int | None]:
+    if steps is not None and check_whole("steps", steps) % 2:
+        raise ValueError(f"steps: expected an even number of positions, or none for the exact search, got {steps}")
+    return check_whole("neighbors", neighbors), steps
 
 
 class FlowWarpIdw(nn.Module):
@@ -154,8 +163,7 @@ class FlowWarpIdw(nn.Module):
 
     def __init__(self, *, neighbors: int = 4, steps: int | None = None) -> None:
         super().__init__()
-        self.neighbors = neighbors
-        self.steps = steps
+        self.neighbors, self.steps = _check_search(neighbors, steps)
 
     def forward(self, features: Tensor, flow: Tensor, mask: Tensor) -> Tensor:  # noqa: D102
         return flow_warp_idw(features, flow, mask, neighbors=self.neighbors, steps=self.steps)

@@ -22,7 +22,7 @@ from lightning_modules.data.layouts import EXPECTED, Collection, FilmFiles, find
 from lightning_modules.data.loading import FreshClips, default_workers, load_clips
 from lightning_modules.data.pictures import split_pictures
 from spikekit import bayer_pattern
-from spikekit.check import check_positive, check_scale, check_whole
+from spikekit.check import check_positive, check_whole
 from spikekit.film import Film, FilmClip
 from spikekit.interpolate import FlowInterpolation
 from spikekit.noise import SensorNoise
@@ -59,7 +59,7 @@ class ClipRecipe:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_scale(self.scale)
+        self.scale = check_whole("scale", self.scale)
         check_positive("alpha", self.alpha)
         check_whole("frames", self.frames)
         check_whole("clocks", self.clocks)

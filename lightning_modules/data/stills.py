@@ -17,7 +17,7 @@ from lightning_modules.data.loading import FreshClips, default_workers, load_cli
 from lightning_modules.data.pictures import cached_picture, embedded_pictures, folder_pictures, split_pictures
 from lightning_modules.data.textures import outline_mask, texture
 from spikekit import bayer_pattern
-from spikekit.check import check_positive, check_scale
+from spikekit.check import check_positive, check_whole
 from spikekit.noise import SensorNoise
 from spikekit.scene import Layer, Motion, Scene
 from spikekit.simulate import simulate_spikes
@@ -138,7 +138,7 @@ class StillClips(Dataset):
 
 
 def _check(clips: StillClips) -> None:
-    check_scale(clips.scale)
+    clips.scale = check_whole("scale", clips.scale)
     check_positive("alpha", clips.alpha)
     bayer_pattern(clips.pattern)
     low, high = clips.brightness

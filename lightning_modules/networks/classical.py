@@ -10,7 +10,7 @@ from torch import Tensor
 from lightning_modules.motion import ZeroFlow
 from lightning_modules.networks.network import Network
 from spikekit import bayer_pattern, demosaic, tfi_at, tfp_at
-from spikekit.check import check_planes, check_positive, check_scale, check_whole
+from spikekit.check import check_planes, check_positive, check_whole
 
 
 class ClassicalDecoder(Network):
@@ -45,7 +45,7 @@ class ClassicalDecoder(Network):
         order: int = 1,
         frames: int = 41,
     ) -> None:
-        check_scale(scale)
+        scale = check_whole("scale", scale)
         check_positive("alpha", alpha)
         if method not in ("tfi", "tfp"):
             raise ValueError(f"method: expected 'tfi' or 'tfp', got {method!r}")

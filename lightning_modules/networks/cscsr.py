@@ -18,7 +18,7 @@ from lightning_modules.networks.reconstruction import ColorCorrelation, EarlyFus
 from lightning_modules.networks.refinement import FeatureRefinement, TimeFusion
 from lightning_modules.networks.representation import IntervalRepresentation, SpikeRepresentation, WindowMeans
 from spikekit import bayer_mask, bayer_pattern, demosaic, flow_warp_idw, linear_motion, split_colors, tfp_at
-from spikekit.check import check_planes, check_scale
+from spikekit.check import check_planes, check_whole
 
 _SEARCHED = 1 << 19  # positions that are searched in one go
 
@@ -58,8 +58,8 @@ class CSCSR(Network):
             such skip; with it training starts where the classical decoder ends.
         alpha: gain of the camera, what a white pixel receives per clock in thresholds; only the skip divides by it.
         neighbors: known pixels that the temporal pixel search weighs.
-        steps: positions per pixel of the picture, along each axis, that the search rounds motion to, which makes it
-            faster on a CPU; 0 for the exact search. Weights serve with any.
+        steps: positions per pixel of the picture, along each axis, that the search rounds motion to, an even number,
+            which makes it faster on a CPU; 0 for the exact search. Weights serve with any.
         motion: estimator that is asked where no flow is given; when not given,
             :class:`lightning_modules.motion.ClassicalFlow`.
         representation: features of a time point: ``"bssr"`` learns them; ``"spikes"``, without BSSR (A), averages the
@@ -126,7 +126,7 @@ class CSCSR(Network):
         reconstruction: Literal["correlated", "separate", "early"] = "correlated",
         resolution: Literal["output", "sensor"] = "output",
     ) -> None:
-        check_scale(scale)
+        scale = check_whole("scale", scale)
         if frames % 2 == 0 or window % 2 == 0 or not 1 <= window < frames or (frames - window) % stride:
             raise ValueError(
                 "frames, window, stride: expected odd frames and window, and a stride that divides frames - window, "
@@ -135,8 +135,8 @@ class CSCSR(Network):
         end = width if end_width is None else end_width
         if min(width, representation_width, features, stages, blocks, end_blocks, end, neighbors) < 1:
             raise ValueError("widths, stages, blocks and neighbors: expected 1 or more of each")
-        if steps < 0:
-            raise ValueError(f"steps: expected 1 or more, or 0 for the exact search, got {steps}")
+        if steps < 0 or steps % 2:
+            raise ValueError(f"steps: expected an even number, or 0 for the exact search, got {steps}")
         if representation in ("spikes", "interval") and not global_perception:
             raise ValueError(f"global_perception: part of representation bssr, cannot be taken from {representation}")
         if motion_fusion in ("independent", "assembled") and not search:

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import torch
 
+from spikekit.arguments import UsageError
 from spikekit.bench import pictures, streams
 from spikekit.bench.case import SEED, SIZES, Case, Other, Setup
 from spikekit.bench.measure import Ratio, Run, Timer, floor_run, interleave, peak_memory, ratio, timer_of
@@ -92,11 +93,11 @@ def run(args: argparse.Namespace) -> None:
     """Measure every operator beside what one would otherwise run, and print the table."""
     unknown = [name for name in args.operators if name not in CASES]
     if unknown:
-        raise ValueError(f"operators: expected some of {', '.join(CASES)}, got {', '.join(unknown)}")
+        raise UsageError(f"operators: expected some of {', '.join(CASES)}, got {', '.join(unknown)}")
     try:
         device = torch.empty(0, device=args.device).device
     except (RuntimeError, AssertionError) as error:
-        raise ValueError(f"--device: {args.device} cannot be used here ({str(error).splitlines()[0]})") from error
+        raise UsageError(f"--device: {args.device} cannot be used here ({str(error).splitlines()[0]})") from error
     timer, unit = timer_of(device, args.threads)
     with _threads(args.threads):
         measured = list(rows(args.operators or list(CASES), args.size, device, args.rounds, timer))

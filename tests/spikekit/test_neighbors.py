@@ -186,7 +186,7 @@ def test_table_is_exact_at_its_positions(scale, neighbors, size, path):
         torch.testing.assert_close(*shares)
 
 
-@pytest.mark.parametrize("steps", [1, 2, 3, 16])
+@pytest.mark.parametrize("steps", [2, 4, 16])
 def test_table_between_its_positions(steps, path):
     """Weights are those of the rounded position, and no neighbour is farther than the rounding lets it."""
     mask = bayer_mask(12, 14, scale=2)[1]
@@ -216,7 +216,7 @@ def test_table_far_outside_is_that_of_the_border(path):
 
 def test_table_keeps_known_pixels():
     features, mask = torch.randn(1, 9, 24, 28), bayer_mask(12, 14, scale=2, dtype=torch.bool)[2]
-    for steps in (1, 3, 16):
+    for steps in (2, 6, 16):
         warped = flow_warp_idw(features, torch.zeros(1, 2, 24, 28), mask, steps=steps)
         assert torch.equal(warped[..., mask], features[..., mask])
 

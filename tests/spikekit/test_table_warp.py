@@ -40,7 +40,7 @@ def plain(monkeypatch):
 
 
 @pytest.mark.parametrize("mask", MASKS)
-@pytest.mark.parametrize("steps", [1, 2, 7, 10, 16])
+@pytest.mark.parametrize("steps", [2, 6, 10, 16])
 @pytest.mark.parametrize(("neighbors", "channels"), [(4, 2), (1, 1), (3, 9)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
 def test_as_without_numba(mask, steps, neighbors, channels, dtype, plain):
