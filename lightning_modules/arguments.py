@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -10,15 +11,20 @@ from typing import Any, TypeVar
 import yaml
 from jsonargparse import ArgumentParser
 
+from lightning_modules import motion
 from lightning_modules.pretrained import read_weights
 
 WEIGHTS = "--model.weights", "--model.init_args.weights"
+
+_MOTION = re.compile(r"--model\.(init_args\.)?network\.(init_args\.)?motion(\.class_path)?")
 
 T = TypeVar("T")
 
 
 def with_network_of_weights(args: Sequence[str]) -> list[str]:
     """Put in the network that ``--model.weights`` are of, so that it need not be said again.
+
+    An estimator of motion is exchanged freely: that of the weights is put in where nothing else is named.
 
     Args:
         args: verb and arguments of ``lightning``.
@@ -27,17 +33,24 @@ def with_network_of_weights(args: Sequence[str]) -> list[str]:
         FileNotFoundError: there are no such weights.
         ValueError: the file is damaged, or of something else.
     """
-    asked = None
+    asked, named = None, False
     for _, option, value in options(args):
         if option in ("-c", "--config"):
-            asked = _weights_in(value) or asked
+            model = _init_args(_model_in(value))
+            asked = model.get("weights") or asked
+            named |= bool(_class_of(_init_args(model.get("network")).get("motion")))
         elif option in WEIGHTS:
             asked = value
+        named |= bool(_MOTION.fullmatch(option))
     if asked in (None, "", "null"):
         return list(args)
     found = read_weights(asked)
+    kind = found.settings.get("class", "")
+    if hasattr(motion, kind):
+        takes = "--model.network.motion.weights takes them"
+        raise ValueError(f"model.weights: expected weights of a network, got {asked}, of the estimator {kind}; {takes}")
     network = _class_and_arguments(found.settings)
-    if found.motion:
+    if found.motion and not named:
         network["init_args"]["motion"] = _class_and_arguments(found.motion)
     return behind_configurations(args, ["--config", json.dumps({"model": {"network": network}})])
 
@@ -46,6 +59,8 @@ def options(args: Sequence[str]) -> Iterator[tuple[int, str, str]]:
     """Yield where the word after an option and its value is, the option, and the value."""
     for n, word in enumerate(args):
         option, equals, value = word.partition("=")
+        if re.match(r"-[a-z][^=]", word):  # -cFILE
+            option, equals, value = word[:2], "=", word[2:]
         yield (n + 1, option, value) if equals else (n + 2, option, args[n + 1] if n + 1 < len(args) else "")
 
 
@@ -62,13 +77,38 @@ def _class_and_arguments(settings: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _weights_in(config: str) -> str | None:
-    """Return what a file of configuration says about weights; whether it is one at all is the parser's affair."""
+def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield dotted keys and what is no dictionary.
+
+    Example:
+        >>> dict(flatten({"network": {"width": 4, "motion": {}}}))
+        {'network.width': 4}
+    """
+    if not isinstance(config, dict):
+        yield prefix, config
+        return
+    for key, value in config.items():
+        yield from flatten(value, f"{prefix}.{key}" if prefix else key)
+
+
+def _model_in(config: str) -> Any:
+    """Return what a file of configuration says about the model; whether it is one at all is the parser's affair."""
     try:
-        model = yaml.safe_load(Path(config).read_text())["model"]
-        return model.get("weights") or model["init_args"].get("weights")
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, yaml.YAMLError):
+        return yaml.safe_load(Path(config).read_text())["model"]
+    except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError):
         return None
+
+
+def _init_args(choice: Any) -> dict[str, Any]:
+    """Return the arguments of an object in a configuration, which may stand in it without ``init_args``."""
+    if not isinstance(choice, dict):
+        return {}
+    inner = choice.get("init_args")
+    return {**choice, **inner} if isinstance(inner, dict) else choice
+
+
+def _class_of(choice: Any) -> str | None:
+    return choice.get("class_path") if isinstance(choice, dict) else choice
 
 
 def make_module(kind: type[T], args: Sequence[str]) -> T:

@@ -11,11 +11,12 @@ import torch
 import yaml
 from safetensors.torch import load_file, save_file
 
-from lightning_modules.cli import main
+from lightning_modules.cli import main, run
 from lightning_modules.module import SuperResolution
 from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
 from lightning_modules.networks import CSCSR, ClassicalDecoder
 from lightning_modules.pretrained import read_weights, shipped_weights, write_weights
+from lightning_modules.sweep.trials import Rehearsal
 from spikekit import read_picture, write_spikes
 
 TINY = {"scale": 2, "width": 4, "representation_width": 4, "features": 1, "stages": 1, "end_blocks": 1, "skip": True}
@@ -161,6 +162,28 @@ def test_predict_needs_nothing_but_weights(file, how, tmp_path):
     refused = predict(*args, "--model.network.width", "8", *recording, "-o", "no", cwd=tmp_path)
     assert refused.returncode == 1
     assert refused.stderr.endswith("was trained with width=4; this run asks for width=8\n")
+
+
+@pytest.mark.parametrize(
+    ("named", "expected"),
+    [
+        ([], Spike2Flow),
+        (["-c", "{configs}/motion/zero.yaml"], ZeroFlow),
+        (["-c{configs}/motion/zero.yaml"], ZeroFlow),
+        (["--model.network.motion", "ZeroFlow"], ZeroFlow),
+        (["--model.network.motion", "ZeroFlow", "-c", "{configs}/x2.yaml"], ZeroFlow),
+        (["--model.network.motion.iterations", "1"], Spike2Flow),
+    ],
+)
+def test_motion_is_that_of_the_weights_unless_another_is_named(named, expected, tmp_path, configs, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["lightning"])
+    trained = checkpoint(tmp_path / "moving.ckpt", SuperResolution(network(motion=Spike2Flow(**FLOW_TINY))))
+    words = [word.format(configs=configs) for word in named]
+    built = run(["test", "-c", str(configs / "x2.yaml"), *words, "--model.weights", str(trained)], Rehearsal)
+    motion = built.model.network.motion
+    assert type(motion) is expected
+    if expected is Spike2Flow:
+        assert motion.settings["iterations"] == (1 if named else 3)
 
 
 @pytest.mark.slow
