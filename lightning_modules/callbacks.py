@@ -150,12 +150,16 @@ class PredictionPictures(Callback):
     def __init__(self, output: str | Path) -> None:
         self.output = Path(output)
 
+    def on_predict_start(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
+        self._written = 0
+
     def on_predict_batch_end(  # noqa: D102
         self, trainer: Trainer, module: LightningModule, outputs: Tensor, batch: dict[str, Tensor], *_: Any
     ) -> None:
         for rgb, frame in zip(outputs, batch["frame"].tolist(), strict=True):
             write_picture(self.output / f"frame_{frame:06d}.png", rgb)
+            self._written += 1
 
     def on_predict_end(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
         if trainer.is_global_zero:
-            print(f"{self.output}: {len(list(self.output.glob('frame_*.png')))} pictures")  # noqa: T201
+            print(f"{self.output}: {self._written} pictures")  # noqa: T201

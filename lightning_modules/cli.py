@@ -17,7 +17,7 @@ from pytorch_lightning.callbacks import LearningRateMonitor, ModelCheckpoint
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI
 from pytorch_lightning.loggers import TensorBoardLogger
 
-from lightning_modules.arguments import WEIGHTS, behind_configurations, options, with_network_of_weights
+from lightning_modules.arguments import WEIGHTS, behind_configurations, flatten, options, with_network_of_weights
 from lightning_modules.callbacks import PredictionPictures
 from lightning_modules.data import FilmScenes, Recording, StillScenes
 from lightning_modules.flow_training import FlowTraining
@@ -25,7 +25,7 @@ from lightning_modules.learner import Learner
 from lightning_modules.module import SuperResolution
 from lightning_modules.motion import Spike2Flow
 from lightning_modules.networks import CSCSR
-from lightning_modules.pretrained import CheckpointMismatchError, read_weights, write_weights
+from lightning_modules.pretrained import CheckpointMismatchError, check_settings, read_weights, write_weights
 from lightning_modules.speed import SPEEDS, choose
 from spikekit import SpikeFileError, spikes_shape
 
@@ -41,6 +41,13 @@ CHOICES = (
 )
 
 _NO_RECORDING = "predict: expected a recording: --data Recording --data.path FILE"
+
+_LOADERS = {
+    "fit": "train_dataloader",
+    "validate": "val_dataloader",
+    "test": "test_dataloader",
+    "predict": "predict_dataloader",
+}
 
 
 class InputError(ValueError):
@@ -132,6 +139,7 @@ class Command(LightningCLI):
     def before_instantiate_classes(self) -> None:
         """Turn ``--ckpt_path best`` and ``last`` into files, and keep a run from being written over."""
         config = self.config[self.subcommand]
+        check_folder(config.output)
         checkpoints = Path(config.output) / "checkpoints"
         asked = config.get("ckpt_path")
         if asked in ("best", "last"):
@@ -142,11 +150,20 @@ class Command(LightningCLI):
             raise InputError(f"{checkpoints}: holds a run already; --ckpt_path last goes on with it, -o goes elsewhere")
 
     def instantiate_classes(self) -> None:  # noqa: D102
+        config = self.config[self.subcommand]
+        if self.subcommand == "fit":
+            _check_trainer(config.trainer)
         try:
             super().instantiate_classes()
             # here, so that what is wrong with it is known before anything is written
+            _check_verb(self.subcommand, self.model, self.datamodule)
             self.datamodule.setup(self.subcommand)
             _check_agreement(self.model, self.datamodule)
+            if self.subcommand == "fit":
+                chosen = self.config_dump["model"]["init_args"]
+                self.model.recipe = {name: chosen.get(name) for name in ("optimizer", "lr_scheduler")}
+                if config.ckpt_path:
+                    _check_continuation(config.ckpt_path, self.model)
         except (OSError, ValueError) as error:
             # jsonargparse wraps what a class of a class says into pages about its own types
             said = re.search(r"^ *- (?!Does not validate|Expected a )(.*)$", str(error), re.MULTILINE)
@@ -163,33 +180,75 @@ class Command(LightningCLI):
             kwargs["logger"] = TensorBoardLogger(output, name="", version="") if self.subcommand == "fit" else False
         if config.get("precision") is None:
             kwargs["precision"] = _precision(config.get("accelerator"))
+        if self.subcommand != "fit":
+            self.save_config_callback = None  # config.yaml is the record of the training
         return super().instantiate_trainer(**kwargs)
 
     def _callbacks(self, output: Path) -> list[Callback]:
         if self.subcommand == "fit":
             monitor, mode = self.model.best
             folder = {"dirpath": output / "checkpoints", "enable_version_counter": False}
+            logs = self._get(self.config_init, "trainer").get("logger") not in (False, [])
             return [
                 ModelCheckpoint(filename="best", monitor=monitor, mode=mode, **folder),
                 ModelCheckpoint(filename="last", save_on_train_epoch_end=True, **folder),
-                LearningRateMonitor(),
+                *([LearningRateMonitor()] if logs else []),
                 self.model.pictures(),
             ]
         if self.subcommand == "test":
             return [self.model.report(output)]
         return [PredictionPictures(output)] if self.subcommand == "predict" else []
 
-    def before_predict(self) -> None:  # noqa: D102
-        if type(self.model).predict_step is LightningModule.predict_step:
-            raise InputError(f"predict: expected a model that makes pictures, got {type(self.model).__name__}")
-        if type(self.datamodule).predict_dataloader is LightningDataModule.predict_dataloader:
-            raise InputError(_NO_RECORDING)
+
+def check_folder(output: str | Path) -> None:
+    """Refuse what cannot be made a folder.
+
+    Raises:
+        InputError: it is a file, or inside one.
+    """
+    there = next(path for path in (Path(output).absolute(), *Path(output).absolute().parents) if path.exists())
+    if not there.is_dir():
+        raise InputError(f"-o: expected a folder, got the file {there}")
+
+
+def _check_trainer(trainer: Any) -> None:
+    """Settings of Lightning that would leave a run without what the other commands need."""
+    if trainer.enable_checkpointing is False:
+        raise InputError("trainer.enable_checkpointing: expected true, checkpoints are what fit is for, got false")
+    if trainer.limit_val_batches == 0:
+        raise InputError("trainer.limit_val_batches: expected more than 0, validation chooses best.ckpt, got 0")
+
+
+def _check_verb(verb: str, model: Learner, data: LightningDataModule) -> None:
+    if verb == "predict" and type(model).predict_step is LightningModule.predict_step:
+        raise InputError(f"predict: expected a model that makes pictures, got {type(model).__name__}")
+    loader = _LOADERS[verb]
+    if getattr(type(data), loader) is getattr(LightningDataModule, loader):
+        scenes = f"{verb}: expected scenes whose truth is known, got {type(data).__name__}"
+        raise InputError(_NO_RECORDING if verb == "predict" else scenes)
+    if verb == "fit" and not any(parameter.requires_grad for parameter in model.network.parameters()):
+        raise InputError(f"fit: expected a network that learns, got {type(model.network).__name__}")
+
+
+def _check_continuation(path: str, model: Learner) -> None:
+    """Refuse to go on with another network, optimizer or schedule: the checkpoint's would win without a word."""
+    checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    check_settings(model.network, checkpoint.get("network", {}), "the checkpoint")
+    here = dict(flatten(model.recipe))
+    there = dict(flatten(checkpoint.get("recipe") or model.recipe))  # older checkpoints do not say
+    for key in sorted({**there, **here}):
+        if there.get(key) != here.get(key):
+            name, expected = key.replace(".init_args", ""), f"{there.get(key)}, as {path} was trained with"
+            anew = "--model.weights starts anew with other settings"
+            raise InputError(f"model.{name}: expected {expected}, got {here.get(key)}; {anew}")
 
 
 def _check_agreement(model: Learner, data: LightningDataModule) -> None:
     """What is not linked, because more than one kind of model has it; a recording has a Bayer phase of its own."""
     if not isinstance(data, (StillScenes, FilmScenes)):
         return
+    if data.workers < 0:
+        raise ValueError(f"data.workers: expected 0 or more, got {data.workers}")
     for name, expected in model.needs.items():
         got = data.options[name]
         if got != expected:

@@ -19,6 +19,10 @@ class Learner(LightningModule):
         needs: options of the data, by name, that must be as they are here.
         optimizer: builds the optimizer from the parameters.
         lr_scheduler: builds the schedule from the optimizer, counted in steps.
+
+    Attributes:
+        recipe: what a configuration says of optimizer and schedule, which ``lightning fit`` fills in; a checkpoint
+            remembers it, because it goes on with its own.
     """
 
     #: the figure of validation that says which checkpoint is the best, and whether it is the "min" or the "max"
@@ -36,6 +40,7 @@ class Learner(LightningModule):
         self.needs = needs
         self.make_optimizer = optimizer
         self.make_lr_scheduler = lr_scheduler
+        self.recipe: dict[str, Any] = {}
 
     def configure_optimizers(self) -> Any:  # noqa: D102
         optimizer = self.make_optimizer(self.network.parameters())
@@ -47,6 +52,7 @@ class Learner(LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:  # noqa: D102
         checkpoint["network"] = settings_of(self.network)
         checkpoint["motion"] = motion_of(self.network)
+        checkpoint["recipe"] = self.recipe
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:  # noqa: D102
         check_settings(self.network, checkpoint.get("network", {}), "the checkpoint")

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
-from pytorch_lightning import LightningDataModule, LightningModule
+from pytorch_lightning import LightningModule
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 
@@ -59,8 +59,6 @@ class Runner:
         trainer, module = command.trainer, command.model
         if type(module).predict_step is LightningModule.predict_step:
             raise InputError(f"expected a model that makes pictures, got {type(module).__name__}")
-        if type(command.datamodule).test_dataloader is LightningDataModule.test_dataloader:
-            raise InputError(f"expected scenes whose truth is known, got {type(command.datamodule).__name__}")
         self.config = resolved(command)
         self.data = command.datamodule
         self.device = trainer.strategy.root_device

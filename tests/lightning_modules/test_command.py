@@ -4,13 +4,19 @@ import csv
 import re
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 import torch
 import yaml
+from pytorch_lightning.callbacks import LearningRateMonitor
 
-from lightning_modules.cli import main
+from lightning_modules.arguments import behind_configurations, options
+from lightning_modules.callbacks import PredictionPictures
+from lightning_modules.cli import InputError, main
+from lightning_modules.cli import run as run_command
 from lightning_modules.networks import CSCSR
+from lightning_modules.sweep.trials import Rehearsal
 from spikekit import read_picture, write_spikes
 
 TINY = """
@@ -48,6 +54,12 @@ def trained(overlay, tmp_path_factory):
     done = run("fit", "-c", x4, "-c", overlay, "-o", output)
     assert done.returncode == 0, done.stderr
     return output
+
+
+class Fit(Rehearsal):
+    """All of ``lightning fit`` but the training."""
+
+    verb = "fit"
 
 
 def run(*args):
@@ -146,6 +158,14 @@ def test_a_finished_run_is_not_written_over(trained, overlay, configs):
         (["fit", "--model.network.motion_fusion", "assembled"], "flow: expected 'estimated' with motion_fusion"),
         (["predict"], "--data Recording --data.path FILE"),
         (["predict", "--data", "Recording", "--data.path", "nowhere.dat"], "nowhere.dat: no such file"),
+        (["predict", "--model.weights", "spike2flow"], "expected weights of a network, got spike2flow, of"),
+        (["fit", "--data", "Recording", "--data.path", "X"], "expected scenes whose truth is known, got Recording"),
+        (["test", "--data", "Recording", "--data.path", "X"], "test: expected scenes whose truth is known"),
+        (["validate", "--data", "Recording", "--data.path", "X"], "validate: expected scenes whose truth is known"),
+        (["fit", "--model.network", "ClassicalDecoder"], "fit: expected a network that learns, got ClassicalDecoder"),
+        (["fit", "--trainer.enable_checkpointing", "false"], "trainer.enable_checkpointing: expected true"),
+        (["fit", "--trainer.limit_val_batches", "0"], "trainer.limit_val_batches: expected more than 0"),
+        (["fit", "--data.workers", "-1"], "data.workers: expected 0 or more, got -1"),
     ],
 )
 def test_errors_are_one_line(args, message, configs, tmp_path, overlay):
@@ -155,6 +175,89 @@ def test_errors_are_one_line(args, message, configs, tmp_path, overlay):
     assert str(exit.value).startswith("lightning: ")
     assert "\n" not in str(exit.value)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("verb", ["fit", "validate", "test", "predict", "sweep"])
+@pytest.mark.parametrize("inside", ["", "run"])
+def test_a_file_is_no_folder_for_the_output(verb, inside, configs, tmp_path):
+    (tmp_path / "file").touch()
+    config = [str(configs / "x4.yaml")] if verb == "sweep" else ["-c", str(configs / "x4.yaml")]
+    with pytest.raises(SystemExit) as exit:
+        main([verb, *config, "-o", str(tmp_path / "file" / inside)])
+    assert exit.value.code == f"lightning: -o: expected a folder, got the file {tmp_path / 'file'}"
+
+
+@pytest.mark.slow
+def test_config_yaml_stays_the_record_of_the_training(trained, overlay, configs):
+    before = (trained / "config.yaml").read_text()
+    args = ["-c", configs / "x4.yaml", "-c", overlay, "-o", trained, "--ckpt_path", "best", "--data.val_clips", 1]
+    for verb in ("validate", "test"):
+        main([verb, *map(str, args)])
+        assert (trained / "config.yaml").read_text() == before
+
+
+@pytest.fixture(name="checkpoint")
+def _checkpoint(overlay, configs, tmp_path):
+    """A command that goes on from a checkpoint, and the checkpoint."""
+    words = ["fit", "-c", str(configs / "x4.yaml"), "-c", str(overlay), "-o", str(tmp_path)]
+    model = run_command(words, Fit).model
+    content = {"state_dict": model.state_dict()}
+    model.on_save_checkpoint(content)
+    (tmp_path / "checkpoints").mkdir()
+    path = tmp_path / "checkpoints" / "last.ckpt"
+    torch.save(content, path)
+    return [*words, "--ckpt_path", "last"], path
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("--model.optimizer.lr=1e-3", "model.optimizer.lr: expected 0.0001, as .*last.ckpt was .* with, got 0.001"),
+        ("--model.lr_scheduler.step_size=5", "model.lr_scheduler.step_size: expected 7500, .* got 5"),
+        ("--model.optimizer=SGD", "model.optimizer.class_path: expected torch.optim.Adam, .* got torch.optim.SGD"),
+        ("--model.network.width=6", "the checkpoint was trained with width=4; this run asks for width=6"),
+    ],
+)
+def test_a_run_does_not_go_on_with_what_the_checkpoint_would_override(checkpoint, change, said):
+    words, path = checkpoint
+    with pytest.raises(InputError, match=said) as refused:
+        run_command([*words, change], Fit)
+    assert "\n" not in str(refused.value)
+    assert [file.name for file in path.parents[1].iterdir()] == ["checkpoints"]
+
+
+def test_a_run_goes_on_for_longer_with_other_data_and_from_older_checkpoints(checkpoint):
+    words, path = checkpoint
+    run_command([*words, "--trainer.max_steps=9", "--data.motion=1"], Fit)
+    content = torch.load(path, weights_only=True)
+    del content["recipe"]
+    torch.save(content, path)
+    run_command([*words, "--model.optimizer.lr=1e-3"], Fit)
+
+
+@pytest.mark.parametrize(("logger", "expected"), [("null", 1), ("true", 1), ("false", 0)])
+def test_the_learning_rate_is_monitored_where_there_is_a_logger(logger, expected, overlay, configs, tmp_path):
+    words = ["fit", "-c", str(configs / "x4.yaml"), "-c", str(overlay), "-o", str(tmp_path)]
+    trainer = run_command([*words, f"--trainer.logger={logger}"], Fit).trainer
+    assert sum(isinstance(callback, LearningRateMonitor) for callback in trainer.callbacks) == expected
+
+
+def test_configurations_are_found_however_they_are_typed():
+    words = ["fit", "-cA.yaml", "-c=B.yaml", "-c", "C.yaml", "--config=D=.yaml", "--data.motion", "-1"]
+    found = [value for _, option, value in options(words) if option in ("-c", "--config")]
+    assert found == ["A.yaml", "B.yaml", "C.yaml", "D=.yaml"]
+    assert behind_configurations(["fit", "-cA.yaml", "--x=1"], ["more"]) == ["fit", "-cA.yaml", "more", "--x=1"]
+
+
+def test_pictures_are_counted_that_were_written(tmp_path, capsys):
+    (tmp_path / "frame_000099.png").touch()
+    pictures, trainer = PredictionPictures(tmp_path), SimpleNamespace(is_global_zero=True)
+    pictures.on_predict_start(trainer, None)
+    for frame in (20, 40):
+        batch = {"frame": torch.tensor([frame])}
+        pictures.on_predict_batch_end(trainer, None, torch.zeros(1, 3, 4, 4), batch)
+    pictures.on_predict_end(trainer, None)
+    assert capsys.readouterr().out == f"{tmp_path}: 2 pictures\n"
 
 
 def test_help_explains_every_option(configs, capsys):
