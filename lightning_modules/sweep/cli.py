@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NoReturn
 
-from lightning_modules.cli import InputError
+from lightning_modules.cli import InputError, check_folder
 from lightning_modules.sweep.budget import seconds
 from lightning_modules.sweep.engines import run_locally, run_on_ray
 from lightning_modules.sweep.plot import plot
@@ -137,6 +137,7 @@ def sweep(args: Sequence[str]) -> None:
     configs = asked.configs + asked.config
     if not configs:
         raise InputError("sweep: expected a configuration, such as configs/x4.yaml")
+    check_folder(asked.output)
     budget = {"steps": asked.steps, "seconds": asked.time, "flops": asked.flops}
     budget = {name: value for name, value in budget.items() if value is not None}
     trials = make_trials(configs, asked.over, asked.set, asked.seeds, budget, asked.output)

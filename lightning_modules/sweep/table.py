@@ -9,9 +9,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from lightning_modules.arguments import flatten
 from lightning_modules.sweep.paper import TABLE_3
 from lightning_modules.sweep.state import RESULT, read_json
-from lightning_modules.sweep.trials import Trial, flatten
+from lightning_modules.sweep.trials import Trial
 
 #: how metrics are written in a table: heading and decimals
 _STYLE = {"psnr": ("PSNR (dB)", 2), "ssim": ("SSIM", 4)}

@@ -6,13 +6,14 @@ import itertools
 import json
 import re
 from argparse import ArgumentError
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from lightning_modules.arguments import flatten
 from lightning_modules.cli import Command, InputError, run
 from lightning_modules.sweep.budget import with_budget
 from lightning_modules.sweep.state import write_json
@@ -82,7 +83,7 @@ def make_trials(
         output: folder of the sweep.
 
     Raises:
-        InputError: two combinations of one name, or one that ``lightning fit`` would refuse.
+        InputError: two combinations of one name, or two that are the same, or one that ``lightning fit`` would refuse.
     """
     common = [word for config in configs for word in ("-c", str(config))]
     groups = [[(Path(path).stem, ["-c", str(path)]) for path in group] for group in over]
@@ -112,7 +113,20 @@ def make_trials(
     twice = next((folder for folder in folders if folders.count(folder) > 1), None)
     if twice:
         raise InputError(f"two trials are called {twice.name}: give overlays and values names that differ")
+    _check_differences(trials)
     return trials
+
+
+def _check_differences(trials: Sequence[Trial]) -> None:
+    seen: dict[str, Trial] = {}
+    for trial in trials:
+        what = json.dumps({**trial.config, "output": None}, sort_keys=True)
+        other = seen.setdefault(what, trial)
+        if other is not trial:
+            weights = trial.config["model"]["init_args"].get("weights")
+            why = f"; model.weights={weights} says what the network is, whatever overlays say" if weights else ""
+            names = f"{other.folder.name} and {trial.folder.name}"
+            raise InputError(f"sweep: expected trials that differ, got the same settings for {names}{why}")
 
 
 def _key_and_values(setting: str) -> tuple[str, list[str]]:
@@ -121,6 +135,8 @@ def _key_and_values(setting: str) -> tuple[str, list[str]]:
     split = re.findall(r"(?:[^,\[{]|\[.*?\]|\{.*?\})+", values)
     if not (key and equals and split):
         raise InputError(f"--set: expected KEY=VALUE,VALUE,..., such as model.network.width=16,32, got {setting}")
+    if key == "output":
+        raise InputError(f"--set: expected the folder of the sweep as -o DIR, got {setting}")
     return key.removeprefix("--"), split
 
 
@@ -148,7 +164,10 @@ class _Resolver(Rehearsal):
         pass
 
     def before_instantiate_classes(self) -> None:
-        pass
+        path = self.config[self.verb].ckpt_path
+        if path:
+            instead = "a trial goes on from its own; model.weights=FILE starts from weights"
+            raise InputError(f"ckpt_path: expected none, {instead}, got {path}")
 
     def instantiate_trainer(self, **kwargs: Any) -> None:
         """None: the machine that trains may be another one."""
@@ -212,20 +231,6 @@ def _suggestion(unknown: Sequence[str], names: Sequence[str]) -> str:
 def argument_names(config: dict[str, Any]) -> list[str]:
     """Return the keys of a configuration as they are typed: those of the objects in it have no ``init_args``."""
     return sorted({key.replace(".init_args", "") for key, _ in flatten(config)})
-
-
-def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield dotted keys and what is no dictionary.
-
-    Example:
-        >>> dict(flatten({"network": {"width": 4, "motion": {}}}))
-        {'network.width': 4}
-    """
-    if not isinstance(config, dict):
-        yield prefix, config
-        return
-    for key, value in config.items():
-        yield from flatten(value, f"{prefix}.{key}" if prefix else key)
 
 
 def _difference(there: dict[str, Any], asked: dict[str, Any]) -> str:

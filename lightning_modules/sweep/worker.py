@@ -56,7 +56,7 @@ class Report(Callback):
     ) -> None:
         now = time.monotonic()
         if self._ended is not None:
-            self.steps += 1
+            self.steps += 1 / trainer.accumulate_grad_batches
             self.seconds += now - self._ended
         self._ended, self._loss = now, outputs["loss"]
         if now - self._reported > _A_MOMENT:
@@ -110,17 +110,20 @@ class Report(Callback):
 
 
 class _Cost(Callback):
-    """Count the FLOPs of the first step, and time the others."""
+    """Count the FLOPs of the first step, and time the others; a step may take several batches."""
 
-    def on_train_batch_start(self, trainer: Trainer, *_: Any) -> None:
-        if trainer.global_step == 0:
+    flops: int | None = None
+
+    def on_train_batch_start(self, trainer: Trainer, module: LightningModule, batch: Any, index: int) -> None:
+        if index == 0:
             self._counter = FlopCounterMode(display=False)
             self._counter.__enter__()
         self._wait()
-        self._began = time.monotonic() if trainer.global_step <= _WARM_UP else self._began
+        if trainer.global_step <= _WARM_UP and index % trainer.accumulate_grad_batches == 0:
+            self._began = time.monotonic()
 
     def on_train_batch_end(self, trainer: Trainer, *_: Any) -> None:
-        if trainer.global_step == 1:
+        if trainer.global_step == 1 and self.flops is None:
             self._counter.__exit__(None, None, None)
             self.flops = self._counter.get_total_flops()
         self._wait()
@@ -153,9 +156,9 @@ def plan(folder: Path) -> Path:
         return own
     if not planned.is_file():
         write_json(folder / PROGRESS, {"phase": "measuring"})
-        steps = 1 if "flops" in budget else _TIMED
+        batches = (1 if "flops" in budget else _TIMED) * config["trainer"]["accumulate_grad_batches"]
         cost = _Cost()
-        main(["fit", "-c", str(own), f"--trainer.fast_dev_run={steps}"], _command([cost]))
+        main(["fit", "-c", str(own), f"--trainer.fast_dev_run={batches}"], _command([cost]))
         count = budget["flops"] / max(1, cost.flops) if "flops" in budget else budget["seconds"] / cost.seconds
         if count < 1:
             raise SystemExit(

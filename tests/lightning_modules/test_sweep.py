@@ -10,12 +10,13 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 import yaml
 
-from lightning_modules.cli import main
+from lightning_modules.cli import InputError, main
 from lightning_modules.sweep import cli, engines, worker
 from lightning_modules.sweep import plot as plots
 from lightning_modules.sweep.budget import seconds
@@ -304,6 +305,44 @@ def test_flops_pay_for_steps(typed, overlays, tmp_path, convolutions):
     assert worker.plan(trial.folder).stat().st_mtime_ns == before  # a resumed trial keeps its plan
 
 
+def test_a_checkpoint_in_a_configuration_is_refused(overlays, tmp_path):
+    (tmp_path / "goes_on.yaml").write_text("ckpt_path: last")
+    with pytest.raises(InputError, match="ckpt_path: expected none, .* got last"):
+        make_trials([CONFIGS / "x4.yaml", tmp_path / "goes_on.yaml"], [], [], [], {}, tmp_path)
+
+
+@pytest.mark.slow
+def test_a_step_is_all_batches_that_gradients_are_accumulated_over(overlays, tmp_path):
+    configs = [CONFIGS / "x4.yaml", overlays / "tiny.yaml"]
+    counted = []
+    for trial in make_trials(configs, [], ["trainer.accumulate_grad_batches=1,2"], [], {"flops": 1e9}, tmp_path):
+        trial.write()
+        counted.append(float(re.search(r"(\S+) FLOPs", worker.plan(trial.folder).read_text()).group(1)))
+    one, two = counted
+    assert two == pytest.approx(2 * one, rel=1e-4)
+
+
+@pytest.mark.parametrize("batches", [1, 3])
+def test_steps_are_timed_whole(batches, monkeypatch, tmp_path):
+    """A batch takes a second, and the warm-up ten times as long."""
+    clock = [0.0]
+    monkeypatch.setattr(worker.time, "monotonic", lambda: clock[0])
+    trainer = SimpleNamespace(global_step=0, accumulate_grad_batches=batches, max_steps=-1, callbacks=[])
+    trainer.callback_metrics = {}
+    cost, report = worker._Cost(), worker.Report(tmp_path / "progress.json")
+    report.on_train_start(trainer, None)
+    for index in range(worker._TIMED * batches):
+        cost.on_train_batch_start(trainer, None, None, index)
+        clock[0] += 10 if trainer.global_step < worker._WARM_UP else 1
+        trainer.global_step = (index + 1) // batches
+        cost.on_train_batch_end(trainer, None, None, None, index)
+        if trainer.global_step > worker._WARM_UP:
+            report.on_train_batch_end(trainer, None, {"loss": torch.tensor(1.0)}, None, index)
+    assert cost.flops == 0
+    assert cost.seconds == batches
+    assert report.seconds / report.steps == pytest.approx(batches)
+
+
 @pytest.mark.slow
 def test_time_ends_training(typed, overlays, tmp_path):
     main([*typed, "--time", "00:00:02", "--set", "data.val_clips=1", "-o", str(tmp_path / "constant")])
@@ -341,10 +380,18 @@ def test_time_ends_training(typed, overlays, tmp_path):
         (["X", "--set", "trainer.devices=2"], "trainer.devices: expected 1, the one of a trial, got 2"),
         (["X", "--over", "nowhere.yaml"], "nowhere: config: File does not exist"),
         (["X", "--over", "X", "X"], "two trials are called x4"),
+        (["X", "--set", "output=there"], "--set: expected the folder of the sweep as -o DIR, got output=there"),
+        (["X", "--set", "ckpt_path=a.ckpt"], "ckpt_path: expected none, a trial goes on from its own; model.weights"),
+        (["X", "--set", "trainer.max_steps=5,6", "--steps", "4"], "same settings for max_steps=5 and max_steps=6"),
+        (
+            ["X", "--set", "model.weights=x4-e", "--over", "A", "J", "--seeds", "0", "1"],
+            "same settings for a-seed0 and j-seed0; model.weights=x4-e says what the network is, whatever overlays say",
+        ),
     ],
 )
 def test_mistakes_are_one_line_before_anything_is_written(args, message, tmp_path):
-    words = [str(CONFIGS / "x4.yaml") if word == "X" else word for word in args]
+    files = {"X": "x4.yaml", "A": "ablation/a.yaml", "J": "ablation/j.yaml"}
+    words = [str(CONFIGS / files[word]) if word in files else word for word in args]
     with pytest.raises(SystemExit) as exit:
         main(["sweep", *words, "-o", str(tmp_path / "sweep")])
     assert message in str(exit.value)
