@@ -17,6 +17,7 @@ from lightning_modules.look import look, required
 from lightning_modules.networks import CSCSR, Network
 from lightning_modules.tiles import forward_in_tiles
 from spikekit import psnr
+from spikekit.arguments import whole
 from spikekit.bench.measure import interleave, ratio, timer_of
 from spikekit.scene import Layer, Motion, Scene
 from spikekit.simulate import simulate_spikes
@@ -69,6 +70,13 @@ def rows(
         yield value, *ratio(times[value], times[0.0]), *cells, ratio(times[-1.0], times[value]).median, loss
 
 
+def _tile(text: str) -> int:
+    side = whole(0)(text)
+    if side % 2:
+        raise argparse.ArgumentTypeError(f"expected an even number of sensor pixels, or 0 for no tiles, got {text}")
+    return side
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(prog="python -m lightning_modules.savings", description=__doc__)
@@ -76,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--pictures", help="folder of pictures; without it, held-out ones of scikit-image")
     parser.add_argument("--height", type=int, default=250, help="sensor rows")
     parser.add_argument("--width", type=int, default=400, help="sensor columns")
-    parser.add_argument("--tile", type=int, default=128, help="as of lightning predict")
+    parser.add_argument("--tile", type=_tile, default=128, help="as of lightning predict")
     parser.add_argument("--rounds", type=int, default=3, help="timings of each")
     parser.add_argument("--tolerances", type=float, nargs="+", default=TOLERANCES, metavar="DB")
     args = parser.parse_args(arguments)

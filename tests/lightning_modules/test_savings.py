@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from lightning_modules.networks import CSCSR
-from lightning_modules.savings import rows, scenes
+from lightning_modules.savings import main, rows, scenes
 
 
 def test_what_a_tolerance_saves_and_costs():
@@ -20,3 +20,10 @@ def test_what_a_tolerance_saves_and_costs():
     assert still == 0
     assert still <= mixed <= fast
     assert fast == 1
+
+
+def test_tiles_are_even(capsys):
+    with pytest.raises(SystemExit):
+        main(["x4-e", "--tile", "63"])
+    said = "argument --tile: expected an even number of sensor pixels, or 0 for no tiles, got 63"
+    assert said in capsys.readouterr().err
