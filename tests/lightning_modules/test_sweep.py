@@ -307,7 +307,7 @@ def test_flops_pay_for_steps(typed, overlays, tmp_path, convolutions):
 
 def test_a_checkpoint_in_a_configuration_is_refused(overlays, tmp_path):
     (tmp_path / "goes_on.yaml").write_text("ckpt_path: last")
-    with pytest.raises(InputError, match="ckpt_path: expected none, .* got last"):
+    with pytest.raises(InputError, match=r"ckpt_path: expected none, .* got last"):
         make_trials([CONFIGS / "x4.yaml", tmp_path / "goes_on.yaml"], [], [], [], {}, tmp_path)
 
 
