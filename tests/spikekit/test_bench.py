@@ -10,6 +10,7 @@ import torch
 from spikekit import bench
 from spikekit.bench import measure
 from spikekit.bench.case import Case, Other
+from spikekit.cli import main
 
 CPU = torch.device("cpu")
 PEERS = {"spikezoo", "spikingjelly", "snntorch"}
@@ -249,9 +250,11 @@ def test_more_threads_are_timed_by_the_wall(capsys):
     assert torch.get_num_threads() == before
 
 
-def test_refuses_an_operator_that_is_not_measured():
+def test_refuses_an_operator_that_is_not_measured(capsys):
     with pytest.raises(ValueError, match=r"operators: expected some of .*tfi.*, got warp"):
         bench.run(arguments("tfi", "warp"))
+    assert main(["bench", "foo"]) == 2
+    assert capsys.readouterr().err.endswith(", got foo\n")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

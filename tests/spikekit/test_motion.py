@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from spikekit import joint_flow, linear_motion, upsample_flow
+from spikekit import LinearMotion, UpsampleFlow, joint_flow, linear_motion, upsample_flow
 
 LEADS = pytest.mark.parametrize("lead", [(), (2,), (3, 2)])
 
@@ -141,3 +141,30 @@ def test_joint_flow_of_an_empty_batch_and_of_no_flow():
         joint_flow(torch.zeros(0, 2, 3, 5))
     with pytest.raises(TypeError, match="flows"):
         joint_flow(3)
+
+
+def test_numbers_of_numpy():
+    """The scale as a byte: sizes are not, or they would run over."""
+    flow = torch.randn(2, 100, 90)
+    assert torch.equal(upsample_flow(flow, np.uint8(3)), upsample_flow(flow, 3))
+    assert torch.equal(UpsampleFlow(np.uint8(3))(flow), upsample_flow(flow, 3))
+    expected = linear_motion(flow, -flow, [0, 1, 2], scale=3)
+    assert torch.equal(linear_motion(flow, -flow, np.arange(3), scale=np.uint8(3)), expected)
+    assert torch.equal(LinearMotion(np.arange(3), scale=np.uint8(3))(flow, -flow), expected)
+
+
+@pytest.mark.parametrize(
+    ("times", "error", "message"),
+    [
+        (None, TypeError, "times: expected numbers, got None"),
+        (5, TypeError, "times: expected numbers, got 5"),
+        (["soon"], TypeError, "times: expected numbers"),
+        ([], ValueError, "times: expected at least one time, got none"),
+        ([2, 1, 0], ValueError, r"first, middle, last: expected rising times, got 2.0, 1.0, 0.0"),
+    ],
+)
+def test_times_that_are_none(times, error, message):
+    """In the function, and in the module before it is called."""
+    for call in (lambda: linear_motion(FLOW, FLOW, times), lambda: LinearMotion(times)):
+        with pytest.raises(error, match=message):
+            call()

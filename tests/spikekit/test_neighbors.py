@@ -8,7 +8,7 @@ import torch
 
 from spikekit import bayer_mask, flow_warp_idw
 from spikekit.kernels import cpu_warp
-from spikekit.neighbors import _products, _table, idw_neighbors, nearest_known
+from spikekit.neighbors import _key, _products, _table, idw_neighbors, nearest_known
 
 UNIT = 64  # flows below are multiples of 1 / UNIT, squared distances are whole numbers in units of 1 / UNIT^2
 
@@ -155,12 +155,23 @@ def test_tables_are_made_once():
     assert _products.cache_info().misses == made + 3
 
 
+class Elsewhere(torch.Tensor):
+    """On the CPU, but says that it is not."""
+
+    device = torch.device("cuda")
+
+
 def test_the_same_mask_is_not_read_again(monkeypatch):
-    """On a GPU reading it would wait for all that runs there."""
-    flow, mask = torch.randn(1, 2, 6, 8), torch.rand(6, 8) < 0.3
-    expected = nearest_known(flow, mask, 4, 0)
+    """On a GPU reading it would wait for all that runs there; on the CPU its memory may be another's."""
+    mask = (torch.rand(6, 8) < 0.3).as_subclass(Elsewhere)
+    seen = _key(mask)
+    mask[0] = ~mask[0]
+    changed = _key(mask)
+    assert changed != seen
     monkeypatch.setattr(torch.Tensor, "cpu", lambda self: pytest.fail("read again"))
-    assert torch.equal(nearest_known(flow, mask, 4, 0)[0], expected[0])
+    assert _key(mask) == changed
+    with pytest.raises(pytest.fail.Exception, match="read again"):
+        _key(torch.ones(6, 8))
 
 
 def on_the_grid(mask, steps):

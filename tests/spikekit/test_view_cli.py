@@ -27,6 +27,7 @@ from spikekit import (
 from spikekit.cli import main
 from spikekit.decoders import spike_interval
 from spikekit.drawing import fit, histogram, raster, sheet
+from spikekit.encoding import gif_bytes
 from spikekit.view_cli import Moment
 
 PATTERN = "RGGB"
@@ -93,6 +94,14 @@ def test_a_sheet_by_its_sidecar(still, capsys):
     shown = read_picture("made/a.png")
     assert shown[:, 200, 60].tolist() == pytest.approx([1, 0, 0], abs=0.1)
     assert shown[:, 200, 400].tolist() == pytest.approx([0, 0, 1], abs=0.1)
+
+
+@pytest.mark.parametrize(("seconds", "shown"), [(1e9, 655_350), (1e-9, 20), (0.5, 500)])
+def test_pictures_of_a_gif_are_shown_as_long_as_it_can_tell(seconds, shown):
+    data = gif_bytes([torch.zeros(4, 6), torch.ones(4, 6)], seconds)
+    with Image.open(io.BytesIO(data)) as film:
+        assert film.n_frames == 2
+        assert film.info["duration"] == shown
 
 
 def test_an_animation_slides(moving):

@@ -324,9 +324,9 @@ def test_idw_with_steps():
 
 def test_numbers_of_numpy():
     args = torch.rand(1, 1, 6, 8), torch.rand(1, 2, 6, 8), bayer_mask(6, 8)[0]
-    for number in (np.int64(3), np.uint8(3), torch.tensor(3)):
+    for number in (np.int64(4), np.uint8(4), torch.tensor(4)):
         assert torch.equal(
-            flow_warp_idw(*args, neighbors=number, steps=number), flow_warp_idw(*args, neighbors=3, steps=3)
+            flow_warp_idw(*args, neighbors=number, steps=number), flow_warp_idw(*args, neighbors=4, steps=4)
         )
 
 
@@ -371,6 +371,20 @@ def test_idw_remembers_masks_but_not_too_well():
         mask = torch.rand(6, 8) < 0.3
         mask[0, 0] = True
         torch.testing.assert_close(flow_warp_idw(features, flow, mask), idw_brute(features, flow, mask, 4))
+
+
+@pytest.mark.parametrize("steps", [None, 4])
+@pytest.mark.parametrize("channels", [1, 9])
+def test_idw_sees_a_mask_change_through_other_names(steps, channels):
+    """NumPy's view of the same memory and ``mask.data`` do not count their changes."""
+    features, flow = torch.rand(1, channels, 6, 8), 3 * torch.rand(1, 2, 6, 8) - 1.5
+    for other in (lambda mask: mask.numpy(), lambda mask: mask.data):
+        mask = bayer_mask(6, 8)[0].clone()
+        before = flow_warp_idw(features, flow, mask, steps=steps)
+        other(mask)[:] = other(bayer_mask(6, 8)[2])
+        after = flow_warp_idw(features, flow, mask, steps=steps)
+        assert not torch.equal(after, before)
+        assert torch.equal(after, flow_warp_idw(features, flow, bayer_mask(6, 8)[2], steps=steps))
 
 
 def test_idw_under_inference_mode():
@@ -459,3 +473,11 @@ def test_wrong_neighbors(neighbors):
         flow_warp_idw(IMAGE, FLOW, MASK, neighbors=neighbors)
     with pytest.raises(ValueError, match="steps"):
         flow_warp_idw(IMAGE, FLOW, MASK, steps=neighbors)
+
+
+@pytest.mark.parametrize("steps", [1, 3, 15, np.int64(3)])
+def test_odd_steps(steps):
+    """Half a pixel, where the picture ends, is no position of theirs."""
+    for call in (lambda: flow_warp_idw(IMAGE, FLOW, MASK, steps=steps), lambda: FlowWarpIdw(steps=steps)):
+        with pytest.raises(ValueError, match=r"steps: expected an even number .*, got "):
+            call()
