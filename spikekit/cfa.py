@@ -92,6 +92,7 @@ def bayer_mask(
         Zeros and ones of shape :math:`(3, scale \cdot height, scale \cdot width)`.
 
     Raises:
+        TypeError: ``dtype`` is not a type of torch.
         ValueError: a size or the scale is below 1, or the pattern is unknown.
 
     Example:
@@ -103,6 +104,8 @@ def bayer_mask(
     Reference:
         Dong et al., Super-Resolution Reconstruction from Bayer-Pattern Spike Streams, CVPR 2024, Fig. 5 (b).
     """
+    if not (dtype is None or isinstance(dtype, torch.dtype)):
+        raise TypeError(f"dtype: expected a type of torch, got {dtype!r}")
     scale = check_whole("scale", scale)
     height, width = check_whole("height", height), check_whole("width", width)
     rows = torch.arange(scale * height, device=device) // scale % 2

@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -113,14 +114,15 @@ def panel(rows: Sequence[Sequence[Tensor]], gap: int = 4) -> Tensor:
     """Lay pictures out in rows and columns on white.
 
     Args:
-        rows: pictures (3, H, W) or (H, W); rows may differ in length, pictures in size.
+        rows: pictures (3, H, W), (1, H, W) or (H, W); rows may differ in length, pictures in size.
         gap: white pixels between two pictures.
 
     Returns:
         One picture (3, H, W), float32, on the CPU; every picture stands at the top left of its cell.
 
     Raises:
-        ValueError: no rows, or a row without a picture.
+        TypeError: a picture that is not a tensor of real numbers.
+        ValueError: no rows, a row without a picture, or a picture of another shape.
 
     Example:
         >>> panel([[torch.zeros(3, 4, 4), torch.zeros(4, 4)], [torch.zeros(3, 2, 4)]], gap=1).shape
@@ -128,6 +130,10 @@ def panel(rows: Sequence[Sequence[Tensor]], gap: int = 4) -> Tensor:
     """
     if not rows or not all(rows):
         raise ValueError("rows: expected at least one row, and a picture in each, got none")
+    for picture in chain.from_iterable(rows):
+        check_planes("rows", picture, 2, "(3, H, W) or (H, W)")
+        if picture.shape[:-2] not in ((), (1,), (3,)):
+            raise ValueError(f"rows: expected pictures (3, H, W) or (H, W), got one of {tuple(picture.shape)}")
     heights = [max(picture.shape[-2] for picture in row) for row in rows]
     columns = range(max(len(row) for row in rows))
     widths = [max(row[i].shape[-1] for row in rows if i < len(row)) for i in columns]

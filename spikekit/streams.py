@@ -38,7 +38,8 @@ def decode_in_chunks(decode: Callable[[Tensor], Tensor], chunks: Iterable[Tensor
         An iterator over consecutive pieces of the result; together they have as many frames as the chunks.
 
     Raises:
-        TypeError: ``overlap`` is not a whole number; when iterated, a chunk that is not a tensor of real numbers.
+        TypeError: ``overlap`` is not a whole number; when iterated, a chunk that is not a tensor of real numbers, or a
+            ``decode`` that returns no tensor.
         ValueError: an overlap below 0; when iterated, an empty chunk, chunks that do not fit each other, or a
             ``decode`` that changes the number of frames.
 
@@ -82,6 +83,8 @@ def _pieces(decode: Callable[[Tensor], Tensor], chunks: Iterable[Tensor], overla
 
 def _decoded(decode: Callable[[Tensor], Tensor], span: Tensor, past: int, count: int) -> Tensor:
     result = decode(span)
+    if not isinstance(result, Tensor):
+        raise TypeError(f"decode: expected a function that returns a tensor, got {type(result).__name__}")
     if result.ndim < 3 or result.shape[-3] != span.shape[-3]:
         raise ValueError(f"decode: expected {span.shape[-3]} frames as given, got a result of {tuple(result.shape)}")
     return result[..., past : past + count, :, :]

@@ -183,3 +183,19 @@ def test_wrong_size_of_a_mask(size):
 
 def test_merge_of_an_empty_batch():
     assert sk.merge_bayer(torch.zeros(4, 0, 3, 5)).shape == (0, 6, 10)
+
+
+def test_scale_of_numpy():
+    """A byte as the scale: sizes are no bytes, or they would run over."""
+    expected = sk.bayer_mask(100, 90, scale=3)
+    assert torch.equal(sk.bayer_mask(100, np.uint8(90), scale=np.uint8(3)), expected)
+    assert torch.equal(sk.BayerMask(scale=np.uint8(3))(torch.zeros(100, 90)), expected)
+    rgb = torch.rand(3, 300, 270)
+    assert torch.equal(sk.bin_to_sensor(rgb, scale=np.uint8(3)), sk.bin_to_sensor(rgb, scale=3))
+    assert torch.equal(sk.BinToSensor(scale=np.uint8(3))(rgb), sk.bin_to_sensor(rgb, scale=3))
+
+
+@pytest.mark.parametrize("dtype", ["float32", np.float32, float])
+def test_wrong_dtype_of_a_mask(dtype):
+    with pytest.raises(TypeError, match="dtype: expected a type of torch, got "):
+        sk.bayer_mask(2, 2, dtype=dtype)

@@ -156,5 +156,43 @@ def test_panel_of_nothing(rows):
 
 @pytest.mark.parametrize("longest", [0, -1.0, float("nan")])
 def test_wrong_max_flow(longest):
-    with pytest.raises(ValueError, match="max_flow"):
+    with pytest.raises(ValueError, match=f"max_flow: expected a finite number above 0, got {longest}"):
         flow_to_rgb(torch.ones(2, 1, 1), longest)
+
+
+@pytest.mark.parametrize("longest", ["1", [1.0], 1j, torch.ones(2), np.ones(2)])
+def test_max_flow_that_is_no_number(longest):
+    with pytest.raises(TypeError, match="max_flow: expected a finite number above 0, got "):
+        flow_to_rgb(torch.ones(2, 1, 1), longest)
+
+
+def test_flow_to_rgb_of_flow_that_is_not_finite():
+    """NaN is no motion; infinite flow points where it points, in full colour, and leaves others their colours."""
+    nan, inf = float("nan"), float("inf")
+    flow = torch.tensor([[[nan, inf, -inf, 1.0]], [[nan, 0.0, 0.0, 0.0]]])
+    white, right, left = torch.ones(3), torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 1, 1])
+    for dtype in (torch.float16, torch.bfloat16, torch.float32, torch.float64):
+        colors = flow_to_rgb(flow.to(dtype), 1.0)
+        assert colors.dtype is dtype
+        expected = torch.stack([white, right, left, right], dim=-1)[:, None]
+        torch.testing.assert_close(colors.float(), expected, rtol=0, atol=1e-2)
+        assert flow_to_rgb(flow.to(dtype)).isfinite().all()
+
+
+def test_flow_to_rgb_of_nothing():
+    assert flow_to_rgb(torch.zeros(0, 2, 3, 4)).shape == (0, 3, 3, 4)
+
+
+def test_flow_to_rgb_in_half_precision():
+    """Lengths beyond what the type holds have colours as well."""
+    flow = torch.tensor([60000.0, 60000.0]).reshape(2, 1, 1)
+    torch.testing.assert_close(flow_to_rgb(flow.half()).float(), flow_to_rgb(flow), rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("shape", [(2, 4, 5), (4, 4, 5), (1, 3, 4, 5)])
+def test_panel_of_other_pictures(shape):
+    with pytest.raises(ValueError, match=r"rows: expected pictures \(3, H, W\) or \(H, W\), got one of"):
+        panel([[torch.zeros(3, 4, 5), torch.zeros(shape)]])
+    with pytest.raises(TypeError, match="rows: expected a tensor"):
+        panel([[np.zeros((4, 5))]])
+    assert torch.equal(panel([[torch.zeros(1, 4, 5)]]), torch.zeros(3, 4, 5))

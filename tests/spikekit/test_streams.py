@@ -200,6 +200,12 @@ def test_decode_that_changes_the_number_of_frames():
         list(decode_in_chunks(lambda part: part[:1], [torch.ones(7, 4, 5)], 2))
 
 
+@pytest.mark.parametrize("result", [None, (torch.ones(7, 4, 5),), 3])
+def test_decode_that_returns_no_tensor(result):
+    with pytest.raises(TypeError, match=r"decode: expected a function that returns a tensor, got "):
+        list(decode_in_chunks(lambda _: result, [torch.ones(7, 4, 5)], 2))
+
+
 BOUNDED = """
 import resource, sys
 import torch
