@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import io
 import os
 import re
 import secrets
@@ -80,6 +81,8 @@ def decode(args: argparse.Namespace) -> None:
     chosen = _chosen(args, frames)
     if len(chosen) > 1 and _NUMBER not in str(args.output):
         raise UsageError(f"--output: expected {_NUMBER} in the name of {len(chosen)} pictures, got {args.output}")
+    if args.order > frames:
+        raise UsageError(f"--order: expected 1 .. {frames}, as {args.file} has {frames} frames, got {args.order}")
 
     window = args.window or TFP_WINDOW
     reach = args.order * (window // 2) if args.method == "tfp" else TFI_REACH
@@ -124,8 +127,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, MemoryError) as error:
         print(f"spikekit: {one_line(error)}", file=sys.stderr)
         return 2 if isinstance(error, UsageError) else 1
-    except OSError as error:  # nobody reads what is printed, or it finds no room
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it flushes at exit
+    except OSError as error:
+        if error.filename is not None:
+            print(f"spikekit: {error.filename}: {one_line(error)}", file=sys.stderr)
+            return 1
+        # nobody reads what is printed, or it finds no room: Python would complain when it flushes at exit
+        with suppress(io.UnsupportedOperation):  # what is printed goes to no file
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if isinstance(error, BrokenPipeError):
             return 141
         print(f"spikekit: standard output: {one_line(error)}", file=sys.stderr)

@@ -99,9 +99,13 @@ def run(args: argparse.Namespace) -> None:
             yield row
 
     table = noted(rows([args.device] if args.device else None, args.operator))
-    with open(args.output, "w", encoding="utf-8") if args.output else nullcontext(sys.stdout) as file:
-        for line in (markdown if args.markdown else text)(table):
-            print(line, file=file, flush=True)
+    try:
+        with open(args.output, "w", encoding="utf-8") if args.output else nullcontext(sys.stdout) as file:
+            for line in (markdown if args.markdown else text)(table):
+                print(line, file=file, flush=True)
+    except OSError as error:
+        error.filename = args.output  # a full disk does not say which file it has no room for
+        raise
     failing = [row for row in measured if not row.passed]
     for row in failing:
         print(_why(row), file=sys.stderr)  # noqa: T201

@@ -1,5 +1,8 @@
 """The ``spikekit`` command as a user types it."""
 
+import contextlib
+import errno
+import io
 import os
 import subprocess
 import sys
@@ -401,6 +404,22 @@ def test_many_pictures_under_one_name(clip, tmp_path, fails):
     assert message in fails(2, "decode", *sized(clip), *words)
 
 
+@pytest.mark.parametrize("order", [61, 10**20])
+def test_an_order_beyond_the_recording(clip, tmp_path, fails, order):
+    words = ("--method", "tfp", "-o", tmp_path / "a.png", "--order", order)
+    message = f"--order: expected 1 .. 60, as {clip} has 60 frames, got {order}\n"
+    assert message in fails(2, "decode", *sized(clip), *words)
+
+
+@pytest.mark.parametrize("window", [2 * 60 - 1, 10**20 + 1])
+def test_a_window_beyond_the_recording(clip, tmp_path, window):
+    """The mean of all frames."""
+    words = ["--method", "tfp", "--alpha", "1", "-o", str(tmp_path / "a.png"), "--window", str(window)]
+    assert main(["decode", *map(str, sized(clip)), *words]) == 0
+    expected = read_spikes(clip, 12, 20).float().mean(0)
+    assert (read_picture(tmp_path / "a.png")[0] - expected).abs().max() < 1 / 255
+
+
 def test_wrong_files(clip, tmp_path, fails):
     (tmp_path / "clip.raw").write_bytes(b"raw")
     np.savez(tmp_path / "a.npz", spk=np.zeros((3, 12, 20)))
@@ -481,6 +500,42 @@ def test_full_disk(clip):
             [*COMMAND, "info", *map(str, sized(clip))], stdout=full, stderr=subprocess.PIPE, text=True
         )
     assert (done.returncode, done.stderr) == (1, "spikekit: standard output: No space left on device\n")
+
+
+def test_a_file_that_cannot_be_opened_is_named(tmp_path, fails):
+    long = tmp_path / ("a" * 300)
+    for out, why in ((tmp_path / "missing" / "a.md", "No such file or directory"), (long, "File name too long")):
+        assert fails(1, "extremes", "--operator", "tfp", "-o", out) == f"spikekit: {out}: {why}\n"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
+def test_a_table_without_room_is_named(fails):
+    words = "extremes", "--operator", "spike_interval", "--device", "cpu", "-o", "/dev/full"
+    assert fails(1, *words) == "spikekit: /dev/full: No space left on device\n"
+
+
+class Full(io.StringIO):
+    """Standard output in memory that finds no room."""
+
+    def __init__(self, error):
+        super().__init__()
+        self.error = error
+
+    def write(self, text):
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "said"),
+    [
+        (OSError(errno.ENOSPC, "No room"), 1, "spikekit: standard output: No room\n"),
+        (BrokenPipeError(errno.EPIPE, "Broken pipe"), 141, ""),
+    ],
+)
+def test_called_where_standard_output_is_no_file(clip, capsys, error, status, said):
+    with contextlib.redirect_stdout(Full(error)):
+        assert main(["info", *map(str, sized(clip))]) == status
+    assert capsys.readouterr() == ("", said)
 
 
 # --- the field's own --------------------------------------------------------------------------------------------------
