@@ -106,12 +106,13 @@ def open_recording(args: argparse.Namespace) -> Recording:
         UsageError: a headerless file whose size nobody knows, or a camera and a size as well.
         ValueError: a file that cannot be read, or is not of the camera.
     """
-    path, pattern, known = args.file, getattr(args, "pattern", None), find_sidecar(args.file)
+    path, pattern = args.file, getattr(args, "pattern", None)
     if args.camera is not None:
         if args.flip or not args.height is args.width is None:
             raise UsageError("--camera: it knows --height, --width and --flip, leave them out")
         return _of_camera(path, camera(args.camera), pattern)
-    if known is not None and args.height is args.width is None:
+    known = find_sidecar(path) if args.height is args.width is None else None  # a damaged one can be done without
+    if known is not None:
         size = known.stream["height"], known.stream["width"]
         frames, *_ = spikes_shape(path, *size)
         if frames != known.stream["frames"]:

@@ -7,8 +7,9 @@ import json
 import os
 import platform
 import shutil
+import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,6 +17,8 @@ from typing import Any
 
 import numpy as np
 import torch
+
+from spikekit.cfa import PATTERNS
 
 #: What the first line of a side-car says it is.
 KIND = "spikekit simulation 1"
@@ -76,16 +79,70 @@ def read_sidecar(path: Path) -> Sidecar:
         if not isinstance(data, dict) or data.pop("kind", None) != KIND:
             raise ValueError(f"expected the side-car of a simulation ({KIND})")
         sidecar = Sidecar(**data)
-        sizes = [sidecar.stream[key] for key in ("frames", "height", "width")]
-        if not all(isinstance(size, int) and size > 0 for size in sizes):
-            raise ValueError(f"expected frames, height and width above 0, got {sizes}")
-        sidecar.stream["file"], sidecar.stream["sha256"], sidecar.source["path"], sidecar.source["frames"]
+        _check(sidecar)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
         said = f"lacks {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
         raise ValueError(f"{path}: not a side-car that can be read ({said})") from error
     return sidecar
+
+
+def _check(sidecar: Sidecar) -> None:
+    """Raise unless the values are of the kinds that those who read them count on."""
+    for name, part in vars(sidecar).items():
+        if not isinstance(part, dict):
+            raise ValueError(f"{name}: expected names and values, got {part!r}")
+    stream, source, settings = sidecar.stream, sidecar.source, sidecar.settings
+    sizes = [stream[key] for key in ("frames", "height", "width")]
+    if not all(map(_is_whole, sizes)):
+        raise ValueError(f"expected frames, height and width above 0, got {sizes}")
+    texts = {"file": stream["file"], "sha256": stream["sha256"], "path": source["path"]}
+    for name, value in texts.items():
+        if not isinstance(value, str):
+            raise ValueError(f"{name}: expected a text, got {value!r}")
+    if not isinstance(source["frames"], dict):
+        raise ValueError(f"frames of the source: expected names and values, got {source['frames']!r}")
+    for name, (expected, is_good) in _SETTINGS.items():
+        if name in settings and not is_good(settings[name]):
+            raise ValueError(f"{name}: expected {expected}, got {settings[name]!r}")
+
+
+def _is_whole(value: Any, least: int = 1) -> bool:
+    return type(value) is int and least <= value < 1 << 31  # True is an int, and JSON's have no end
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) <= sys.float_info.max
+
+
+def _is_positive(value: Any) -> bool:
+    return _is_number(value) and value > 0
+
+
+def _is_noise(value: Any) -> bool:
+    return isinstance(value, dict) and all(one is None or _is_number(one) for one in value.values())
+
+
+_WHOLE = ("a whole number, 1 or more", _is_whole)
+_POSITIVE = ("a finite number above 0", _is_positive)
+
+# Of the settings that something is computed from: what to expect, and whether a value is that.
+_SETTINGS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "scale": _WHOLE,
+    "pattern": (f"one of {', '.join(PATTERNS)}", lambda value: value in PATTERNS),
+    "alpha": _POSITIVE,
+    "clocks": _WHOLE,
+    "frame": ("a whole number, 0 or more, or null", lambda value: value is None or _is_whole(value, 0)),
+    "frames": ("a whole number, 1 or more, or null", lambda value: value is None or _is_whole(value)),
+    "readout": _WHOLE,
+    "seed": ("a whole number, 0 or more", lambda value: type(value) is int and value >= 0),
+    "plan": ("a text or a number of latent frames", lambda value: isinstance(value, str) or _is_whole(value, 0)),
+    "tolerance": _POSITIVE,
+    "step": _POSITIVE,
+    "interpolation": ("a text", lambda value: isinstance(value, str)),
+    "noise": ("names and finite numbers", _is_noise),
+}
 
 
 def find_sidecar(stream: Path) -> Sidecar | None:
@@ -96,13 +153,27 @@ def find_sidecar(stream: Path) -> Sidecar | None:
 
     Returns:
         The side-car; ``None`` where there is none, or that of another stream.
+
+    Raises:
+        ValueError: it speaks of this file, but not as a side-car does; the message names it.
     """
     path = stream.with_suffix(".json")
     try:
         sidecar = read_sidecar(path)
     except ValueError:
+        if _claims(path, stream):
+            raise
         return None
     return sidecar if sidecar.stream["file"] == stream.name else None
+
+
+def _claims(path: Path, stream: Path) -> bool:
+    """Return whether a damaged side-car still says that it is that of a stream."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        return data["kind"] == KIND and data["stream"]["file"] == stream.name
+    except (OSError, ValueError, TypeError, LookupError, RecursionError):
+        return False
 
 
 @contextmanager

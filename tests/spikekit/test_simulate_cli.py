@@ -236,6 +236,70 @@ def test_not_made_again_with_other_settings(film, fails, capsys):
     assert "b.json: not a side-car that can be read" in fails(1, "b.json", "-o", "c.dat")
 
 
+@pytest.mark.parametrize(
+    ("part", "value", "said"),
+    [
+        ("settings", [], "settings: expected names and values, got []"),
+        ("source", None, "source: expected names and values, got None"),
+        ("versions", "1", "versions: expected names and values, got '1'"),
+        ("source.path", 5, "path: expected a text, got 5"),
+        ("source.frames", 5, "frames of the source: expected names and values, got 5"),
+        ("stream.sha256", 5, "sha256: expected a text, got 5"),
+        ("stream.frames", True, "expected frames, height and width above 0, got [True, "),
+        ("stream.height", -1, "expected frames, height and width above 0, got [41, -1, 18]"),
+        ("settings.alpha", "x", "alpha: expected a finite number above 0, got 'x'"),
+        ("settings.alpha", -1, "alpha: expected a finite number above 0, got -1"),
+        ("settings.alpha", float("nan"), "alpha: expected a finite number above 0, got nan"),
+        ("settings.alpha", 10**400, "alpha: expected a finite number above 0, got 1000"),
+        ("settings.pattern", "RGB", "pattern: expected one of RGGB, BGGR, GRBG, GBRG, got 'RGB'"),
+        ("settings.pattern", ["RGGB"], "pattern: expected one of RGGB, BGGR, GRBG, GBRG, got ['RGGB']"),
+        ("settings.frames", "4", "frames: expected a whole number, 1 or more, or null, got '4'"),
+        ("settings.frame", -1, "frame: expected a whole number, 0 or more, or null, got -1"),
+        ("settings.scale", 2.5, "scale: expected a whole number, 1 or more, got 2.5"),
+        ("settings.clocks", "20", "clocks: expected a whole number, 1 or more, got '20'"),
+        ("settings.readout", 0, "readout: expected a whole number, 1 or more, got 0"),
+        ("settings.seed", 1.0, "seed: expected a whole number, 0 or more, got 1.0"),
+        ("settings.tolerance", True, "tolerance: expected a finite number above 0, got True"),
+        ("settings.plan", 1.0, "plan: expected a text or a number of latent frames, got 1.0"),
+        ("settings.interpolation", 5, "interpolation: expected a text, got 5"),
+        ("settings.noise", {"photons": "many"}, "noise: expected names and finite numbers, got {'photons': 'many'}"),
+    ],
+)
+def test_a_sidecar_edited_by_hand(film, fails, capsys, part, value, said):
+    """One line that names it, from every verb that reads it."""
+    simulate(film, "-o", "a.dat", *QUICK)
+    known = json.loads(Path("a.json").read_text())
+    section, _, name = part.partition(".")
+    known = known | {section: known[section] | {name: value} if name else value}
+    Path("a.json").write_text(json.dumps(known))
+    capsys.readouterr()
+    assert fails(1, "a.json", "-o", "b.dat").startswith(f"spikekit: a.json: not a side-car that can be read ({said}")
+    for words in (["info"], ["decode", "--method", "tfp", "-o", "a.png"], ["view", "-o", "a.png"]):
+        assert main([words[0], "a.dat", *words[1:]]) == 1
+        err = capsys.readouterr().err
+        assert err.startswith(f"spikekit: a.json: not a side-car that can be read ({said}")
+        assert err.count("\n") == 1
+    assert main(["info", "a.dat", "--height", "16", "--width", "18"]) == 0  # without it
+
+
+def test_a_json_that_speaks_of_no_stream_is_no_sidecar(film, fails, capsys):
+    simulate(film, "-o", "a.dat", *QUICK)
+    known = json.loads(Path("a.json").read_text())
+    capsys.readouterr()
+    for other in ("{}", "[" * 100_000, json.dumps(known | {"kind": "something else", "settings": []})):
+        Path("a.json").write_text(other)
+        assert find_sidecar(Path("a.dat")) is None
+        assert "a.json: not a side-car that can be read" in fails(1, "a.json", "-o", "b.dat")
+    Path("a.json").write_text(json.dumps(known | {"stream": known["stream"] | {"file": "b.dat"}, "settings": []}))
+    assert find_sidecar(Path("a.dat")) is None
+
+
+def test_a_long_seed_is_read_again(film):
+    simulate(film, "-o", "a.dat", *QUICK, "--seed", 10**30)
+    simulate("a.json", "-o", "b.dat")
+    assert Path("b.dat").read_bytes() == Path("a.dat").read_bytes()
+
+
 @pytest.mark.slow
 def test_four_at_once(film):
     """Processes that write one name, and one process with as many threads as there are, give the same files."""
