@@ -361,6 +361,7 @@ def tfp(
     check_positive("max_range", max_range)
     check_dtype(dtype, torch.uint8)
     dtype = dtype or default_float(spikes)
+    window = min(window, 2 * spikes.shape[-3] - 1)  # which sees all frames from either end
     between = torch.float64 if dtype == torch.float64 else torch.float32
     for _ in range(order - 1):
         spikes = _Tfp.apply(spikes, window, 1.0, between, False)

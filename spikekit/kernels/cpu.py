@@ -274,7 +274,7 @@ def _running_sums(values: np.ndarray, window: int, weights: np.ndarray | None = 
     elif values.dtype == np.uint8:
         counter = np.min_scalar_type(window * int(values.max(initial=0)))
     else:
-        counter = np.dtype(np.int64)
+        counter = np.dtype(np.uint64 if values.dtype == np.uint64 else np.int64)
     total, weighed = np.zeros(values.shape[1:], counter), np.empty(values.shape[1:], counter)
 
     def weigh(n: int) -> np.ndarray:

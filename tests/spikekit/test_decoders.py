@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.autograd import gradcheck, gradgradcheck
 
-from spikekit import Tfp, spike_integrate_fire, spike_interval, tfi, tfp
+from spikekit import Tfp, spike_integrate_fire, spike_interval, tfi, tfp, tfp_at
 
 DTYPES = [torch.float64, torch.float32, torch.bfloat16, torch.float16]
 
@@ -302,3 +302,38 @@ def test_wrong_range(max_range):
     for op in (tfi, lambda s, max_range: tfp(s, 3, max_range)):
         with pytest.raises(ValueError, match="max_range"):
             op(torch.ones(3, 2, 2), max_range)
+
+
+@pytest.mark.parametrize("window", [17, 2**31 + 1, 2**62 + 1, 2**70 + 1])
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.bool, torch.int64, torch.float32])
+def test_windows_beyond_the_clip(window, dtype):
+    """The mean of all frames, however long the window."""
+    spikes = ((torch.rand(2, 9, 4, 6) < 0.4) * (1 if dtype is torch.bool else 255)).to(dtype)
+    expected = spikes.double().mean(-3, keepdim=True).expand(2, 9, 4, 6).float()
+    for order in (1, 2):
+        torch.testing.assert_close(tfp(spikes, window, order=order), expected)
+        torch.testing.assert_close(tfp_at(spikes, 3, window, order=order), expected[:, 3])
+    leaf = spikes.double().requires_grad_()
+    (grad,) = torch.autograd.grad(tfp(leaf, window).sum(), leaf)
+    torch.testing.assert_close(grad, torch.ones_like(leaf))
+
+
+@pytest.mark.parametrize("window", [3, 11])
+def test_a_window_in_a_clip_of_any_length(window):
+    torch.compiler.reset()
+    compiled = torch.compile(lambda spikes: tfp(spikes, window), fullgraph=True, backend="aot_eager", dynamic=True)
+    batch, frames = torch.export.Dim("batch"), torch.export.Dim("frames")
+    clip = torch.rand(2, 9, 4, 6)
+    shapes = ({0: batch, 1: frames},)
+    exported = torch.export.export(Tfp(window), (clip,), dynamic_shapes=shapes, strict=False).module()
+    for length in (9, 4, 30):
+        spikes = torch.rand(3, length, 4, 6)
+        torch.testing.assert_close(compiled(spikes), tfp(spikes, window))
+        torch.testing.assert_close(exported(spikes), tfp(spikes, window))
+
+
+@pytest.mark.parametrize("dtype", [torch.uint16, torch.uint32, torch.uint64])
+def test_wide_unsigned_spikes(dtype):
+    spikes = torch.rand(9, 4, 6) < 0.4
+    for op in (tfi, spike_interval, lambda s: tfp(s, 3), lambda s: tfp(s, 41, 255.0, dtype=torch.uint8)):
+        assert torch.equal(op(spikes.to(dtype)), op(spikes))
