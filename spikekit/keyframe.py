@@ -11,6 +11,7 @@ from torch import Tensor
 
 from spikekit.check import check_dtype, check_index, check_planes, check_positive, check_whole, default_float
 from spikekit.decoders import cast_light, check_window, interval_dtype
+from spikekit.kernels import batch_first
 
 
 @torch.library.custom_op("spikekit::spike_interval_at", mutates_args=())
@@ -47,6 +48,9 @@ def _(spikes: Tensor, frame: int) -> Tensor:
 def _(spikes: Tensor, frame: int) -> Tensor:
     size = spikes.shape[:-3] + spikes.shape[-2:]
     return spikes.new_empty(size, dtype=interval_dtype(spikes.shape[-3]))
+
+
+batch_first(_spike_interval_at)
 
 
 def search(plane: Callable[[int], np.ndarray], frame: int, clip: range) -> np.ndarray:

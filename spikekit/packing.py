@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from spikekit.check import check_planes, check_whole
+from spikekit.kernels import batch_first
 
 _NOT_BITS = "spikes: expected zeros and ones, got other values"
 
@@ -49,6 +50,10 @@ def _(packed: Tensor, width: int) -> Tensor:
 @_unpack_bits.register_fake
 def _(packed: Tensor, width: int) -> Tensor:
     return packed.new_empty((*packed.shape[:-1], width))
+
+
+batch_first(_pack_bits)
+batch_first(_unpack_bits)
 
 
 def pack_spikes(spikes: Tensor) -> Tensor:

@@ -88,12 +88,21 @@ def test_strides_batches_and_gradients():
     assert tfi_at(torch.zeros(0, 3, 4, 5), 1).shape == (0, 4, 5)
 
 
-def test_compile_and_vmap():
+@pytest.mark.filterwarnings("error")  # without a rule of its own vmap loops, with a warning
+@pytest.mark.parametrize("axis", [0, 1, 3])
+def test_vmap(axis):
+    spikes = torch.rand(3, 9, 4, 6) < 0.3
+    for op in (spike_interval_at, tfi_at):
+        for frame in (0, 4):
+            mapped = torch.func.vmap(lambda one, op=op, frame=frame: op(one, frame), axis)(spikes.movedim(0, axis))
+            assert mapped.equal(op(spikes, frame))
+
+
+def test_compile():
     spikes = torch.rand(2, 9, 4, 6) < 0.3
     torch.compiler.reset()
     compiled = torch.compile(tfi_at, fullgraph=True, backend="aot_eager")
     assert compiled(spikes, 4).equal(tfi_at(spikes, 4))
-    assert torch.func.vmap(lambda one: tfi_at(one, 4))(spikes).equal(tfi_at(spikes, 4))
     torch.library.opcheck(
         torch.ops.spikekit.spike_interval_at.default,
         (spikes, 4),
