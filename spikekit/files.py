@@ -230,7 +230,7 @@ def _write_bits(path: Path, part: Path, spikes: Tensor | Iterable[Tensor], flip:
             height, width = chunk.shape[1:]
             for block in chunk.split(max(1, _BLOCK // (height * width))):
                 block = block.float() if block.dtype is torch.bfloat16 else block  # NumPy has no bfloat16
-                bits = binary(block.cpu().numpy(), "spikes", written, ValueError)[:, :: -1 if flip else 1]
+                bits = binary(block.cpu().resolve_neg().numpy(), "spikes", written, ValueError)[:, :: -1 if flip else 1]
                 with writing(path):
                     file.write(dat_bytes(bits))
                 written += len(bits)

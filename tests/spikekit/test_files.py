@@ -97,6 +97,15 @@ def test_written_views_and_gradients(tmp_path):
     assert read_spikes(str(tmp_path / "a.dat"), 5, 4).equal(spikes.detach().byte())
 
 
+def test_written_with_the_sign_still_to_be_turned(tmp_path):
+    """What torch calls a negative view, which NumPy does not know."""
+    spikes = random_spikes(3, 4, 5)
+    negative = torch.complex(torch.zeros(3, 4, 5), -spikes.float()).conj().imag
+    assert negative.is_neg()
+    write_spikes(tmp_path / "a.dat", negative)
+    assert read_spikes(tmp_path / "a.dat", 4, 5).equal(spikes)
+
+
 # --- parts of recordings ----------------------------------------------------------------------------------------------
 
 
