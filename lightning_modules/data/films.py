@@ -59,7 +59,7 @@ class ClipRecipe:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        self.scale = check_whole("scale", self.scale)
+        object.__setattr__(self, "scale", check_whole("scale", self.scale))  # frozen
         check_positive("alpha", self.alpha)
         check_whole("frames", self.frames)
         check_whole("clocks", self.clocks)

@@ -255,6 +255,12 @@ def test_another_setting_is_another_clip(film, tmp_path, simulated, changed):
     assert simulated.clips == 2
 
 
+def test_a_recipe_takes_a_scale_of_numpy():
+    recipe = ClipRecipe(scale=np.uint8(2))
+    assert recipe == ClipRecipe(scale=2)
+    assert type(recipe.scale) is int
+
+
 def test_keys_tell_code_and_kinds_of_films_apart(film, tmp_path, monkeypatch):
     (one,) = find_films(film, lambda found: (found, found)).test
     recipe = ClipRecipe()
