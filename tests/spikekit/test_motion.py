@@ -144,13 +144,14 @@ def test_joint_flow_of_an_empty_batch_and_of_no_flow():
 
 
 def test_numbers_of_numpy():
-    """The scale as a byte: sizes are not, or they would run over."""
+    """The scale as a byte, which is not kept: what it is multiplied with would run over."""
     flow = torch.randn(2, 100, 90)
     assert torch.equal(upsample_flow(flow, np.uint8(3)), upsample_flow(flow, 3))
     assert torch.equal(UpsampleFlow(np.uint8(3))(flow), upsample_flow(flow, 3))
     expected = linear_motion(flow, -flow, [0, 1, 2], scale=3)
     assert torch.equal(linear_motion(flow, -flow, np.arange(3), scale=np.uint8(3)), expected)
     assert torch.equal(LinearMotion(np.arange(3), scale=np.uint8(3))(flow, -flow), expected)
+    assert type(UpsampleFlow(np.uint8(3)).scale) is type(LinearMotion([0, 2], scale=np.uint8(3)).scale) is int
 
 
 @pytest.mark.parametrize(
