@@ -282,6 +282,7 @@ def test_classical_decoder_shows_the_middle_of_the_clip(method, settings):
         ({"scale": 0}, "scale"),
         ({"pattern": "RGB"}, "pattern"),
         ({"width": 0}, "1 or more"),
+        ({"steps": 3}, "steps: expected an even number, or 0 for the exact search, got 3"),
     ],
 )
 def test_wrong_arguments(arguments, message):
