@@ -105,6 +105,7 @@ class Command(LightningCLI):
         network = "model.init_args.network.init_args"
         for name in ("scale", "frames", "alpha"):
             parser.link_arguments(f"{network}.{name}", f"data.init_args.{name}")
+        parser.link_arguments(f"{network}.pattern", "data.init_args.crop_to")
         parser.link_arguments(
             (f"{network}.frames", f"{network}.window"),
             "data.init_args.flow_times",

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 
 import torch
 from pytorch_lightning.cli import LRSchedulerCallable, OptimizerCallable
-from torch import Tensor
+from torch import Tensor, nn
 
 from lightning_modules.flow_callbacks import FlowPictures, FlowReport
 from lightning_modules.flow_metrics import end_point_error, outliers
-from lightning_modules.learner import Learner
+from lightning_modules.learner import Learner, step_schedule
 from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
 from spikekit import bayer_pattern, split_bayer
 
 _DISCOUNT = 0.8  # of every iteration against the one after it
+
+
+# no lambda, so that a module can be pickled
+def _adamw(parameters: Iterable[nn.Parameter]) -> torch.optim.AdamW:
+    return torch.optim.AdamW(parameters, lr=1e-3)
 
 
 class FlowTraining(Learner):
@@ -45,8 +51,8 @@ class FlowTraining(Learner):
         frames: int = 41,
         window: int = 11,
         pattern: str = "RGGB",
-        optimizer: OptimizerCallable = lambda parameters: torch.optim.AdamW(parameters, lr=1e-3),
-        lr_scheduler: LRSchedulerCallable = lambda optimizer: torch.optim.lr_scheduler.StepLR(optimizer, 7500, 0.8),
+        optimizer: OptimizerCallable = _adamw,
+        lr_scheduler: LRSchedulerCallable = step_schedule,
     ) -> None:
         first, last = window // 2, frames - 1 - window // 2
         needs = {"pattern": bayer_pattern(pattern), "frames": frames, "flow_times": (first, last)}

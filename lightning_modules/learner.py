@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
+import torch
 from pytorch_lightning import Callback, LightningModule
 from pytorch_lightning.cli import LRSchedulerCallable, OptimizerCallable
 from torch import nn
 
 from lightning_modules.pretrained import check_settings, motion_of, settings_of
+
+
+def step_schedule(optimizer: torch.optim.Optimizer) -> torch.optim.lr_scheduler.StepLR:
+    """Times 0.8 every 7500 steps, as in the paper."""
+    return torch.optim.lr_scheduler.StepLR(optimizer, 7500, 0.8)
 
 
 class Learner(LightningModule):

@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any, Literal, Self
 
 import torch
 import torch.nn.functional as F
 from pytorch_lightning.cli import LRSchedulerCallable, OptimizerCallable
-from torch import Tensor
+from torch import Tensor, nn
 
 from lightning_modules.arguments import make_module
 from lightning_modules.callbacks import TestReport, ValidationPictures
-from lightning_modules.learner import Learner
+from lightning_modules.learner import Learner, step_schedule
 from lightning_modules.networks import ClassicalDecoder, Network
 from lightning_modules.pretrained import load_weights, read_weights, with_own_motion
 from lightning_modules.speed import choose
 from lightning_modules.tiles import TILE, forward_in_tiles
 from spikekit import psnr, ssim
+
+
+# no lambda, so that a module can be pickled
+def _adam(parameters: Iterable[nn.Parameter]) -> torch.optim.Adam:
+    return torch.optim.Adam(parameters, lr=1e-4)
 
 
 class SuperResolution(Learner):
@@ -49,8 +55,8 @@ class SuperResolution(Learner):
     def __init__(
         self,
         network: Network,
-        optimizer: OptimizerCallable = lambda parameters: torch.optim.Adam(parameters, lr=1e-4),
-        lr_scheduler: LRSchedulerCallable = lambda optimizer: torch.optim.lr_scheduler.StepLR(optimizer, 7500, 0.8),
+        optimizer: OptimizerCallable = _adam,
+        lr_scheduler: LRSchedulerCallable = step_schedule,
         tile: int = TILE,
         tolerance: float = 0.0,
         flow: Literal["scene", "estimated"] = "scene",

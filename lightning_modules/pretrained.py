@@ -73,7 +73,7 @@ def _read_safetensors(path: Path) -> Weights:
         raise ValueError(f"{path}: not a file of safetensors, or a damaged one ({_first_line(error)})") from error
     try:
         settings, motion = json.loads(said["network"]), json.loads(said["motion"])
-        return Weights(path, {"class": settings["class"], **settings}, dict(motion), tensors)
+        return Weights(path, {"class": settings["class"], **_named(settings)}, _named(motion), tensors)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: does not say what network it is of, as lightning export would") from error
 
@@ -81,12 +81,23 @@ def _read_safetensors(path: Path) -> Weights:
 def _read_checkpoint(path: Path) -> Weights:
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        settings, tensors = dict(checkpoint["network"]), dict(checkpoint["state_dict"])
+        settings, motion = _named(checkpoint["network"]), _named(checkpoint.get("motion", {}))
+        tensors = {name.removeprefix("network."): value for name, value in checkpoint["state_dict"].items()}
+        if not all(isinstance(value, Tensor) for value in tensors.values()):
+            raise TypeError("state_dict: expected tensors")
     except Exception as error:
         reason = f"{type(error).__name__}: {_first_line(error)}"
         raise ValueError(f"{path}: not a checkpoint of lightning fit ({reason})") from error
-    tensors = {name.removeprefix("network."): value for name, value in tensors.items()}
-    return Weights(path, settings, dict(checkpoint.get("motion", {})), tensors)
+    return Weights(path, settings, motion, tensors)
+
+
+def _named(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return settings whose class is a name: a path would be imported, and so run, when the network is built."""
+    settings = dict(settings)
+    if not str(settings.get("class", "none")).isidentifier():
+        raise ValueError(f"class: expected a name, got {settings['class']!r}")
+    json.dumps(settings)  # plain values
+    return settings
 
 
 def write_weights(weights: Weights, path: str | Path) -> None:
@@ -99,7 +110,8 @@ def write_weights(weights: Weights, path: str | Path) -> None:
     if path.suffix != ".safetensors":
         raise ValueError(f"{path}: expected a name that ends in .safetensors")
     path.parent.mkdir(parents=True, exist_ok=True)
-    tensors = {name: value.contiguous() for name, value in weights.tensors.items()}
+    # copies, as tensors that share memory cannot be saved
+    tensors = {name: value.clone(memory_format=torch.contiguous_format) for name, value in weights.tensors.items()}
     # save_file leaves a file that nobody else may read
     path.write_bytes(save(tensors, {"network": json.dumps(weights.settings), "motion": json.dumps(weights.motion)}))
 
@@ -138,7 +150,9 @@ def check_settings(network: nn.Module, settings: dict[str, Any], source: str | P
         raise CheckpointMismatchError(f"{source} was trained with {trained}; this run asks for {asked}")
 
 
-def with_own_motion(tensors: dict[str, Tensor], motion: nn.Module, prefix: str = "") -> dict[str, Tensor]:
+def with_own_motion(
+    tensors: dict[str, Tensor], motion: nn.Module, prefix: str = "", keep: bool = False
+) -> dict[str, Tensor]:
     """Weights in which those of another kind of estimator are replaced by an estimator's own.
 
     Estimators are exchanged freely: a network is trained with one and used with all of them.
@@ -147,17 +161,24 @@ def with_own_motion(tensors: dict[str, Tensor], motion: nn.Module, prefix: str =
         tensors: weights of a network, by name.
         motion: the estimator of the network that they are meant for.
         prefix: what the names begin with.
+        keep: replace those of the same kind as well.
     """
     prefix += _MOTION
     ours = {f"{prefix}{name}": value for name, value in motion.state_dict().items()}
     theirs = {name: value for name, value in tensors.items() if name.startswith(prefix)}
-    if {name: value.shape for name, value in ours.items()} == {name: value.shape for name, value in theirs.items()}:
+    shapes = [{name: value.shape for name, value in weights.items()} for weights in (ours, theirs)]
+    if shapes[0] == shapes[1] and not keep:
         return tensors
     return {name: tensors[name] for name in tensors.keys() - theirs.keys()} | ours
 
 
-def load_weights(network: nn.Module, weights: Weights) -> None:
+def load_weights(network: nn.Module, weights: Weights, keep_motion: bool = False) -> None:
     """Give a network weights that are of its kind.
+
+    Args:
+        network: what the weights are meant for.
+        weights: they.
+        keep_motion: leave its estimator of motion as it is, also where the weights have one of the same kind.
 
     Raises:
         CheckpointMismatchError: they are of another network.
@@ -165,7 +186,7 @@ def load_weights(network: nn.Module, weights: Weights) -> None:
     """
     check_settings(network, weights.settings, weights.source)
     motion = getattr(network, "motion", None)
-    tensors = weights.tensors if motion is None else with_own_motion(weights.tensors, motion)
+    tensors = weights.tensors if motion is None else with_own_motion(weights.tensors, motion, keep=keep_motion)
     try:
         network.load_state_dict(tensors)
     except RuntimeError as error:

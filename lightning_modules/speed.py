@@ -66,8 +66,9 @@ def choices(scale: int, size: tuple[int, int]) -> list[Choice]:
 
     Time is taken to grow with the number of pixels; times are the table's ratios, taken times that of its first
     setting. Memory grows with them, too, until a tile is full, with all that motion may reach over; from there on only
-    by what the leanest setting takes, such as the picture itself, and by an estimate of motion. A setting without tiles is left out: on recordings
-    larger than the table's clips its memory has no bound, and on the clips themselves it is the first one.
+    by what the leanest setting takes, such as the picture itself, and by an estimate of motion. A setting without tiles
+    is left out: on recordings larger than the table's clips its memory has no bound, and on the clips themselves it is
+    the first one.
 
     Args:
         scale: super-resolution factor.

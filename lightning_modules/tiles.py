@@ -27,7 +27,7 @@ BLEND = 4
 
 @torch.no_grad()
 def forward_in_tiles(
-    network: Network, spikes: Tensor, tile: int, tolerance: float = 0.0, flow: Tensor | None = None
+    network: Network, spikes: Tensor, tile: int, tolerance: float = 0.0, flow: Tensor | Literal[0] | None = None
 ) -> Tensor:
     r"""Run a network on tiles that overlap, and put the results together.
 
@@ -118,7 +118,7 @@ def _boxes(network: Tensor, motion: Tensor, tile: int) -> dict[Box, bool]:
 
 
 def _forward_where_needed(
-    network: Network, spikes: Tensor, tile: int, tolerance: float, given: Tensor | None
+    network: Network, spikes: Tensor, tile: int, tolerance: float, given: Tensor | Literal[0] | None
 ) -> Tensor:
     height, width = spikes.shape[-2:]
     s = network.scale
@@ -130,7 +130,10 @@ def _forward_where_needed(
     if any(boxes.values()):
         tops, lefts, bottoms, rights = zip(*(box for box, moves in boxes.items() if moves), strict=True)
         around = Box(min(tops), min(lefts), max(bottoms), max(rights)).grown(AROUND, whole)
-        flow = _motion(network, around.of(spikes)) if given is None else around.of(given)
+        if given is None:
+            flow = _motion(network, around.of(spikes))
+        else:
+            flow = around.of(given) if isinstance(given, Tensor) else given
     rgb = seen.picture
     for box, moves in boxes.items():
         if moves and isinstance(flow, Tensor):

@@ -19,14 +19,15 @@ class RecordingClips(Dataset[dict[str, Any]]):
         height: rows; needed for ``.dat``.
         width: columns; needed for ``.dat``.
         flip: turn the stored frames upside down, as real cameras need.
-        pattern: Bayer phase after the flip; the clips are cropped by up to one row and column so that they begin with
-            red, which makes every phase RGGB.
+        pattern: Bayer phase after the flip.
         frames: spike frames N of a clip.
         every: frames between two clips.
+        crop_to: Bayer phase that a network wants; up to one row and column are cut off so that clips begin with it.
 
     Raises:
         spikekit.SpikeFileError: the file cannot be read.
-        ValueError: the recording is shorter than a clip, or an argument is out of range.
+        ValueError: the recording is shorter than a clip, less than 3 x 3 pixels are left, or an argument is out of
+            range.
     """
 
     def __init__(
@@ -38,13 +39,19 @@ class RecordingClips(Dataset[dict[str, Any]]):
         pattern: str = "RGGB",
         frames: int = 41,
         every: int = 20,
+        crop_to: str = "RGGB",
     ) -> None:
         if every < 1:
             raise ValueError(f"every: expected at least 1 frame, got {every}")
         total, self.height, self.width = spikes_shape(path, height, width)
         if total < frames:
             raise ValueError(f"{path}: expected at least {frames} frames for a clip, got {total}")
-        (_, self.top, self.left), *_ = bayer_sites(pattern)
+        # where red is says which of the four phases it is
+        (_, row, column), (_, to_row, to_column) = bayer_sites(pattern)[0], bayer_sites(crop_to)[0]
+        self.top, self.left = (row - to_row) % 2, (column - to_column) % 2
+        left = self.height - self.top, self.width - self.left
+        if min(left) < 3:
+            raise ValueError(f"{path}: expected at least 3 x 3 pixels that begin with {crop_to}, got {left}")
         self.path, self.flip, self.frames, self.every = path, flip, frames, every
         self.clips = (total - frames) // every + 1
 
@@ -72,6 +79,7 @@ class Recording(LightningDataModule):
         pattern: Bayer phase after the flip, one of RGGB, BGGR, GRBG, GBRG; for a grey camera leave it as it is.
         every: frames between two reconstructed pictures; 20 is a millisecond at 20 kHz.
         frames: spike frames of a clip, as the network was trained.
+        crop_to: Bayer phase that the network was trained with; clips begin with it, a row and a column less at most.
     """
 
     def __init__(
@@ -83,6 +91,7 @@ class Recording(LightningDataModule):
         pattern: str = "RGGB",
         every: int = 20,
         frames: int = 41,
+        crop_to: str = "RGGB",
     ) -> None:
         super().__init__()
         self.path = path
@@ -93,6 +102,7 @@ class Recording(LightningDataModule):
             "pattern": pattern,
             "frames": frames,
             "every": every,
+            "crop_to": crop_to,
         }
 
     def setup(self, stage: str | None = None) -> None:

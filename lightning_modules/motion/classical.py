@@ -11,7 +11,7 @@ from torch import Tensor
 from lightning_modules.flicker import flicker
 from lightning_modules.motion.estimator import MotionEstimator, split_any_size
 from lightning_modules.motion.tvl1 import tvl1_flow
-from spikekit import flow_warp, tfp_at
+from spikekit import bayer_pattern, flow_warp, tfp_at
 from spikekit.check import check_planes, check_positive, check_whole
 
 _GREY = torch.tensor([[0.25, 0.5, 0.25]])  # each pixel the mean of the Bayer cells that it is part of
@@ -72,6 +72,10 @@ class ClassicalFlow(MotionEstimator):
     def _flows(self, spikes: Tensor, times: tuple[int, int, int], pattern: str, by_site: bool) -> tuple[Tensor, Tensor]:
         check_planes("spikes", spikes, 4, "(B, N, H, W)")
         first, middle, last = times
+        if not 0 < middle < spikes.shape[1] - 1 or min(spikes.shape[-2:]) < 2:
+            expected = f"(B, N, H, W) of at least 2 x 2 pixels, with frames before and after the middle, {middle}"
+            raise ValueError(f"spikes: expected {expected}, got {tuple(spikes.shape)}")
+        bayer_pattern(pattern)
         with torch.autocast(spikes.device.type, enabled=False):
             raw, clock, window = _decode(spikes, middle)
             noise = _noise(window).to(raw)[(raw.mean(dim=1, keepdim=True) * _RATES).long().clamp(0, _RATES - 1)]

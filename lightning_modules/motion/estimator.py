@@ -53,6 +53,11 @@ def split_any_size(raw: Tensor, pattern: str) -> Tensor:
 
     Returns:
         (4, B, T, h, w), h and w being half of H and W, rounded up.
+
+    Raises:
+        ValueError: less than 2 x 2 pixels.
     """
     height, width = raw.shape[-2:]
+    if min(height, width) < 2:
+        raise ValueError(f"spikes: expected at least 2 x 2 pixels, got {height} x {width}")
     return split_bayer(F.pad(raw, (0, width % 2, 0, height % 2), "reflect"), pattern)

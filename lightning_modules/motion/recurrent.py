@@ -130,7 +130,7 @@ class Correlation:
                 found.append(picked.reshape(grid.shape[:-1]))
             else:
                 found.append((self.features * F.grid_sample(level, grid, align_corners=False)).sum(dim=1))
-        return torch.cat(found, dim=-1).transpose(1, 2).unflatten(2, (self.height, self.width))
+        return torch.cat(found, dim=-1).transpose(1, 2).unflatten(2, (self.height, self.width)).to(flow.dtype)
 
 
 def _positions(rows: range, columns: range, like: Tensor) -> Tensor:

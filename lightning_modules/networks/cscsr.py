@@ -18,7 +18,7 @@ from lightning_modules.networks.reconstruction import ColorCorrelation, EarlyFus
 from lightning_modules.networks.refinement import FeatureRefinement, TimeFusion
 from lightning_modules.networks.representation import IntervalRepresentation, SpikeRepresentation, WindowMeans
 from spikekit import bayer_mask, bayer_pattern, demosaic, flow_warp_idw, linear_motion, split_colors, tfp_at
-from spikekit.check import check_planes, check_whole
+from spikekit.check import check_planes, check_positive, check_whole
 
 _SEARCHED = 1 << 19  # positions that are searched in one go
 
@@ -126,15 +126,28 @@ class CSCSR(Network):
         reconstruction: Literal["correlated", "separate", "early"] = "correlated",
         resolution: Literal["output", "sensor"] = "output",
     ) -> None:
-        scale = check_whole("scale", scale)
-        if frames % 2 == 0 or window % 2 == 0 or not 1 <= window < frames or (frames - window) % stride:
+        sizes = {
+            "scale": scale,
+            "frames": frames,
+            "window": window,
+            "stride": stride,
+            "width": width,
+            "representation_width": representation_width,
+            "features": features,
+            "stages": stages,
+            "blocks": blocks,
+            "end_blocks": end_blocks,
+            "neighbors": neighbors,
+        }
+        sizes = {name: check_whole(name, size) for name, size in sizes.items()}
+        check_positive("alpha", alpha)
+        if frames % 2 == 0 or window % 2 == 0 or window >= frames or (frames - window) % stride:
             raise ValueError(
                 "frames, window, stride: expected odd frames and window, and a stride that divides frames - window, "
                 f"got {frames}, {window}, {stride}"
             )
-        end = width if end_width is None else end_width
-        if min(width, representation_width, features, stages, blocks, end_blocks, end, neighbors) < 1:
-            raise ValueError("widths, stages, blocks and neighbors: expected 1 or more of each")
+        if end_width is not None:
+            end_width = check_whole("end_width", end_width)
         if steps < 0 or steps % 2:
             raise ValueError(f"steps: expected an even number, or 0 for the exact search, got {steps}")
         if representation in ("spikes", "interval") and not global_perception:
@@ -146,21 +159,11 @@ class CSCSR(Network):
         if end_width is not None and reconstruction == "separate":
             raise ValueError(f"end_width: separate colours are never fused, expected none, got {end_width}")
         settings = {
-            "scale": scale,
-            "frames": frames,
-            "window": window,
-            "stride": stride,
+            **sizes,
             "pattern": bayer_pattern(pattern),
-            "width": width,
-            "representation_width": representation_width,
-            "features": features,
-            "stages": stages,
-            "blocks": blocks,
-            "end_blocks": end_blocks,
             "end_width": end_width,
             "skip": skip,
             "alpha": alpha,
-            "neighbors": neighbors,
             "representation": representation,
             "global_perception": global_perception,
             "motion_fusion": motion_fusion,
@@ -224,10 +227,7 @@ class CSCSR(Network):
             nn.init.zeros_(self.reconstruction.rgb.weight)
 
     def forward(self, spikes: Tensor, flow: Tensor | Literal[0] | None = None) -> Tensor:  # noqa: D102
-        check_planes("spikes", spikes, 4, "(B, N, H, W)")
-        if spikes.ndim != 4 or spikes.shape[1] != self.frames or min(spikes.shape[-2:]) < 3:
-            expected = f"(B, {self.frames}, H, W) of at least 3 x 3 pixels"
-            raise ValueError(f"spikes: expected {expected}, got {tuple(spikes.shape)}")
+        self._check_spikes(spikes)
         batch, _, height, width = spikes.shape
         spikes = spikes.to(self.reconstruction.rgb.weight.dtype)
         if flow is None:
@@ -260,9 +260,16 @@ class CSCSR(Network):
         Returns:
             (B, 2, 2, H, W), or (B, 3, 2, 2, H, W) where every colour has its own.
         """
+        self._check_spikes(spikes)
         if not self.search:
             return torch.zeros(len(spikes), 2, 2, *spikes.shape[-2:], device=spikes.device)
         return self._fuse_motion(self.motion, spikes, self.flow_times, self.pattern)
+
+    def _check_spikes(self, spikes: Tensor) -> None:
+        check_planes("spikes", spikes, 4, "(B, N, H, W)")
+        if spikes.ndim != 4 or spikes.shape[1] != self.frames or min(spikes.shape[-2:]) < 3:
+            expected = f"(B, {self.frames}, H, W) of at least 3 x 3 pixels"
+            raise ValueError(f"spikes: expected {expected}, got {tuple(spikes.shape)}")
 
     def _offsets(self, flow: Tensor) -> tuple[Tensor, ...]:
         """How far every colour has moved at every time point, each (B, T, 2, s H, s W)."""
@@ -309,7 +316,8 @@ class CSCSR(Network):
         return F.interpolate(smooth, scale_factor=self.scale, mode="bicubic", align_corners=False)
 
     def _mask(self, height: int, width: int, device: torch.device) -> tuple[Tensor, ...]:
-        key = height, width, device
+        # what is made in inference mode cannot be kept for a gradient
+        key = height, width, device, torch.is_inference_mode_enabled()
         if key not in self._masks:
             mask = bayer_mask(height, width, self.pattern, scale=self.scale, device=device, dtype=torch.bool)
             self._masks = {key: mask.unbind(0)}  # the same tensors every time: their tables are kept

@@ -62,13 +62,14 @@ class Network(nn.Module):
         kind = settings.pop("class", None)
         if kind != cls.__name__:
             raise ValueError(f"{weights}: expected weights of {cls.__name__}, got those of {kind}")
+        own = motion is not None
         try:
-            if motion is None and inside:
+            if inside and not own:
                 motion = getattr(estimators, inside.pop("class"))(**inside)
             network = cls(**settings, motion=motion)
-        except (AttributeError, TypeError) as error:
+        except (AttributeError, KeyError, TypeError) as error:
             raise ValueError(f"{weights}: written by another version of this package ({error})") from error
-        load_weights(network, found)
+        load_weights(network, found, keep_motion=own)
         return network.eval()
 
     def estimate_flow(self, spikes: Tensor) -> Tensor:

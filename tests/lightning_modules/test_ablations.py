@@ -385,7 +385,7 @@ def test_the_reconstructions_have_equally_many_residual_blocks(end_blocks, confi
         ({"representation": "spikes", "global_perception": False}, "global_perception: part of representation bssr"),
         ({"motion_fusion": "independent", "search": False}, "motion_fusion: expected joint without search"),
         ({"end_width": 8, "reconstruction": "separate"}, "end_width: separate colours are never fused"),
-        ({"end_width": 0}, "widths, stages, blocks and neighbors: expected 1 or more"),
+        ({"end_width": 0}, "end_width: expected a whole number >= 1, got 0"),
     ],
 )
 def test_wrong_arguments(arguments, message):

@@ -224,3 +224,18 @@ def test_more_warps_are_more_exact():
 
     once, twice, often = (error((0.25, -0.2), warps) for warps in (1, 2, 5))
     assert once > 1.1 * twice > 1.1 * often, (once, twice, often)
+
+
+@pytest.mark.parametrize(
+    ("size", "times", "pattern", "message"),
+    [
+        ((1, 8, 8), (0, 0, 0), "RGGB", "with frames before and after the middle, 0"),
+        ((41, 8, 8), (0, 0, 10), "RGGB", "with frames before and after the middle, 0"),
+        ((41, 8, 8), (0, 40, 40), "RGGB", "with frames before and after the middle, 40"),
+        ((41, 1, 8), TIMES, "RGGB", "at least 2 x 2 pixels"),
+        ((41, 8, 8), TIMES, "XYZ", "pattern"),
+    ],
+)
+def test_classical_flow_refuses_what_has_no_motion(size, times, pattern, message):
+    with pytest.raises(ValueError, match=message):
+        ClassicalFlow()(torch.zeros(1, *size), times, pattern)

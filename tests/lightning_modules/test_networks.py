@@ -281,8 +281,11 @@ def test_classical_decoder_shows_the_middle_of_the_clip(method, settings):
         ({"stride": 7}, "divides frames - window"),
         ({"scale": 0}, "scale"),
         ({"pattern": "RGB"}, "pattern"),
-        ({"width": 0}, "1 or more"),
-        ({"steps": 3}, "steps: expected an even number, or 0 for the exact search, got 3"),
+        ({"width": 0}, "width: expected a whole number >= 1, got 0"),
+        ({"width": 2.5}, "width: expected a whole number >= 1, got 2.5"),
+        ({"stride": 0}, "stride: expected a whole number >= 1, got 0"),
+        ({"alpha": float("nan")}, "alpha: expected a finite number above 0, got nan"),
+        ({"steps": 5}, "steps: expected an even number, or 0 for the exact search, got 5"),
     ],
 )
 def test_wrong_arguments(arguments, message):
@@ -297,3 +300,14 @@ def test_wrong_input():
         network(spikes[:, :21], flow)
     with pytest.raises(ValueError, match="flow: expected"):
         network(spikes, flow[..., :8])
+
+
+def test_trains_after_a_look_in_inference_mode():
+    """What Lightning's validation keeps in the network must serve training, too."""
+    network = CSCSR(2, **TINY)
+    spikes, flow = clip()
+    with torch.inference_mode():
+        seen = network(spikes, flow)
+    learned = network(spikes, flow)
+    learned.square().mean().backward()
+    assert torch.equal(learned, seen)

@@ -2,8 +2,10 @@
 
 import json
 import os
+import pickle
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -71,6 +73,10 @@ def test_learned_motion_is_part_of_the_weights(tmp_path, suffix):
     assert torch.equal(read(SPIKES), made(SPIKES))
     with_other = CSCSR.from_pretrained(path.with_suffix(suffix), motion=ZeroFlow())
     torch.testing.assert_close(with_other(SPIKES), made(SPIKES, torch.zeros(1, 2, 2, 8, 10)))
+    mine = Spike2Flow(**FLOW_TINY)
+    before = {name: value.clone() for name, value in mine.state_dict().items()}
+    assert CSCSR.from_pretrained(path.with_suffix(suffix), motion=mine).motion is mine
+    assert all(torch.equal(value, before[name]) for name, value in mine.state_dict().items())
 
 
 def test_weights_of_something_else(file, tmp_path):
@@ -120,6 +126,55 @@ def test_loading_runs_no_code(tmp_path):
     assert not (tmp_path / "harmed").exists()
 
 
+def test_classes_of_a_file_are_names_and_no_paths(tmp_path):
+    """A path would be imported where the network is built, and a module runs when it is imported."""
+    said = {"class": "this.That", **network().settings}
+    torch.save({"network": said, "state_dict": {}}, tmp_path / "file.ckpt")
+    save_file(
+        load_file(shipped_weights()["x4-t"]),
+        tmp_path / "file.safetensors",
+        {"network": json.dumps(said), "motion": "{}"},
+    )
+    for name in ("file.ckpt", "file.safetensors"):
+        with pytest.raises(ValueError, match=name):
+            read_weights(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"motion": None},
+        {"state_dict": {1: torch.zeros(1)}},
+        {"state_dict": {"a": "b"}},
+        {"network": {"scale": torch.ones(1)}},
+    ],
+)
+def test_odd_checkpoints_say_so(tmp_path, changes):
+    torch.save({"network": {"class": "CSCSR"}, "state_dict": {}, **changes}, tmp_path / "odd.ckpt")
+    with pytest.raises(ValueError, match=r"odd.ckpt: not a checkpoint of lightning fit"):
+        read_weights(tmp_path / "odd.ckpt")
+
+
+def test_motion_of_no_class_is_refused(file, tmp_path):
+    said = {"network": json.dumps({"class": "CSCSR", **network().settings}), "motion": json.dumps({"window": 11})}
+    save_file(load_file(file), tmp_path / "odd.safetensors", said)
+    with pytest.raises(ValueError, match=r"odd.safetensors: written by another version of this package \('class'\)"):
+        CSCSR.from_pretrained(tmp_path / "odd.safetensors")
+
+
+def test_weights_that_share_memory_can_be_exported(tmp_path):
+    shared = torch.zeros(3)
+    found = read_weights("x4-t")
+    write_weights(replace(found, tensors={"a": shared, "b": shared}), tmp_path / "shared.safetensors")
+    assert set(load_file(tmp_path / "shared.safetensors")) == {"a", "b"}
+
+
+def test_a_module_can_be_pickled():
+    module = SuperResolution.from_pretrained(speed="fastest")
+    spikes = torch.ones(1, 41, 8, 8)
+    assert torch.equal(pickle.loads(pickle.dumps(module))(spikes), module(spikes))
+
+
 def test_shipped_weights_are_what_their_names_and_cards_say():
     assert "spike2flow" in shipped_weights()
     for name, path in shipped_weights().items():
@@ -131,7 +186,8 @@ def test_shipped_weights_are_what_their_names_and_cards_say():
             continue
         assert found.settings["class"] == "CSCSR"
         assert name.startswith(f"x{found.settings['scale']}-")
-        assert CSCSR.from_pretrained(name).settings == {k: v for k, v in found.settings.items() if k != "class"}
+        built = {"class": "CSCSR", **CSCSR.from_pretrained(name).settings}
+        assert {key: built[key] for key in found.settings} == found.settings
 
 
 def predict(*args, cwd):

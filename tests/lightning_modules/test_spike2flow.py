@@ -349,6 +349,17 @@ def test_bfloat16_is_close_and_gives_float32():
     assert (half - exact).abs().max() < 0.2 * exact.abs().max()
 
 
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_a_network_in_half_precision_asks_it_for_motion(dtype):
+    torch.manual_seed(0)
+    network = CSCSR(2, width=4, representation_width=4, features=1, stages=1, end_blocks=1, motion=Spike2Flow(**TINY))
+    expected = network.estimate_flow(clip(1, 24, 24))
+    flow = network.to(dtype).estimate_flow(clip(1, 24, 24).to(dtype))
+    assert flow.dtype == dtype
+    torch.testing.assert_close(flow.float(), expected, rtol=0, atol=0.05 * expected.abs().max().item())
+    assert network(clip(1, 24, 24)).isfinite().all()
+
+
 def test_phase_of_the_joint_flow():
     """Flow that the sites see at their own places, and that grows across the sensor, comes out where it was."""
     x = torch.arange(16.0).expand(1, 1, 16, 16)

@@ -244,6 +244,23 @@ def test_a_motion_that_is_given_takes_the_place_of_the_estimate(tile, tolerance)
     assert network.motion.sizes == []
 
 
+@pytest.mark.parametrize("tolerance", [0.0, 0.01])
+def test_a_motion_of_0_may_be_given(tolerance):
+    network, _ = counted()
+    spikes = mixed()
+    still = forward_in_tiles(network, spikes, 64, tolerance, 0)
+    zeros = forward_in_tiles(network, spikes, 64, tolerance, torch.zeros(1, 2, 2, 64, 192))
+    torch.testing.assert_close(still, zeros, rtol=0, atol=1e-5)
+    assert network.motion.sizes == []
+
+
+def test_clips_of_another_length_are_refused_before_motion_is_estimated():
+    network, _ = counted()
+    with pytest.raises(ValueError, match=r"^spikes: expected \(B, 41, H, W\) .*, got \(1, 15, 64, 192\)$"):
+        forward_in_tiles(network, mixed()[:, :15], 64)
+    assert network.motion.sizes == []
+
+
 def test_test_shows_what_predict_would():
     network, calls = counted()
     batch = {"spikes": mixed(), "flow": torch.full((1, 2, 2, 64, 192), 0.5)}
