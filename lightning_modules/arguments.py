@@ -33,15 +33,16 @@ def with_network_of_weights(args: Sequence[str]) -> list[str]:
         FileNotFoundError: there are no such weights.
         ValueError: the file is damaged, or of something else.
     """
-    asked, named = None, False
+    asked, named = None, None
     for _, option, value in options(args):
         if option in ("-c", "--config"):
             model = _init_args(_model_in(value))
             asked = model.get("weights") or asked
-            named |= bool(_class_of(_init_args(model.get("network")).get("motion")))
+            named = _with_class(_init_args(model.get("network")).get("motion")) or named
         elif option in WEIGHTS:
             asked = value
-        named |= bool(_MOTION.fullmatch(option))
+        elif _MOTION.fullmatch(option):
+            named = _with_class(yaml.safe_load(value)) or named
     if asked in (None, "", "null"):
         return list(args)
     found = read_weights(asked)
@@ -50,8 +51,9 @@ def with_network_of_weights(args: Sequence[str]) -> list[str]:
         takes = "--model.network.motion.weights takes them"
         raise ValueError(f"model.weights: expected weights of a network, got {asked}, of the estimator {kind}; {takes}")
     network = _class_and_arguments(found.settings)
-    if found.motion and not named:
-        network["init_args"]["motion"] = _class_and_arguments(found.motion)
+    chosen = named or (found.motion and _class_and_arguments(found.motion))
+    if chosen:
+        network["init_args"]["motion"] = chosen
     return behind_configurations(args, ["--config", json.dumps({"model": {"network": network}})])
 
 
@@ -107,8 +109,10 @@ def _init_args(choice: Any) -> dict[str, Any]:
     return {**choice, **inner} if isinstance(inner, dict) else choice
 
 
-def _class_of(choice: Any) -> str | None:
-    return choice.get("class_path") if isinstance(choice, dict) else choice
+def _with_class(choice: Any) -> dict[str, Any] | None:
+    """Return an object of a configuration as a dictionary, ``None`` where it does not say of what class it is."""
+    choice = {"class_path": choice} if isinstance(choice, str) else choice
+    return choice if isinstance(choice, dict) and choice.get("class_path") else None
 
 
 def make_module(kind: type[T], args: Sequence[str]) -> T:
