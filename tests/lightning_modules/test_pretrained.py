@@ -239,7 +239,7 @@ def test_motion_is_that_of_the_weights_unless_another_is_named(named, expected, 
     motion = built.model.network.motion
     assert type(motion) is expected
     if expected is Spike2Flow:
-        assert motion.settings["iterations"] == (1 if named else 3)
+        assert motion.iterations == (1 if named else 3)
 
 
 @pytest.mark.slow
