@@ -316,9 +316,9 @@ class CSCSR(Network):
         return F.interpolate(smooth, scale_factor=self.scale, mode="bicubic", align_corners=False)
 
     def _mask(self, height: int, width: int, device: torch.device) -> tuple[Tensor, ...]:
-        # what is made in inference mode cannot be kept for a gradient
-        key = height, width, device, torch.is_inference_mode_enabled()
+        key = height, width, device
         if key not in self._masks:
-            mask = bayer_mask(height, width, self.pattern, scale=self.scale, device=device, dtype=torch.bool)
-            self._masks = {key: mask.unbind(0)}  # the same tensors every time: their tables are kept
+            with torch.inference_mode(False):  # what is made in inference mode cannot be kept for a gradient
+                mask = bayer_mask(height, width, self.pattern, scale=self.scale, device=device, dtype=torch.bool)
+                self._masks = {key: mask.unbind(0)}  # the same tensors every time: their tables are kept
         return self._masks[key]
