@@ -118,4 +118,4 @@ def unpack_spikes(packed: Tensor, width: int, *, dtype: torch.dtype = torch.uint
             f"bytes, got {width}"
         )
     spikes = _unpack_bits(packed, width)
-    return spikes.view(dtype) if dtype is torch.bool else spikes.to(dtype)
+    return spikes.view(dtype) if dtype is torch.bool else spikes.to(dtype=dtype)

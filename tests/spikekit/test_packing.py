@@ -108,6 +108,7 @@ def test_other_values(value):
         (lambda: unpack_spikes(torch.zeros(3, 2).byte(), 8), ValueError, r"width: expected 9 \.\. 16 .* got 8"),
         (lambda: unpack_spikes(torch.zeros(3, 2).byte(), 0), ValueError, "width: expected a whole number >= 1, got 0"),
         (lambda: unpack_spikes(torch.zeros(3, 2).byte(), 9.5), ValueError, "width: expected a whole number"),
+        (lambda: unpack_spikes(torch.zeros(3, 2).byte(), 9, dtype="int8"), TypeError, r"to\(\)"),
     ],
 )
 def test_bad_arguments(call, error, message):
