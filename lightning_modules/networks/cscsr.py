@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
 import torch
@@ -11,12 +11,13 @@ from kornia.filters import filter2d_separable
 from torch import Tensor, nn
 
 from lightning_modules.motion import MotionEstimator, ZeroFlow
-from lightning_modules.networks.layers import ResBlock, fold
+from lightning_modules.networks.layers import ResBlock, enlarge, fold
 from lightning_modules.networks.motion_fusion import assembled_motion, independent_motion, joint_motion
 from lightning_modules.networks.network import Network
 from lightning_modules.networks.reconstruction import ColorCorrelation, EarlyFusion, SeparateColors
 from lightning_modules.networks.refinement import FeatureRefinement, TimeFusion
 from lightning_modules.networks.representation import IntervalRepresentation, SpikeRepresentation, WindowMeans
+from lightning_modules.networks.rest import WORTH_IT, convolve_at_rest, rest_response
 from spikekit import bayer_mask, bayer_pattern, demosaic, flow_warp_idw, linear_motion, split_colors, tfp_at
 from spikekit.check import check_planes, check_positive, check_whole
 
@@ -200,6 +201,9 @@ class CSCSR(Network):
         self.alpha = alpha
         self._initialize()
         self._masks: dict[Any, Tensor] = {}
+        at_rest = search and self.fold == scale > 1
+        self._response = rest_response(scale, settings["pattern"], sizes["neighbors"]) if at_rest else None
+        self._responses: dict[Any, Tensor] = {}
 
     def _initialize(self) -> None:
         """Start nearly pixel by pixel: orthogonal centre taps, small ones around (Xiao et al., ICML 2018).
@@ -239,16 +243,18 @@ class CSCSR(Network):
         planes = split_colors(spikes, self.pattern)
         # one colour after the other: high resolution takes memory
         features = (encode(plane) for encode, plane in zip(self.representation, planes, strict=True))
-        if self.search:
-            if isinstance(flow, Tensor):
-                offsets = self._offsets(flow)
-            else:
-                offsets = [spikes.new_zeros(batch, 1, 2, self.scale * height, self.scale * width)] * 3
-            pixels = map(self._search, features, offsets, self._mask(height, width, spikes.device))
+        response = None if isinstance(flow, Tensor) else self._response_for(spikes)
+        if response is not None:
+            colors = list(map(self._at_rest, features, self.refinement, response, range(3)))
         else:
-            pixels = map(self._enlarge, features)
-        pixels = (fold(part.flatten(1, 2), self.fold) for part in pixels)
-        rgb = self.reconstruction([refine(part) for refine, part in zip(self.refinement, pixels, strict=True)])
+            if self.search:
+                offsets = self._offsets(flow, spikes)
+                pixels = map(self._search, features, offsets, self._mask(height, width, spikes.device))
+            else:
+                pixels = (enlarge(part, self.scale) for part in features)
+            pixels = (fold(part.flatten(1, 2), self.fold) for part in pixels)
+            colors = [refine(part) for refine, part in zip(self.refinement, pixels, strict=True)]
+        rgb = self.reconstruction(colors)
         return rgb + self._base(spikes) if self.skip else rgb
 
     def estimate_flow(self, spikes: Tensor) -> Tensor:
@@ -271,14 +277,20 @@ class CSCSR(Network):
             expected = f"(B, {self.frames}, H, W) of at least 3 x 3 pixels"
             raise ValueError(f"spikes: expected {expected}, got {tuple(spikes.shape)}")
 
-    def _offsets(self, flow: Tensor) -> tuple[Tensor, ...]:
-        """How far every colour has moved at every time point, each (B, T, 2, s H, s W)."""
+    def _offsets(self, flow: Tensor | Literal[0], spikes: Tensor) -> Sequence[Tensor]:
+        """How far every colour has moved at every time point, each (B, T, 2, s H, s W), T being 1 at rest."""
+        if not isinstance(flow, Tensor):
+            return [self._no_offset(spikes)] * 3
         flow = flow if flow.ndim == 6 else flow.unsqueeze(1)
         first, middle, last = self.flow_times
         offsets = linear_motion(
             flow[:, :, 0], flow[:, :, 1], self.times, first=first, middle=middle, last=last, scale=self.scale
         )
         return offsets.expand(-1, 3, -1, -1, -1, -1).unbind(1)
+
+    def _no_offset(self, planes: Tensor) -> Tensor:
+        height, width = planes.shape[-2:]
+        return planes.new_zeros(len(planes), 1, 2, self.scale * height, self.scale * width)
 
     def _search(self, features: Tensor, offsets: Tensor, mask: Tensor) -> Tensor:
         """Temporal pixel search (section 4.3, Fig. 5 b): (B, T, C, H, W) to (B, T, C, s H, s W).
@@ -287,23 +299,15 @@ class CSCSR(Network):
         """
         how = {"neighbors": self.neighbors, "steps": self.steps or None}
         if offsets.shape[1] == 1:
-            pixels = self._enlarge(features)
+            pixels = enlarge(features, self.scale)
             return flow_warp_idw(pixels.flatten(1, 2), offsets[:, 0], mask, **how).reshape(pixels.shape)
         # a few time points after the others: what the search needs on the way is many times its result
         few = max(1, _SEARCHED // (offsets.shape[-2] * offsets.shape[-1]))
         pixels = [
-            flow_warp_idw(self._enlarge(part), offset, mask, **how)
+            flow_warp_idw(enlarge(part, self.scale), offset, mask, **how)
             for part, offset in zip(features.flatten(0, 1).split(few), offsets.flatten(0, 1).split(few), strict=True)
         ]
         return torch.cat(pixels).unflatten(0, features.shape[:2])
-
-    def _enlarge(self, features: Tensor) -> Tensor:
-        """Bilinear: (*, C, H, W) to (*, C, s H, s W)."""
-        if self.scale == 1:
-            return features
-        planes = features.reshape(-1, *features.shape[-3:])
-        planes = F.interpolate(planes, scale_factor=self.scale, mode="bilinear", align_corners=False)
-        return planes.reshape(*features.shape[:-2], *planes.shape[-2:])
 
     def _base(self, spikes: Tensor) -> Tensor:
         """TFP of the whole clip, demosaiced, smoothed, enlarged."""
@@ -320,5 +324,25 @@ class CSCSR(Network):
         if key not in self._masks:
             with torch.inference_mode(False):  # what is made in inference mode cannot be kept for a gradient
                 mask = bayer_mask(height, width, self.pattern, scale=self.scale, device=device, dtype=torch.bool)
-                self._masks = {key: mask.unbind(0)}  # the same tensors every time: their tables are kept
+                # the same tensors every time: their tables are kept; at rest, a picture and its sides have three sizes
+                self._masks = dict([*self._masks.items()][-2:]) | {key: mask.unbind(0)}
         return self._masks[key]
+
+    def _response_for(self, spikes: Tensor) -> Tensor | None:
+        """What temporal pixels are made of where nothing moves, if it is known, and of use for so large a picture."""
+        if self._response is None or min(spikes.shape[-2:]) < WORTH_IT:
+            return None
+        key = spikes.device, torch.promote_types(spikes.dtype, torch.float32)
+        if key not in self._responses:
+            with torch.inference_mode(False):
+                self._responses[key] = self._response.to(*key)
+        return self._responses[key]
+
+    def _at_rest(self, features: Tensor, refine: nn.Module, response: Tensor, color: int) -> Tensor:
+        """Search and refinement of one colour where nothing moves: (B, T, C, H, W) to (B, width, H, W)."""
+
+        def search(planes: Tensor) -> Tensor:
+            mask = self._mask(*planes.shape[-2:], planes.device)[color]
+            return fold(self._search(planes.unsqueeze(1), self._no_offset(planes), mask).flatten(1, 2), self.fold)
+
+        return refine.finish(convolve_at_rest(features.flatten(1, 2), *refine.first(), response, search))

@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 
 def channels_last(planes: Tensor) -> Tensor:
     """(B, C, H, W) with its channels side by side in memory, as convolutions keep them, and are faster with."""
     return planes.contiguous(memory_format=torch.channels_last)
+
+
+def enlarge(features: Tensor, scale: int) -> Tensor:
+    """Bilinear: (*, C, H, W) to (*, C, s H, s W)."""
+    if scale == 1:
+        return features
+    planes = features.reshape(-1, *features.shape[-3:])
+    planes = F.interpolate(planes, scale_factor=scale, mode="bilinear", align_corners=False)
+    return planes.reshape(*features.shape[:-2], *planes.shape[-2:])
 
 
 def fold(planes: Tensor, size: int) -> Tensor:

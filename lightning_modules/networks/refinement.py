@@ -28,16 +28,22 @@ class FeatureRefinement(nn.Module):
         self.base = nn.Sequential(ConvBlock(times * features, width), conv(width, width))
         self.residual = nn.Sequential(ConvBlock(times * features, width), conv(width, width))
 
-    def forward(self, pixels: Tensor) -> Tensor:  # noqa: D102
-        (base, _), base_end = self.base
-        (residual, _), residual_end = self.residual
-        # the mean is taken off the weights, which are few, not off the pixels, and both branches run as one
+    def first(self) -> tuple[Tensor, Tensor]:
+        """Weight and bias of the first convolution, that of both branches."""
+        base, residual = self.base[0][0], self.residual[0][0]
+        # the mean is taken off the weights, which are few, not off the pixels
         weight = residual.weight.unflatten(1, (self.times, -1))
         weight = (weight - weight.mean(dim=1, keepdim=True)).flatten(1, 2)
-        weight, bias = torch.cat([base.weight, weight]), torch.cat([base.bias, residual.bias])
-        seen = F.conv2d(pixels, weight, bias, padding=1)
-        ends = torch.cat([base_end.weight, residual_end.weight], dim=1)
-        return F.conv2d(seen.relu_(), ends, base_end.bias + residual_end.bias, padding=1)
+        return torch.cat([base.weight, weight]), torch.cat([base.bias, residual.bias])
+
+    def finish(self, seen: Tensor) -> Tensor:
+        """What comes behind the first convolution."""
+        base, residual = self.base[1], self.residual[1]
+        weight = torch.cat([base.weight, residual.weight], dim=1)
+        return F.conv2d(seen.relu_(), weight, base.bias + residual.bias, padding=1)
+
+    def forward(self, pixels: Tensor) -> Tensor:  # noqa: D102
+        return self.finish(F.conv2d(pixels, *self.first(), padding=1))
 
 
 class TimeFusion(nn.Conv2d):
@@ -55,6 +61,14 @@ class TimeFusion(nn.Conv2d):
     def __init__(self, times: int, features: int, width: int) -> None:
         super().__init__(times * features, width, 3, padding=1)
         self.times = times
+
+    def first(self) -> tuple[Tensor, Tensor]:
+        """Its weight and bias."""
+        return self.weight, self.bias
+
+    def finish(self, seen: Tensor) -> Tensor:
+        """Nothing more."""
+        return seen
 
     @torch.no_grad()
     def start_at_the_mean(self, pixels: int) -> None:

@@ -1,0 +1,89 @@
+import pytest
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from lightning_modules.networks import CSCSR
+from lightning_modules.networks.rest import WORTH_IT, rest_response
+
+TINY = {"width": 4, "representation_width": 4, "features": 2, "stages": 1, "blocks": 1, "end_blocks": 1}
+SIZES = (WORTH_IT, WORTH_IT), (WORTH_IT + 1, WORTH_IT + 2), (WORTH_IT + 4, WORTH_IT + 3)
+
+
+def tiny(scale=3, **settings):
+    return CSCSR(scale, **TINY, resolution="sensor", **settings).double()
+
+
+def clip(height, width, batch=1):
+    return torch.rand(batch, 41, height, width, generator=torch.Generator().manual_seed(0)) < 0.3
+
+
+def both(network, spikes):
+    """What a flow of 0 gives, and what flows of zeros give."""
+    return network(spikes, 0), network(spikes, torch.zeros(len(spikes), 2, 2, *spikes.shape[-2:]))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
+@pytest.mark.parametrize(
+    "settings", [{}, {"scale": 4, "refinement": False}, {"neighbors": 1}, {"representation": "spikes"}]
+)
+def test_search_and_convolution_are_one(pattern, settings):
+    network = tiny(**settings, pattern=pattern)
+    for size in SIZES:
+        torch.testing.assert_close(*both(network, clip(*size, batch=2)), rtol=0, atol=1e-12)
+
+
+def test_gradients_are_those_of_a_search():
+    network = tiny()
+    losses = (rgb.square().mean() for rgb in both(network, clip(64, 66)))
+    gradients = [torch.autograd.grad(loss, [*network.parameters()]) for loss in losses]
+    for at_rest, searched in zip(*gradients, strict=True):
+        torch.testing.assert_close(at_rest, searched, rtol=1e-9, atol=1e-12)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(("settings", "side"), [({"scale": 2}, 64), ({"neighbors": 5}, 64), ({}, WORTH_IT - 2)])
+def test_what_is_not_worth_it_is_searched(settings, side):
+    network = tiny(**settings)
+    torch.testing.assert_close(*both(network, clip(side, side)), rtol=0, atol=1e-12)
+
+
+@torch.no_grad()
+def test_it_is_less_work():
+    network, flops = CSCSR.from_pretrained("x4-e"), []
+    for flow in (0, torch.zeros(1, 2, 2, 128, 128)):
+        with FlopCounterMode(display=False) as counter:
+            network(clip(128, 128), flow)
+        flops.append(counter.get_total_flops())
+    assert flops[0] < 0.85 * flops[1]
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("how", ["mixed", "true"])
+def test_half_precision_loses_no_more_than_with_a_search(how):
+    network, spikes = CSCSR.from_pretrained("x4-t"), clip(64, 64)
+    exact = network(spikes, 0)
+    if how == "mixed":
+        with torch.autocast("cpu", torch.bfloat16):
+            pictures = both(network, spikes)
+    else:
+        pictures = both(network.bfloat16(), spikes)
+    at_rest, searched = ((rgb.float() - exact).square().mean().sqrt() for rgb in pictures)
+    assert 0 < at_rest < 1.1 * searched
+
+
+def test_compiles_in_one_piece():
+    network, spikes = tiny().eval(), clip(64, 64)
+    with torch.inference_mode():
+        expected = network(spikes, 0)
+    torch.testing.assert_close(torch.compile(network, fullgraph=True, backend="eager")(spikes, 0), expected)
+
+
+def test_what_is_kept_in_inference_mode_serves_training():
+    network = tiny()
+    rest_response.cache_clear()
+    with torch.inference_mode():
+        tiny()(clip(64, 64), 0)
+        network(clip(64, 64), 0)
+    network(clip(64, 64), 0).mean().backward()
+    assert all(p.grad is not None for p in network.parameters())
