@@ -31,11 +31,12 @@ def clip(batch=1, height=12, width=16, seed=0):
         ("e", 1_080_294, 1.48),
         ("t", 300_963, 0.356),
         ("w", 2_257_222, 2.66),
+        ("h", 3_783_526, 4.18),
     ],
 )
 def test_parameters_and_work_of_the_sizes(size, parameters, mmac, configs):
     settings = yaml.safe_load((configs / f"size/{size}.yaml").read_text())["model"]["network"]["init_args"]
-    for scale in (4,) if size in "detw" else (2, 3, 4):  # D, E, T and W see scale x scale pixels as channels
+    for scale in (4,) if size in "detwh" else (2, 3, 4):  # D, E, T, W and H see scale x scale pixels as channels
         network = CSCSR(scale, **settings)
         assert sum(p.numel() for p in network.parameters()) == parameters
     with torch.no_grad(), FlopCounterMode(display=False) as counter:

@@ -10,6 +10,7 @@ from test_ablations import TINY, clip, variant
 
 from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
 from lightning_modules.networks import CSCSR, ClassicalDecoder
+from lightning_modules.networks.rest import WORTH_IT
 from lightning_modules.tiles import forward_in_tiles
 
 DEVICE = pretend.DEVICE
@@ -53,6 +54,20 @@ def test_nothing_is_waited_for():
     pretend.waits.clear()
     network(spikes, flow).sum().backward()
     assert pretend.waits == []
+
+
+def test_at_rest():
+    network = CSCSR(3, **TINY, resolution="sensor")
+    moved = copy.deepcopy(network).to(DEVICE)
+    spikes, _ = clip(height=WORTH_IT, width=WORTH_IT + 1)
+    expected = network(spikes, 0)
+    expected.sum().backward()
+    for _ in range(2):
+        pretend.waits.clear()
+        got = moved(spikes.to(DEVICE), 0)
+        got.sum().backward()
+    assert pretend.waits == []
+    torch.testing.assert_close(got.detach().cpu(), expected.detach(), rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 0.3])
