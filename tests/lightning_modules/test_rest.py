@@ -87,3 +87,12 @@ def test_what_is_kept_in_inference_mode_serves_training():
         network(clip(64, 64), 0)
     network(clip(64, 64), 0).mean().backward()
     assert all(p.grad is not None for p in network.parameters())
+
+
+def test_built_where_tensors_are_elsewhere_by_default():
+    rest_response.cache_clear()
+    with torch.device("meta"):
+        network = tiny()
+    assert next(network.parameters()).is_meta
+    network.to_empty(device="cpu").load_state_dict(tiny().state_dict())
+    torch.testing.assert_close(*both(network, clip(64, 64)), rtol=0, atol=1e-12)
