@@ -59,7 +59,7 @@ def read_setting(text: str) -> Setting:
 
 
 #: what is tried on every network: behind its name, and behind its arguments
-_EFFORT = [("no motion", "--model.network.motion ZeroFlow")]
+_EFFORT = [("no motion", "--model.network.motion ZeroFlow"), ("self-ensemble", "--model.self_ensemble true")]
 
 #: what is tried on the first, besides
 _VARIANTS = [
@@ -87,8 +87,8 @@ _DECODERS = [
 def usual_settings(scale: int, own: Sequence[str] = ()) -> list[Setting]:
     """Return what is measured where nothing else is asked for.
 
-    The networks whose weights come with the package, as they are; then the same without
-    motion, and the first of them faster and more exact in other ways; then the decoders without learning.
+    The networks whose weights come with the package, as they are; then the same without motion and as a self-ensemble,
+    and the first of them faster and more exact in other ways; then the decoders without learning.
 
     Args:
         scale: super-resolution factor.

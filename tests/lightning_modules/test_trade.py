@@ -181,7 +181,8 @@ def test_usual_settings_are_those_of_the_weights_that_are_shipped(monkeypatch):
     assert "Spike2Flow" in settings["x4-e, Spike2Flow"]
     assert settings["x4-e, no motion"][:2] == ["--model.weights", "x4-e"]
     assert settings["x4-s, no motion"][:2] == ["--model.weights", "x4-s"]
-    assert len([name for name in settings if name.startswith("x4-s")]) == 2
+    assert settings["x4-s, self-ensemble"] == ["--model.weights", "x4-s", "--model.self_ensemble", "true"]
+    assert len([name for name in settings if name.startswith("x4-s")]) == 3
     assert not [name for name in settings if name.startswith("x2")]
     assert settings["TFI"][-3:] == ["tfi", "--model.network.scale", "4"]
     own = dict(usual_settings(4, ["--ckpt_path"]))
