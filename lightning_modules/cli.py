@@ -128,7 +128,7 @@ class Command(LightningCLI):
             parser.add_argument(
                 "--speed",
                 choices=list(SPEEDS),
-                help="Weights of the package and how they are used: the best; the fastest at most 0.1 dB (balanced) or "
+                help="Weights of the package and how they are used: the best; the fastest at most 0.2 dB (balanced) or "
                 "1 dB (fast) below it, as measured by lightning trade; the fastest.",
             )
             parser.add_argument(

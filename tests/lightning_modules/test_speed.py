@@ -21,7 +21,7 @@ ROWS = [
     ("all", 30.0, 400, 80, 40, 50, "--model.weights {weights}", ""),
     ("no tiles", 30.0, 350, 20, 40, 50, "--model.weights {weights} --model.tile 0", ""),
     ("small tiles", 30.0, 500, 20, 40, 50, "--model.weights {weights} --model.tile 16", ""),
-    ("no motion", 29.92, 200, 70, 40, 50, "--model.weights {weights} --model.network.motion ZeroFlow", ""),
+    ("no motion", 29.85, 200, 70, 40, 50, "--model.weights {weights} --model.network.motion ZeroFlow", ""),
     ("tfp", 29.6, 10, 5, 40, 50, f"{DECODER} tfp", ""),
     ("tfi", 25.0, 4, 2, 40, 50, f"{DECODER} tfi", ""),
     ("tfp 5", 24.0, 3.8, 3, 40, 50, f"{DECODER} tfp --model.network.window 5", ""),
