@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from lightning_modules.networks import CSCSR
+from lightning_modules.networks import CSCSR, cscsr
 from lightning_modules.networks.rest import WORTH_IT, rest_response
 
 TINY = {"width": 4, "representation_width": 4, "features": 2, "stages": 1, "blocks": 1, "end_blocks": 1}
@@ -17,6 +17,16 @@ def clip(height, width, batch=1):
     return torch.rand(batch, 41, height, width, generator=torch.Generator().manual_seed(0)) < 0.3
 
 
+@pytest.fixture(name="searched")
+def _searched(monkeypatch):
+    """Sizes of the pictures in which the network has searched."""
+    sizes, warp = [], cscsr.flow_warp_idw
+    monkeypatch.setattr(
+        cscsr, "flow_warp_idw", lambda *args, **how: sizes.append(tuple(args[0].shape[-2:])) or warp(*args, **how)
+    )
+    return sizes
+
+
 def both(network, spikes):
     """What a flow of 0 gives, and what flows of zeros give."""
     return network(spikes, 0), network(spikes, torch.zeros(len(spikes), 2, 2, *spikes.shape[-2:]))
@@ -27,10 +37,13 @@ def both(network, spikes):
 @pytest.mark.parametrize(
     "settings", [{}, {"scale": 4, "refinement": False}, {"neighbors": 1}, {"representation": "spikes"}]
 )
-def test_search_and_convolution_are_one(pattern, settings):
+def test_search_and_convolution_are_one(pattern, settings, searched):
     network = tiny(**settings, pattern=pattern)
     for size in SIZES:
-        torch.testing.assert_close(*both(network, clip(*size, batch=2)), rtol=0, atol=1e-12)
+        searched.clear()
+        at_rest, expected = both(network, clip(*size, batch=2))
+        torch.testing.assert_close(at_rest, expected, rtol=0, atol=1e-12)
+        assert all(min(sides) < 16 * network.scale for sides in searched[:6])  # two opposite sides, of every colour
 
 
 def test_gradients_are_those_of_a_search():
@@ -43,9 +56,10 @@ def test_gradients_are_those_of_a_search():
 
 @torch.no_grad()
 @pytest.mark.parametrize(("settings", "side"), [({"scale": 2}, 64), ({"neighbors": 5}, 64), ({}, WORTH_IT - 2)])
-def test_what_is_not_worth_it_is_searched(settings, side):
+def test_what_is_not_worth_it_is_searched(settings, side, searched):
     network = tiny(**settings)
     torch.testing.assert_close(*both(network, clip(side, side)), rtol=0, atol=1e-12)
+    assert searched[:3] == [(network.scale * side, network.scale * side)] * 3
 
 
 @torch.no_grad()
