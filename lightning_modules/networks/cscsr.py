@@ -334,8 +334,7 @@ class CSCSR(Network):
             return None
         key = spikes.device, torch.promote_types(spikes.dtype, torch.float32)
         if key not in self._responses:
-            with torch.inference_mode(False):
-                self._responses[key] = self._response.to(*key)
+            self._responses[key] = self._response.to(*key)
         return self._responses[key]
 
     def _at_rest(self, features: Tensor, refine: nn.Module, response: Tensor, color: int) -> Tensor:

@@ -33,18 +33,17 @@ def rest_response(scale: int, pattern: str, neighbors: int) -> Tensor | None:
     """
     side, begin = 2 * _WINDOW, _WINDOW - 2  # of a picture large enough, and of a cell in its middle
     near, sites = slice(begin - _AROUND, begin + 2 + _AROUND), slice(begin - 1, begin + 3)
-    with torch.inference_mode(False), torch.no_grad():  # what is made in inference mode cannot be kept for a gradient
-        pixels = torch.eye(side**2, dtype=torch.float64, device="cpu").reshape(1, -1, side, side)
-        pixels = enlarge(pixels, scale)
-        flow = pixels.new_zeros(1, 2, *pixels.shape[-2:])
-        colors = []
-        for mask in bayer_mask(side, side, pattern, scale=scale, device="cpu"):
-            found = fold(flow_warp_idw(pixels, flow, mask, neighbors=neighbors).movedim(0, 1), scale)
-            found = found[..., sites, sites].unflatten(0, (side, side))[near, near].flatten(0, 1)
-            if not torch.allclose(found.sum(dim=0), torch.ones_like(found[0])):
-                return None
-            colors.append(found)
-        return torch.stack(colors)
+    pixels = torch.eye(side**2, dtype=torch.float64, device="cpu").reshape(1, -1, side, side)
+    pixels = enlarge(pixels, scale)
+    flow = pixels.new_zeros(1, 2, *pixels.shape[-2:])
+    colors = []
+    for mask in bayer_mask(side, side, pattern, scale=scale, device="cpu"):
+        found = fold(flow_warp_idw(pixels, flow, mask, neighbors=neighbors).movedim(0, 1), scale)
+        found = found[..., sites, sites].unflatten(0, (side, side))[near, near].flatten(0, 1)
+        if not torch.allclose(found.sum(dim=0), torch.ones_like(found[0])):
+            return None
+        colors.append(found)
+    return torch.stack(colors)
 
 
 def convolve_at_rest(

@@ -93,11 +93,13 @@ def test_compiles_in_one_piece():
     torch.testing.assert_close(torch.compile(network, fullgraph=True, backend="eager")(spikes, 0), expected)
 
 
-def test_what_is_kept_in_inference_mode_serves_training():
-    network = tiny()
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_what_is_kept_in_inference_mode_serves_training(dtype):
     rest_response.cache_clear()
     with torch.inference_mode():
-        tiny()(clip(64, 64), 0)
+        tiny()
+    network = tiny().to(dtype)
+    with torch.inference_mode():
         network(clip(64, 64), 0)
     network(clip(64, 64), 0).mean().backward()
     assert all(p.grad is not None for p in network.parameters())
