@@ -16,6 +16,7 @@ from lightning_modules.callbacks import TestReport, ValidationPictures
 from lightning_modules.learner import Learner, step_schedule
 from lightning_modules.networks import ClassicalDecoder, Network
 from lightning_modules.pretrained import load_weights, read_weights, with_own_motion
+from lightning_modules.self_ensemble import COUNTS, self_ensemble
 from lightning_modules.speed import choose
 from lightning_modules.tiles import TILE, forward_in_tiles
 from spikekit import psnr, ssim
@@ -41,8 +42,8 @@ class SuperResolution(Learner):
             none.
         tolerance: by how many dB the PSNR of a picture may be expected to fall when ``predict`` and ``test`` look at
             the clip first and do only what each part of it needs; 0 for everything everywhere.
-        self_ensemble: let ``predict`` and ``test`` give the mean of what they make of a clip and of the same transposed
-            (Timofte et al., CVPR 2016), in twice the time.
+        self_ensemble: 2, 4 or 8 lets ``predict`` and ``test`` give the mean of what they make of so many views of a
+            clip, transposed, turned and mirrored, in so many times the time.
         flow: the motion that training uses. "scene" is that of the data, where they have it: the true one of analytic
             scenes, or that which the frames of a film were interpolated with. "estimated" is that of the network's own
             estimator, which learns as well unless it is frozen.
@@ -61,7 +62,7 @@ class SuperResolution(Learner):
         lr_scheduler: LRSchedulerCallable = step_schedule,
         tile: int = TILE,
         tolerance: float = 0.0,
-        self_ensemble: bool = False,
+        self_ensemble: Literal[1, 2, 4, 8] = 1,
         flow: Literal["scene", "estimated"] = "scene",
         weights: str | None = None,
     ) -> None:
@@ -72,8 +73,8 @@ class SuperResolution(Learner):
             raise ValueError(f"tolerance: expected 0 dB or more, got {tolerance}")
         if flow not in ("scene", "estimated"):
             raise ValueError(f"flow: expected 'scene' or 'estimated', got {flow!r}")
-        if self_ensemble and network.pattern not in ("RGGB", "BGGR"):
-            raise ValueError(f"self_ensemble: expected RGGB or BGGR, which can be transposed, got {network.pattern}")
+        if isinstance(self_ensemble, bool) or self_ensemble not in COUNTS:
+            raise ValueError(f"self_ensemble: expected one of {COUNTS}, got {self_ensemble!r}")
         fusion = network.settings.get("motion_fusion", "joint")
         if flow == "scene" and fusion != "joint":
             raise ValueError(
@@ -98,7 +99,7 @@ class SuperResolution(Learner):
 
         Args:
             scale: super-resolution factor.
-            speed: see :func:`lightning_modules.speed.choose`; without a budget ``"best"`` when not given.
+            speed: see :func:`lightning_modules.speed.choose`; without a budget ``"balanced"`` when not given.
             budget: likewise.
             size: of a frame, (H, W) in sensor pixels, which a budget depends on.
 
@@ -113,7 +114,7 @@ class SuperResolution(Learner):
             torch.Size([1, 3, 64, 64])
         """
         if budget is None and speed is None:
-            speed = "best"
+            speed = "balanced"
         return make_module(cls, choose(scale, speed, budget, size).args).eval()
 
     def forward(self, spikes: Tensor, flow: Tensor | None = None) -> Tensor:
@@ -121,11 +122,12 @@ class SuperResolution(Learner):
 
         The motion is ``flow``, (B, 2, 2, H, W), or else what the network's estimator sees.
         """
-        rgb = forward_in_tiles(self.network, spikes, self.tile, self.tolerance, flow)
-        if self.self_ensemble:
-            flow = None if flow is None else flow.mT.flip(-3)  # x becomes y
-            turned = forward_in_tiles(self.network, spikes.mT.contiguous(), self.tile, self.tolerance, flow)
-            rgb = (rgb + turned.mT) / 2
+
+        def run(spikes: Tensor, flow: Tensor | None) -> Tensor:
+            return forward_in_tiles(self.network, spikes, self.tile, self.tolerance, flow)
+
+        network = self.network
+        rgb = self_ensemble(run, spikes, flow, network.pattern, network.scale, self.self_ensemble)
         return rgb.clamp(0, 1)
 
     def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:  # noqa: D102

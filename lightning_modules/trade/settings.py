@@ -59,7 +59,10 @@ def read_setting(text: str) -> Setting:
 
 
 #: what is tried on every network: behind its name, and behind its arguments
-_EFFORT = [("no motion", "--model.network.motion ZeroFlow"), ("self-ensemble", "--model.self_ensemble true")]
+_EFFORT = [("no motion", "--model.network.motion ZeroFlow"), ("self-ensemble of 2", "--model.self_ensemble 2")]
+
+#: what is tried on the largest, besides: a larger network is worth more than more views of a smaller one
+_MOST = [(f"self-ensemble of {views}", f"--model.self_ensemble {views}") for views in (4, 8)]
 
 #: what is tried on the first, besides
 _VARIANTS = [
@@ -88,7 +91,8 @@ def usual_settings(scale: int, own: Sequence[str] = ()) -> list[Setting]:
     """Return what is measured where nothing else is asked for.
 
     The networks whose weights come with the package, as they are; then the same without motion and as a self-ensemble,
-    and the first of them faster and more exact in other ways; then the decoders without learning.
+    the first of them faster and more exact in other ways, and the largest as larger self-ensembles; then the decoders
+    without learning.
 
     Args:
         scale: super-resolution factor.
@@ -98,13 +102,19 @@ def usual_settings(scale: int, own: Sequence[str] = ()) -> list[Setting]:
     shipped = shipped_weights()
     names = [name for name in shipped if name.startswith(f"x{scale}-")]
     networks = [Setting(name, ["--model.weights", name]) for name in names]
+    largest = max(names, key=lambda name: shipped[name].stat().st_size, default=None)
     if own:
-        networks = [Setting("own weights", [])]
+        networks, largest = [Setting("own weights", [])], "own weights"
     learned = _LEARNED if "spike2flow" in shipped else []
     variants = [
         Setting(f"{network.name}, {name}", [*network.args, *shlex.split(args)])
         for place, network in enumerate(networks)
-        for name, args in ([*learned, *_EFFORT, *_VARIANTS] if place == 0 else _EFFORT)
+        for name, args in [
+            *(learned if place == 0 else []),
+            *_EFFORT,
+            *(_MOST if network.name == largest else []),
+            *(_VARIANTS if place == 0 else []),
+        ]
     ]
     # weights know their scale, decoders are told it: the arguments of a row are to serve without the configuration
     rest = ["--model.network.scale", str(scale), *(word for option in own for word in (option, "null"))]

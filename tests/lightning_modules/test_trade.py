@@ -172,8 +172,10 @@ def test_usual_settings_all_run_on_weights_of_ones_own(shared, checkpoint, tmp_p
     assert len({psnr[name] for name in (*motions, "TFI", "TFP 41", "TFP 13, order 3")}) == 5
 
 
-def test_usual_settings_are_those_of_the_weights_that_are_shipped(monkeypatch):
-    shipped = {name: Path(f"{name}.safetensors") for name in ("spike2flow", "x2-e", "x4-e", "x4-s")}
+def test_usual_settings_are_those_of_the_weights_that_are_shipped(monkeypatch, tmp_path):
+    shipped = {name: tmp_path / name for name in ("spike2flow", "x2-e", "x4-e", "x4-l", "x4-s")}
+    for name, path in shipped.items():
+        path.write_bytes(bytes(99 if name == "x4-l" else 9))
     monkeypatch.setattr("lightning_modules.trade.settings.shipped_weights", lambda: shipped)
     settings = dict(usual_settings(4))
     assert settings["x4-e"] == ["--model.weights", "x4-e"]
@@ -181,12 +183,15 @@ def test_usual_settings_are_those_of_the_weights_that_are_shipped(monkeypatch):
     assert "Spike2Flow" in settings["x4-e, Spike2Flow"]
     assert settings["x4-e, no motion"][:2] == ["--model.weights", "x4-e"]
     assert settings["x4-s, no motion"][:2] == ["--model.weights", "x4-s"]
-    assert settings["x4-s, self-ensemble"] == ["--model.weights", "x4-s", "--model.self_ensemble", "true"]
+    assert settings["x4-s, self-ensemble of 2"] == ["--model.weights", "x4-s", "--model.self_ensemble", "2"]
     assert len([name for name in settings if name.startswith("x4-s")]) == 3
+    assert settings["x4-l, self-ensemble of 8"] == ["--model.weights", "x4-l", "--model.self_ensemble", "8"]
+    assert len([name for name in settings if name.startswith("x4-l")]) == 5
     assert not [name for name in settings if name.startswith("x2")]
     assert settings["TFI"][-3:] == ["tfi", "--model.network.scale", "4"]
     own = dict(usual_settings(4, ["--ckpt_path"]))
     assert own["own weights"] == []
+    assert own["own weights, self-ensemble of 4"] == ["--model.self_ensemble", "4"]
     assert own["TFI"][-2:] == ["--ckpt_path", "null"]
     del shipped["spike2flow"]
     assert not [args for _, args in usual_settings(4) if "Spike2Flow" in args]
