@@ -8,6 +8,7 @@ import pytest
 import torch
 from test_ablations import TINY, clip, variant
 
+from lightning_modules.module import SuperResolution
 from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
 from lightning_modules.networks import CSCSR, ClassicalDecoder
 from lightning_modules.networks.rest import WORTH_IT
@@ -77,6 +78,15 @@ def test_tiles(tolerance):
     spikes, _ = clip(height=40, width=56)
     expected = forward_in_tiles(network, spikes, 24, tolerance)
     got = forward_in_tiles(network.to(DEVICE), spikes.to(DEVICE), 24, tolerance)
+    torch.testing.assert_close(got.cpu(), expected, rtol=0, atol=1e-4)
+
+
+def test_self_ensemble():
+    module = SuperResolution(CSCSR(2, **TINY), self_ensemble=8)
+    spikes, flow = clip(height=12, width=15)
+    expected = module(spikes, flow)
+    got = module.to(DEVICE)(spikes.to(DEVICE), flow.to(DEVICE))
+    assert got.device == DEVICE
     torch.testing.assert_close(got.cpu(), expected, rtol=0, atol=1e-4)
 
 
