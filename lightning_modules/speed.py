@@ -16,7 +16,7 @@ from spikekit.bench.measure import timer_of
 _FOLDER = Path(__file__).parent / "weights"
 
 #: how far a speed may be below the best, in dB of the table
-SPEEDS = {"fastest": float("inf"), "fast": 1.0, "balanced": 0.3, "best": 0.005}
+SPEEDS = {"fastest": float("inf"), "fast": 1.2, "balanced": 0.3, "best": 0.005}
 
 #: times this close cannot be told apart, and the better setting is picked
 _AS_FAST = 1.1
@@ -138,7 +138,7 @@ def choose(
 
     Args:
         scale: super-resolution factor.
-        speed: ``"best"``, ``"balanced"`` and ``"fast"``, the fastest at most 0.005, 0.3 and 1 dB below the most exact,
+        speed: ``"best"``, ``"balanced"`` and ``"fast"``, the fastest at most 0.005, 0.3 and 1.2 dB below the most exact,
             or ``"fastest"``; of those within 10 % of its time the most exact.
         budget: instead, what a frame may take: a time, such as ``"40ms"``, or memory, such as ``"200MB"``. Of what fits
             it is the best.
