@@ -138,8 +138,8 @@ def choose(
 
     Args:
         scale: super-resolution factor.
-        speed: ``"best"``, ``"balanced"`` and ``"fast"``, the fastest at most 0.005, 0.3 and 1.2 dB below the most exact,
-            or ``"fastest"``; of those within 10 % of its time the most exact.
+        speed: ``"best"``, ``"balanced"`` and ``"fast"``, the fastest at most 0.005, 0.3 and 1.2 dB below the most
+            exact, or ``"fastest"``; of those within 10 % of its time the most exact.
         budget: instead, what a frame may take: a time, such as ``"40ms"``, or memory, such as ``"200MB"``. Of what fits
             it is the best.
         size: of a frame, (H, W) in sensor pixels, which a budget depends on.
