@@ -15,7 +15,7 @@ from lightning_modules.networks import Network
 #: side of a tile, in sensor pixels, where nothing else is asked for
 TILE = 128
 #: sensor pixels around a tile that are computed and thrown away, beside those that motion reaches over: what shipped
-#: networks see beyond them changes a picture by less than a fiftieth of a step of 8 bits
+#: networks see beyond them changes a picture by less than a thirtieth of a step of 8 bits
 HALO = 12
 #: motion that is followed over the edge of a tile, in sensor pixels; what moves further is searched inside
 FAR = 48

@@ -79,7 +79,7 @@ def test_shipped_networks_see_no_further_than_the_halo(name):
     spikes = mixed()[..., :128]
     with torch.no_grad():
         in_tiles = forward_in_tiles(network, spikes, 64)
-        torch.testing.assert_close(in_tiles, network(spikes), rtol=0, atol=0.02 / 255)
+        torch.testing.assert_close(in_tiles, network(spikes), rtol=0, atol=0.03 / 255)
 
 
 @pytest.mark.parametrize("settings", [{}, {"neighbors": 3}, {"resolution": "sensor"}, {"representation": "interval"}])
