@@ -11,9 +11,9 @@ from torch import Tensor
 
 
 class _View(NamedTuple):
-    top_down: bool = False
-    left_right: bool = False
-    transposed: bool = False
+    top_down: bool
+    left_right: bool
+    transposed: bool
 
 
 # those first that bring most: pairs, then half turns, then single mirrors

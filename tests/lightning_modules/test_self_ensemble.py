@@ -90,7 +90,7 @@ def test_what_is_transposed_gives_the_transposed_picture(pattern, tile, toleranc
 @torch.no_grad()
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_of_odd_sides_every_turn_of_the_clip_gives_that_of_the_picture(pattern):
-    """Where nothing is left out, all eight views are those of the turned clip as well."""
+    """Mirrors of an odd side leave nothing out: all eight views are those of the turned clip as well."""
     module = SuperResolution(CSCSR(2, **TINY, pattern=pattern), self_ensemble=8)
     spikes, _ = clip(23, 29)
     for axes in [-1], [-2], [-1, -2]:
