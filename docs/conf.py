@@ -1,5 +1,6 @@
 """How Sphinx builds these pages: ``sphinx-build -W -b html docs docs/_build``."""
 
+import csv
 import os
 import re
 import subprocess
@@ -8,29 +9,38 @@ from pathlib import Path
 
 from docutils import nodes
 from docutils.statemachine import StringList
+from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx.util.docutils import SphinxDirective
 
+import lightning_modules
 import spikekit
 
 project = "spikekit"
-author = "the spikekit contributors"
+author = copyright = "the spikekit contributors"
 version = release = spikekit.__version__
 
 extensions = [
     "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
-    "sphinx.ext.mathjax",
     "sphinx.ext.viewcode",
     "matplotlib.sphinxext.plot_directive",
+    "sphinx_gallery.gen_gallery",
 ]
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "examples", "sg_execution_times.rst", "gallery/sg_execution_times.rst"]
+html_math_renderer = "mathml"  # browsers draw it themselves: the pages need no network
 html_theme = "furo"
 html_title = f"spikekit {version}"
 
 # A name in a docstring that leads nowhere is an error, except where it belongs to another project.
 nitpicky = True
-nitpick_ignore_regex = [("py:.*", r"(torch|kornia|collections|pathlib|optional)\b.*"), ("py:.*", "(CFA|Tensor|Path)")]
+nitpick_ignore_regex = [
+    ("py:.*", r"(torch|kornia|collections|pathlib|optional|numpy|pytorch_lightning)\b.*"),
+    ("py:.*", "(CFA|CSCSRConfig|Tensor|Path|Callback|InputError)"),
+]
 
+autosummary_generate = False  # every name has a page already
+autodoc_inherit_docstrings = False
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 maximum_signature_line_length = 80
@@ -40,6 +50,18 @@ plot_basedir = str(Path(__file__).parent / "figures")
 plot_formats = [("png", 160)]
 plot_html_show_formats = False
 plot_html_show_source_link = True
+
+sphinx_gallery_conf = {
+    "examples_dirs": "examples",
+    "gallery_dirs": "gallery",
+    "within_subsection_order": "FileNameSortKey",
+    "abort_on_example_error": True,
+    "download_all_examples": False,
+    "show_memory": False,
+    "show_signature": False,
+    "min_reported_time": 1e9,
+    "reset_modules": ("matplotlib",),
+}
 
 
 class Run(SphinxDirective):
@@ -61,7 +83,7 @@ class Run(SphinxDirective):
 
 
 def _spikekit(arguments):
-    main = "import sys; from spikekit.cli import main; sys.exit(main())"
+    main = "import sys; from spikekit.cli.command import main; sys.exit(main())"
     command = [sys.executable, "-c", main, *arguments.split()]
     done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "COLUMNS": "90"}, check=False)
     if done.returncode:
@@ -91,6 +113,45 @@ def _inline(text):
     return "".join(f"``{part}``" if i % 2 else re.sub(r"([*_|\\])", r"\\\1", part) for i, part in enumerate(parts))
 
 
+class ShippedTrade(SphinxDirective):
+    """``.. shipped-trade:: 4`` is the table that comes with the weights of this scale, fastest setting first."""
+
+    required_arguments = 1
+
+    def run(self):
+        """Return the nodes."""
+        path = Path(lightning_modules.__file__).parent / "weights" / f"x{self.arguments[0]}.csv"
+        self.env.note_dependency(str(path))
+        rst = StringList(list(_restructured("\n".join(_trade(path)))), source=self.get_source_info()[0])
+        node = nodes.Element()
+        self.state.nested_parse(rst, self.content_offset, node)
+        return node.children
+
+
+def _trade(path):
+    """Rows of Markdown."""
+    with path.open(newline="") as file:
+        rows = sorted((row for row in csv.DictReader(file) if not row["failed"]), key=lambda row: float(row["ms"]))
+    yield "| setting | PSNR (dB) | SSIM | time, ratio | ms a frame | MiB | on the front |"
+    yield "|---|---|---|---|---|---|---|"
+    for row in rows:
+        psnr, ssim, ratio, ms, mib = (float(row[name]) for name in ("psnr", "ssim", "ratio", "ms", "mib"))
+        on_front = "yes" if row["front"] == "1" else ""
+        yield f"| {row['setting']} | {psnr:.2f} | {ssim:.4f} | {ratio:.2g} | {ms:.0f} | {mib:.0f} | {on_front} |"
+
+
+def _inline_math(self, node):
+    self.body.append(tex2mathml(node.astext()))
+    raise nodes.SkipNode
+
+
+def _block_math(self, node):
+    self.body.append(f'<div class="math">{tex2mathml(node.astext(), as_block=True)}</div>')
+    raise nodes.SkipNode
+
+
 def setup(app):
-    """Register the directive."""
+    """Register the directives, and MathML as the form of formulas."""
     app.add_directive("run", Run)
+    app.add_directive("shipped-trade", ShippedTrade)
+    app.add_html_math_renderer("mathml", (_inline_math, None), (_block_math, None))

@@ -1,1 +1,46 @@
 """Networks, data and commands that learn from colour spike streams, built on spikekit."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lightning_modules.networks import CSCSR
+    from lightning_modules.shipped import list_pretrained
+    from lightning_modules.tasks.super_resolution import SuperResolution
+
+__all__ = ["CSCSR", "SuperResolution", "list_pretrained"]
+
+# where what the package offers is
+_HOME = {"CSCSR": "networks", "SuperResolution": "tasks.super_resolution", "list_pretrained": "shipped"}
+
+
+class _OldNames:
+    """Asks spikekit where a module of an old name is now; only then, as it imports torch."""
+
+    @staticmethod
+    def find_spec(name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> ModuleSpec | None:
+        if not name.startswith("lightning_modules."):
+            return None
+        from spikekit._renamed import RenamedModules
+
+        return RenamedModules.find_spec(name)
+
+
+sys.meta_path.append(_OldNames)
+
+
+def __getattr__(name: str) -> Any:
+    """Import what the package offers when it is asked for: importing the package takes no time."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,8 +1,9 @@
-"""Weights in files: those that come with the package, those of safetensors, and checkpoints of ``lightning fit``."""
+"""Files of weights: shipped ones, safetensors, and checkpoints of ``lightning fit``."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from inspect import signature
 from pathlib import Path
@@ -13,7 +14,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-_FOLDER = Path(__file__).parent / "weights"
+from lightning_modules.checkpoint import check_tensors, read_checkpoint
+from lightning_modules.error_model import read_error_model
+from lightning_modules.shipped import find_shipped, list_pretrained
+from lightning_modules.stored_settings import check_plain, check_shapes
+from spikekit.io.whole_file import whole_file
+
 _MOTION = "motion."
 
 
@@ -40,28 +46,42 @@ class Weights:
     tensors: dict[str, Tensor]
 
 
-def shipped_weights() -> dict[str, Path]:
-    """Return the files of weights that come with the package, by name."""
-    return {path.stem: path for path in sorted(_FOLDER.glob("*.safetensors"))}
-
-
 def read_weights(source: str | Path) -> Weights:
     """Read weights; nothing in the file is run.
 
     Args:
-        source: the name of weights that come with the package, such as ``"x4-e"``; a file of safetensors; or a
-            checkpoint of ``lightning fit``.
+        source: the name of weights that come with the package, such as ``"cscsr_small_x4"``; a file of safetensors; or
+            a checkpoint of ``lightning fit``.
 
     Raises:
         FileNotFoundError: neither a file nor the name of one.
-        ValueError: a file that is damaged, or of something else.
+        ValueError: a file that is damaged or of something else, weights that are not finite, or settings that this
+            package cannot have written or that do not fit the weights; the message is one line and names the file.
     """
-    shipped = shipped_weights()
-    path = shipped.get(str(source), Path(source))
+    shipped = find_shipped(str(source))
+    path = shipped.path if shipped else Path(source)
     if not path.is_file():
-        names = ", ".join(shipped) or "none"
+        names = ", ".join(weights.name for weights in list_pretrained())
         raise FileNotFoundError(f"{source}: neither a file of weights nor the name of those in the package ({names})")
     return _read_safetensors(path) if path.suffix == ".safetensors" else _read_checkpoint(path)
+
+
+def check_weights(weights: Weights, kinds: Mapping[str, type[nn.Module]]) -> None:
+    """Compare weights with what they are said to be of, before any of it is built and takes memory.
+
+    Args:
+        weights: as they were read.
+        kinds: networks and estimators of this package, by name; weights of others are compared when they are loaded.
+
+    Raises:
+        ValueError: settings that this package cannot have written, or that do not fit the weights; the message is one
+            line and names the file.
+    """
+    inside = {name.removeprefix(_MOTION): value for name, value in weights.tensors.items() if name.startswith(_MOTION)}
+    outside = {name: value for name, value in weights.tensors.items() if not name.startswith(_MOTION)}
+    for settings, tensors in ((weights.settings, outside), (weights.motion, inside)):
+        if settings.get("class") in kinds:
+            check_shapes(settings, tensors, weights.source, kinds)
 
 
 def _read_safetensors(path: Path) -> Weights:
@@ -69,34 +89,31 @@ def _read_safetensors(path: Path) -> Weights:
         with safe_open(path, "pt") as file:
             said = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
+        check_tensors(tensors)
+    except (SafetensorError, OSError, AttributeError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: not a file of safetensors, or a damaged one ({_first_line(error)})") from error
     try:
         settings, motion = json.loads(said["network"]), json.loads(said["motion"])
         return Weights(path, {"class": settings["class"], **_named(settings)}, _named(motion), tensors)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"{path}: does not say what network it is of, as lightning export would") from error
 
 
 def _read_checkpoint(path: Path) -> Weights:
+    checkpoint = read_checkpoint(path)
+    tensors = {name.removeprefix("network."): value for name, value in checkpoint["state_dict"].items()}
     try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        settings, motion = _named(checkpoint["network"]), _named(checkpoint.get("motion", {}))
-        tensors = {name.removeprefix("network."): value for name, value in checkpoint["state_dict"].items()}
-        if not all(isinstance(value, Tensor) for value in tensors.values()):
-            raise TypeError("state_dict: expected tensors")
-    except Exception as error:
-        reason = f"{type(error).__name__}: {_first_line(error)}"
-        raise ValueError(f"{path}: not a checkpoint of lightning fit ({reason})") from error
-    return Weights(path, settings, motion, tensors)
+        return Weights(path, _named(checkpoint["network"]), _named(checkpoint["motion"]), tensors)
+    except ValueError as error:
+        raise ValueError(f"{path}: not a checkpoint of lightning fit ({error})") from error
 
 
 def _named(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return settings whose class is a name: a path would be imported, and so run, when the network is built."""
+    """Return settings that are plain, and whose class is a name and no path."""
     settings = dict(settings)
+    check_plain("settings", settings)
     if not str(settings.get("class", "none")).isidentifier():
         raise ValueError(f"class: expected a name, got {settings['class']!r}")
-    json.dumps(settings)  # plain values
     return settings
 
 
@@ -109,11 +126,20 @@ def write_weights(weights: Weights, path: str | Path) -> None:
     path = Path(path)
     if path.suffix != ".safetensors":
         raise ValueError(f"{path}: expected a name that ends in .safetensors")
-    path.parent.mkdir(parents=True, exist_ok=True)
     # copies, as tensors that share memory cannot be saved
     tensors = {name: value.clone(memory_format=torch.contiguous_format) for name, value in weights.tensors.items()}
-    # save_file leaves a file that nobody else may read
-    path.write_bytes(save(tensors, {"network": json.dumps(weights.settings), "motion": json.dumps(weights.motion)}))
+    said = {"network": json.dumps(weights.settings), "motion": json.dumps(weights.motion)}
+    with whole_file(path) as file:
+        file.write(_same_every_time(save(tensors, said)))
+
+
+def _same_every_time(data: bytes) -> bytes:
+    """Sort what the header of a safetensors file says: its own writer shuffles the metadata."""
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + length])
+    header = {key: dict(sorted(value.items())) if key == "__metadata__" else value for key, value in header.items()}
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    return data[:8] + text.ljust(length) + data[8 + length :]
 
 
 def settings_of(network: nn.Module) -> dict[str, Any]:
@@ -175,6 +201,9 @@ def with_own_motion(
 def load_weights(network: nn.Module, weights: Weights, keep_motion: bool = False) -> None:
     """Give a network weights that are of its kind.
 
+    Weights are of the gain alpha that they were trained with. Where the network was built for another, its picture is
+    multiplied by what one gain is of the other.
+
     Args:
         network: what the weights are meant for.
         weights: they.
@@ -184,7 +213,9 @@ def load_weights(network: nn.Module, weights: Weights, keep_motion: bool = False
         CheckpointMismatchError: they are of another network.
         ValueError: the file says that they fit, and they do not.
     """
-    check_settings(network, weights.settings, weights.source)
+    settings, alpha = weights.settings, network.settings.get("alpha")
+    ratio = 1 if alpha is None else settings.get("alpha", alpha) / alpha
+    check_settings(network, settings if ratio == 1 else {**settings, "alpha": alpha}, weights.source)
     motion = getattr(network, "motion", None)
     tensors = weights.tensors if motion is None else with_own_motion(weights.tensors, motion, keep=keep_motion)
     try:
@@ -192,6 +223,10 @@ def load_weights(network: nn.Module, weights: Weights, keep_motion: bool = False
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
         raise ValueError(f"{weights.source}: weights that do not fit ({reason})") from error
+    if ratio != 1:
+        network.scale_picture(ratio)
+    if hasattr(network, "error_model"):
+        network.error_model = read_error_model(weights.source)
 
 
 def _first_line(error: Exception) -> str:

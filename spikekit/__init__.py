@@ -1,10 +1,14 @@
 """spikekit: differentiable operators for the colour spike camera."""
 
-from spikekit.cameras import CAMERAS, Camera, camera
-from spikekit.cfa import (
+import sys
+
+from spikekit import _renamed  # noqa: F401
+from spikekit.color import (
     PATTERNS,
     BayerMask,
     BinToSensor,
+    Demosaic,
+    DemosaicResidual,
     MergeBayer,
     Mosaic,
     SplitBayer,
@@ -13,29 +17,68 @@ from spikekit.cfa import (
     bayer_pattern,
     bayer_sites,
     bin_to_sensor,
+    demosaic,
+    demosaic_residual,
     merge_bayer,
     mosaic,
     split_bayer,
     split_colors,
 )
-from spikekit.decoders import SpikeInterval, Tfi, Tfp, spike_interval, tfi, tfp
-from spikekit.demosaic import Demosaic, demosaic
-from spikekit.files import SpikeFileError, iter_spikes, read_spikes, spikes_shape, write_spikes
-from spikekit.film import Film, FilmClip
-from spikekit.interpolate import Between, Blend, FlowInterpolation, Still
-from spikekit.keyframe import spike_interval_at, tfi_at, tfp_at
+from spikekit.decoders import (
+    SpikeInterval,
+    Tfi,
+    Tfp,
+    decode_in_chunks,
+    pack_spikes,
+    spike_interval,
+    spike_interval_at,
+    tfi,
+    tfi_at,
+    tfp,
+    tfp_at,
+    unpack_spikes,
+)
+from spikekit.flow import (
+    Between,
+    Blend,
+    FlowInterpolation,
+    JointFlow,
+    LinearMotion,
+    Still,
+    UpsampleFlow,
+    joint_flow,
+    linear_motion,
+    upsample_flow,
+)
+from spikekit.io import (
+    CAMERAS,
+    Camera,
+    PictureError,
+    SpikeFileError,
+    VideoError,
+    VideoFrames,
+    camera,
+    flow_to_rgb,
+    iter_spikes,
+    panel,
+    read_picture,
+    read_spikes,
+    read_video,
+    spikes_shape,
+    write_picture,
+    write_spikes,
+)
 from spikekit.metrics import psnr, ssim
-from spikekit.motion import JointFlow, LinearMotion, UpsampleFlow, joint_flow, linear_motion, upsample_flow
-from spikekit.noise import SensorNoise, SpikeChange
-from spikekit.packing import pack_spikes, unpack_spikes
-from spikekit.pictures import flow_to_rgb, panel, read_picture, write_picture
-from spikekit.plan import Plan, SceneProfile
-from spikekit.scene import Layer, Motion, Scene
-from spikekit.sensor import SpikeIntegrateFire, spike_integrate_fire
-from spikekit.simulate import SpikeSensor, simulate_spikes
-from spikekit.streams import decode_in_chunks
-from spikekit.video import VideoError, VideoFrames, read_video
-from spikekit.warp import FlowWarp, FlowWarpIdw, flow_warp, flow_warp_idw
+from spikekit.scenes import Film, FilmClip, Layer, Motion, Plan, Scene, SceneProfile
+from spikekit.sensor import (
+    SensorNoise,
+    SpikeChange,
+    SpikeIntegrateFire,
+    SpikeSensor,
+    simulate_spikes,
+    spike_integrate_fire,
+)
+from spikekit.warp import DemosaicAlongMotion, FlowWarp, FlowWarpIdw, demosaic_along_motion, flow_warp, flow_warp_idw
 
 __version__ = "0.1.0.dev0"
 
@@ -48,6 +91,8 @@ __all__ = [
     "Blend",
     "Camera",
     "Demosaic",
+    "DemosaicAlongMotion",
+    "DemosaicResidual",
     "Film",
     "FilmClip",
     "FlowInterpolation",
@@ -59,6 +104,7 @@ __all__ = [
     "MergeBayer",
     "Mosaic",
     "Motion",
+    "PictureError",
     "Plan",
     "Scene",
     "SceneProfile",
@@ -83,6 +129,8 @@ __all__ = [
     "camera",
     "decode_in_chunks",
     "demosaic",
+    "demosaic_along_motion",
+    "demosaic_residual",
     "flow_to_rgb",
     "flow_warp",
     "flow_warp_idw",
@@ -114,3 +162,6 @@ __all__ = [
     "write_picture",
     "write_spikes",
 ]
+
+# the old name of a module that a function has taken: imported anew, the module would take the place of the function
+sys.modules["spikekit.demosaic"] = sys.modules["spikekit.color.demosaic"]

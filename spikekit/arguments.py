@@ -1,15 +1,13 @@
-"""What the verbs of the command line have in common: kinds of arguments, mistakes in them, and progress."""
+"""Kinds of arguments that the verbs of the command line share, and mistakes in them."""
 
 from __future__ import annotations
 
 import argparse
-import sys
-from collections.abc import Callable, Iterable, Iterator
-from typing import TypeVar
+import re
+from collections.abc import Callable
 
-T = TypeVar("T")
-
-_BAR = 30
+#: what names frames: N, A:B or A:B:STEP
+FRAMES = r"\d+|\d*:\d*(:0*[1-9]\d*)?"
 
 
 class UsageError(ValueError):
@@ -31,6 +29,34 @@ def whole(least: int) -> Callable[[str], int]:
     return read
 
 
+def frames_of(text: str, first: int, last: int, step: int = 1) -> range:
+    """Return which frames ``N`` or ``A:B[:STEP]`` asks for, from A to B - 1.
+
+    Args:
+        text: what was typed.
+        first: the first frame that there is, which stands for a missing A.
+        last: the last frame that there is; the one after it stands for a missing B.
+        step: stands for a missing STEP.
+
+    Raises:
+        ValueError: another text, none of the frames, or some that are not there.
+
+    Example:
+        >>> list(frames_of("20:80:20", 20, 99)), list(frames_of(":23", 20, 99))
+        ([20, 40, 60], [20, 21, 22])
+    """
+    if not re.fullmatch(FRAMES, text, re.ASCII):
+        raise ValueError(f"expected a whole number, 0 or more, or A:B or A:B:STEP, got {text}")
+    if ":" in text:
+        begin, end, every = (text + ":").split(":")[:3]
+        chosen = range(int(begin or first), int(end or last + 1), int(every or step))
+    else:
+        chosen = range(int(text), int(text) + 1)
+    if not chosen or chosen.start < first or chosen.stop > last + 1:
+        raise ValueError(f"expected frames within {first} .. {last}, got {text}")
+    return chosen
+
+
 def positive(text: str) -> float:
     """Read a finite number above 0."""
     try:
@@ -46,36 +72,3 @@ def one_line(error: BaseException) -> str:
     """Return what an error says, on one line."""
     text = getattr(error, "strerror", None) or str(error) or type(error).__name__
     return " ".join(text.split())
-
-
-def progress(parts: Iterable[T], total: int, what: str, length: Callable[[T], int] = len) -> Iterator[T]:
-    """Pass on parts of a whole, and show on a terminal how much of it has come.
-
-    Args:
-        parts: what comes.
-        total: length of all of them.
-        what: what is counted.
-        length: that of a part.
-
-    Returns:
-        An iterator over the parts.
-    """
-    if not sys.stderr.isatty():
-        yield from parts
-        return
-    done = 0
-    try:
-        _show(done, total, what)
-        for part in parts:
-            yield part
-            done += length(part)
-            _show(done, total, what)
-    finally:
-        sys.stderr.write("\r\033[K")
-        sys.stderr.flush()
-
-
-def _show(done: int, total: int, what: str) -> None:
-    filled = _BAR * done // total
-    sys.stderr.write(f"\r[{'#' * filled}{'.' * (_BAR - filled)}] {done} of {total} {what}")
-    sys.stderr.flush()

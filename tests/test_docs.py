@@ -1,23 +1,31 @@
 """The docs: every operator has a page and a docstring that says all it should, figures draw, the build is clean."""
 
 import builtins
+import doctest
 import inspect
+import os
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 import typing
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 import pytest
+import torch
 from torch import nn
 
 import spikekit as sk
+from spikekit.cli.command import main
 
 DOCS = Path(__file__).parents[1] / "docs"
-PAGES = {path: path.read_text() for path in sorted(DOCS.rglob("*.rst")) if "_build" not in path.parts}
+MADE = {"_build", "gallery", "sg_execution_times.rst"}  # by Sphinx
+PAGES = {path: path.read_text() for path in sorted(DOCS.rglob("*.rst")) if not MADE & set(path.parts)}
 FIGURES = sorted((DOCS / "figures").glob("*.py"))
+EXAMPLES = sorted((DOCS / "examples").glob("*.py"))
 
 MODULES = {
     name: getattr(sk, name)
@@ -79,12 +87,46 @@ def test_operator_has_a_page_with_its_module_and_a_picture(name):
     assert ":alt: " in PAGES[page]
 
 
-def test_every_page_under_operators_is_an_operators_and_is_in_the_contents():
+def contents():
+    """The pages that some table of contents leads to, by their names from the root of the pages."""
+    found = []
+    for path, text in PAGES.items():
+        for block in re.findall(r"^\.\. toctree::\n((?:   :\w+:.*\n)*)\n((?:   \S+\n)+)", text, flags=re.MULTILINE):
+            for entry in block[1].split():
+                name = DOCS / entry[1:] if entry.startswith("/") else path.parent / entry
+                found.append(name.relative_to(DOCS).as_posix())
+    return found
+
+
+def test_every_page_under_operators_is_an_operators_and_every_page_is_in_the_contents_once():
     pages = {path for path in PAGES if path.parent.name == "operators"}
     assert pages == {documented("autofunction")[name] for name in OPERATORS}
-    for path in PAGES:
-        if path.name != "index.rst":
-            assert f"   {path.relative_to(DOCS).with_suffix('').as_posix()}\n" in PAGES[DOCS / "index.rst"]
+    named = {path.relative_to(DOCS).with_suffix("").as_posix() for path in PAGES}
+    assert sorted(contents()) == sorted(named - {"index", "examples/README"} | {"gallery/index"})
+
+
+def test_every_public_name_is_in_the_list_of_its_room():
+    listed = [
+        name
+        for path, text in PAGES.items()
+        if path.parent.name == "api" and ".. autosummary::" in text
+        for name in text.split(".. autosummary::\n\n")[1].split("\n\n")[0].split()
+    ]
+    assert len(listed) == len(set(listed)), "in two rooms"
+    modules = {camel(name) for name in OPERATORS} & set(MODULES)
+    without_room = {"CAMERAS", "PATTERNS", "PictureError", "SpikeFileError", "VideoError", "psnr", "ssim", *modules}
+    assert sorted(listed) == sorted(set(sk.__all__) - without_room)
+    for name in listed:
+        room = next(path.stem for path, text in PAGES.items() if path.parent.name == "api" and f"   {name}\n" in text)
+        assert getattr(sk, name).__module__.startswith(f"spikekit.{room}."), name
+
+
+def test_gallery_has_its_examples():
+    assert len(EXAMPLES) >= 8
+    for script in EXAMPLES:
+        assert script.stem.startswith("plot_"), "sphinx-gallery runs only those"
+        title, line, *_ = script.read_text().split("\n")[1:]
+        assert line == "=" * len(title)
 
 
 def test_every_figure_is_on_one_page():
@@ -129,7 +171,6 @@ def test_docstring_of_module(name):
 
 @pytest.mark.parametrize("script", FIGURES, ids=[path.stem for path in FIGURES])
 def test_figure_draws(script):
-    matplotlib = pytest.importorskip("matplotlib", reason="figures need matplotlib, see the docs extra")
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
@@ -149,12 +190,89 @@ def test_figure_draws(script):
         plt.close("all")
 
 
-@pytest.mark.slow
-def test_docs_build_without_a_warning(tmp_path):
-    for needed in ("sphinx", "furo", "matplotlib"):
+def test_quickstart_runs():
+    flags = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
+    failed, tried = doctest.testfile(str(DOCS / "quickstart.rst"), module_relative=False, optionflags=flags)
+    assert tried > 10
+    assert failed == 0
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """The pages, built from a copy, since the gallery is written beside its source."""
+    for needed in ("sphinx", "furo", "matplotlib", "sphinx_gallery"):
         pytest.importorskip(needed, reason="the docs extra is not installed")
-    command = [sys.executable, "-m", "sphinx", "-W", "-q", "-b", "html", str(DOCS), str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    folder = tmp_path_factory.mktemp("docs")
+    shutil.copytree(DOCS, folder / "docs", ignore=shutil.ignore_patterns(*MADE))
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", "docs", "pages"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(DOCS.parent), os.environ.get("PYTHONPATH", "")])}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+    return folder / "pages"
+
+
+@pytest.mark.slow
+def test_docs_build_without_a_warning(built):
     for script in FIGURES:
-        assert list((tmp_path / "_images").glob(f"{script.stem}*.png"))
+        assert list((built / "_images").glob(f"{script.stem}*.png"))
+    for script in EXAMPLES:
+        assert list((built / "_images").glob(f"sphx_glr_{script.stem}_*.png"))
+        assert (built / "gallery" / f"{script.stem}.html").is_file()
+
+
+@pytest.mark.slow
+def test_pages_need_no_network(built):
+    formulas = 0
+    for page in built.rglob("*.html"):
+        html = page.read_text()
+        for tag in re.findall(r"<(?:script|link|img|iframe)\b[^>]*>", html):
+            if 'rel="canonical"' not in tag:
+                assert not re.search(r"""(?:src|href)=["']?(?:https?:)?//""", tag), (page.name, tag)
+        formulas += html.count("<math ")
+    assert formulas > 100
+
+
+QUIET = [
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--hide-scrollbars",
+    "--enable-logging=stderr",
+    "--virtual-time-budget=5000",
+    "--window-size=1200,1600",
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "page", ["index.html", "operators/tfi.html", "gallery/index.html", "gallery/plot_02_decoders.html", "view.html"]
+)
+def test_pages_open_in_a_browser(built, page, tmp_path):
+    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if browser is None:
+        pytest.skip("no Chromium is installed")
+    if page == "view.html":
+        light = 0.4 * torch.rand(1, 24, 32, generator=torch.Generator().manual_seed(0)).expand(60, -1, -1)
+        sk.write_spikes(tmp_path / "a.npz", sk.simulate_spikes(light, generator=torch.Generator().manual_seed(0)))
+        assert main(["view", str(tmp_path / "a.npz"), "-o", str(tmp_path / page)]) == 0
+        built = tmp_path
+    picture = tmp_path / "page.png"
+    command = [
+        browser,
+        *QUIET,
+        f"--user-data-dir={tmp_path / 'profile'}",
+        f"--screenshot={picture}",
+        (built / page).as_uri(),
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    # the console of the page: what failed to load, and errors of its scripts
+    assert not re.findall(r"CONSOLE.*(?:Failed to load|Uncaught|Not allowed|ERR_).*", done.stderr)
+    shown = sk.read_picture(picture)
+    assert shown.shape[-2:] == (1600, 1200)
+    assert shown.std() > 0.03, "an empty page"

@@ -5,7 +5,7 @@ import torch
 from skimage import data
 
 import spikekit as sk
-from spikekit.noise import SensorNoise
+from spikekit.sensor.noise import SensorNoise
 
 background = sk.Layer(
     torch.tensor(data.chelsea()).permute(2, 0, 1)[:, :200, 100:330] / 255,

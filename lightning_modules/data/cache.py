@@ -1,18 +1,14 @@
-"""Clips on disk: packed, found again by what they were made of, and believed only when every byte is as it was."""
+"""Cache of simulated clips on disk: packed, keyed by what they were made of, verified by digest."""
 
 from __future__ import annotations
 
 import hashlib
 import io
 import json
-import re
-import secrets
-import time
 import warnings
 from collections.abc import Mapping
 from contextlib import suppress
 from functools import lru_cache
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -20,18 +16,18 @@ import torch
 from torch import Tensor
 
 from spikekit import pack_spikes, unpack_spikes
+from spikekit.io.whole_file import whole_file
 
 _DIGEST = 32  # bytes of a SHA-256
-_STALE = 24 * 3600  # seconds after which nobody goes on with a file that was begun
 
 
 class ClipCache:
     """A folder of clips that took time to make.
 
-    A clip is a file, named after its key. It is written beside and then renamed, so that a run that is killed leaves a
-    part that nobody looks at, and of two processes that write the same clip the last one wins. Before the arrays
-    stands a digest of the key and all bytes; a file that does not agree with it is removed and made again. A clip that
-    cannot be written, as on a full disk, is warned of once and made again the next time.
+    A clip is a file, named after its key. It is written as :func:`spikekit.io.whole_file.whole_file` does: a run that
+    is killed leaves a part that nobody looks at, and of two processes that write a clip the last one wins. Before the
+    arrays stands a digest of the key and all bytes; a file that does not agree with it is removed and made again. A
+    clip that cannot be written, as on a full disk, is warned of once and made again the next time.
 
     Nothing is ever removed for its size or age: delete the folder, or any files in it, at any time.
 
@@ -54,10 +50,8 @@ class ClipCache:
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder).expanduser()
-        self._parts = self.folder / "unfinished"
-        self._parts.mkdir(parents=True, exist_ok=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
         self._warned = False
-        self._sweep()
 
     def load(self, key: str) -> dict[str, np.ndarray] | None:
         """Return the arrays of a clip, or None where there are none, or damaged ones."""
@@ -74,26 +68,25 @@ class ClipCache:
             with suppress(OSError):
                 path.unlink()
             return None
-        with np.load(io.BytesIO(stored[_DIGEST:]), allow_pickle=False) as arrays:
-            return dict(arrays)
+        try:
+            with np.load(io.BytesIO(stored[_DIGEST:]), allow_pickle=False) as arrays:
+                return dict(arrays)
+        except Exception as error:  # somebody wrote the digest of something else
+            self._warn(f"{path}: holds no clip ({type(error).__name__}), made again")
+            return None
 
     def store(self, key: str, arrays: Mapping[str, np.ndarray]) -> None:
         """Keep the arrays of a clip."""
-        path, part = self._path(key), self._parts / secrets.token_hex(8)
+        path = self._path(key)
         stored = io.BytesIO()
         np.savez(stored, **arrays)
         stored = stored.getbuffer()
         try:
-            path.parent.mkdir(exist_ok=True)
-            with open(part, "xb") as file:
+            with whole_file(path) as file:
                 file.write(_digest(key, stored))
                 file.write(stored)
-            part.replace(path)
         except OSError as error:
             self._warn(f"{path}: cannot be written ({error.strerror or error}), goes on without")
-        finally:
-            with suppress(OSError):
-                part.unlink(missing_ok=True)
 
     def _path(self, key: str) -> Path:
         return self.folder / key[:2] / f"{key[2:]}.clip"
@@ -102,13 +95,6 @@ class ClipCache:
         if not self._warned:
             warnings.warn(message, stacklevel=3)
         self._warned = True
-
-    def _sweep(self) -> None:
-        """Remove what killed runs have left."""
-        for part in self._parts.iterdir():
-            with suppress(OSError):
-                if time.time() - part.stat().st_mtime > _STALE:
-                    part.unlink()
 
 
 def _digest(key: str, stored: memoryview) -> bytes:
@@ -147,39 +133,6 @@ def file_digest(path: Path) -> str:
 def _file_digest(path: Path, size: int, time_ns: int) -> str:
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-@lru_cache
-def code_digest(*modules: str) -> str:
-    """Return a digest of the source of modules and of all modules of their packages that they import.
-
-    Whatever in the simulator changes, clips are made anew; what it does not use may change.
-
-    Args:
-        modules: their names, such as ``spikekit.film``.
-
-    Returns:
-        Hexadecimal digits.
-
-    Example:
-        >>> code_digest("spikekit.sensor") == code_digest("spikekit.simulate")
-        False
-    """
-    packages = "|".join(sorted({name.partition(".")[0] for name in modules}))
-    imports = re.compile(rf"^\s*(?:from|import)\s+((?:{packages})(?:\.\w+)*)(?:\s+import\s+([^\n#]+))?", re.MULTILINE)
-    waiting, sources = list(modules), {}
-    while waiting:
-        name = waiting.pop()
-        if name in sources:
-            continue
-        with suppress(ImportError, ValueError):  # an attribute of a module, or a script
-            spec = find_spec(name)
-            if spec is None or not spec.has_location:
-                continue
-            sources[name] = Path(spec.origin).read_bytes()
-            for module, attributes in imports.findall(sources[name].decode()):
-                waiting += [module, *(f"{module}.{attribute}" for attribute in re.findall(r"\w+", attributes))]
-    return hashlib.sha256(b"".join(name.encode() + sources[name] for name in sorted(sources))).hexdigest()
 
 
 def pack_clip(clip: Mapping[str, Tensor]) -> dict[str, np.ndarray]:

@@ -1,11 +1,13 @@
-"""Films as seen by the camera: clips of REDS, Vid4, Vimeo-90K and any other folder of frames."""
+"""Clips simulated from films: REDS, Vid4, Vimeo-90K, or any folder of frames."""
 
 from __future__ import annotations
 
 import hashlib
+import inspect
 import pickle
 import zlib
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,16 +19,16 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from lightning_modules.data.cache import ClipCache, clip_key, code_digest, file_digest, pack_clip, unpack_clip
+from lightning_modules.data.cache import ClipCache, clip_key, file_digest, pack_clip, unpack_clip
 from lightning_modules.data.layouts import EXPECTED, Collection, FilmFiles, find_films
 from lightning_modules.data.loading import FreshClips, default_workers, load_clips
 from lightning_modules.data.pictures import split_pictures
 from spikekit import bayer_pattern
 from spikekit.check import check_positive, check_whole
-from spikekit.film import Film, FilmClip
-from spikekit.interpolate import FlowInterpolation
-from spikekit.noise import SensorNoise
-from spikekit.video import read_video
+from spikekit.flow.interpolate import FlowInterpolation
+from spikekit.io.video import read_video
+from spikekit.scenes.frame_sequence import SIMULATOR_VERSION, Film, FilmClip
+from spikekit.sensor.noise import SensorNoise
 
 
 @dataclass(frozen=True)
@@ -82,12 +84,11 @@ class ClipRecipe:
 
     def key(self, film: FilmFiles, middle: int) -> str:
         """Return the name of a clip in a cache."""
-        part = type(self.interpolation).__module__
         return clip_key(
-            code=[code_digest("spikekit.film", "spikekit.video"), file_digest(Path(__file__)), code_digest(part)],
+            simulator=SIMULATOR_VERSION,
             files=[file_digest(path) for path in self.files(film, middle)],
             shrink=film.shrink,
-            interpolation=hashlib.sha256(pickle.dumps(self.interpolation)).hexdigest(),
+            interpolation=_interpolation_digest(self.interpolation),
             noise=asdict(self.noise),
             pattern=bayer_pattern(self.pattern),
             flow_times=list(self.flow_times),
@@ -106,7 +107,7 @@ class ClipRecipe:
             pixels, all of the whole view. Where the film is cut, nothing can be followed, and flow is 0.
 
         Raises:
-            spikekit.video.VideoError: a file that cannot be read; the message names it.
+            spikekit.io.video.VideoError: a file that cannot be read; the message names it.
             ValueError: frames too small for the sensor, or a truth of another size than theirs.
         """
         paths = self.files(film, middle)
@@ -139,6 +140,16 @@ class ClipRecipe:
     def _chance(self, paths: list[Path]) -> int:
         """A seed for the sensor that depends on what the frames show, not on where they lie."""
         return int(clip_key(seed=self.seed, files=[file_digest(path) for path in paths])[:15], 16)
+
+
+def _interpolation_digest(interpolation: Callable[[Tensor, Tensor], Any]) -> str:
+    """Digest of an interpolation and, where it is somebody's own, of the file that it is written in."""
+    digest = hashlib.sha256(pickle.dumps(interpolation))
+    kind = interpolation if inspect.isroutine(interpolation) else type(interpolation)
+    if kind.__module__.partition(".")[0] != "spikekit":  # which SIMULATOR_VERSION covers
+        with suppress(OSError, TypeError):  # no file: typed at a prompt, or compiled
+            digest.update(file_digest(Path(inspect.getfile(kind))).encode())
+    return digest.hexdigest()
 
 
 def _shrunk(rgb: Tensor, factor: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""The films of a folder: how REDS, Vid4 and Vimeo-90K are distributed, and any other folder of frame folders."""
+"""Folder layouts of video data sets: REDS, Vid4, Vimeo-90K, or any folder of frame folders."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from spikekit.video import PICTURE_ENDINGS
+from spikekit.io.video import PICTURE_ENDINGS
 
 #: What a folder may look like, for messages.
 EXPECTED = """\
@@ -148,7 +148,10 @@ def _septuplets(folder: Path, small: Path | None, listed: str, large: str = "seq
     """Return the sequences of a list, which has ``00001/0001`` and the like in its lines."""
     if not (folder / listed).is_file():
         return ()
-    names = (folder / listed).read_text().split()
+    try:
+        names = (folder / listed).read_text(encoding="utf-8").split()
+    except ValueError as error:
+        raise ValueError(f"{folder / listed}: expected a list of sequences ({error})") from error
     parents = sorted({name.partition("/")[0] for name in names})
     for place in filter(None, (small, folder / large)):
         # one look at each folder of folders: there are 96 of them, but 91,701 sequences
@@ -185,7 +188,7 @@ def _subfolders(folder: Path) -> list[str]:
     if not folder.is_dir():
         return []
     with os.scandir(folder) as entries:
-        return [entry.name for entry in entries if entry.is_dir() and not entry.name.startswith(".")]
+        return [entry.name for entry in entries if os.path.isdir(entry.path) and not entry.name.startswith(".")]
 
 
 def _pictures(folder: Path) -> list[str]:

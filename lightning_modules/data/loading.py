@@ -1,4 +1,4 @@
-"""What loads clips, whichever they are: fresh ones every epoch, as arrays, by workers of one thread."""
+"""Data loaders for clips: fresh ones every epoch, made by workers of one thread each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the pictures of the scenes come from: any folder, or the photographs inside scikit-image's wheel."""
+"""Source pictures of the scenes: any folder, or the photographs inside scikit-image's wheel."""
 
 from __future__ import annotations
 

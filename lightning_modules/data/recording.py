@@ -2,27 +2,46 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
 from pytorch_lightning import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from spikekit import bayer_sites, read_spikes, spikes_shape
+from spikekit import bayer_sites
+from spikekit.arguments import frames_of
+from spikekit.io.recording import open_recording, white_rate
+
+# clips that are looked at for what is white, from the first to the last of the recording
+_LOOKS = 8
 
 
 class RecordingClips(Dataset[dict[str, Any]]):
-    """Clips around every ``every``-th frame of a recording, read when they are asked for.
+    """Clips around some frames of a recording, read when they are asked for.
 
     Args:
         path: a ``.dat`` or ``.npz`` file, see :func:`spikekit.read_spikes`.
-        height: rows; needed for ``.dat``.
-        width: columns; needed for ``.dat``.
+        height: rows; needed for a ``.dat`` without side-car or camera.
+        width: columns; likewise.
         flip: turn the stored frames upside down, as real cameras need.
-        pattern: Bayer phase after the flip.
+        pattern: Bayer phase after the flip; that of the side-car or the camera, or else RGGB, when not given.
         frames: spike frames N of a clip.
         every: frames between two clips.
         crop_to: Bayer phase that a network wants; up to one row and column are cut off so that clips begin with it.
+        camera: what recorded it, see :func:`spikekit.camera`.
+        frame: N, or A:B or A:B:STEP: the frames in the middle of the clips, from A to B - 1, ``every`` apart where
+            STEP is left out; all that a whole clip is around when not given.
+        white: spikes a frame of a pixel that is shown white; see :class:`Recording`.
+
+    Attributes:
+        size: (H, W) of a clip.
+        recording: the file and what is known of it.
 
     Raises:
         spikekit.SpikeFileError: the file cannot be read.
@@ -36,50 +55,85 @@ class RecordingClips(Dataset[dict[str, Any]]):
         height: int | None = None,
         width: int | None = None,
         flip: bool = False,
-        pattern: str = "RGGB",
+        pattern: str | None = None,
         frames: int = 41,
         every: int = 20,
         crop_to: str = "RGGB",
+        camera: str | None = None,
+        frame: str | None = None,
+        white: float | None = None,
     ) -> None:
         if every < 1:
             raise ValueError(f"every: expected at least 1 frame, got {every}")
-        total, self.height, self.width = spikes_shape(path, height, width)
+        if white is not None and not 0 < white < float("inf"):
+            raise ValueError(f"white: expected a finite number above 0, got {white}")
+        self._white = white
+        self.recording = open_recording(
+            Namespace(file=Path(path), height=height, width=width, flip=flip, pattern=pattern, camera=camera)
+        )
+        total, (rows, columns) = self.recording.frames, self.recording.size
         if total < frames:
             raise ValueError(f"{path}: expected at least {frames} frames for a clip, got {total}")
         # where red is says which of the four phases it is
-        (_, row, column), (_, to_row, to_column) = bayer_sites(pattern)[0], bayer_sites(crop_to)[0]
+        phase = self.recording.pattern or "RGGB"
+        (_, row, column), (_, to_row, to_column) = bayer_sites(phase)[0], bayer_sites(crop_to)[0]
         self.top, self.left = (row - to_row) % 2, (column - to_column) % 2
-        left = self.height - self.top, self.width - self.left
-        if min(left) < 3:
-            raise ValueError(f"{path}: expected at least 3 x 3 pixels that begin with {crop_to}, got {left}")
-        self.path, self.flip, self.frames, self.every = path, flip, frames, every
-        self.clips = (total - frames) // every + 1
+        self.size = rows - self.top, columns - self.left
+        if min(self.size) < 3:
+            raise ValueError(f"{path}: expected at least 3 x 3 pixels that begin with {crop_to}, got {self.size}")
+        self.frames = frames
+        self._every_clip = range(frames // 2, total - (frames - 1) // 2, every)
+        try:
+            ends = self._every_clip[0], total - 1 - (frames - 1) // 2
+            self.chosen = self._every_clip if frame is None else frames_of(frame, *ends, every)
+        except ValueError as error:
+            raise ValueError(f"frame: {error}; a clip has {frames} frames of the {total} of {path}") from error
 
     def __len__(self) -> int:
-        return self.clips
+        return len(self.chosen)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        if not 0 <= index < self.clips:
+        if not 0 <= index < len(self):
             raise IndexError(index)
-        start = index * self.every
-        spikes: Tensor = read_spikes(
-            self.path, self.height, self.width, flip=self.flip, start=start, frames=self.frames
-        )
-        return {"spikes": spikes[:, self.top :, self.left :].contiguous(), "frame": start + self.frames // 2}
+        middle = self.chosen[index]
+        return {"spikes": self._clip(middle), "frame": middle, "white": torch.tensor(self.white)}
+
+    @cached_property
+    def white(self) -> float:
+        """Spikes a frame of a white pixel, which is the same for whichever frames are chosen."""
+        known = self._white or self.recording.alpha
+        if known is not None:
+            return known
+        clips = self._every_clip
+        looks = sorted({clips[round(n)] for n in np.linspace(0, len(clips) - 1, _LOOKS)})
+        return white_rate(torch.stack([self._clip(middle).float().mean(0) for middle in looks]).mean(0))
+
+    def _clip(self, middle: int) -> Tensor:
+        spikes = self.recording.read(middle - self.frames // 2, self.frames)
+        return spikes[:, self.top :, self.left :].contiguous()
 
 
 class Recording(LightningDataModule):
     """One recording of a colour spike camera, for ``predict``.
 
+    What a side-car beside the recording knows, or ``camera``, need not be said: size, Bayer phase and gain.
+
     Args:
         path: a ``.dat`` or ``.npz`` file.
-        height: rows; needed for ``.dat``, which has no header.
+        height: rows; needed for a ``.dat`` without side-car or camera, as it has no header.
         width: columns; likewise.
         flip: turn the stored frames upside down, as real cameras need.
-        pattern: Bayer phase after the flip, one of RGGB, BGGR, GRBG, GBRG; for a grey camera leave it as it is.
+        pattern: Bayer phase after the flip, one of RGGB, BGGR, GRBG, GBRG; that of the side-car or the camera, or else
+            RGGB, when not given. For a grey camera leave it as it is.
         every: frames between two reconstructed pictures; 20 is a millisecond at 20 kHz.
         frames: spike frames of a clip, as the network was trained.
         crop_to: Bayer phase that the network was trained with; clips begin with it, a row and a column less at most.
+        camera: what recorded it: m1k40, m1k40-bayer, uhsr, vidar, or a .json file of the same form; gives the size, the
+            flip, the Bayer phase, what to crop, and the gamma of the pictures.
+        frame: which frames to reconstruct: N, or from A to B - 1 as A:B or A:B:STEP, ``every`` apart where STEP is left
+            out; all when not given.
+        white: spikes a frame of a pixel that is shown white; less makes pictures brighter. When not given, that of the
+            side-car, or else what 99.9 % of the pixels of the recording do not exceed, the same in all its pictures.
     """
 
     def __init__(
@@ -88,10 +142,13 @@ class Recording(LightningDataModule):
         height: int | None = None,
         width: int | None = None,
         flip: bool = False,
-        pattern: str = "RGGB",
+        pattern: str | None = None,
         every: int = 20,
         frames: int = 41,
         crop_to: str = "RGGB",
+        camera: str | None = None,
+        frame: str | None = None,
+        white: float | None = None,
     ) -> None:
         super().__init__()
         self.path = path
@@ -103,6 +160,9 @@ class Recording(LightningDataModule):
             "frames": frames,
             "every": every,
             "crop_to": crop_to,
+            "camera": camera,
+            "frame": frame,
+            "white": white,
         }
 
     def setup(self, stage: str | None = None) -> None:
@@ -113,6 +173,11 @@ class Recording(LightningDataModule):
             ValueError: the recording is shorter than a clip, or an argument is out of range.
         """
         self.clips = RecordingClips(self.path, **self.how)
+
+    def show(self, rgb: Tensor) -> Tensor:
+        """Return light in [0, 1], white being 1, as the camera shows it."""
+        camera = self.clips.recording.camera
+        return rgb if camera is None else replace(camera, gain=1.0).display(rgb)
 
     def predict_dataloader(self) -> DataLoader[dict[str, Any]]:  # noqa: D102
         return DataLoader(self.clips, batch_size=1)

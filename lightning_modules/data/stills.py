@@ -1,4 +1,4 @@
-"""Still pictures set in motion: clips for training and validation, with sharp truth and exact flow."""
+"""Clips from still pictures in motion, with exact ground truth and flow, for training and validation."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from lightning_modules.data.pictures import cached_picture, embedded_pictures, f
 from lightning_modules.data.textures import outline_mask, texture
 from spikekit import bayer_pattern
 from spikekit.check import check_positive, check_whole
-from spikekit.noise import SensorNoise
-from spikekit.scene import Layer, Motion, Scene
-from spikekit.simulate import simulate_spikes
+from spikekit.scenes.analytic import Layer, Motion, Scene
+from spikekit.sensor.noise import SensorNoise
+from spikekit.sensor.simulate import simulate_spikes
 
 _TEXTURES = 0.3  # share of procedural pictures among embedded ones
 
@@ -37,6 +37,7 @@ class StillClips(Dataset):
         alpha: light of a white pixel per clock, the threshold being 1.
         motion: largest displacement of the middle of the background from the middle of the clip to its first or last
             frame, in sensor pixels; an object moves by up to as much again relative to the background.
+        bend: what acceleration adds to that displacement at most, in sensor pixels, of every layer by itself.
         rotation: largest turn in the same time, in degrees.
         zoom: largest growth or shrinkage in the same time; 0.01 is one per cent.
         objects: most objects in front of the background.
@@ -63,6 +64,7 @@ class StillClips(Dataset):
         pattern: str = "RGGB",
         alpha: float = 0.4,
         motion: float = 3.0,
+        bend: float = 0.0,
         rotation: float = 1.0,
         zoom: float = 0.01,
         objects: int = 2,
@@ -76,7 +78,7 @@ class StillClips(Dataset):
     ) -> None:
         self.pictures = list(pictures)
         self.scale, self.patch, self.frames, self.pattern, self.alpha = scale, patch, frames, pattern, alpha
-        self.motion, self.rotation, self.zoom, self.objects = motion, rotation, zoom, objects
+        self.motion, self.bend, self.rotation, self.zoom, self.objects = motion, bend, rotation, zoom, objects
         self.brightness, self.photons, self.flow_times = tuple(brightness), photons, tuple(flow_times)
         self.seed, self.augment, self.textures, self.length = seed, augment, textures, length
         _check(self)
@@ -104,7 +106,8 @@ class StillClips(Dataset):
         velocity = _in_disc(rng) * self.motion * self.scale / half
 
         # what comes into view: the corners by motion, rotation and zoom
-        reach = middle * math.sqrt(2) * (math.radians(self.rotation) + self.zoom) + self.motion * self.scale
+        turns = middle * math.sqrt(2) * (math.radians(self.rotation) + self.zoom)
+        reach = turns + (self.motion + self.bend) * self.scale
         margin = math.ceil(reach) + 2
         background = self._picture(side + 2 * margin, rng, index) * brightness
         layers = [Layer(background, self._motion(velocity, (middle, middle), half, rng), (-margin, -margin))]
@@ -123,7 +126,9 @@ class StillClips(Dataset):
     def _motion(self, velocity: np.ndarray, centre: tuple[float, float], half: int, rng: np.random.Generator) -> Motion:
         rotation = math.radians(self.rotation * rng.uniform(-1, 1)) / half
         zoom = (1 + self.zoom) ** (rng.uniform(-1, 1) / half)
-        return Motion((float(velocity[0]), float(velocity[1])), rotation, zoom, centre)
+        # without a bend nothing is drawn: a seed's clips stay what they were
+        bend = _in_disc(rng) * (2 * self.bend * self.scale / half**2) if self.bend else np.zeros(2)
+        return Motion(_pair(velocity), rotation, zoom, centre, _pair(bend))
 
     def _picture(self, side: int, rng: np.random.Generator, turn: int | None = None) -> Tensor:
         """A random square out of a picture: ``turn`` says whose turn it is, where pictures take turns."""
@@ -147,10 +152,11 @@ def _check(clips: StillClips) -> None:
         ("patch", clips.patch >= 1, "at least 1"),
         ("frames", clips.frames >= 1, "at least 1"),
         ("motion", 0 <= clips.motion < math.inf, "0 or more"),
+        ("bend", 0 <= clips.bend < math.inf, "0 or more"),
         ("rotation", 0 <= clips.rotation < math.inf, "0 or more degrees"),
         ("zoom", 0 <= clips.zoom < math.inf, "0 or more"),
         ("objects", clips.objects >= 0, "0 or more"),
-        ("brightness", 0 <= low <= high <= 1, "two numbers 0 <= low <= high <= 1"),
+        ("brightness", 0 <= low <= high < math.inf, "two numbers 0 <= low <= high"),
         ("flow_times", all(0 <= t < clips.frames for t in clips.flow_times), f"clocks in [0, {clips.frames})"),
         ("photons", clips.photons is None or 0 < clips.photons < math.inf, "a number above 0, or null for no noise"),
         ("seed", clips.seed >= 0, "0 or more"),
@@ -158,6 +164,10 @@ def _check(clips: StillClips) -> None:
     ):
         if not good:
             raise ValueError(f"{name}: expected {expected}, got {getattr(clips, name)}")
+
+
+def _pair(vector: np.ndarray) -> tuple[float, float]:
+    return float(vector[0]), float(vector[1])
 
 
 def _in_disc(rng: np.random.Generator) -> np.ndarray:
@@ -216,6 +226,8 @@ class StillScenes(pl.LightningDataModule):
         alpha: light of a white pixel per clock; a threshold of charge is 1.
         motion: largest displacement of the background, at its centre, from the middle frame to the first or last one,
             in sensor pixels. An object moves by up to as much again relative to the background.
+        bend: what acceleration adds to that displacement at most, in sensor pixels, for the background and for each
+            object: paths are parabolas instead of straight lines.
         rotation: largest turn of the background and of each object in that time, in degrees.
         zoom: largest growth or shrinkage of the background and of each object in that time; 0.01 is one per cent.
         objects: most objects that move in front of the background.
@@ -242,6 +254,7 @@ class StillScenes(pl.LightningDataModule):
         pattern: str = "RGGB",
         alpha: float = 0.4,
         motion: float = 3.0,
+        bend: float = 0.0,
         rotation: float = 1.0,
         zoom: float = 0.01,
         objects: int = 2,
@@ -266,6 +279,7 @@ class StillScenes(pl.LightningDataModule):
             "pattern": pattern,
             "alpha": alpha,
             "motion": motion,
+            "bend": bend,
             "rotation": rotation,
             "zoom": zoom,
             "objects": objects,

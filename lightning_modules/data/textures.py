@@ -1,4 +1,4 @@
-"""Procedural pictures: colourful and rich in fine detail, where photographs are few."""
+"""Procedural textures, colourful and rich in fine detail, for where photographs are few."""
 
 from __future__ import annotations
 

@@ -5,4 +5,7 @@ from lightning_modules.motion.estimator import MotionEstimator
 from lightning_modules.motion.spike2flow import Spike2Flow
 from lightning_modules.motion.zero import ZeroFlow
 
-__all__ = ["ClassicalFlow", "MotionEstimator", "Spike2Flow", "ZeroFlow"]
+#: what weights and configurations may name
+ESTIMATORS = {kind.__name__: kind for kind in (ClassicalFlow, Spike2Flow, ZeroFlow)}
+
+__all__ = ["ESTIMATORS", "ClassicalFlow", "MotionEstimator", "Spike2Flow", "ZeroFlow"]

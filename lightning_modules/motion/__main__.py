@@ -1,4 +1,4 @@
-"""``python -m lightning_modules.motion``: motion without weights, beside what scikit-image has; error and time.
+"""``python -m lightning_modules.motion``: error and time of ClassicalFlow and of scikit-image's TV-L1.
 
 Scenes whose flow is known, those of README's table of estimators; all estimate in turns, in one process.
 """
@@ -16,8 +16,9 @@ from torch import Tensor
 from lightning_modules.data import StillScenes
 from lightning_modules.motion import ClassicalFlow, ZeroFlow
 from spikekit.bench import cpu_name, software
-from spikekit.bench.measure import interleave, ratio, timer_of
 from spikekit.kernels import loops
+from spikekit.tables import table
+from spikekit.timing import interleave, ratio, timer_of
 
 _TIMES = 5, 20, 35
 
@@ -74,13 +75,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     timer, counted = timer_of(torch.device("cpu"), threads)
     times = interleave(runs, args.rounds, timer)
     print(f"machine  {cpu_name()}, {threads} threads, {counted}, {args.rounds} rounds\n{software()}")  # noqa: T201
-    print("\n| estimator | end-point error (px) | ms a clip | time, ratio |\n|---|---|---|---|")  # noqa: T201
+    lines = []
     for name, run in runs.items():
         errors = [(got - clip["flow"]).norm(dim=1).mean().item() for got, clip in zip(run(), clips, strict=True)]
         taken = ratio(times[name], times["ClassicalFlow"])
         spread = f"{taken.median:.2f} ({taken.least:.2f} to {taken.most:.2f})"
         milliseconds = 1000 * float(np.median(times[name])) / len(clips)
-        print(f"| {name} | {sum(errors) / len(errors):.3f} | {milliseconds:.1f} | {spread} |")  # noqa: T201
+        lines.append([name, f"{sum(errors) / len(errors):.3f}", f"{milliseconds:.1f}", spread])
+    print("\n" + table(["estimator", "end-point error (px)", "ms a clip", "time, ratio"], lines))  # noqa: T201
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Motion without weights: TV-L1, on decoded pictures."""
+"""Classical motion estimation: TV-L1 on decoded pictures."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ import torch
 from kornia.filters import filter2d_separable, gaussian_blur2d, get_gaussian_kernel1d
 from torch import Tensor
 
-from lightning_modules.flicker import flicker
 from lightning_modules.motion.estimator import MotionEstimator, split_any_size
-from lightning_modules.motion.tvl1 import tvl1_flow
 from spikekit import bayer_pattern, flow_warp, tfp_at
 from spikekit.check import check_planes, check_positive, check_whole
+from spikekit.flow.tvl1 import tvl1_flow
+from spikekit.sensor.quantization_noise import flicker
 
 _GREY = torch.tensor([[0.25, 0.5, 0.25]])  # each pixel the mean of the Bayer cells that it is part of
 _BLUR = get_gaussian_kernel1d(5, 0.5)  # of the pictures of a site, in Bayer cells
 _ORDER = 3  # of the means that pictures are
+_LONGEST = 17  # their window, in frames: in longer clips more of motion blurs them than noise is averaged
 _NOISE = 0.002  # standard deviation, in firing rates, of a pixel that counts half
 _RATES = 1024
 _NEAR = 2.0  # around a pixel where it is asked whether motion is linear, in pixels
@@ -28,7 +29,8 @@ class ClassicalFlow(MotionEstimator):
     r"""TV-L1 optical flow on decoded pictures: no weights, any device; on a CPU faster with Numba.
 
     The clip is decoded in its middle and a quarter of it before and after, by means of third order that see nearly all
-    of it, see :func:`spikekit.tfp_at`: noise harms the estimate more than what moves meanwhile. Motion is taken to be
+    of it, but at most 49 frames, see :func:`spikekit.tfp_at`: noise harms the estimate more than what moves meanwhile.
+    Motion is taken to be
     linear, so that both flows are those of one velocity, the one that takes the earlier picture to the later; from
     there each half of the clip finds its own, and the flows part where one velocity leaves the pictures clearly more
     different than these two do. The joint flow is estimated on grey pictures of the sensor's size, each pixel the mean
@@ -115,7 +117,7 @@ class ClassicalFlow(MotionEstimator):
 def _decode(spikes: Tensor, middle: int) -> tuple[Tensor, Tensor, int]:
     """Three raw pictures (B, 3, H, W), the times that they show, and the window of their means."""
     frames = spikes.shape[1]
-    window, away = 2 * max((frames - 1) // 6, 1) + 1, max(frames // 4, 1)
+    window, away = min(2 * max((frames - 1) // 6, 1) + 1, _LONGEST), max(frames // 4, 1)
     seen = [max(middle - away, 0), middle, min(middle + away, frames - 1)]
     raw = torch.stack([tfp_at(spikes, n, window, order=_ORDER, dtype=torch.float32) for n in seen], dim=1)
     # where the mean is cut by the ends of the clip, it stands for a later or an earlier time

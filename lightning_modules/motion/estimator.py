@@ -1,4 +1,4 @@
-"""What every estimator of motion promises, and the way from the flows of four sub-streams to the joint one."""
+"""Base class of the motion estimators, and the joint flow of the four sub-streams."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ class MotionEstimator(nn.Module):
 
     ``forward`` averages the flows of the four sub-streams, eq. (7), and brings them to the sensor's resolution.
 
+    Attributes:
+        static: nothing ever moves; nobody asks for the flows then.
+
     Shape:
         - Input: spikes :math:`(B, N, H, W)`, any real dtype; the times of the first, the middle and the last time
           point, in spike frames; the Bayer phase
@@ -21,6 +24,8 @@ class MotionEstimator(nn.Module):
     Reference:
         Dong et al., CVPR 2024, section 4.3, joint motion estimation.
     """
+
+    static: bool = False
 
     def channel_flows(self, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> tuple[Tensor, Tensor]:
         """Estimate the flows of every sub-stream by itself.

@@ -1,4 +1,4 @@
-"""The network inside Spike2Flow: features, correlations, and three flows that are refined again and again."""
+"""The network inside Spike2Flow: features, correlations, and iterative refinement of three flows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Motion that is learned: Spike2Flow on the spike intervals of the four sub-streams."""
+"""Learned motion estimation: Spike2Flow on the spike intervals of the four sub-streams."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lightning_modules.motion.estimator import MotionEstimator, split_any_size
 from lightning_modules.motion.recurrent import RecurrentFlow
-from lightning_modules.pretrained import load_weights, read_weights
+from lightning_modules.pretrained import check_weights, load_weights, read_weights
 from spikekit import spike_interval
 from spikekit.check import check_planes
 
@@ -113,7 +113,9 @@ class Spike2Flow(MotionEstimator):
         self.window, self.iterations, self.frozen = window, iterations, frozen
         self.network = RecurrentFlow(**self.settings)
         if weights is not None:
-            load_weights(self, read_weights(weights))
+            found = read_weights(weights)
+            check_weights(found, {type(self).__name__: type(self)})
+            load_weights(self, found)
         if frozen:
             self.requires_grad_(False)
 
@@ -131,8 +133,8 @@ class Spike2Flow(MotionEstimator):
             pattern: Bayer phase.
 
         Returns:
-            For every iteration (4, B, 2, 3, 2, h, w) in Bayer cells: the sites, the clips, to the first and to the
-            last time point, a third, two thirds and all of the way, x and y.
+            A flow :math:`(4, B, 2, 3, 2, h, w)` in Bayer cells for every iteration. Its axes are the sites, the clips,
+            to the first and to the last time point, a third, two thirds and all of the way, and x and y.
         """
         check_planes("spikes", spikes, 4, "(B, N, H, W)")
         first, middle, last = times

@@ -1,4 +1,4 @@
-"""No motion, the lower bound of every comparison."""
+"""Zero motion, the lower bound of every comparison."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ class ZeroFlow(MotionEstimator):
         >>> ZeroFlow()(torch.ones(1, 41, 16, 16), (5, 20, 35), "RGGB")[0].any().item()
         False
     """
+
+    static = True
 
     def channel_flows(  # noqa: D102
         self, spikes: Tensor, times: tuple[int, int, int], pattern: str

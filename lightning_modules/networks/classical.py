@@ -1,23 +1,22 @@
-"""What one gets without learning: decode, demosaic, enlarge."""
+"""The classical baseline without weights: decode, demosaic, enlarge."""
 
 from __future__ import annotations
-
-from typing import Literal
 
 import torch.nn.functional as F
 from torch import Tensor
 
 from lightning_modules.motion import ZeroFlow
 from lightning_modules.networks.network import Network
-from spikekit import bayer_pattern, demosaic, tfi_at, tfp_at
+from spikekit import bayer_pattern, demosaic
 from spikekit.check import check_planes, check_positive, check_whole
+from spikekit.decoders.methods import DECODERS
 
 
 class ClassicalDecoder(Network):
     r"""TFI or TFP of the middle frame, demosaicing, bicubic enlargement; the baseline that every network must beat.
 
     Args:
-        method: the decoder, ``"tfi"`` or ``"tfp"``.
+        method: the decoder, a name in ``spikekit.decoders.methods.DECODERS``: ``"tfi"`` or ``"tfp"``.
         scale: super-resolution factor.
         pattern: Bayer phase.
         alpha: gain of the camera, what a white pixel receives per clock in thresholds; the result is divided by it.
@@ -35,9 +34,12 @@ class ClassicalDecoder(Network):
         torch.Size([1, 3, 16, 16])
     """
 
+    halo = 4  # two pixels of demosaicing and two of the bicubic enlargement
+    takes_flow = False
+
     def __init__(
         self,
-        method: Literal["tfi", "tfp"] = "tfp",
+        method: str = "tfp",
         scale: int = 4,
         pattern: str = "RGGB",
         alpha: float = 0.4,
@@ -47,8 +49,8 @@ class ClassicalDecoder(Network):
     ) -> None:
         scale = check_whole("scale", scale)
         check_positive("alpha", alpha)
-        if method not in ("tfi", "tfp"):
-            raise ValueError(f"method: expected 'tfi' or 'tfp', got {method!r}")
+        if method not in DECODERS:
+            raise ValueError(f"method: expected {' or '.join(map(repr, DECODERS))}, got {method!r}")
         if min(frames, window) < 1 or frames % 2 == 0 or window % 2 == 0:
             raise ValueError(f"frames, window: expected odd numbers, got {frames} and {window}")
         settings = {
@@ -66,11 +68,11 @@ class ClassicalDecoder(Network):
         self.window = window
         self.order = order
 
-    def forward(self, spikes: Tensor, flow: Tensor | Literal[0] | None = None) -> Tensor:
+    def forward(self, spikes: Tensor, flow: Tensor | None = None, static: bool = False) -> Tensor:
         """Return rgb; a flow changes nothing."""
         check_planes("spikes", spikes, 4, "(B, N, H, W)")
         n = spikes.shape[1] // 2
-        raw = tfi_at(spikes, n) if self.method == "tfi" else tfp_at(spikes, n, self.window, order=self.order)
+        raw = DECODERS[self.method].frame(spikes, n, **self._options())
         rgb = demosaic(raw / self.alpha, self.pattern)
         if self.scale > 1:
             rgb = F.interpolate(rgb, scale_factor=self.scale, mode="bicubic", align_corners=False)
@@ -78,4 +80,7 @@ class ClassicalDecoder(Network):
 
     def extra_repr(self) -> str:  # noqa: D102
         text = f"method={self.method!r}, scale={self.scale}, alpha={self.alpha}"
-        return text if self.method == "tfi" else f"{text}, window={self.window}, order={self.order}"
+        return ", ".join([text, *(f"{name}={value}" for name, value in self._options().items())])
+
+    def _options(self) -> dict[str, int]:
+        return {name: getattr(self, name) for name in DECODERS[self.method].options}

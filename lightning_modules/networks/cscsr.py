@@ -1,95 +1,76 @@
-"""CSCSR: colour spike camera super-resolution (Dong et al., CVPR 2024), its parts put together."""
+"""CSCSR: colour spike camera super-resolution (Dong et al., CVPR 2024)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal, TypeVar
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from kornia.filters import filter2d_separable
 from torch import Tensor, nn
 
-from lightning_modules.motion import MotionEstimator, ZeroFlow
+from lightning_modules.motion import MotionEstimator
+from lightning_modules.networks.configuration import takes
+from lightning_modules.networks.cscsr_config import CSCSRConfig
 from lightning_modules.networks.layers import ResBlock, enlarge, fold
 from lightning_modules.networks.motion_fusion import assembled_motion, independent_motion, joint_motion
 from lightning_modules.networks.network import Network
 from lightning_modules.networks.reconstruction import ColorCorrelation, EarlyFusion, SeparateColors
 from lightning_modules.networks.refinement import FeatureRefinement, TimeFusion
 from lightning_modules.networks.representation import IntervalRepresentation, SpikeRepresentation, WindowMeans
-from lightning_modules.networks.rest import WORTH_IT, convolve_at_rest, rest_response
-from spikekit import bayer_mask, bayer_pattern, demosaic, flow_warp_idw, linear_motion, split_colors, tfp_at
-from spikekit.check import check_planes, check_positive, check_whole
+from lightning_modules.networks.static_scene import WORTH_IT, convolve_at_rest, rest_response
+from spikekit import bayer_mask, demosaic, flow_warp_idw, linear_motion, split_colors, tfp_at
+from spikekit.check import check_planes
 
 _SEARCHED = 1 << 19  # positions that are searched in one go
-
-T = TypeVar("T")
 
 _MOTION_FUSIONS = {"joint": joint_motion, "independent": independent_motion, "assembled": assembled_motion}
 _RECONSTRUCTIONS = {"correlated": ColorCorrelation, "separate": SeparateColors, "early": EarlyFusion}
 
 
-def _choose(name: str, value: str, choices: Mapping[str, T]) -> T:
-    if value not in choices:
-        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
-    return choices[value]
+def _representation(config: CSCSRConfig) -> nn.Module:
+    """Features of the time points of one colour."""
+    if config.representation == "spikes":
+        return WindowMeans(config.window, config.stride)
+    if config.representation == "interval":
+        return IntervalRepresentation(config.times)
+    return SpikeRepresentation(
+        config.frames,
+        config.window,
+        config.stride,
+        config.representation_width,
+        config.features,
+        config.global_perception,
+    )
 
 
 class CSCSR(Network):
     r"""Super-resolution of a colour picture from a Bayer-pattern spike stream.
 
-    The middle frame of the clip is reconstructed. Widths and depths are not in the paper; the defaults are size M of
-    this project, see ``configs/size``. The arguments from ``representation`` to ``reconstruction`` are the ablations
-    of the paper's Table 3, see ``configs/ablation``; the defaults are the full network (J).
+    The middle frame of the clip is reconstructed.
 
     Args:
-        scale: super-resolution factor s.
-        frames: spike frames N of a clip, odd.
-        window: spike frames that a time point sees, odd.
-        stride: spike frames between two time points; must divide frames - window.
-        pattern: Bayer phase of the streams.
-        width: channels of refinement and reconstruction.
-        representation_width: channels of the spike representation, at sensor resolution.
-        features: channels of every time point that are warped.
-        stages: fusions of the colours.
-        blocks: residual blocks of every colour before every fusion.
-        end_blocks: residual blocks after the last fusion.
-        end_width: channels after the last fusion; when not given, ``width``.
-        skip: learn what to add to a smooth, enlarged TFP picture instead of the picture itself. The paper has no
-            such skip; with it training starts where the classical decoder ends.
-        alpha: gain of the camera, what a white pixel receives per clock in thresholds; only the skip divides by it.
-        neighbors: known pixels that the temporal pixel search weighs.
+        *args: fields of :class:`CSCSRConfig`, in its order; ``CSCSR(4)`` is ``CSCSR(scale=4)``.
         steps: positions per pixel of the picture, along each axis, that the search rounds motion to, an even number,
             which makes it faster on a CPU; 0 for the exact search. Weights serve with any.
         motion: estimator that is asked where no flow is given; when not given,
             :class:`lightning_modules.motion.ClassicalFlow`.
-        representation: features of a time point: ``"bssr"`` learns them; ``"spikes"``, without BSSR (A), averages the
-            spikes of the window; ``"interval"`` (C) takes the inverse of the spike interval. These two have no weights
-            and one feature.
-        global_perception: BSSR sees the whole clip beside the window; False is B.
-        motion_fusion: where no flow is given, ``"joint"`` moves all colours alike; ``"independent"`` (D) moves each
-            by the flow of its own sub-stream, green by the mean of its two; ``"assembled"`` (E) puts the sub-streams'
-            flows together as their pixels are in the Bayer pattern.
-        search: temporal pixel search along the motion. Without it no motion is estimated, a given one is ignored, and
-            the features of every time point are only enlarged; without refinement as well it is F, no MSR.
-        refinement: FR; False is G, which merges the time points by one convolution.
-        reconstruction: ``"correlated"`` is CCR; ``"separate"`` (H) lets every colour make its channel by itself;
-            ``"early"`` (I) fuses the colours once, at the beginning.
-        resolution: where refinement and reconstruction work. ``"output"`` is that of the picture, as in the paper;
-            ``"sensor"`` that of the sensor, with the s x s temporal pixels of a site as channels and a sub-pixel
-            convolution at the end: the same width then costs 1 / s^2 of the work.
+        **settings: fields of :class:`CSCSRConfig`, by name.
+
+    Attributes:
+        config: the configuration.
 
     Shape:
         - Input: spikes :math:`(B, N, H, W)`, zeros and ones, any real dtype, any H and W of at least 3; optionally
           the flows from the middle to the first and to the last time point, :math:`(B, 2, 2, H, W)`, in sensor
-          pixels, or those of R, G and B, :math:`(B, 3, 2, 2, H, W)`, or 0 where nothing moves: what flows of zeros
-          give, in less time
+          pixels, or those of R, G and B, :math:`(B, 3, 2, 2, H, W)`; or ``static=True`` where nothing moves: what
+          flows of zeros give, in less time
         - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
 
     Raises:
-        ValueError: sizes that do not fit each other, an unknown choice, or choices that would have no effect:
-            ``global_perception=False`` without BSSR, a ``motion_fusion`` without search, an ``end_width`` of separate
-            colours.
+        ValueError: a field that :class:`CSCSRConfig` refuses, or an odd number of steps.
 
     Example:
         >>> network = CSCSR(scale=2, width=8, representation_width=8, features=1, stages=1, end_blocks=1)
@@ -100,109 +81,38 @@ class CSCSR(Network):
         Dong et al., Super-Resolution Reconstruction from Bayer-Pattern Spike Streams, CVPR 2024.
     """
 
-    def __init__(
-        self,
-        scale: int = 4,
-        frames: int = 41,
-        window: int = 11,
-        stride: int = 3,
-        pattern: str = "RGGB",
-        width: int = 32,
-        representation_width: int = 32,
-        features: int = 4,
-        stages: int = 3,
-        blocks: int = 1,
-        end_blocks: int = 3,
-        end_width: int | None = None,
-        skip: bool = False,
-        alpha: float = 0.4,
-        neighbors: int = 4,
-        steps: int = 16,
-        motion: MotionEstimator | None = None,
-        representation: Literal["bssr", "spikes", "interval"] = "bssr",
-        global_perception: bool = True,
-        motion_fusion: Literal["joint", "independent", "assembled"] = "joint",
-        search: bool = True,
-        refinement: bool = True,
-        reconstruction: Literal["correlated", "separate", "early"] = "correlated",
-        resolution: Literal["output", "sensor"] = "output",
-    ) -> None:
-        sizes = {
-            "scale": scale,
-            "frames": frames,
-            "window": window,
-            "stride": stride,
-            "width": width,
-            "representation_width": representation_width,
-            "features": features,
-            "stages": stages,
-            "blocks": blocks,
-            "end_blocks": end_blocks,
-            "neighbors": neighbors,
-        }
-        sizes = {name: check_whole(name, size) for name, size in sizes.items()}
-        check_positive("alpha", alpha)
-        if frames % 2 == 0 or window % 2 == 0 or window >= frames or (frames - window) % stride:
-            raise ValueError(
-                "frames, window, stride: expected odd frames and window, and a stride that divides frames - window, "
-                f"got {frames}, {window}, {stride}"
-            )
-        if end_width is not None:
-            end_width = check_whole("end_width", end_width)
+    #: what shipped networks see beyond it changes a picture by less than a thirtieth of a step of 8 bits
+    halo = 12
+    flow_groups = ((), (3,))
+
+    @takes(CSCSRConfig)
+    def __init__(self, *args: Any, steps: int = 16, motion: MotionEstimator | None = None, **settings: Any) -> None:
+        config = CSCSRConfig(*args, **settings)
         if steps < 0 or steps % 2:
             raise ValueError(f"steps: expected an even number, or 0 for the exact search, got {steps}")
-        if representation in ("spikes", "interval") and not global_perception:
-            raise ValueError(f"global_perception: part of representation bssr, cannot be taken from {representation}")
-        if motion_fusion in ("independent", "assembled") and not search:
-            raise ValueError(
-                f"motion_fusion: expected joint without search, which asks for no motion, got {motion_fusion}"
-            )
-        if end_width is not None and reconstruction == "separate":
-            raise ValueError(f"end_width: separate colours are never fused, expected none, got {end_width}")
-        settings = {
-            **sizes,
-            "pattern": bayer_pattern(pattern),
-            "end_width": end_width,
-            "skip": skip,
-            "alpha": alpha,
-            "representation": representation,
-            "global_perception": global_perception,
-            "motion_fusion": motion_fusion,
-            "search": search,
-            "refinement": refinement,
-            "reconstruction": reconstruction,
-            "resolution": resolution,
-        }
-        times = tuple(range(window // 2, frames - window // 2, stride))
-        super().__init__(settings, (times[0], frames // 2, times[-1]), motion)
-        self.times = times  # centres of the windows, in spike frames
-        self.neighbors = neighbors
+        times = config.times
+        super().__init__(asdict(config), (times[0], config.frames // 2, times[-1]), motion)
+        self.config = config
+        self.times = times
         self.steps = steps
-        self.search = search
-        self._fuse_motion = _choose("motion_fusion", motion_fusion, _MOTION_FUSIONS)
-        represent = {
-            "bssr": lambda: SpikeRepresentation(
-                frames, window, stride, representation_width, features, global_perception
-            ),
-            "spikes": lambda: WindowMeans(window, stride),
-            "interval": lambda: IntervalRepresentation(times),
-        }
-        encoder = _choose("representation", representation, represent)
-        self.representation = nn.ModuleList(encoder() for _ in range(3))
-        refine = FeatureRefinement if refinement else TimeFusion
-        self.fold = _choose("resolution", resolution, {"output": 1, "sensor": scale})
+        sensor = config.resolution == "sensor"
+        self.fold = config.scale if sensor else 1
+        self.representation = nn.ModuleList(_representation(config) for _ in range(3))
+        refine = FeatureRefinement if config.refinement else TimeFusion
         self.refinement = nn.ModuleList(
-            refine(len(times), part.features * self.fold**2, width) for part in self.representation
+            refine(len(times), part.features * self.fold**2, config.width) for part in self.representation
         )
-        reconstruct = _choose("reconstruction", reconstruction, _RECONSTRUCTIONS)
-        wider = {} if end_width is None else {"end_width": end_width}
-        self.reconstruction = reconstruct(width, stages, blocks, end_blocks, self.fold, **wider)
-        self.skip = skip
-        self.alpha = alpha
-        self._initialize()
+        wider = {} if config.end_width is None else {"end_width": config.end_width}
+        reconstruct = _RECONSTRUCTIONS[config.reconstruction]
+        self.reconstruction = reconstruct(
+            config.width, config.stages, config.blocks, config.end_blocks, self.fold, **wider
+        )
+        shapes_only = self.reconstruction.rgb.weight.is_meta
+        if not shapes_only:
+            self._initialize()
         self._masks: dict[Any, Tensor] = {}
-        at_rest = search and self.fold == scale > 1
-        self._response = rest_response(scale, settings["pattern"], sizes["neighbors"]) if at_rest else None
+        foldable = config.search and sensor and config.scale > 1 and not shapes_only
+        self._response = rest_response(config.scale, config.pattern, config.neighbors) if foldable else None
         self._responses: dict[Any, Tensor] = {}
 
     def _initialize(self) -> None:
@@ -227,27 +137,22 @@ class CSCSR(Network):
         for part in self.refinement:
             if isinstance(part, TimeFusion):
                 part.start_at_the_mean(self.fold**2)
-        if self.skip:
+        if self.config.skip:
             nn.init.zeros_(self.reconstruction.rgb.weight)
 
-    def forward(self, spikes: Tensor, flow: Tensor | Literal[0] | None = None) -> Tensor:  # noqa: D102
+    def forward(self, spikes: Tensor, flow: Tensor | None = None, static: bool = False) -> Tensor:  # noqa: D102
         self._check_spikes(spikes)
-        batch, _, height, width = spikes.shape
+        height, width = spikes.shape[-2:]
         spikes = spikes.to(self.reconstruction.rgb.weight.dtype)
-        if flow is None:
-            flow = 0 if isinstance(self.motion, ZeroFlow) else self.estimate_flow(spikes)
-        shapes = (batch, 2, 2, height, width), (batch, 3, 2, 2, height, width)
-        if flow.shape not in shapes if isinstance(flow, Tensor) else flow != 0:
-            got = tuple(flow.shape) if isinstance(flow, Tensor) else repr(flow)
-            raise ValueError(f"flow: expected {shapes[0]} or {shapes[1]} or 0, got {got}")
+        flow = self.resolve_flow(spikes, flow, static)
         planes = split_colors(spikes, self.pattern)
         # one colour after the other: high resolution takes memory
         features = (encode(plane) for encode, plane in zip(self.representation, planes, strict=True))
-        response = None if isinstance(flow, Tensor) else self._response_for(spikes)
+        response = self._response_for(spikes) if flow is None else None
         if response is not None:
             colors = list(map(self._at_rest, features, self.refinement, response, range(3)))
         else:
-            if self.search:
+            if self.config.search:
                 offsets = self._offsets(flow, spikes)
                 pixels = map(self._search, features, offsets, self._mask(height, width, spikes.device))
             else:
@@ -255,7 +160,12 @@ class CSCSR(Network):
             pixels = (fold(part.flatten(1, 2), self.fold) for part in pixels)
             colors = [refine(part) for refine, part in zip(self.refinement, pixels, strict=True)]
         rgb = self.reconstruction(colors)
-        return rgb + self._base(spikes) if self.skip else rgb
+        return rgb + self._base(spikes) if self.config.skip else rgb
+
+    @torch.no_grad()
+    def scale_picture(self, factor: float) -> None:  # noqa: D102
+        self.reconstruction.rgb.weight *= factor
+        self.reconstruction.rgb.bias *= factor
 
     def estimate_flow(self, spikes: Tensor) -> Tensor:
         """Flows from the middle to the first and to the last time point, in sensor pixels; zero if nothing is searched.
@@ -267,9 +177,9 @@ class CSCSR(Network):
             (B, 2, 2, H, W), or (B, 3, 2, 2, H, W) where every colour has its own.
         """
         self._check_spikes(spikes)
-        if not self.search:
+        if not self.config.search:
             return torch.zeros(len(spikes), 2, 2, *spikes.shape[-2:], device=spikes.device)
-        return self._fuse_motion(self.motion, spikes, self.flow_times, self.pattern)
+        return _MOTION_FUSIONS[self.config.motion_fusion](self.motion, spikes, self.flow_times, self.pattern)
 
     def _check_spikes(self, spikes: Tensor) -> None:
         check_planes("spikes", spikes, 4, "(B, N, H, W)")
@@ -277,9 +187,9 @@ class CSCSR(Network):
             expected = f"(B, {self.frames}, H, W) of at least 3 x 3 pixels"
             raise ValueError(f"spikes: expected {expected}, got {tuple(spikes.shape)}")
 
-    def _offsets(self, flow: Tensor | Literal[0], spikes: Tensor) -> Sequence[Tensor]:
+    def _offsets(self, flow: Tensor | None, spikes: Tensor) -> Sequence[Tensor]:
         """How far every colour has moved at every time point, each (B, T, 2, s H, s W), T being 1 at rest."""
-        if not isinstance(flow, Tensor):
+        if flow is None:
             return [self._no_offset(spikes)] * 3
         flow = flow if flow.ndim == 6 else flow.unsqueeze(1)
         first, middle, last = self.flow_times
@@ -297,7 +207,7 @@ class CSCSR(Network):
 
         Offsets of a single time point are those of all.
         """
-        how = {"neighbors": self.neighbors, "steps": self.steps or None}
+        how = {"neighbors": self.config.neighbors, "steps": self.steps or None}
         if offsets.shape[1] == 1:
             pixels = enlarge(features, self.scale)
             return flow_warp_idw(pixels.flatten(1, 2), offsets[:, 0], mask, **how).reshape(pixels.shape)
@@ -311,7 +221,7 @@ class CSCSR(Network):
 
     def _base(self, spikes: Tensor) -> Tensor:
         """TFP of the whole clip, demosaiced, smoothed, enlarged."""
-        raw = tfp_at(spikes, self.frames // 2, self.frames) / self.alpha
+        raw = tfp_at(spikes, self.frames // 2, self.frames) / self.config.alpha
         # zero at the Nyquist frequency, where demosaicing leaves a zipper that training would have to undo first
         binomial = raw.new_tensor([[0.25, 0.5, 0.25]])
         smooth = filter2d_separable(demosaic(raw, self.pattern), binomial, binomial)

@@ -1,4 +1,4 @@
-"""The blocks that the parts of CSCSR are made of."""
+"""Building blocks of CSCSR."""
 
 from __future__ import annotations
 

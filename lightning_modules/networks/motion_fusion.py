@@ -1,4 +1,4 @@
-"""From the motion of the sensor to that of every colour: one flow for all (eq. 7), and the ablations D and E."""
+"""Motion of the colours: joint flow (eq. 7), and the ablations D (independent) and E (assembled)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the rest of the house knows of a super-resolution network."""
+"""Base class of the super-resolution networks."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from lightning_modules import motion as estimators
-from lightning_modules.motion import ClassicalFlow, MotionEstimator
-from lightning_modules.pretrained import load_weights, read_weights
+from lightning_modules.error_model import ErrorModel
+from lightning_modules.motion import ESTIMATORS, ClassicalFlow, MotionEstimator
+from lightning_modules.pretrained import check_weights, load_weights, read_weights
+from lightning_modules.stored_settings import own_class
 
 
 class Network(nn.Module):
@@ -23,11 +24,23 @@ class Network(nn.Module):
         motion: estimator that is asked where no flow is given; :class:`lightning_modules.motion.ClassicalFlow` when
             not given.
 
+    Attributes:
+        halo: how many sensor pixels around a place the network sees, beside those that motion reaches over; even, as
+            the Bayer phase is kept. None where it sees the whole picture, or where nobody knows: such a network is
+            not run in tiles.
+        takes_flow: whether a flow changes anything.
+        error_model: what less work costs it, for a tolerance; that of the weights, once they are loaded.
+        flow_groups: leading dimensions of the flows that the network takes, behind the batch.
+
     Shape:
         - Input: spikes :math:`(B, N, H, W)`; optionally flow :math:`(B, 2, 2, H, W)`, from the middle to the first
-          and to the last time point, in sensor pixels, or 0 where nothing moves
+          and to the last time point, in sensor pixels; or ``static=True`` where nothing moves
         - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
     """
+
+    halo: int | None = None
+    takes_flow: bool = True
+    flow_groups: tuple[tuple[int, ...], ...] = ((),)
 
     def __init__(
         self, settings: dict[str, Any], flow_times: tuple[int, int, int], motion: MotionEstimator | None = None
@@ -38,40 +51,83 @@ class Network(nn.Module):
         self.frames: int = settings["frames"]
         self.pattern: str = settings["pattern"]
         self.flow_times = flow_times
+        self.error_model = ErrorModel()
         self.motion = ClassicalFlow() if motion is None else motion
 
     @classmethod
-    def from_pretrained(cls, weights: str | Path, motion: MotionEstimator | None = None) -> Self:
+    def from_pretrained(cls, weights: str | Path, motion: MotionEstimator | None = None, **arguments: Any) -> Self:
         """Build the network that weights are of, and load them.
 
         Args:
-            weights: the name of weights that come with the package, such as ``"x4-e"``; a file of safetensors; or a
-                checkpoint of ``lightning fit``.
+            weights: the name of weights that come with the package, such as ``"cscsr_small_x4"``; a file of
+                safetensors; or a checkpoint of ``lightning fit``.
             motion: estimator that is asked where no flow is given; when not given, the one inside the weights, or
                 :class:`lightning_modules.motion.ClassicalFlow` where none is.
+            arguments: of the constructor, such as ``steps`` or ``alpha``, that weights serve with any of.
 
         Returns:
             The network, in evaluation mode, on the CPU.
 
         Raises:
             FileNotFoundError: neither a file nor the name of one; the message says which names there are.
-            ValueError: a file that is damaged, or of another kind of network.
+            ValueError: a file that is damaged, or of another kind of network; an estimator for one that takes no flow.
         """
         found = read_weights(weights)
-        settings, inside = dict(found.settings), dict(found.motion)
-        kind = settings.pop("class", None)
+        kind = found.settings.get("class")
         if kind != cls.__name__:
             raise ValueError(f"{weights}: expected weights of {cls.__name__}, got those of {kind}")
+        check_weights(found, {cls.__name__: cls, **ESTIMATORS})
+        settings = {name: value for name, value in found.settings.items() if name != "class"}
         own = motion is not None
+        if own and not cls.takes_flow:
+            raise ValueError(f"motion: {cls.__name__} takes no flow, expected none, got {type(motion).__name__}")
         try:
-            if inside and not own:
-                motion = getattr(estimators, inside.pop("class"))(**inside)
-            network = cls(**settings, motion=motion)
-        except (AttributeError, KeyError, TypeError) as error:
+            if found.motion and not own:
+                estimator, built_with = own_class(found.motion, weights, ESTIMATORS)
+                motion = estimator(**built_with)
+            flow = {"motion": motion} if cls.takes_flow else {}
+            network = cls(**{**settings, **arguments}, **flow)
+        except TypeError as error:
             raise ValueError(f"{weights}: written by another version of this package ({error})") from error
         load_weights(network, found, keep_motion=own)
         return network.eval()
 
+    def scale_picture(self, factor: float) -> None:
+        """Multiply the picture by a factor, in the weights, once and for all.
+
+        A camera of twice the gain sees a scene as the other sees one twice as bright: the same spikes, half the
+        picture. A network whose input is divided by alpha knows that already; others override this.
+        """
+
     def estimate_flow(self, spikes: Tensor) -> Tensor:
         """Flows from the middle to the first and to the last time point, (B, 2, 2, H, W), in sensor pixels."""
         return torch.stack(self.motion(spikes, self.flow_times, self.pattern), dim=1)
+
+    def resolve_flow(self, spikes: Tensor, flow: Tensor | None, static: bool) -> Tensor | None:
+        """Return the flow that is given, or the network's own estimate, or None where nothing moves.
+
+        Args:
+            spikes: (B, N, H, W).
+            flow: (B, 2, 2, H, W), or what else the network takes; None to ask the estimator.
+            static: nothing moves.
+
+        Raises:
+            ValueError: a flow of another size, or both a flow and ``static``.
+            RuntimeError: ``torch.jit.trace``, which would keep the motion of its example.
+        """
+        if static and flow is not None:
+            raise ValueError("flow, static: expected a flow or static=True, got both")
+        if static or (flow is None and self.motion.static):
+            return None
+        if torch.jit.is_tracing():  # not of torch.compile and torch.export, which see the code
+            raise RuntimeError(
+                "torch.jit.trace: expected static=True or ZeroFlow, as a trace would keep the motion of its example "
+                "for every clip; torch.compile keeps none"
+            )
+        if flow is None:
+            flow = self.estimate_flow(spikes)
+        shapes = [(len(spikes), *groups, 2, 2, *spikes.shape[-2:]) for groups in self.flow_groups]
+        if not isinstance(flow, Tensor) or flow.shape not in shapes:
+            got = tuple(flow.shape) if isinstance(flow, Tensor) else f"{flow!r}; static=True says that nothing moves"
+            raise ValueError(f"flow: expected {' or '.join(map(str, shapes))}, got {got}")
+        return flow

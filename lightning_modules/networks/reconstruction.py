@@ -1,4 +1,4 @@
-"""The picture from the features of three colours: CCR, and the two structures that Fig. 6 sets beside it."""
+"""Reconstruction from the features of three colours: CCR, and the ablations H and I (Fig. 6)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From the features of all time points to those of the picture: FR (section 4.3), and one convolution instead."""
+"""Feature refinement over the time points: FR (section 4.3), and the ablation G (one convolution)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Features of every time point from the spikes of one colour: BSSR (section 4.2), and what the ablations put there."""
+"""Spike representation, features of every time point of one colour: BSSR (section 4.2), and the ablations A and C."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How long a trial trains: steps, a wall clock or FLOPs, and a schedule that ends with it."""
+"""Training budgets of a sweep, in steps, wall time or FLOPs, with a schedule that ends with them."""
 
 from __future__ import annotations
 

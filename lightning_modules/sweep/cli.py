@@ -1,23 +1,26 @@
-"""The verb ``lightning sweep``."""
+"""The command ``lightning sweep``."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import NoReturn
 
-from lightning_modules.cli import InputError, check_folder
+from lightning_modules.cli.command import check_folder
+from lightning_modules.cli.errors import InputError
+from lightning_modules.cli.folder_lock import locked_folder
 from lightning_modules.sweep.budget import seconds
+from lightning_modules.sweep.cost import measure_variants
 from lightning_modules.sweep.engines import run_locally, run_on_ray
 from lightning_modules.sweep.plot import plot
-from lightning_modules.sweep.state import PROGRESS, RESULT
+from lightning_modules.sweep.state import COSTS, PROGRESS, RESULT
 from lightning_modules.sweep.table import collect, markdown, write_csv
 from lightning_modules.sweep.trials import Trial, make_trials
 from lightning_modules.sweep.view import View
 from spikekit.arguments import positive, whole
+from spikekit.io.whole_file import whole_file
 
 _ENGINES = {"local": run_locally, "ray": run_on_ray}
 
@@ -48,12 +51,14 @@ failed ones are tried again, the others go on from their last checkpoint. A fold
 refused.
 
 The result is sweep.md, sweep.csv and sweep.png: a row a variant, mean and spread over seeds, the difference from J or
-from the first row, and the paper's Table 3 for overlays of a folder `ablation`. Every trial lies in a folder of its
-own:
+from the first row, and the paper's Table 3 for overlays of a folder `ablation`. Where networks of the paper's Table 2
+are among them, its rows stand beside ours, and the difference is that from the first CSCSR. At the end time, memory and
+multiplications of a frame are measured for all of them, in turns. Every trial lies in a folder of its own:
   lightning test -c runs/sweep/c-s-seed1/trial.yaml --ckpt_path last
 
 examples:
   lightning sweep configs/x4.yaml -c configs/quick.yaml --over configs/ablation/*.yaml --seeds 0 1 --steps 300
+  lightning sweep configs/x4.yaml --over configs/baseline/*.yaml configs/size/{small,paper_large}.yaml --flops 1e16
   lightning sweep configs/x4.yaml --over configs/ablation/*.yaml --over configs/size/*.yaml --time 12:00:00 --engine ray
   lightning sweep configs/x4.yaml --set model.network.width=16,32,64 --set data.root=DIR --flops 1e15
 """,
@@ -143,7 +148,7 @@ def sweep(args: Sequence[str]) -> None:
     trials = make_trials(configs, asked.over, asked.set, asked.seeds, budget, asked.output)
     if asked.engine == "ray" and find_spec("ray") is None:
         raise InputError("sweep: --engine ray: Ray is not installed; pip install 'spikekit[ray]' brings it")
-    with _locked(asked.output):
+    with locked_folder(asked.output, "sweep"):
         for trial in trials:
             trial.write()
         failed = _run(trials, asked)
@@ -171,29 +176,19 @@ def _run(trials: Sequence[Trial], asked: argparse.Namespace) -> dict[Path, str]:
         raise InputError("sweep: stopped; the same command goes on") from None
     finally:
         view.close()
-    print(f"\n{_write_tables(trials, failed, asked)}")
+    print(f"\n{_write_tables(trials, failed, asked, with_costs=True)}")
     print(", ".join(str(path) for path in sorted(asked.output.glob("sweep.*"))))
     return failed
 
 
-def _write_tables(trials: Sequence[Trial], failed: dict[Path, str], asked: argparse.Namespace) -> str:
+def _write_tables(
+    trials: Sequence[Trial], failed: dict[Path, str], asked: argparse.Namespace, with_costs: bool = False
+) -> str:
     rows = collect(trials, failed)
-    text = markdown(rows)
-    (asked.output / "sweep.md").write_text(text)
-    write_csv(rows, asked.output / "sweep.csv")
+    costs = measure_variants(rows, asked.output / COSTS) if with_costs else None
+    text = markdown(rows, costs)
+    with whole_file(asked.output / "sweep.md", "w") as file:
+        file.write(text)
+    write_csv(rows, asked.output / "sweep.csv", costs)
     plot(rows, asked.output / "sweep.png")
     return text
-
-
-@contextmanager
-def _locked(output: Path) -> Iterator[None]:
-    """Keep others out of a folder; the lock goes when the process does, however it ends."""
-    import fcntl
-
-    output.mkdir(parents=True, exist_ok=True)
-    with open(output / "lock", "w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(f"{output}: another sweep is at work here; -o goes elsewhere") from None
-        yield

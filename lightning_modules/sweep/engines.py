@@ -1,4 +1,4 @@
-"""Where trials run: on this machine, or on a Ray cluster; each in a process of its own."""
+"""Engines of a sweep: trials in processes of their own, on this machine or on a Ray cluster."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a trial says about itself while it runs, and what is left when it is done: two small files in its folder."""
+"""State of a trial on disk: two small JSON files, one while it runs and one when it is done."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ import json
 from pathlib import Path
 from typing import Any
 
-PROGRESS, RESULT, LOG = "progress.json", "result.json", "log.txt"
+from spikekit.io.whole_file import whole_file
+
+PROGRESS, RESULT, LOG, COSTS = "progress.json", "result.json", "log.txt", "costs.json"
 
 
 def write_json(path: Path, value: Any) -> None:
     """Write a file that is there whole or not at all."""
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(value, indent=1))
-    partial.replace(path)
+    with whole_file(path, "w") as file:
+        file.write(json.dumps(value, indent=1))
 
 
 def read_json(path: Path) -> dict[str, Any] | None:

@@ -1,4 +1,4 @@
-"""The table of a sweep, in the form of the paper's Table 3: a row a variant, seeds averaged."""
+"""The table of a sweep, in the form of the paper's Tables 2 and 3: a row a variant, seeds averaged."""
 
 from __future__ import annotations
 
@@ -9,13 +9,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lightning_modules.arguments import flatten
-from lightning_modules.sweep.paper import TABLE_3
+from lightning_modules.cli.arguments import flatten
+from lightning_modules.sweep.paper import TABLE_2, TABLE_3, Scores, method_of
 from lightning_modules.sweep.state import RESULT, read_json
 from lightning_modules.sweep.trials import Trial
+from spikekit.io.whole_file import whole_file
+from spikekit.tables import table
 
 #: how metrics are written in a table: heading and decimals
-_STYLE = {"psnr": ("PSNR (dB)", 2), "ssim": ("SSIM", 4)}
+_STYLE = {"psnr": ("PSNR (dB)", 2), "ssim": ("SSIM", 4), "lpips": ("LPIPS", 4)}
+
+#: what a frame costs: heading and format
+_COSTS = {"ms": ("ms a frame", ".4g"), "mib": ("MiB", ".4g"), "macs": ("MAC a pixel", ",.0f")}
+
+#: what Table 2 calls the network that the others are compared with
+_OURS = "CSCSR"
 
 
 @dataclass
@@ -26,11 +34,13 @@ class Row:
         trials: of one variant, a seed each.
         results: of those that are finished, by seed.
         failed: why others failed, by seed.
+        compared: methods of the paper's Table 2 stand beside it, so that it is a row of that table itself.
     """
 
     trials: list[Trial]
     results: dict[int | None, dict[str, Any]] = field(default_factory=dict)
     failed: dict[int | None, str] = field(default_factory=dict)
+    compared: bool = False
 
     @property
     def variant(self) -> str:
@@ -48,11 +58,33 @@ class Row:
         return {seed: value for seed, value in found.items() if value is not None}
 
     @property
+    def method(self) -> str | None:
+        """What the paper's Table 2 calls the network; None where it has no row of it, such as an ablation."""
+        found = {method_of(result["network"]) for result in self.results.values()}
+        return found.pop() if len(found) == 1 and self.trials[0].letter in ("", "J") else None
+
+    @property
     def paper(self) -> float | None:
-        """PSNR that the paper reports for it."""
+        """PSNR on REDS that the paper reports for it, in Table 3 or, beside other methods, in Table 2."""
+        letter = self.trials[0].letter
+        if letter:
+            return TABLE_3.get(self._scale, {}).get(letter)
+        return self.paper_scores["REDS"].psnr if self.paper_scores else None
+
+    @property
+    def paper_scores(self) -> dict[str, Scores]:
+        """Scores of the paper's Table 2 by data set, where other methods stand beside it."""
+        return TABLE_2.get(self._scale, {}).get(self.method or "", {}) if self.compared else {}
+
+    @property
+    def paper_gap(self) -> float | None:
+        """How far that is above CSCSR, the full network, in the same table."""
+        return None if self.paper is None else self.paper - TABLE_3[self._scale]["J"]
+
+    @property
+    def _scale(self) -> int | None:
         scales = {result["network"].get("scale") for result in self.results.values()}
-        table = TABLE_3.get(scales.pop(), {}) if len(scales) == 1 else {}
-        return table.get(self.trials[0].letter)
+        return scales.pop() if len(scales) == 1 else None
 
 
 def own_scores(result: dict[str, Any]) -> dict[str, float]:
@@ -83,16 +115,24 @@ def collect(trials: Sequence[Trial], failed: dict[Path, str]) -> list[Row]:
             row.results[trial.seed] = result
         elif trial.folder in failed:
             row.failed[trial.seed] = failed[trial.folder]
+    compared = any(row.method not in (None, _OURS) for row in rows.values())
+    for row in rows.values():
+        row.compared = compared
     return list(rows.values())
 
 
 def reference(row: Row, rows: Sequence[Row]) -> Row:
-    """Return the row that another is compared with: J with all else the same, or else the first."""
-    for place in range(len(row.labels)):
-        for other in rows:
-            rest = other.labels[:place] + other.labels[place + 1 :]
-            if other.labels[place].upper() == "J" and rest == row.labels[:place] + row.labels[place + 1 :]:
-                return other
+    """Return the row that another is compared with: J or else, among other methods, CSCSR, with all else the same.
+
+    Where there is none, it is the first.
+    """
+    for name in ("J", _OURS):
+        for place in range(len(row.labels)):
+            for other in rows:
+                rest = other.labels[:place] + other.labels[place + 1 :]
+                found = other.labels[place].upper() == name or (other.compared and other.method == name)
+                if found and rest == row.labels[:place] + row.labels[place + 1 :]:
+                    return other
     return rows[0]
 
 
@@ -105,21 +145,30 @@ def differences(row: Row, other: Row, name: str) -> list[float]:
     return [ours[seed] - theirs[seed] for seed in shared]
 
 
-def markdown(rows: Sequence[Row]) -> str:
-    """Return the table as Markdown."""
+def markdown(rows: Sequence[Row], costs: dict[str, Any] | None = None) -> str:
+    """Return the table as Markdown.
+
+    Args:
+        rows: of the sweep.
+        costs: as :func:`lightning_modules.sweep.cost.measure_variants` returns them; not known before the end.
+    """
     names = score_names(rows)
     names = [name for name in names if "," not in name or name.startswith(names[0])]
-    settings = _differing(rows)
+    settings = [name for name in _differing(rows) if all(name in _settings(result) for result in _results(rows))]
     papers = any(row.paper is not None for row in rows)
     compared = list(dict.fromkeys(reference(row, rows).variant for row in rows))
     versus = compared[0] if len(compared) == 1 else "reference"
     header = ["variant", "n", *(_heading(name) for name in names)]
     if names:
         header.append(f"{_heading(names[0])} - {versus}")
+    data = list(dict.fromkeys(name for row in rows for name in row.paper_scores))
     if papers:
-        header += ["paper, PSNR on REDS (dB)", "paper - J"]
-    header += ["ms/step", "steps", "parameters", *(f"`{name}`" for name in settings)]
-    lines = [header, ["---"] * len(header)]
+        header += ["paper, PSNR on REDS (dB)", f"paper - {_OURS if data else 'J'}"]
+    if data:
+        header += ["method", *(f"paper, {name}: PSNR / SSIM / LPIPS" for name in data)]
+    header += ["ms/step", "steps", "parameters", *(name for name, _ in _COSTS.values() if costs)]
+    header += [f"`{name}`" for name in settings]
+    lines = []
     for row in rows:
         count = f"{len(row.results)}" + (f", {len(row.failed)} failed" if row.failed else "")
         cells = [row.variant, count, *(_mean(row.scores(name).values(), _decimals(name)) for name in names)]
@@ -128,19 +177,29 @@ def markdown(rows: Sequence[Row]) -> str:
             gaps = differences(row, other, names[0]) if other is not row else []
             cells.append(_mean(gaps, _decimals(names[0]), "+"))
         if papers:
-            scale = {result["network"].get("scale") for result in row.results.values()}
-            best = TABLE_3[scale.pop()]["J"] if row.paper is not None else None
-            cells += ["", ""] if best is None else [f"{row.paper:.2f}", f"{row.paper - best:+.2f}"]
+            gap = row.paper_gap
+            cells += ["", ""] if gap is None else [f"{row.paper:.2f}", f"{gap:+.2f}"]
+        if data:
+            cells += [row.method or "", *(str(row.paper_scores.get(name, "")) for name in data)]
         times = [result["seconds_per_step"] for result in row.results.values() if result["seconds_per_step"]]
         cells.append(f"{1000 * statistics.mean(times):.0f}" if times else "")
         cells.append(_values(row, lambda result: result["steps"]))
         cells.append(_values(row, lambda result: f"{result['parameters']:,}"))
+        if costs:
+            cost = costs["variants"].get(row.variant, {})
+            cells += [
+                f"{cost[name]:{form}}" if cost.get(name) is not None else "" for name, (_, form) in _COSTS.items()
+            ]
         cells += [_values(row, lambda result, name=name: _settings(result).get(name, "")) for name in settings]
         lines.append(cells)
-    text = [*("| " + " | ".join(cells) + " |" for cells in lines), ""]
+    text = [table(header, lines), ""]
     text.append(
         "Means over seeds ± sample standard deviation; differences seed by seed. The weights tested are the last."
     )
+    if data:
+        text.append("\nThe paper's clips are others: what can be compared is how far the methods are apart.")
+    if costs and costs["where"]:
+        text.append(f"\nTime, memory and multiplications, those of convolutions and matrices: {costs['where']}.")
     for row in rows:
         for seed, why in row.failed.items():
             text.append(f"\n{row.variant}{'' if seed is None else f', seed {seed}'}, failed: {why}")
@@ -151,36 +210,41 @@ def markdown(rows: Sequence[Row]) -> str:
     return "\n".join(text) + "\n"
 
 
-def write_csv(rows: Sequence[Row], path: Path) -> None:
-    """Write every trial, and the mean and spread of every variant."""
+def write_csv(rows: Sequence[Row], path: Path, costs: dict[str, Any] | None = None) -> None:
+    """Write every trial, and the mean, the spread and the costs of every variant.
+
+    Args:
+        rows: of the sweep.
+        path: of the file.
+        costs: as :func:`markdown` takes them.
+    """
     names, settings = score_names(rows), _differing(rows)
-    with open(path, "w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(
-            ["variant", "seed", *names, "paper_psnr", "seconds_per_step", "steps", "parameters", *settings, "failed"]
-        )
+    data = list(dict.fromkeys(name for row in rows for name in row.paper_scores))
+    papers = [f"paper_{name}_{score}".lower() for name in data for score in Scores._fields]
+    measured = list(_COSTS) if costs else []
+    columns = ["variant", "seed", *names, "paper_psnr", "seconds_per_step", "steps", "parameters", *settings, "failed"]
+    with whole_file(path, "w", newline="") as file:
+        writer = csv.DictWriter(file, columns + ["method", *papers] * bool(data) + measured)
+        writer.writeheader()
         for row in rows:
+            paper = [score for name in data for score in row.paper_scores.get(name, (None,) * 3)]
+            shared = {"variant": row.variant, "paper_psnr": row.paper, **dict(zip(papers, paper, strict=True))}
+            shared |= {"method": row.method} if data else {}
             for trial in row.trials:
+                cells = {"seed": trial.seed, "failed": row.failed.get(trial.seed)}
                 result = row.results.get(trial.seed)
-                scores = own_scores(result) if result else {}
-                cells = [_rounded(scores.get(name)) for name in names] + [row.paper]
-                for name in ("seconds_per_step", "steps", "parameters"):
-                    cells.append(result[name] if result else None)
-                cells += [_settings(result).get(name) if result else None for name in settings]
-                writer.writerow([row.variant, trial.seed, *cells, row.failed.get(trial.seed)])
-            columns = [list(row.scores(name).values()) for name in names]
-            empty = [None] * (len(settings) + 4)
-            writer.writerow(
-                [
-                    row.variant,
-                    "mean",
-                    *(_rounded(statistics.mean(c)) if c else None for c in columns),
-                    row.paper,
-                    *empty,
-                ]
-            )
-            spreads = (_rounded(statistics.stdev(c)) if len(c) > 1 else None for c in columns)
-            writer.writerow([row.variant, "spread", *spreads, None, *empty])
+                if result:
+                    scores = own_scores(result)
+                    cells |= {name: _rounded(scores.get(name)) for name in names}
+                    cells |= {name: result[name] for name in ("seconds_per_step", "steps", "parameters")}
+                    cells |= {name: _settings(result).get(name) for name in settings}
+                writer.writerow({**shared, **cells})
+            found = {name: list(row.scores(name).values()) for name in names}
+            means = {name: _rounded(statistics.mean(values)) for name, values in found.items() if values}
+            cost = {name: costs["variants"].get(row.variant, {}).get(name) for name in measured}
+            writer.writerow({**shared, "seed": "mean", **means, **cost})
+            spreads = {name: _rounded(statistics.stdev(values)) for name, values in found.items() if len(values) > 1}
+            writer.writerow({"variant": row.variant, "seed": "spread", **spreads})
 
 
 def _settings(result: dict[str, Any]) -> dict[str, Any]:
@@ -189,15 +253,19 @@ def _settings(result: dict[str, Any]) -> dict[str, Any]:
     return {**network, **result["optimizer"]}
 
 
+def _results(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    return [result for row in rows for result in row.results.values()]
+
+
 def _differing(rows: Sequence[Row]) -> list[str]:
-    found = [_settings(result) for row in rows for result in row.results.values()]
+    found = [_settings(result) for result in _results(rows)]
     names = dict.fromkeys(name for settings in found for name in settings)
     return [name for name in names if any(settings.get(name) != found[0].get(name) for settings in found)]
 
 
 def _others(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     """Return the methods that were tested beside the networks and that scored the same in all trials."""
-    found = [result for row in rows for result in row.results.values()]
+    found = _results(rows)
     if not found:
         return {}
     networks = [result["method"] or "" for result in found]

@@ -1,4 +1,4 @@
-"""The trials of a sweep: every combination, its name, and its configuration as the parser of ``fit`` resolves it."""
+"""Trials of a sweep: every combination, its name, and its resolved configuration."""
 
 from __future__ import annotations
 
@@ -13,10 +13,13 @@ from typing import Any
 
 import yaml
 
-from lightning_modules.arguments import flatten
-from lightning_modules.cli import Command, InputError, run
+from lightning_modules.cli.arguments import flatten
+from lightning_modules.cli.command import run
+from lightning_modules.cli.errors import InputError
+from lightning_modules.cli.rehearsal import Rehearsal, argument_names, mistake, resolved
 from lightning_modules.sweep.budget import with_budget
 from lightning_modules.sweep.state import write_json
+from spikekit.io.whole_file import whole_file
 
 
 @dataclass(frozen=True)
@@ -59,8 +62,8 @@ class Trial:
         elif self.folder.is_dir() and any(path != config for path in self.folder.iterdir()):
             raise InputError(f"{self.folder}: is not empty, and holds no trial; -o goes elsewhere")
         else:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            config.write_text(yaml.safe_dump(self.config, sort_keys=False))
+            with whole_file(config, "w") as file:
+                file.write(yaml.safe_dump(self.config, sort_keys=False))
             write_json(budget, self.budget)
 
 
@@ -140,23 +143,6 @@ def _key_and_values(setting: str) -> tuple[str, list[str]]:
     return key.removeprefix("--"), split
 
 
-class Rehearsal(Command):
-    """Parses and builds what a verb would, to find mistakes, which are raised; runs nothing and writes nothing."""
-
-    verb = "test"
-
-    @classmethod
-    def subcommands(cls) -> dict[str, set[str]]:
-        """One verb, so that only its parser is built."""
-        return {cls.verb: Command.subcommands()[cls.verb]}
-
-    def init_parser(self, **kwargs: Any) -> Any:  # noqa: D102
-        return super().init_parser(**kwargs, exit_on_error=False)
-
-    def _run_subcommand(self, subcommand: str) -> None:
-        pass
-
-
 class _Resolver(Rehearsal):
     verb = "fit"
 
@@ -184,53 +170,6 @@ def _resolve(args: Sequence[str], trial: str, names: Sequence[str] = ()) -> dict
     config["trainer"]["devices"] = 1
     # not part of what the trial is
     return {key: value for key, value in config.items() if key not in ("ckpt_path", "weights_only")}
-
-
-def resolved(command: Rehearsal) -> dict[str, Any]:
-    """Return the whole configuration of a verb, as plain values."""
-    return yaml.safe_load(command.parser.dump(command.config, skip_none=False))[command.verb]
-
-
-def mistake(error: Exception, args: Sequence[str], names: Sequence[str]) -> str:
-    """Return in one line what is wrong with arguments.
-
-    Args:
-        error: what was raised on them.
-        args: they.
-        names: of all arguments that there are, of which the one that was meant is looked for.
-    """
-    unknown = [word[2:].partition("=")[0] for word in args if word.startswith("--")]
-    unknown = [key for key in unknown if names and key not in names]
-    return _reason(str(error)) + _suggestion(unknown, names)
-
-
-def _reason(message: str) -> str:
-    """Return jsonargparse's message, which is a tree of alternatives, as one line: the deepest, and where it is."""
-    lines = message.splitlines()
-    where = [key for line in lines for key in re.findall(r'[Pp]arser key "([^"]+)"', line)]
-    inner = [
-        line for line in lines if not re.match(r"\s*(- Expected a <class 'NoneType'>|Given value|.*arser key)", line)
-    ]
-    deepest = max(inner or lines, key=lambda line: len(line) - len(line.lstrip()))
-    deepest = re.sub(r'^- |[Pp]arser key "[^"]+":\s*', "", deepest.strip())
-    return ".".join(where) + (": " if where else "") + deepest
-
-
-def _suggestion(unknown: Sequence[str], names: Sequence[str]) -> str:
-    from difflib import get_close_matches
-
-    for key in unknown:
-        ends = {name.rpartition(".")[2] for name in names}
-        close = get_close_matches(key.rpartition(".")[2], ends, 1, 0.75)
-        meant = [name for name in names if close and name.rpartition(".")[2] == close[0]]
-        if meant:
-            return f"; {key}: did you mean {' or '.join(meant)}?"
-    return ""
-
-
-def argument_names(config: dict[str, Any]) -> list[str]:
-    """Return the keys of a configuration as they are typed: those of the objects in it have no ``init_args``."""
-    return sorted({key.replace(".init_args", "") for key, _ in flatten(config)})
 
 
 def _difference(there: dict[str, Any], asked: dict[str, Any]) -> str:

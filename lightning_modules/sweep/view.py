@@ -1,4 +1,4 @@
-"""What a sweep shows while it runs: on a terminal a view that is drawn anew, elsewhere a line for what happens."""
+"""Progress of a sweep: a live view on a terminal, a line per event elsewhere."""
 
 from __future__ import annotations
 

@@ -20,9 +20,12 @@ from pytorch_lightning import Callback, LightningModule, Trainer
 from pytorch_lightning.callbacks import ModelCheckpoint, Timer
 from torch.utils.flop_counter import FlopCounterMode
 
-from lightning_modules.cli import Command, main
+from lightning_modules.checkpoint import read_checkpoint
+from lightning_modules.cli.command import Command, run
+from lightning_modules.cli.errors import as_one_line
 from lightning_modules.sweep.budget import has_end, with_budget
 from lightning_modules.sweep.state import PROGRESS, RESULT, read_json, write_json
+from spikekit.io.whole_file import whole_file
 
 _A_MOMENT = 0.5  # seconds between two reports
 
@@ -158,7 +161,7 @@ def plan(folder: Path) -> Path:
         write_json(folder / PROGRESS, {"phase": "measuring"})
         batches = (1 if "flops" in budget else _TIMED) * config["trainer"]["accumulate_grad_batches"]
         cost = _Cost()
-        main(["fit", "-c", str(own), f"--trainer.fast_dev_run={batches}"], _command([cost]))
+        run(["fit", "-c", str(own), f"--trainer.fast_dev_run={batches}"], _command([cost]))
         count = budget["flops"] / max(1, cost.flops) if "flops" in budget else budget["seconds"] / cost.seconds
         if count < 1:
             raise SystemExit(
@@ -166,9 +169,8 @@ def plan(folder: Path) -> Path:
             )
         config = with_budget(config, {**budget, "steps": int(count)})
         text = f"# a step: {cost.flops:.6g} FLOPs, {cost.seconds:.3g} s\n" + yaml.safe_dump(config, sort_keys=False)
-        partial = planned.with_suffix(".partial")
-        partial.write_text(text)
-        partial.replace(planned)
+        with whole_file(planned, "w") as file:
+            file.write(text)
     return planned
 
 
@@ -189,14 +191,14 @@ def train_and_test(folder: Path, every: float) -> None:
         checkpoints, "last", train_time_interval=timedelta(seconds=every), enable_version_counter=False
     )
     resume = ["--ckpt_path", "last"] if last.is_file() else []
-    main(["fit", "-c", str(config), *resume, "--trainer.enable_progress_bar=false"], _command([report, often]))
-    main(["test", "-c", str(config), "--ckpt_path", "last", "--trainer.enable_progress_bar=false"], _command([report]))
+    run(["fit", "-c", str(config), *resume, "--trainer.enable_progress_bar=false"], _command([report, often]))
+    run(["test", "-c", str(config), "--ckpt_path", "last", "--trainer.enable_progress_bar=false"], _command([report]))
     write_json(folder / RESULT, _result(folder, last, report))
 
 
 def _result(folder: Path, last: Path, report: Report) -> dict[str, Any]:
-    checkpoint = torch.load(last, map_location="cpu", weights_only=True)
-    network = checkpoint.get("network", {})
+    checkpoint = read_checkpoint(last)
+    network = checkpoint["network"]
     optimizer = checkpoint["optimizer_states"][0]["param_groups"][0]
     return {
         "metrics": _metrics(folder / "test.csv"),
@@ -240,6 +242,7 @@ if __name__ == "__main__":
     _end_with_parent()
     arguments, sys.argv = sys.argv[1:], sys.argv[:1]
     try:
-        train_and_test(Path(arguments[0]), float(arguments[1]))
+        with as_one_line():
+            train_and_test(Path(arguments[0]), float(arguments[1]))
     except DivergedError as error:
         sys.exit(f"lightning: {error}")

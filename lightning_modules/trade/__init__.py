@@ -1,1 +1,1 @@
-"""``lightning trade``: what every setting costs and what it is worth, measured side by side."""
+"""``lightning trade``: cost and quality of every setting, measured side by side."""

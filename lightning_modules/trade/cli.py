@@ -1,4 +1,4 @@
-"""The verb ``lightning trade``."""
+"""The command ``lightning trade``."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from lightning_modules.cli import InputError
+from lightning_modules.cli.errors import InputError
 from lightning_modules.trade.measure import Row, measure, running
 from lightning_modules.trade.plot import plot
 from lightning_modules.trade.runner import CannotRunError, Runner, make_runner
 from lightning_modules.trade.settings import Setting, read_setting, usual_settings
 from lightning_modules.trade.table import COLUMNS, markdown, write_csv
 from spikekit.arguments import whole
+from spikekit.io.whole_file import whole_file
 
 _OUTPUT, _ROUNDS = Path("runs/trade"), 9
 
@@ -50,7 +51,7 @@ examples:
   lightning trade -c configs/x4.yaml
   lightning trade -c configs/x4.yaml -c configs/data/films.yaml --data.root DIR
   lightning trade -c configs/x4.yaml -c configs/quick.yaml --ckpt_path runs/quick/checkpoints/best.ckpt
-  lightning trade -c configs/x4.yaml --setting "--model.weights x4-e" --setting "mine: -c my.yaml --ckpt_path my.ckpt"
+  lightning trade -c configs/x4.yaml --setting "--model.weights cscsr_small_x4" --setting "-c my.yaml --ckpt_path FILE"
 """,
     )
     parser.add_argument(
@@ -101,7 +102,8 @@ def trade(args: Sequence[str]) -> None:
     _check_any(rows)
     commands = [_command(setting, shared, asked) for setting in settings]
     text = markdown(rows, commands, timed)
-    (asked.output / "trade.md").write_text(text)
+    with whole_file(asked.output / "trade.md", "w") as file:
+        file.write(text)
     write_csv(rows, commands, timed, asked.output / "trade.csv")
     plot(rows, asked.output / "trade.png")
     print(f"\n{text}")

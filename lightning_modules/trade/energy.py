@@ -1,4 +1,4 @@
-"""Energy, where the machine counts it: NVML on GPUs of NVIDIA, RAPL on CPUs under Linux."""
+"""Energy counters: NVML on NVIDIA GPUs, RAPL on CPUs under Linux."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measuring: every setting on the same clips, first for its quality, then in turns for its time."""
+"""Measure quality and time of every setting on the same clips, times in turns."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
 from torch.utils.flop_counter import FlopCounterMode
+from tqdm import tqdm
 
-from lightning_modules.quality import measures
+from lightning_modules.metrics.image import measures
 from lightning_modules.trade.energy import energy_meter, energy_per_call
 from lightning_modules.trade.runner import Runner
 from lightning_modules.trade.settings import Setting
-from spikekit.arguments import one_line, progress
-from spikekit.bench.measure import Timer, peak_memory, timer_of
+from spikekit.arguments import one_line
+from spikekit.timing import Timer, peak_memory, timer_of
 
 
 @dataclass
@@ -85,17 +86,28 @@ def measure(rows: Sequence[Row], scenes: DataLoader, rounds: int) -> Timed:
     """
     kept: list[Tensor] = []
     total = len(scenes.dataset)
-    for clip in progress(_clips(scenes), total, "clips", length=lambda _: 1):
+    for clip in tqdm(_clips(scenes), "clips", total, disable=None, leave=False):
         if len(kept) < rounds and (not kept or clip["spikes"].shape == kept[0].shape):
             kept.append(clip["spikes"])
         for row in running(rows):
             _attempt(row, lambda row=row, clip=clip: _score(row, clip))
+    return measure_costs(rows, kept, rounds)
+
+
+def measure_costs(rows: Sequence[Row], clips: Sequence[Tensor], rounds: int) -> Timed:
+    """Fill in what rows cost, of what can run; what fails on the way gets a reason, and the others go on.
+
+    Args:
+        rows: of settings that can run.
+        clips: spikes (1, N, H, W), of one size, which take turns at being timed; the first of them is also weighed.
+        rounds: how often a setting is timed.
+    """
     for row in running(rows):
-        _attempt(row, lambda row=row: _weigh(row, kept[0]))
+        _attempt(row, lambda row=row: _weigh(row, clips[0]))
     rows = running(rows)
-    time_in_turns(rows, kept, rounds)
+    time_in_turns(rows, clips, rounds)
     units = dict.fromkeys(_timer(row)[1] for row in rows)
-    return Timed(len(kept), tuple(kept[0].shape[-2:]), rounds, ", ".join(units))
+    return Timed(len(clips), tuple(clips[0].shape[-2:]), rounds, ", ".join(units))
 
 
 def running(rows: Sequence[Row]) -> list[Row]:
@@ -114,7 +126,7 @@ def time_in_turns(rows: Sequence[Row], clips: Sequence[Tensor], rounds: int) -> 
         clips: spikes (1, N, H, W), which take turns.
         rounds: how many.
     """
-    for turn in progress(range(rounds), rounds, "rounds of timing", length=lambda _: 1):
+    for turn in tqdm(range(rounds), "rounds of timing", disable=None, leave=False):
         first = turn % max(1, len(rows))
         for row in [*rows[first:], *rows[:first]]:
             spikes = clips[turn % len(clips)].to(row.runner.device)

@@ -1,4 +1,4 @@
-"""The Pareto front: what nothing else beats in both, time and quality."""
+"""The Pareto front of cost and quality."""
 
 from __future__ import annotations
 

@@ -1,105 +1,64 @@
-"""The plot of a trade: PSNR over time per frame, and the Pareto front."""
+"""Chart of a trade: PSNR over time per frame, and the Pareto front."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from lightning_modules.sweep.plot import axis
+from lightning_modules.charts import BLUE, GREY, chart
 from lightning_modules.trade.measure import Row
 from lightning_modules.trade.table import figures, front
-
-_ZOOM = 2  # drawn larger, so that text and dots are smooth
-_LEFT, _TOP, _WIDTH, _HEIGHT, _FOOT, _LINE = 62, 40, 560, 400, 56, 18
-_FRONT, _OTHER, _INK, _GRID = (38, 92, 160), (150, 150, 150), (40, 40, 40), (222, 222, 222)
-_DOT = 4
 
 
 def plot(rows: Sequence[Row], path: Path) -> None:
     """Draw a numbered dot a setting, those of the front in blue and joined by its steps, and the names beside it."""
-    from PIL import Image, ImageDraw, ImageFont
-
-    shown = [(n, values["ms"], values["psnr"]) for n, values in enumerate(figures(rows)) if values]
+    points = {n: (values["ms"], values["psnr"]) for n, values in enumerate(figures(rows)) if values}
     best = front(rows)
-    fastest, slowest, ticks = _log_axis([ms for _, ms, _ in shown])
-    low, high, step = axis([psnr for _, _, psnr in shown])
-
-    font = ImageFont.load_default(12 * _ZOOM)
+    colors = [BLUE if n in best else "black" for n in range(len(rows))]
     names = [f"{n + 1}  {row.setting.name}" + (" (cannot run)" if row.reason else "") for n, row in enumerate(rows)]
-    beside = _LEFT + _WIDTH + 24
-    size = (
-        beside + math.ceil(max(map(font.getlength, names)) / _ZOOM) + 16,
-        _TOP + max(_HEIGHT + _FOOT, _LINE * len(rows) + 16),
-    )
-    image = Image.new("RGB", [side * _ZOOM for side in size], "white")
-    draw = ImageDraw.Draw(image)
+    with chart(path, 10, max(5.0, 0.5 + 0.19 * len(rows))) as axes:
+        from matplotlib.patheffects import withStroke
+        from matplotlib.ticker import LogLocator, NullLocator
 
-    def at(ms: float, psnr: float) -> tuple[float, float]:
-        share = math.log(ms / fastest) / math.log(slowest / fastest)
-        return _LEFT + share * _WIDTH, _TOP + (high - psnr) / (high - low) * _HEIGHT
+        axes.set(xscale="log", xlabel="ms a frame", ylabel="PSNR (dB)")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_locator(NullLocator())
+        for n in sorted(points, key=lambda n: n in best):
+            axes.plot(*points[n], "o", color=BLUE if n in best else GREY, markersize=5)
+        right = axes.get_xlim()[1]
+        steps = [*(points[n] for n in best), (right, points[best[-1]][1])]
+        axes.step(*zip(*steps, strict=True), where="post", color=BLUE, linewidth=1, zorder=1)
+        axes.set_xlim(right=right)
+        lines = [axes.plot([], [], " ")[0] for _ in rows]
+        axes.figure.legend(lines, names, loc="outside right upper", handlelength=0, labelcolor=colors)
 
-    def write(x: float, y: float, text: str, anchor: str, fill: Any = _INK) -> None:
-        around = {"stroke_width": 2 * _ZOOM, "stroke_fill": "white"}  # readable on lines, too
-        draw.text((x * _ZOOM, y * _ZOOM), text, fill=fill, font=font, anchor=anchor, **around)
-
-    def line(points: Sequence[tuple[float, float]], fill: Any, width: int = 1) -> None:
-        draw.line([(x * _ZOOM, y * _ZOOM) for x, y in points], fill=fill, width=width * _ZOOM)
-
-    write(_LEFT, 16, "PSNR (dB)", "lm")
-    for n in range(round((high - low) / step) + 1):
-        _, y = at(fastest, low + n * step)
-        line([(_LEFT, y), (_LEFT + _WIDTH, y)], _GRID)
-        digits = max(0, -math.floor(math.log10(step) + 1e-9))
-        write(_LEFT - 8, y, f"{low + n * step:.{digits}f}", "rm")
-    for ms in ticks:
-        x, _ = at(ms, low)
-        line([(x, _TOP), (x, _TOP + _HEIGHT)], _GRID)
-        write(x, _TOP + _HEIGHT + 8, f"{ms:g}", "mt")
-    write(_LEFT + _WIDTH, _TOP + _HEIGHT + 30, "ms a frame", "rt")
-
-    points = {n: at(ms, psnr) for n, ms, psnr in shown}
-    corners = [points[n] for n in best]
-    steps = [(x, before) for (x, _), (_, before) in zip(corners[1:], corners, strict=False)]
-    joined = [point for pair in zip(corners, [*steps, corners[-1]], strict=True) for point in pair]
-    line([*joined, (_LEFT + _WIDTH, corners[-1][1])], _FRONT)
-    labels = _labels(points)
-    for n, label in labels.items():
-        line([points[n], label], _GRID)
-    for n in sorted(points, key=lambda n: n in best):
-        (x, y), fill = points[n], _FRONT if n in best else _OTHER
-        box = [(x - _DOT) * _ZOOM, (y - _DOT) * _ZOOM, (x + _DOT) * _ZOOM, (y + _DOT) * _ZOOM]
-        draw.ellipse(box, fill=fill)
-    for n, (x, y) in labels.items():
-        write(x, y, str(n + 1), "mm", _FRONT if n in best else _INK)
-    for n, name in enumerate(names):
-        write(beside, _TOP + _LINE * n, name, "lm", _FRONT if n in best else _INK)
-    image.save(path)
+        axes.figure.draw_without_rendering()  # where labels are free depends on the layout
+        pixels = axes.transData.transform(list(points.values())) * 72 / axes.figure.dpi
+        for n, away in zip(points, _labels(pixels.tolist()), strict=True):
+            axes.annotate(
+                str(n + 1), points[n], away, textcoords="offset points", color=colors[n], ha="center", va="center",
+                arrowprops={"arrowstyle": "-", "color": GREY, "linewidth": 0.5}, in_layout=False, zorder=1.5,
+                path_effects=[withStroke(linewidth=2, foreground="white")],
+            )  # fmt: skip
 
 
-def _labels(points: dict[int, tuple[float, float]]) -> dict[int, tuple[float, float]]:
-    """Find a place beside every point, as free of other points and labels as there is."""
-    taken = list(points.values())
-    places = {}
-    for n, (x, y) in points.items():
+def _labels(points: Sequence[Sequence[float]]) -> list[tuple[float, float]]:
+    """Find a place beside every point, as free of other points and labels as there is: how far away, right and up."""
+    taken = [tuple(point) for point in points]
+    places = []
+    for x, y in list(taken):
         around = [
-            (x + away * math.cos(turn * math.pi / 8), y - away * math.sin(turn * math.pi / 8))
-            for away in (13, 22, 31)
+            (away * math.cos(turn * math.pi / 8), away * math.sin(turn * math.pi / 8))
+            for away in (10, 17, 24)
             for turn in (4, 2, 6, 0, 8, 14, 10, 12, 3, 5, 1, 7, 15, 9, 13, 11)
         ]
 
-        def room(place: tuple[float, float], own: tuple[float, float] = (x, y)) -> float:
-            return min(14.0, *(math.dist(place, other) for other in taken if other != own), math.inf)
+        def room(place: tuple[float, float], x: float = x, y: float = y) -> float:
+            at = x + place[0], y + place[1]
+            return min(11.0, *(math.dist(at, other) for other in taken if other != (x, y)), math.inf)
 
-        places[n] = max(around, key=room)
-        taken.append(places[n])
+        places.append(max(around, key=room))
+        taken.append((x + places[-1][0], y + places[-1][1]))
     return places
-
-
-def _log_axis(values: Sequence[float]) -> tuple[float, float, list[float]]:
-    """Return ends of a logarithmic axis and what is written at it: powers of ten, and 2 and 5 times those."""
-    low, high = min(values) / 1.25, max(values) * 1.25
-    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    ticks = [factor * 10.0**power for power in powers for factor in (1, 2, 5)]
-    return low, high, [tick for tick in ticks if low <= tick <= high]

@@ -1,4 +1,4 @@
-"""A setting made ready to run: built as ``lightning test`` would build it, and run as ``lightning predict`` would."""
+"""Runners: settings built as ``lightning test`` builds them, and run as ``lightning predict`` does."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from pytorch_lightning import LightningModule
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 
-from lightning_modules.cli import InputError, run
+from lightning_modules.cli.command import run
+from lightning_modules.cli.errors import InputError
+from lightning_modules.cli.rehearsal import Rehearsal, argument_names, mistake, resolved
 from lightning_modules.pretrained import load_weights, read_weights
-from lightning_modules.sweep.trials import Rehearsal, argument_names, mistake, resolved
 from spikekit.arguments import one_line
 
 # What the clips of a test do not depend on; and frames, as a network of fewer gets the middle of the clips of all.

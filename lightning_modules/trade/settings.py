@@ -1,14 +1,18 @@
-"""What is traded: settings, each a name and arguments of ``lightning test``; those of the user, or the usual ones."""
+"""Settings to compare: names with arguments of ``lightning test``, the user's or the default ones."""
 
 from __future__ import annotations
 
 import re
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
-from lightning_modules.cli import InputError
-from lightning_modules.pretrained import shipped_weights
+from lightning_modules.cli.arguments import arguments_preset, preset_arguments
+from lightning_modules.cli.errors import InputError
+from lightning_modules.inference.presets import Preset
+from lightning_modules.shipped import shipped_weights
+from spikekit.decoders.methods import DECODERS
 
 
 class Setting(NamedTuple):
@@ -17,10 +21,12 @@ class Setting(NamedTuple):
     Args:
         name: what it is called.
         args: arguments of ``lightning test`` that make it, behind those that all settings share.
+        preset: the same as columns of a table; ``None`` where the arguments say what a preset cannot.
     """
 
     name: str
     args: list[str]
+    preset: Preset | None = None
 
     @property
     def text(self) -> str:
@@ -55,44 +61,40 @@ def read_setting(text: str) -> Setting:
     if not named and not typed.lstrip().startswith("-"):
         expected = "expected arguments of lightning test, or a name, a colon and such arguments"
         raise InputError(f"--setting: {expected}, as in 'small tiles: --model.tile 32', got {text!r}")
-    return Setting(named[1].strip() if named else shlex.join(args), args)
+    return Setting(named[1].strip() if named else shlex.join(args), args, arguments_preset(args))
 
 
-#: what is tried on every network: behind its name, and behind its arguments
-_EFFORT = [("no motion", "--model.network.motion ZeroFlow"), ("self-ensemble of 2", "--model.self_ensemble 2")]
+#: weights that ratios refer to and that are tried in more ways than the others: of a middle size
+_REFERENCE = "cscsr_base_x{scale}"
+
+#: what is tried on every network: behind its name, and what it changes
+_EFFORT = [("no motion", {"motion": "ZeroFlow"}), ("self-ensemble of 2", {"self_ensemble": 2})]
 
 #: what is tried on the largest, besides: a larger network is worth more than more views of a smaller one
-_MOST = [(f"self-ensemble of {views}", f"--model.self_ensemble {views}") for views in (4, 8)]
+_MOST = [(f"self-ensemble of {views}", {"self_ensemble": views}) for views in (4, 8)]
 
-#: what is tried on the first, besides
+#: what is tried on the reference, besides
 _VARIANTS = [
-    ("exact search", "--model.network.steps 0"),
-    ("search steps 4", "--model.network.steps 4"),
-    ("bf16-true", "--trainer.precision bf16-true"),
-    ("bf16-mixed", "--trainer.precision bf16-mixed"),
-    ("no tiles", "--model.tile 0"),
-    ("tiles of 64", "--model.tile 64"),
-    ("tolerance 0.1 dB", "--model.tolerance 0.1"),
-    ("tolerance 0.5 dB", "--model.tolerance 0.5"),
-]  # fmt: skip
-
-_SPIKE2FLOW = "--model.network.motion Spike2Flow --model.network.motion.weights spike2flow"
-_LEARNED = [("Spike2Flow", _SPIKE2FLOW), ("Spike2Flow, once", f"{_SPIKE2FLOW} --model.network.motion.iterations 1")]
-
-_DECODER = "--model.network ClassicalDecoder --model.network.method"
-_DECODERS = [
-    ("TFP 41", f"{_DECODER} tfp --model.network.window 41"),
-    ("TFP 13, order 3", f"{_DECODER} tfp --model.network.window 13 --model.network.order 3"),
-    ("TFI", f"{_DECODER} tfi"),
+    ("exact search", {"steps": 0}),
+    ("search steps 4", {"steps": 4}),
+    ("bf16-true", {"precision": "bf16-true"}),
+    ("bf16-mixed", {"precision": "bf16-mixed"}),
+    ("no tiles", {"tile": 0}),
+    ("tiles of 64", {"tile": 64}),
+    ("tolerance 0.1 dB", {"psnr_tolerance": 0.1}),
+    ("tolerance 0.5 dB", {"psnr_tolerance": 0.5}),
 ]
+
+_SPIKE2FLOW = {"motion": "Spike2Flow", "motion_weights": "spike2flow"}
+_LEARNED = [("Spike2Flow", _SPIKE2FLOW), ("Spike2Flow, once", {**_SPIKE2FLOW, "motion_iterations": 1})]
 
 
 def usual_settings(scale: int, own: Sequence[str] = ()) -> list[Setting]:
     """Return what is measured where nothing else is asked for.
 
-    The networks whose weights come with the package, as they are; then the same without motion and as a self-ensemble,
-    the first of them faster and more exact in other ways, and the largest as larger self-ensembles; then the decoders
-    without learning.
+    The networks whose weights come with the package, as they are, the reference first and then by size; then the same
+    without motion and as a self-ensemble, the reference faster and more exact in other ways, and the largest as larger
+    self-ensembles; then the decoders without learning.
 
     Args:
         scale: super-resolution factor.
@@ -100,22 +102,29 @@ def usual_settings(scale: int, own: Sequence[str] = ()) -> list[Setting]:
             stands in the place of those in the package.
     """
     shipped = shipped_weights()
-    names = [name for name in shipped if name.startswith(f"x{scale}-")]
-    networks = [Setting(name, ["--model.weights", name]) for name in names]
+    # those for longer clips would need other scenes than the rest
+    names = [name for name in shipped if name.endswith(f"_x{scale}") and "_long_" not in name]
+    names.sort(key=lambda name: (name != _REFERENCE.format(scale=scale), shipped[name].stat().st_size, name))
     largest = max(names, key=lambda name: shipped[name].stat().st_size, default=None)
+    networks = {name: Preset(name) for name in names}
     if own:
-        networks, largest = [Setting("own weights", [])], "own weights"
+        networks, largest = {"own weights": Preset()}, "own weights"
     learned = _LEARNED if "spike2flow" in shipped else []
-    variants = [
-        Setting(f"{network.name}, {name}", [*network.args, *shlex.split(args)])
-        for place, network in enumerate(networks)
-        for name, args in [
+    presets = dict(networks)
+    for place, (network, preset) in enumerate(networks.items()):
+        for name, changes in [
             *(learned if place == 0 else []),
             *_EFFORT,
-            *(_MOST if network.name == largest else []),
+            *(_MOST if network == largest else []),
             *(_VARIANTS if place == 0 else []),
-        ]
+        ]:
+            presets[f"{network}, {name}"] = replace(preset, **changes)
+    decoders = {
+        name: Preset(network="ClassicalDecoder", scale=scale, method=method, **options)
+        for method, decoder in DECODERS.items()
+        for name, options in decoder.shown.items()
+    }
+    without = [word for option in own for word in (option, "null")]  # decoders take no weights
+    return [Setting(name, preset_arguments(preset), preset) for name, preset in presets.items()] + [
+        Setting(name, [*preset_arguments(preset), *without], preset) for name, preset in decoders.items()
     ]
-    # weights know their scale, decoders are told it: the arguments of a row are to serve without the configuration
-    rest = ["--model.network.scale", str(scale), *(word for option in own for word in (option, "null"))]
-    return networks + variants + [Setting(name, [*shlex.split(args), *rest]) for name, args in _DECODERS]

@@ -1,20 +1,22 @@
-"""The table of a trade, as CSV and as Markdown, with the machine that it holds for and the command of every row."""
+"""Tables of a trade as CSV and Markdown, with the machine and the command of every row."""
 
 from __future__ import annotations
 
 import csv
 import os
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean
 
 import torch
 
-from lightning_modules.quality import why_no_lpips
+from lightning_modules.inference.presets import Preset
+from lightning_modules.metrics.image import why_no_lpips
 from lightning_modules.trade.measure import Row, Timed, quartiles, running
 from lightning_modules.trade.pareto import pareto_front
 from spikekit.bench import cpu_name, software
+from spikekit.io.whole_file import whole_file
+from spikekit.tables import table
 
 #: what the columns mean, for the table and for ``--help``
 COLUMNS = """\
@@ -96,10 +98,10 @@ def markdown(rows: Sequence[Row], commands: Sequence[str], timed: Timed) -> str:
     header = ["", "setting", "PSNR (dB)", "SSIM", *["LPIPS"] * perceived]
     header += ["ms a frame", "ratio", "MiB", "parameters", "MAC a pixel"]
     header += ["J a frame"] * energy + ["front"]
-    lines = [header, ["---"] * len(header)]
+    lines = []
     for n, (row, values) in enumerate(zip(rows, shown, strict=True)):
         if not values:
-            lines.append([str(n + 1), row.setting.name, *[""] * (len(header) - 2)])
+            lines.append([n + 1, row.setting.name, *[None] * (len(header) - 2)])
             continue
         cells = [
             f"{values['psnr']:.2f}",
@@ -113,37 +115,38 @@ def markdown(rows: Sequence[Row], commands: Sequence[str], timed: Timed) -> str:
             *[_text(values["joules"], ".3g")] * energy,
             "x" if n in best else "",
         ]
-        lines.append([str(n + 1), row.setting.name, *cells])
-    table = "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |" for cells in lines)
+        lines.append([n + 1, row.setting.name, *cells])
     missing = why_no_lpips()
     failed = [f"{row.setting.name} cannot run: {row.reason}" for row in rows if row.reason is not None]
     typed = "\n".join(f"# {n + 1}\n{command}" for n, command in enumerate(commands))
     notes = [*([missing] if missing else []), *failed, f"```text\n{COLUMNS}\n```", f"```sh\n{typed}\n```"]
-    parts = [f"```text\n{machine(rows, timed)}\n```", table, *notes]
+    parts = [f"```text\n{machine(rows, timed)}\n```", table(header, lines), *notes]
     return "\n\n".join(parts) + "\n"
 
 
 def write_csv(rows: Sequence[Row], commands: Sequence[str], timed: Timed, path: Path) -> None:
-    """Write a row a setting, with its arguments, the size of the clips, and the command that measures it alone.
+    """Write a row a setting: the preset that it is, its figures, and the command that measures it alone.
 
-    A table in this form comes with the weights, for :mod:`lightning_modules.speed` to choose from.
+    ``reference`` is the setting that the ratios refer to. The columns of a preset are empty where a setting says what
+    a preset cannot; its command has it all. A table in this form comes with the weights, for
+    :mod:`lightning_modules.inference.presets` to choose from.
     """
     height, width = timed.size
-    best = front(rows)
-    with open(path, "w", newline="") as file:
-        writer = csv.DictWriter(
-            file, ["setting", *_FIGURES, "height", "width", "front", "arguments", "command", "failed"]
-        )
+    best, reference = front(rows), running(rows)[0].setting.name
+    columns = ["setting", *Preset.columns(), *_FIGURES, "reference", "height", "width", "front", "command", "failed"]
+    with whole_file(path, "w", newline="") as file:
+        writer = csv.DictWriter(file, columns)
         writer.writeheader()
         for n, (row, values, command) in enumerate(zip(rows, figures(rows), commands, strict=True)):
             writer.writerow(
                 {
                     "setting": row.setting.name,
+                    **(row.setting.preset or Preset()).write(),
                     **{name: _text(value, ".10g") for name, value in values.items()},
+                    "reference": reference,
                     "height": height,
                     "width": width,
                     "front": int(n in best) if values else "",
-                    "arguments": shlex.join(row.setting.args),
                     "command": command,
                     "failed": row.reason,
                 }

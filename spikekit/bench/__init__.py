@@ -16,6 +16,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -23,10 +24,29 @@ import torch
 
 from spikekit.arguments import UsageError
 from spikekit.bench import pictures, streams
-from spikekit.bench.case import SEED, SIZES, Case, Other, Setup
-from spikekit.bench.measure import Ratio, Run, Timer, floor_run, interleave, peak_memory, ratio, timer_of
+from spikekit.bench.case import SEED, SIZES, Case, Other, Setup, sizes
+from spikekit.examples import EXAMPLES, Example
+from spikekit.io.whole_file import whole_file
+from spikekit.tables import table
+from spikekit.timing import Ratio, Run, Timer, floor_run, interleave, peak_memory, ratio, timer_of
 
-CASES = {**streams.CASES, **pictures.CASES}
+
+def _example(example: Example, setup: Setup) -> Iterator[Case]:
+    """The operator beside nothing, where it has no cases of its own."""
+    frames, size = 8, (setup.size.height, setup.size.width)
+    tensors = [tensor.float().to(setup.device) for tensor in example.tensors((frames,), size)]
+    results = example.results(*tensors)
+    read, written = (sum(tensor.nbytes for tensor in some) for some in (tensors, results))
+    pixels = frames * results[0].shape[-2] * results[0].shape[-1]
+    yield Case(f"float32 {', '.join(map(sizes, tensors))}", partial(example.call, *tensors), pixels, read, written)
+
+
+#: The cases of every operator.
+CASES = {
+    **{example.name: partial(_example, example) for example in EXAMPLES},
+    **streams.CASES,
+    **pictures.CASES,
+}
 
 #: Seconds of one case after which no further round is begun.
 CASE_SECONDS = 1.5
@@ -109,7 +129,8 @@ def run(args: argparse.Namespace) -> None:
         sys.stdout.write(f"{text}\n")
         return
     try:
-        args.output.write_text(f"{text}\n", encoding="utf-8")
+        with whole_file(args.output, "w", encoding="utf-8") as file:
+            file.write(f"{text}\n")
     except OSError as error:
         raise ValueError(f"{args.output}: cannot be written ({error.strerror or error})") from error
 
@@ -219,19 +240,14 @@ def _fenced(text: str, markdown: bool) -> str:
 
 
 def _table(rows: Sequence[Row], markdown: bool) -> str:
-    lines, case = [COLUMNS], None
+    lines, case = [], None
     for row in rows:
         cells = _cells(row)
         if case == (row.operator, row.case) and not markdown:  # the line above says what is ours
             cells = ["" if column in _OURS else cell for column, cell in zip(COLUMNS, cells, strict=True)]
         lines.append(cells)
         case = row.operator, row.case
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    text = [[cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines]
-    if markdown:
-        text.insert(1, ["-" * width for width in widths])
-        return "\n".join(f"| {' | '.join(line)} |" for line in text)
-    return "\n".join("  ".join(line).rstrip() for line in text)
+    return table(COLUMNS, lines, markdown=markdown)
 
 
 def _cells(row: Row) -> list[str]:

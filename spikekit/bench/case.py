@@ -1,4 +1,4 @@
-"""What a measurement is made of: a case, what it is measured beside, and where its inputs come from."""
+"""Cases of the benchmark: an operator, its alternatives, and its inputs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from spikekit.bench.measure import Run
+from spikekit.timing import Run
 
 SEED = 0
 

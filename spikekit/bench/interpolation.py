@@ -15,10 +15,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from spikekit.interpolate import Between, Blend, FlowInterpolation, Still
+from spikekit.flow.interpolate import Between, Blend, FlowInterpolation, Still
+from spikekit.io.video import read_video
 from spikekit.metrics import psnr
-from spikekit.scene import Layer, Motion, Scene
-from spikekit.video import read_video
+from spikekit.scenes.analytic import Layer, Motion, Scene
 
 METHODS: dict[str, Callable[[Tensor, Tensor], Between]] = {
     "nearest": Still(),

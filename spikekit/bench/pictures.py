@@ -14,14 +14,16 @@ from torch import Tensor
 
 from spikekit.bench import plain
 from spikekit.bench.case import Case, Other, Setup, floats, sizes
-from spikekit.bench.measure import Run
-from spikekit.cfa import bayer_mask, bin_to_sensor, mosaic, split_colors
-from spikekit.demosaic import demosaic
-from spikekit.gather import Gather
+from spikekit.color.cfa import bayer_mask, bin_to_sensor, mosaic, split_colors
+from spikekit.color.demosaic import demosaic
+from spikekit.color.residual_demosaic import demosaic_residual
+from spikekit.flow.fields import linear_motion
 from spikekit.metrics import ssim
-from spikekit.motion import linear_motion
-from spikekit.neighbors import idw_neighbors
-from spikekit.warp import flow_warp, flow_warp_idw
+from spikekit.timing import Run
+from spikekit.warp.gather import Gather
+from spikekit.warp.motion_demosaic import demosaic_along_motion
+from spikekit.warp.neighbors import idw_neighbors
+from spikekit.warp.warp import flow_warp, flow_warp_idw
 
 
 def _flow_warp(setup: Setup) -> Iterator[Case]:
@@ -169,6 +171,37 @@ def _demosaic(setup: Setup) -> Iterator[Case]:
     )
 
 
+def _demosaic_residual(setup: Setup) -> Iterator[Case]:
+    raw = setup.rand(2, setup.size.height, setup.size.width)
+    yield Case(
+        f"float32 {sizes(raw)}",
+        lambda: demosaic_residual(raw),
+        raw.numel(),
+        *floats(raw, 1, 3),
+        [Other("demosaic", lambda: partial(demosaic, raw), pair=None, note="Malvar's linear filters: worse pictures")],
+    )
+
+
+def _demosaic_along_motion(setup: Setup) -> Iterator[Case]:
+    raw = setup.rand(5, setup.size.side, setup.size.side)
+    flow = setup.flow() * torch.linspace(-1, 1, 5, device=setup.device).reshape(5, 1, 1, 1)
+    yield Case(
+        f"float32 {sizes(raw)}",
+        lambda: demosaic_along_motion(raw, flow),
+        raw[0].numel(),
+        4 * (raw.numel() + flow.numel()),
+        3 * 4 * raw[0].numel(),
+        [
+            Other(
+                "demosaic_residual",
+                lambda: partial(demosaic_residual, raw[2]),
+                pair=None,
+                note="the middle mosaic alone: worse pictures",
+            )
+        ],
+    )
+
+
 def _linear_motion(setup: Setup) -> Iterator[Case]:
     flow = setup.flow()
     times = list(range(5, 36, 3))
@@ -208,5 +241,7 @@ CASES = {
     "bin_to_sensor": _bin_to_sensor,
     "split_colors": _split_colors,
     "demosaic": _demosaic,
+    "demosaic_residual": _demosaic_residual,
+    "demosaic_along_motion": _demosaic_along_motion,
     "ssim": _ssim,
 }

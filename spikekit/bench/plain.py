@@ -1,4 +1,4 @@
-"""What one would write in plain torch without spikekit: straightforward, and independent of its code.
+"""The operators in plain, straightforward torch, independent of spikekit: what the benchmark compares with.
 
 Each function is here to be measured, and to be compared with: the same result where nothing else is said.
 """

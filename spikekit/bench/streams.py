@@ -11,11 +11,11 @@ from torch import Tensor
 
 from spikekit.bench import peers, plain
 from spikekit.bench.case import SEED, Case, Other, Setup, floats, sizes
-from spikekit.decoders import spike_interval, tfi, tfp
-from spikekit.files import read_spikes, write_spikes
-from spikekit.keyframe import tfi_at, tfp_at
-from spikekit.packing import pack_spikes, unpack_spikes
-from spikekit.sensor import spike_integrate_fire
+from spikekit.decoders.dense import spike_interval, tfi, tfp
+from spikekit.decoders.packing import pack_spikes, unpack_spikes
+from spikekit.decoders.single_frame import tfi_at, tfp_at
+from spikekit.io.files import read_spikes, write_spikes
+from spikekit.sensor.integrate_fire import spike_integrate_fire
 
 
 def _enclosed(ours: Tensor, other: Tensor, spikes: Tensor) -> tuple[Tensor, Tensor]:

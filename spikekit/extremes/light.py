@@ -1,4 +1,4 @@
-"""The sensor under light that is none, too much, negative, not a number, or the same for a very long time."""
+"""Extremes of the sensor: no light, too much, negative, NaN, or constant for a very long time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the operators should give: loops over every pixel in exact arithmetic, or in float64 where roots are taken.
+"""Brute-force references of the operators: loops in exact arithmetic, or in float64 where roots are taken.
 
 Nothing here is shared with the operators. Inputs are what the operator got, after rounding to its dtype.
 """

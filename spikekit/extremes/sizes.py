@@ -1,4 +1,4 @@
-"""No item in a batch, many leading dimensions, every memory layout, and a stream as large as a camera's."""
+"""Extremes of size: empty batches, many leading dimensions, every memory layout, a camera-sized stream."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from spikekit.extremes.operators import OPERATORS, Operator
+from spikekit.examples import EXAMPLES, Example
 from spikekit.extremes.table import Cases, Measured, differ, state, ulps, worst
 
 CASES = Cases()
@@ -19,7 +19,7 @@ CASES = Cases()
 _FLOAT32 = (torch.float32,)
 
 
-def _run(operator: Operator, tensors: tuple[Tensor, ...], device: torch.device) -> tuple[list[Tensor], list[Tensor]]:
+def _run(operator: Example, tensors: tuple[Tensor, ...], device: torch.device) -> tuple[list[Tensor], list[Tensor]]:
     """Results, and gradients of their sum by the inputs, which keep their strides."""
     # a view of a leaf, so that the operator sees the strides of the input
     leaves = [tensor.to(device).requires_grad_() for tensor in tensors]
@@ -35,8 +35,8 @@ def _measured(error: float, results: list[Tensor], grads: list[Tensor]) -> Measu
     return Measured(error, state(*results), state(*grads) if grads else "-")
 
 
-def _empty_batch(operator: Operator, dtype: torch.dtype, device: torch.device) -> Measured:
-    one = [tensor.to(dtype) for tensor in operator.example((1,))]
+def _empty_batch(operator: Example, dtype: torch.dtype, device: torch.device) -> Measured:
+    one = [tensor.to(dtype) for tensor in operator.tensors((1,))]
     none = tuple(tensor.narrow(operator.axis_in, 0, 0) for tensor in one)
     expected, _ = _run(operator, tuple(one), device)
     results, grads = _run(operator, none, device)
@@ -47,9 +47,9 @@ def _empty_batch(operator: Operator, dtype: torch.dtype, device: torch.device) -
     return _measured(error, results, grads)
 
 
-def _leading(operator: Operator, dtype: torch.dtype, device: torch.device) -> Measured:
+def _leading(operator: Example, dtype: torch.dtype, device: torch.device) -> Measured:
     """(2, 1, 3, ...) is six times the same as one."""
-    tensors = [tensor.to(dtype) for tensor in operator.example((2, 1, 3))]
+    tensors = [tensor.to(dtype) for tensor in operator.tensors((2, 1, 3))]
     results, grads = _run(operator, tuple(tensors), device)
     error, into, out = 0.0, operator.axis_in, operator.axis_out
     for i in range(2):
@@ -64,7 +64,7 @@ def _item(tensor: Tensor, axis: int, i: int, j: int) -> Tensor:
     return tensor.select(axis + 2, j).select(axis + 1, 0).select(axis, i)
 
 
-def _same(operator: Operator, views: list[Tensor], device: torch.device) -> Measured:
+def _same(operator: Example, views: list[Tensor], device: torch.device) -> Measured:
     """A view gives what its contiguous copy gives, in ulp of the largest number."""
     expected, expected_grads = _run(operator, tuple(view.contiguous().clone() for view in views), device)
     results, grads = _run(operator, tuple(view.detach() for view in views), device)
@@ -75,23 +75,23 @@ def _same(operator: Operator, views: list[Tensor], device: torch.device) -> Meas
     return _measured(worst(*errors), results, grads)
 
 
-def _strided(operator: Operator, dtype: torch.dtype, device: torch.device) -> Measured:
-    wide = [tensor.to(dtype) for tensor in operator.example((2,), (12, 8))]
+def _strided(operator: Example, dtype: torch.dtype, device: torch.device) -> Measured:
+    wide = [tensor.to(dtype) for tensor in operator.tensors((2,), (12, 8))]
     views = [tensor.mT[..., ::2, ::2].flip(operator.axis_in) for tensor in wide]
     reversed_ = [view.movedim(operator.axis_in, -1).contiguous().movedim(-1, operator.axis_in) for view in views]
     return _same(operator, reversed_, device)
 
 
-def _expanded(operator: Operator, dtype: torch.dtype, device: torch.device) -> Measured:
-    one = [tensor.to(dtype) for tensor in operator.example((1,))]
+def _expanded(operator: Example, dtype: torch.dtype, device: torch.device) -> Measured:
+    one = [tensor.to(dtype) for tensor in operator.tensors((1,))]
     shapes = [[*tensor.shape] for tensor in one]
     for shape in shapes:
         shape[operator.axis_in] = 3
     return _same(operator, [tensor.expand(shape) for tensor, shape in zip(one, shapes, strict=True)], device)
 
 
-def _channels_last(operator: Operator, dtype: torch.dtype, device: torch.device) -> Measured:
-    tensors = [tensor.to(dtype) for tensor in operator.example((2,))]
+def _channels_last(operator: Example, dtype: torch.dtype, device: torch.device) -> Measured:
+    tensors = [tensor.to(dtype) for tensor in operator.tensors((2,))]
     last = [tensor.movedim(-3, -1).contiguous().movedim(-1, -3) for tensor in tensors]
     return _same(operator, last, device)
 
@@ -99,7 +99,7 @@ def _channels_last(operator: Operator, dtype: torch.dtype, device: torch.device)
 _EXACT: dict[str, Any] = {"bound": "0: bit for bit"}
 _IN_ANY_ORDER: dict[str, Any] = {"limit": 4.0, "bound": "4 ulp: the order of sums is free"}
 
-for _operator in OPERATORS:
+for _operator in EXAMPLES:
     _gradients = "-" if _operator.name == "spike_interval" else "finite"
     _layout = _IN_ANY_ORDER if _operator.name.startswith("flow_warp") else _EXACT
     for _extreme, _measure, _bound in (

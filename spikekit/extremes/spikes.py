@@ -1,4 +1,4 @@
-"""The decoders: streams that are empty, full or a few frames long, windows that do not fit, and chunks."""
+"""Extremes of the decoders: empty and full streams, short clips, windows that do not fit, chunks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One row of the table: an operator at an extreme, in one dtype, on one device, and what is asserted of it."""
+"""Rows of the table of extremes: an operator, an extreme, a dtype, a device, and the asserted bound."""
 
 from __future__ import annotations
 

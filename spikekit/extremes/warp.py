@@ -1,4 +1,4 @@
-"""The warps on, near and far from known pixels, with flow that is not a number, and masks that hardly know anything."""
+"""Extremes of the warps: on, near and far from known pixels, NaN flow, nearly empty masks."""
 
 from __future__ import annotations
 

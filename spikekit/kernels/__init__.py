@@ -1,4 +1,4 @@
-"""Faster ways to run the heavy operators, one file a kind of machine; the plain torch path is with the operator."""
+"""Fast kernels of the heavy operators for CPU and GPU; the plain torch path is with the operator."""
 
 from __future__ import annotations
 

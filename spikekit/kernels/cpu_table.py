@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from spikekit.kernels.compiled import compiled, in_threads
-from spikekit.position_table import PositionTable
+from spikekit.kernels.position_table import PositionTable
 
 _WORTH_THREADS = 1 << 16  # positions
 

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from spikekit.kernels.layout import empty_like_layout, is_channels_last
-from spikekit.position_table import PositionTable, TableAxis
+from spikekit.kernels.position_table import PositionTable, TableAxis
 
 _PIECE = 1 << 18  # numbers that are gathered at a time
 _TILE = 1 << 13  # positions that are searched at a time

@@ -1,4 +1,4 @@
-"""What the GPU kernels have in common."""
+"""Helpers that all GPU kernels share."""
 
 from __future__ import annotations
 

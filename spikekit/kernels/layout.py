@@ -1,4 +1,4 @@
-"""Where in memory the result of a gather lies: as its input does."""
+"""Memory layout of the result of a gather: that of its input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Modules of loops that Numba compiles: imported when they are first needed, where there is a Numba."""
+"""Lazy import of the modules that Numba compiles, where Numba is installed."""
 
 from __future__ import annotations
 

@@ -13,13 +13,15 @@ import torch
 import yaml
 from safetensors.torch import load_file, save_file
 
-from lightning_modules.cli import main, run
-from lightning_modules.module import SuperResolution
+from lightning_modules.__main__ import main
+from lightning_modules.cli.command import run
+from lightning_modules.cli.rehearsal import Rehearsal
 from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
 from lightning_modules.networks import CSCSR, ClassicalDecoder
-from lightning_modules.pretrained import read_weights, shipped_weights, write_weights
-from lightning_modules.sweep.trials import Rehearsal
-from spikekit import read_picture, write_spikes
+from lightning_modules.pretrained import read_weights, write_weights
+from lightning_modules.shipped import FOLDER, shipped_weights
+from lightning_modules.tasks.super_resolution import SuperResolution
+from spikekit import read_picture, write_picture, write_spikes
 
 TINY = {"scale": 2, "width": 4, "representation_width": 4, "features": 1, "stages": 1, "end_blocks": 1, "skip": True}
 FLOW_TINY = {"window": 5, "widths": (4,), "features": 4, "hidden": 4, "correlation": (4, 4), "motion": 4, "head": 4}
@@ -54,6 +56,13 @@ def test_export_and_from_pretrained(file, capsys):
         assert isinstance(read.motion, ClassicalFlow)
         assert torch.equal(read(SPIKES), network()(SPIKES))
     assert isinstance(CSCSR.from_pretrained(file, motion=ZeroFlow()).motion, ZeroFlow)
+
+
+def test_weights_serve_cameras_of_another_gain(file):
+    """The same spikes of a camera of half as much gain again are of a scene two thirds as bright."""
+    own, other = CSCSR.from_pretrained(file), CSCSR.from_pretrained(file, alpha=0.6)
+    assert [own.settings["alpha"], other.settings["alpha"]] == [0.4, 0.6]
+    torch.testing.assert_close(other(SPIKES), own(SPIKES) * (0.4 / 0.6))
 
 
 @pytest.mark.skipif(os.name != "posix", reason="modes of files are those of POSIX")
@@ -131,7 +140,7 @@ def test_classes_of_a_file_are_names_and_no_paths(tmp_path):
     said = {"class": "this.That", **network().settings}
     torch.save({"network": said, "state_dict": {}}, tmp_path / "file.ckpt")
     save_file(
-        load_file(shipped_weights()["x4-t"]),
+        load_file(shipped_weights()["cscsr_tiny_x4"]),
         tmp_path / "file.safetensors",
         {"network": json.dumps(said), "motion": "{}"},
     )
@@ -158,13 +167,13 @@ def test_odd_checkpoints_say_so(tmp_path, changes):
 def test_motion_of_no_class_is_refused(file, tmp_path):
     said = {"network": json.dumps({"class": "CSCSR", **network().settings}), "motion": json.dumps({"window": 11})}
     save_file(load_file(file), tmp_path / "odd.safetensors", said)
-    with pytest.raises(ValueError, match=r"odd.safetensors: written by another version of this package \('class'\)"):
+    with pytest.raises(ValueError, match=r"odd.safetensors: class: expected one of ClassicalFlow, .*, got None"):
         CSCSR.from_pretrained(tmp_path / "odd.safetensors")
 
 
 def test_weights_that_share_memory_can_be_exported(tmp_path):
     shared = torch.zeros(3)
-    found = read_weights("x4-t")
+    found = read_weights("cscsr_tiny_x4")
     write_weights(replace(found, tensors={"a": shared, "b": shared}), tmp_path / "shared.safetensors")
     assert set(load_file(tmp_path / "shared.safetensors")) == {"a", "b"}
 
@@ -179,15 +188,50 @@ def test_shipped_weights_are_what_their_names_and_cards_say():
     assert "spike2flow" in shipped_weights()
     for name, path in shipped_weights().items():
         assert path.stat().st_size < 16 * 2**20
-        assert path.with_suffix(".md").is_file(), f"{name} has no card"
+        assert path.with_name(f"{name}.md").is_file(), f"{name} has no card"
         found = read_weights(name)
         if name == "spike2flow":
             Spike2Flow(weights=name)
             continue
         assert found.settings["class"] == "CSCSR"
-        assert name.startswith(f"x{found.settings['scale']}-")
+        assert name.endswith(f"_x{found.settings['scale']}")
         built = {"class": "CSCSR", **CSCSR.from_pretrained(name).settings}
         assert {key: built[key] for key in found.settings} == found.settings
+
+
+SHIPPED_ONCE = ["x2-e", "x2-d", "x2-w", "x3-e", "x3-d", "x3-w", "x4-t", "x4-e", "x4-d", "x4-w", "x4-h", "spike2flow"]
+
+
+def test_every_file_of_weights_is_in_the_index_and_loads_by_every_name_it_had():
+    assert sorted(path for path in FOLDER.glob("*.safetensors")) == sorted(shipped_weights().values())
+    by_file = {path: name for name, path in shipped_weights().items()}
+    for name in SHIPPED_ONCE:
+        assert read_weights(name).source == FOLDER / f"{name}.safetensors"
+        assert read_weights(by_file[FOLDER / f"{name}.safetensors"]).source == FOLDER / f"{name}.safetensors"
+    with pytest.raises(FileNotFoundError, match=r"^x4-q: neither a file of weights nor .* \(cscsr_small_x2, "):
+        read_weights("x4-q")
+
+
+def test_the_list_of_weights_says_what_the_networks_are(configs):
+    import lightning_modules
+
+    listed = lightning_modules.list_pretrained()
+    assert [weights.name for weights in listed] == list(shipped_weights())
+    assert [weights.size for weights in lightning_modules.list_pretrained(4)] == [
+        "tiny",
+        "small",
+        "base",
+        "large",
+        "huge",
+        "huge_long",
+    ]
+    for weights in listed:
+        found = read_weights(weights.name)
+        assert weights.parameters == sum(value.numel() for value in found.tensors.values())
+        assert weights.scale == found.settings.get("scale")
+        if weights.scale:
+            overlay = yaml.safe_load((configs / f"size/{weights.size}.yaml").read_text())
+            assert overlay["model"]["network"]["init_args"].items() <= found.settings.items()
 
 
 def predict(*args, cwd):
@@ -201,6 +245,7 @@ def predict(*args, cwd):
 def test_predict_needs_nothing_but_weights(file, how, tmp_path):
     write_spikes(tmp_path / "clip.dat", SPIKES[0])
     recording = ["--data", "Recording", "--data.path", "clip.dat", "--data.height", "8", "--data.width", "10"]
+    recording += ["--data.white", "0.4"]
     if how == "argument":
         args = ["--model.weights", file.name]
     else:
@@ -240,6 +285,30 @@ def test_motion_is_that_of_the_weights_unless_another_is_named(named, expected, 
     assert type(motion) is expected
     if expected is Spike2Flow:
         assert motion.iterations == (1 if named else 3)
+
+
+@pytest.mark.parametrize(
+    ("named", "expected"),
+    [
+        ([], 0.3),
+        (["-c", "{configs}/data/films.yaml"], 0.3),
+        (["-c", "{configs}/data/paper.yaml"], 0.6),
+        (["-c", "{configs}/data/paper.yaml", "--model.network.alpha", "0.5"], 0.5),
+        (["--model.network.alpha", "0.4"], 0.4),
+    ],
+)
+def test_gain_is_that_of_the_weights_unless_another_is_named(named, expected, tmp_path, configs, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["lightning"])
+    film = tmp_path / "film"
+    film.mkdir()
+    for number in range(13):
+        write_picture(film / f"{number:03d}.png", torch.zeros(3, 16, 16))
+    words = [word.format(configs=configs) for word in [*named, "--data.root", str(tmp_path)]]
+    trained = checkpoint(tmp_path / "bright.ckpt", SuperResolution(network(alpha=0.3)))
+    built = run(["test", "-c", str(configs / "x2.yaml"), *words, "--model.weights", str(trained)], Rehearsal)
+    assert built.model.network.settings["alpha"] == built.datamodule.options["alpha"] == expected
+    own = CSCSR.from_pretrained(trained)
+    torch.testing.assert_close(built.model.network(SPIKES), own(SPIKES) * (0.3 / expected))
 
 
 @pytest.mark.slow

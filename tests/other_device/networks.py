@@ -8,11 +8,11 @@ import pytest
 import torch
 from test_ablations import TINY, clip, variant
 
-from lightning_modules.module import SuperResolution
+from lightning_modules.inference.tiles import forward_in_tiles
 from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
 from lightning_modules.networks import CSCSR, ClassicalDecoder
-from lightning_modules.networks.rest import WORTH_IT
-from lightning_modules.tiles import forward_in_tiles
+from lightning_modules.networks.static_scene import WORTH_IT
+from lightning_modules.tasks.super_resolution import SuperResolution
 
 DEVICE = pretend.DEVICE
 LIBRARY = pretend.register()
@@ -61,11 +61,11 @@ def test_at_rest():
     network = CSCSR(3, **TINY, resolution="sensor")
     moved = copy.deepcopy(network).to(DEVICE)
     spikes, _ = clip(height=WORTH_IT, width=WORTH_IT + 1)
-    expected = network(spikes, 0)
+    expected = network(spikes, static=True)
     expected.sum().backward()
     for _ in range(2):
         pretend.waits.clear()
-        got = moved(spikes.to(DEVICE), 0)
+        got = moved(spikes.to(DEVICE), static=True)
         got.sum().backward()
     assert pretend.waits == []
     torch.testing.assert_close(got.detach().cpu(), expected.detach(), rtol=0, atol=1e-4)

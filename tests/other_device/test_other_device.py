@@ -14,7 +14,9 @@ HERE = Path(__file__).parent
 @pytest.mark.parametrize(("cases", "beside"), [("operators", "spikekit"), ("networks", "lightning_modules")])
 def test_on_another_device(cases, beside):
     # in a process of its own: PyTorch takes up such a device for good
-    path = os.pathsep.join([str(HERE), str(HERE.parent / beside), *filter(None, [os.environ.get("PYTHONPATH")])])
+    path = os.pathsep.join(
+        [str(HERE), *map(str, (HERE.parent / beside).rglob("")), *filter(None, [os.environ.get("PYTHONPATH")])]
+    )
     run = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-n", "0", "--noconftest", str(HERE / f"{cases}.py")],
         env={**os.environ, "PYTHONPATH": path},

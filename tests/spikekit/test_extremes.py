@@ -11,6 +11,7 @@ import torch
 
 import spikekit as sk
 from spikekit import extremes
+from spikekit.examples import EXAMPLES
 from spikekit.extremes import reference, sizes
 from spikekit.extremes.table import BITS, FLOATS, Cases, Measured, differ, rounded_once, short, state, ulps
 
@@ -66,10 +67,7 @@ BILINEAR = """
 """
 SHAPES = "batch of 0; leading dimensions (2, 1, 3); non-contiguous; expanded; channels last"
 TRANSFORMS = "torch.export, batch of any size; torch.autocast; torch.func.vmap; deterministic mode"
-EVERY = """
-    spike_integrate_fire spike_interval tfi tfp flow_warp flow_warp_idw mosaic bin_to_sensor split_colors split_bayer
-    merge_bayer demosaic joint_flow upsample_flow linear_motion
-""".split()  # noqa: SIM905
+EVERY = [example.name for example in EXAMPLES]
 SMOOTH = [name for name in EVERY if name not in ("spike_integrate_fire", "spike_interval", "tfi")]
 
 
@@ -221,7 +219,7 @@ def test_run(few, capsys, tmp_path):
     lines = printed.out.splitlines()
     assert lines[1] == "tfp on cpu"
     assert lines[2].split()[:7] == ["extreme", "float64", "float32", "bfloat16", "float16", "bool", "uint8"]
-    assert [line.split("  ")[1] for line in lines[3:]] == ["no spike", "window even"]
+    assert [line.split("  ")[0] for line in lines[3:]] == ["no spike", "window even"]
     assert lines[4].split()[-3:] == ["-", "an", "error"]
     assert "12 rows, none fails" in printed.err
 

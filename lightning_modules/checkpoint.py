@@ -1,0 +1,152 @@
+"""Checkpoints of ``lightning fit``: reading, writing and removing."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning_fabric.plugins import TorchCheckpointIO
+from torch import Tensor
+
+from lightning_modules.stored_settings import check_plain
+from spikekit.io.whole_file import whole_file
+
+_NUMBERS = {torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.int64, torch.int32, torch.bool}
+#: what Lightning would build something from
+_NOT_TAKEN = ("hyper_parameters", "datamodule_hyper_parameters", "hparams_name", "datamodule_hparams_name")
+#: of the state of a ModelCheckpoint: files that it may go on to remove
+_PATHS = ("best_model_path", "kth_best_model_path", "last_model_path")
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """Read a checkpoint; nothing in it is run, and nothing is built of what it names.
+
+    Args:
+        path: the file.
+
+    Returns:
+        A dictionary on the CPU, without hyper-parameters, that holds ``state_dict``, and ``network``, ``motion`` and
+        ``recipe`` as plain values.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no checkpoint, a damaged one, or one whose weights are not finite; the message is one line and names
+            the file.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such checkpoint")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
+                raise ValueError("compressed, as no checkpoint is")  # a few bytes could become all memory
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(checkpoint, dict) or not isinstance(checkpoint.get("state_dict"), dict):
+            raise TypeError("expected a dictionary with a state_dict")
+        for key in ("network", "motion", "recipe"):  # older ones lack the last
+            if not isinstance(checkpoint.setdefault(key, {}), dict):
+                raise TypeError(f"{key}: expected a dictionary, got a {type(checkpoint[key]).__name__}")
+            check_plain(key, checkpoint[key])
+        check_tensors(checkpoint["state_dict"])
+    except Exception as error:  # what torch raises depends on the damage
+        reason = (str(error).splitlines() or [""])[0][:300]
+        raise ValueError(f"{path}: not a checkpoint of lightning fit ({type(error).__name__}: {reason})") from error
+    return {key: value for key, value in checkpoint.items() if key not in _NOT_TAKEN}
+
+
+def check_tensors(tensors: Mapping[str, Tensor]) -> None:
+    """Refuse weights that are no finite numbers: a network would return black pictures, and nothing would say why.
+
+    Args:
+        tensors: weights by name.
+
+    Raises:
+        TypeError: something else than dense tensors of ordinary numbers.
+        ValueError: NaN or Inf; the message names the weight.
+    """
+    for name, value in tensors.items():
+        if not isinstance(name, str) or not isinstance(value, Tensor):
+            raise TypeError(
+                f"state_dict: expected tensors by name, got a {type(value).__name__} for {str(name)[:80]!r}"
+            )
+        if value.layout is not torch.strided or value.is_meta or value.dtype not in _NUMBERS:
+            raise TypeError(f"{name}: expected a dense tensor of numbers, got {value.dtype}, {value.layout}")
+        if value.numel() * value.element_size() > value.untyped_storage().nbytes():
+            raise TypeError(f"{name}: {tuple(value.shape)} is more than the file holds")
+        if not value.isfinite().all():
+            raise ValueError(f"{name}: expected finite weights, got NaN or Inf")
+
+
+def check_training_state(checkpoint: Mapping[str, Any], path: str | Path) -> None:
+    """Refuse a checkpoint that training cannot go on with, before anything is built.
+
+    Args:
+        checkpoint: as :func:`read_checkpoint` returns it.
+        path: its file, for the message.
+
+    Raises:
+        ValueError: no state of the optimizer, the schedule or the loops, or a damaged one; the message is one line.
+    """
+    lacks = f"{path}: not a checkpoint that training can go on with: expected"
+    for name in ("epoch", "global_step"):
+        value = checkpoint.get(name)
+        if type(value) is not int or value < 0:
+            raise ValueError(f"{lacks} {name} as a whole number, got {str(value)[:80]!r}")
+    for name, kind in (("optimizer_states", list), ("lr_schedulers", list), ("loops", dict)):
+        value = checkpoint.get(name)
+        if not isinstance(value, kind) or (kind is list and not all(isinstance(one, dict) for one in value)):
+            raise ValueError(f"{lacks} {name}, got {'none' if value is None else type(value).__name__}")
+    if not checkpoint["optimizer_states"] or not isinstance(checkpoint["loops"].get("fit_loop"), dict):
+        raise ValueError(f"{lacks} the state of an optimizer and of the training loop, got none")
+    for state in checkpoint["optimizer_states"]:
+        if not isinstance(state.get("state"), dict) or not isinstance(state.get("param_groups"), list):
+            raise ValueError(f"{lacks} state and param_groups of the optimizer")
+
+
+class Checkpoints(TorchCheckpointIO):
+    """How Lightning reads, writes and removes checkpoints: without running code, whole, and nothing else than them."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
+        """Write a checkpoint; one that was there stays until the new one is complete."""
+        with whole_file(path) as file:
+            torch.save(checkpoint, file)
+
+    def load_checkpoint(self, path: str | Path, *_: Any, **__: Any) -> dict[str, Any]:
+        """Read a checkpoint; its callbacks may name files of their own folder, and no others."""
+        checkpoint = read_checkpoint(path)
+        states = checkpoint.get("callbacks", {})
+        if isinstance(states, dict):
+            checkpoint["callbacks"] = {
+                key: _without_foreign_files(state) if isinstance(state, dict) else state
+                for key, state in states.items()
+            }
+        return checkpoint
+
+    def remove_checkpoint(self, path: str | Path) -> None:
+        """Remove a checkpoint; anything else stays."""
+        path = Path(path)
+        if path.suffix == ".ckpt" and path.is_file():
+            path.unlink()
+
+
+def _without_foreign_files(state: dict[str, Any]) -> dict[str, Any]:
+    """Return the state of a callback that names only checkpoints in the folder that it says it writes to."""
+    folder = state.get("dirpath")
+    own = {name: _own_file(state[name], folder) for name in _PATHS if name in state}
+    best = state.get("best_k_models")
+    if isinstance(best, dict):
+        own["best_k_models"] = {_own_file(path, folder): score for path, score in best.items() if path}
+        own["best_k_models"].pop("", None)
+    return {**state, **own}
+
+
+def _own_file(path: Any, folder: Any) -> str:
+    """Return a path without detours, or nothing where it is not that of a checkpoint in a folder."""
+    if not (isinstance(path, str) and isinstance(folder, str) and path.endswith(".ckpt")):
+        return ""
+    path, folder = Path(os.path.abspath(path)), Path(os.path.abspath(folder))
+    return str(path) if folder in path.parents else ""

@@ -1,0 +1,165 @@
+"""Arguments of ``lightning`` before parsing: the settings stored with weights are filled in."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from lightning_modules.inference.presets import Preset
+from lightning_modules.motion import ESTIMATORS, MotionEstimator
+from lightning_modules.networks import NETWORKS
+from lightning_modules.pretrained import check_weights, read_weights
+from lightning_modules.stored_settings import own_class
+
+WEIGHTS = "--model.weights", "--model.init_args.weights"
+
+_MOTION = re.compile(r"--model\.(init_args\.)?network\.(init_args\.)?motion(\.class_path)?")
+
+#: options that the arguments of a preset are, in the order in which they are typed
+_PRESET = {
+    "weights": "--model.weights",
+    "network": "--model.network",
+    "method": "--model.network.method",
+    "window": "--model.network.window",
+    "order": "--model.network.order",
+    "scale": "--model.network.scale",
+    "motion": "--model.network.motion",
+    "motion_weights": "--model.network.motion.weights",
+    "motion_iterations": "--model.network.motion.iterations",
+    "steps": "--model.network.steps",
+    "tile": "--model.tile",
+    "psnr_tolerance": "--model.psnr_tolerance",
+    "self_ensemble": "--model.self_ensemble",
+    "precision": "--trainer.precision",
+}
+_OLD = {"--model.tolerance": "psnr_tolerance"}
+
+
+def with_network_of_weights(args: Sequence[str]) -> list[str]:
+    """Put in the network that ``--model.weights`` are of, so that it need not be said again.
+
+    An estimator of motion is exchanged freely, and so is the gain: those of the weights are put in where nothing else
+    is named.
+
+    Args:
+        args: verb and arguments of ``lightning``.
+
+    Raises:
+        FileNotFoundError: there are no such weights.
+        ValueError: the file is damaged, of something else, or of a network or estimator that is not of this package.
+    """
+    asked, named, alpha = None, None, None
+    for _, option, value in options(args):
+        if option in ("-c", "--config"):
+            model = _init_args(_model_in(value))
+            asked = model.get("weights") or asked
+            network = _init_args(model.get("network"))
+            named = _with_class(network.get("motion")) or named
+            alpha = network.get("alpha", alpha)
+        elif option in WEIGHTS:
+            asked = value
+        elif _MOTION.fullmatch(option):
+            named = _with_class(yaml.safe_load(value)) or named
+    if asked in (None, "", "null"):
+        return list(args)
+    found = read_weights(asked)
+    check_weights(found, {**NETWORKS, **ESTIMATORS})
+    kind, arguments = own_class(found.settings, found.source, {**NETWORKS, **ESTIMATORS})
+    if issubclass(kind, MotionEstimator):
+        takes = f"of the estimator {kind.__name__}; --model.network.motion.weights takes them"
+        raise ValueError(f"model.weights: expected weights of a network, got {asked}, {takes}")
+    network = {"class_path": kind.__name__, "init_args": arguments}
+    chosen = named
+    if found.motion and not named:
+        estimator, arguments = own_class(found.motion, found.source, ESTIMATORS)
+        chosen = {"class_path": estimator.__name__, "init_args": arguments}
+    if chosen:
+        network["init_args"]["motion"] = chosen
+    if alpha is not None:
+        network["init_args"]["alpha"] = alpha
+    return behind_configurations(args, ["--config", json.dumps({"model": {"network": network}})])
+
+
+def options(args: Sequence[str]) -> Iterator[tuple[int, str, str]]:
+    """Yield where the word after an option and its value is, the option, and the value."""
+    for n, word in enumerate(args):
+        option, equals, value = word.partition("=")
+        if re.match(r"-[a-z][^=]", word):  # -cFILE
+            option, equals, value = word[:2], "=", word[2:]
+        yield (n + 1, option, value) if equals else (n + 2, option, args[n + 1] if n + 1 < len(args) else "")
+
+
+def behind_configurations(args: Sequence[str], more: Sequence[str]) -> list[str]:
+    """Put more behind the verb and all configurations, where other arguments still have the last word."""
+    place = max((end for end, option, _ in options(args) if option in ("-c", "--config")), default=1)
+    return [*args[:place], *more, *args[place:]]
+
+
+def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield dotted keys and what is no dictionary.
+
+    Example:
+        >>> dict(flatten({"network": {"width": 4, "motion": {}}}))
+        {'network.width': 4}
+    """
+    if not isinstance(config, dict):
+        yield prefix, config
+        return
+    for key, value in config.items():
+        yield from flatten(value, f"{prefix}.{key}" if prefix else key)
+
+
+def _model_in(config: str) -> Any:
+    """Return what a file of configuration says about the model; whether it is one at all is the parser's affair."""
+    try:
+        return yaml.safe_load(Path(config).read_text())["model"]
+    except (OSError, ValueError, TypeError, LookupError, RecursionError, yaml.YAMLError):
+        return None
+
+
+def _init_args(choice: Any) -> dict[str, Any]:
+    """Return the arguments of an object in a configuration, which may stand in it without ``init_args``."""
+    if not isinstance(choice, dict):
+        return {}
+    inner = choice.get("init_args")
+    return {**choice, **inner} if isinstance(inner, dict) else choice
+
+
+def _with_class(choice: Any) -> dict[str, Any] | None:
+    """Return an object of a configuration as a dictionary, ``None`` where it does not say of what class it is."""
+    choice = {"class_path": choice} if isinstance(choice, str) else choice
+    return choice if isinstance(choice, dict) and choice.get("class_path") else None
+
+
+def preset_arguments(preset: Preset) -> list[str]:
+    """Return the arguments of ``lightning predict`` and ``test`` that make a preset.
+
+    Example:
+        >>> preset_arguments(Preset("cscsr_small_x4", motion="ZeroFlow", tile=64))
+        ['--model.weights', 'cscsr_small_x4', '--model.network.motion', 'ZeroFlow', '--model.tile', '64']
+    """
+    return [word for name, text in preset.write().items() if text for word in (_PRESET[name], text)]
+
+
+def arguments_preset(args: Sequence[str]) -> Preset | None:
+    """Return the preset that arguments make; ``None`` where they say what a preset cannot.
+
+    Example:
+        >>> arguments_preset(["--model.weights=cscsr_small_x4"]).weights
+        'cscsr_small_x4'
+        >>> arguments_preset(["--config", "my.yaml"])
+    """
+    words = [part for word in args for part in (word.split("=", 1) if word.startswith("--") else [word])]
+    names = {option: name for name, option in _PRESET.items()} | _OLD
+    given = {names.get(option): value for option, value in zip(words[::2], words[1::2], strict=False)}
+    if None in given or 2 * len(given) != len(words):
+        return None
+    try:
+        return Preset.read(given)
+    except ValueError:
+        return None

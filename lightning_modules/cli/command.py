@@ -1,0 +1,358 @@
+"""The ``lightning`` command: LightningCLI with one output folder, and with checkpoints that are found again."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import re
+import sys
+import warnings
+from collections.abc import Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any, NoReturn
+
+import torch
+from jsonargparse import ArgumentParser
+from pytorch_lightning import Callback, LightningDataModule, LightningModule, Trainer
+from pytorch_lightning.callbacks import LearningRateMonitor, ModelCheckpoint
+from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
+from pytorch_lightning.loggers import TensorBoardLogger
+from pytorch_lightning.utilities import rank_zero_only
+
+from lightning_modules.checkpoint import Checkpoints, check_training_state, read_checkpoint
+from lightning_modules.cli.arguments import (
+    WEIGHTS,
+    behind_configurations,
+    flatten,
+    options,
+    preset_arguments,
+    with_network_of_weights,
+)
+from lightning_modules.cli.errors import InputError
+from lightning_modules.cli.folder_lock import locked_folder, make_folder
+from lightning_modules.cli.renamed_overlays import with_current_overlays
+from lightning_modules.data import FilmScenes, Recording, RecordingClips, StillScenes
+from lightning_modules.inference.presets import SPEEDS, choose
+from lightning_modules.motion import Spike2Flow
+from lightning_modules.networks import CSCSR
+from lightning_modules.pretrained import check_settings
+from lightning_modules.tasks.base import Learner
+from lightning_modules.tasks.callbacks import PredictionPictures
+from lightning_modules.tasks.optical_flow import FlowTraining
+from lightning_modules.tasks.super_resolution import SuperResolution
+from spikekit.io.video import PICTURE_ENDINGS, VIDEO_ENDINGS
+from spikekit.io.whole_file import whole_file
+
+#: classes whose arguments ``--help`` lists, by the option that names them
+CHOICES = (
+    ("model", SuperResolution),
+    ("model.network", CSCSR),
+    ("model", FlowTraining),
+    ("model.network", Spike2Flow),
+    ("data", StillScenes),
+    ("data", FilmScenes),
+    ("data", Recording),
+)
+
+# warnings about the insides of Lightning and jsonargparse, and about data that need no processes to read them
+_NOTHING_TO_DO = (
+    r".*does not have many workers",
+    r".*isinstance\(treespec, LeafSpec\)",
+    r"\s*skip_none parameter was deprecated",
+)
+
+# of what users may take the output for
+_FILE_ENDINGS = (*PICTURE_ENDINGS, *VIDEO_ENDINGS, ".gif", ".html", ".npz", ".dat", ".ckpt", ".safetensors")
+
+_NO_RECORDING = "predict: expected a recording: --data Recording --data.path FILE"
+
+_LOADERS = {
+    "fit": "train_dataloader",
+    "validate": "val_dataloader",
+    "test": "test_dataloader",
+    "predict": "predict_dataloader",
+}
+
+
+class Parser(LightningArgumentParser):
+    """A parser whose help also lists the arguments of the classes that a configuration may name."""
+
+    def format_help(self) -> str:  # noqa: D102
+        text = super().format_help()
+        if any(action.dest == "model" for action in self._actions):
+            for option, choice in CHOICES:
+                parser = ArgumentParser(add_help=False, usage=argparse.SUPPRESS)
+                parser.add_class_arguments(choice, option)
+                text += f"\nwith --{option} {choice.__name__}:\n\n{parser.format_help()}"
+        elif "{fit," in text:
+            text += "    sweep               Train and test every combination of overlays, values and seeds.\n"
+            text += "    trade               Measure what every setting costs and what it is worth.\n"
+            text += "    export              Write the weights of a checkpoint as safetensors.\n"
+            text += "    models              List the weights that come with the package.\n"
+        return text
+
+    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+        """Say in one line that there is no network: jsonargparse would show what it had tried to build."""
+        if self.exit_on_error and "the following arguments are required: network" in message:
+            sys.exit(
+                "lightning: expected a network: --speed balanced (predict alone), --model.weights NAME "
+                "(lightning models lists them), or a configuration, -c FILE"
+            )
+        super().error(message, ex)
+
+
+def _with_choice(parser: LightningArgumentParser, args: Sequence[str]) -> list[str]:
+    """Put in the setting that ``--speed`` or ``--budget`` asks for, and say which."""
+    given = next((option for _, option, _ in options(args) if option in (*WEIGHTS, "--ckpt_path")), None)
+    if given:
+        raise InputError(f"--speed and --budget: choose from the weights of the package, got {given} as well")
+    verb, *rest = args
+    parsed = parser.parse_args([verb, "--config", '{"model": {"network": {"class_path": "CSCSR"}}}', *rest])[verb]
+    recording = parsed.data.get("init_args", {})
+    if not recording.get("path"):
+        raise InputError(_NO_RECORDING)
+    try:
+        known = ("path", "height", "width", "pattern", "camera")
+        size = RecordingClips(**{name: recording.get(name) for name in known}, frames=1).size
+        choice = choose(parsed.model.init_args.network.init_args.scale, parsed.speed, parsed.budget, size)
+    except (OSError, ValueError) as error:
+        raise InputError(str(error)) from error
+    print(choice, flush=True)
+    return behind_configurations(args, preset_arguments(choice.preset))
+
+
+class Configuration(SaveConfigCallback):
+    """Writes ``config.yaml``, whole or not at all."""
+
+    def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:  # noqa: D102
+        with whole_file(Path(trainer.log_dir) / self.config_filename, "w", encoding="utf-8") as file:
+            file.write(self.parser.dump(self.config, skip_none=False))
+
+
+class Command(LightningCLI):
+    """The ``lightning`` command."""
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:  # noqa: D102
+        parser.add_argument(
+            "-o",
+            "--output",
+            type=str,
+            default="runs",
+            help="Folder of the run: checkpoints, TensorBoard files, config.yaml, tables and pictures.",
+        )
+        parser.set_defaults({"model": {"class_path": "SuperResolution"}})
+        network = "model.init_args.network.init_args"
+        for name in ("scale", "frames", "alpha"):
+            parser.link_arguments(f"{network}.{name}", f"data.init_args.{name}")
+        parser.link_arguments(f"{network}.pattern", "data.init_args.crop_to")
+        parser.link_arguments(
+            (f"{network}.frames", f"{network}.window"),
+            "data.init_args.flow_times",
+            lambda frames, window: (window // 2, frames - 1 - window // 2),
+        )
+
+    def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:  # noqa: D102
+        args = with_current_overlays(sys.argv[1:] if args is None else args)
+        if any(option in ("--speed", "--budget") for _, option, _ in options(args)):
+            args = _with_choice(parser, args)
+        try:
+            args = with_network_of_weights(args)
+        except (OSError, ValueError) as error:
+            raise InputError(str(error)) from error
+        self.config = parser.parse_args(args)
+
+    def _parse_ckpt_path(self) -> None:
+        """Take no hyper-parameters out of a checkpoint: jsonargparse would build whatever they name."""
+
+    def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> LightningArgumentParser:
+        parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
+        if subcommand == "predict":
+            parser.set_defaults({"return_predictions": False})  # pictures are written; kept, they would fill the memory
+            parser.add_argument(
+                "--speed",
+                choices=list(SPEEDS),
+                help="Weights of the package and how they are used: the best; the fastest at most "
+                f"{SPEEDS['balanced']:g} dB (balanced) or {SPEEDS['fast']:g} dB (fast) below it, as measured by "
+                "lightning trade; the fastest.",
+            )
+            parser.add_argument(
+                "--budget",
+                help="Instead, what a frame may take, such as 40ms or 200MB: the best that fits, by the same table.",
+            )
+        return parser
+
+    def before_instantiate_classes(self) -> None:
+        """Turn ``--ckpt_path best`` and ``last`` into files, and keep a run from being written over."""
+        config = self.config[self.subcommand]
+        check_folder(config.output)
+        checkpoints = Path(config.output) / "checkpoints"
+        asked = config.get("ckpt_path")
+        if asked in ("best", "last"):
+            last, best = checkpoints / "last.ckpt", checkpoints / "best.ckpt"
+            # a run that was killed before its first last.ckpt has best.ckpt alone
+            config.ckpt_path = str(last if asked == "last" and (last.is_file() or not best.is_file()) else best)
+        if asked and not Path(config.ckpt_path).is_file():
+            raise InputError(f"{config.ckpt_path}: no such checkpoint")
+        if asked:
+            try:
+                checkpoint = read_checkpoint(config.ckpt_path)
+                if self.subcommand == "fit":
+                    check_training_state(checkpoint, config.ckpt_path)
+            except (OSError, ValueError) as error:
+                raise InputError(str(error)) from error
+        if (
+            self.subcommand == "fit"
+            and not asked
+            and not config.trainer.fast_dev_run
+            and any(checkpoints.glob("*.ckpt"))
+        ):
+            raise InputError(f"{checkpoints}: holds a run already; --ckpt_path last goes on with it, -o goes elsewhere")
+
+    def _run_subcommand(self, subcommand: str) -> None:
+        config = self.config[subcommand]
+        # processes of one distributed training share a folder, which the first of them keeps
+        alone = subcommand == "fit" and not config.trainer.fast_dev_run and rank_zero_only.rank == 0
+        if subcommand in ("test", "predict"):
+            make_folder(config.output)
+        with locked_folder(config.output, "training") if alone else nullcontext():
+            super()._run_subcommand(subcommand)
+
+    def instantiate_classes(self) -> None:  # noqa: D102
+        config = self.config[self.subcommand]
+        if self.subcommand == "fit":
+            _check_trainer(config.trainer)
+        try:
+            super().instantiate_classes()
+            # here, so that what is wrong with it is known before anything is written
+            _check_verb(self.subcommand, self.model, self.datamodule)
+            self.datamodule.setup(self.subcommand)
+            _check_agreement(self.model, self.datamodule)
+            if self.subcommand == "fit":
+                chosen = self.config_dump["model"]["init_args"]
+                self.model.recipe = {name: chosen.get(name) for name in ("optimizer", "lr_scheduler")}
+                if config.ckpt_path:
+                    _check_continuation(config.ckpt_path, self.model)
+        except (OSError, ValueError) as error:
+            # jsonargparse wraps what a class of a class says into pages about its own types
+            said = re.search(r"^ *- (?!Does not validate|Expected a )(.*)$", str(error), re.MULTILINE)
+            raise InputError(said[1] if said else str(error)) from error
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        """Send everything to one folder, and use bfloat16 on a GPU that has it."""
+        output = Path(self._get(self.config_init, "output"))
+        config = self._get(self.config_init, "trainer")
+        kwargs["default_root_dir"] = output
+        kwargs["callbacks"] = [*(config.get("callbacks") or []), *self._callbacks(output)]
+        if config.get("logger") is None:
+            # the tables and pictures of the other commands are files of their own
+            kwargs["logger"] = TensorBoardLogger(output, name="", version="") if self.subcommand == "fit" else False
+        kwargs["plugins"] = [Checkpoints(), *(config.get("plugins") or [])]
+        if config.get("precision") is None:
+            kwargs["precision"] = _precision(config.get("accelerator"))
+        if self.subcommand != "fit":
+            self.save_config_callback = None  # config.yaml is the record of the training
+        return super().instantiate_trainer(**kwargs)
+
+    def _callbacks(self, output: Path) -> list[Callback]:
+        if self.subcommand == "fit":
+            monitor, mode = self.model.best
+            folder = {"dirpath": output / "checkpoints", "enable_version_counter": False}
+            logs = self._get(self.config_init, "trainer").get("logger") not in (False, [])
+            return [
+                ModelCheckpoint(filename="best", monitor=monitor, mode=mode, **folder),
+                ModelCheckpoint(filename="last", save_on_train_epoch_end=True, **folder),
+                *([LearningRateMonitor()] if logs else []),
+                self.model.pictures(),
+            ]
+        if self.subcommand == "test":
+            return [self.model.report(output)]
+        return [PredictionPictures(output)] if self.subcommand == "predict" else []
+
+
+def check_folder(output: str | Path) -> None:
+    """Refuse what cannot be made a folder, or would be a folder that looks like a file.
+
+    Raises:
+        InputError: it is a file, or inside one, or new and ends like a picture, a film or another file.
+    """
+    ending = Path(output).suffix.lower()
+    if ending in _FILE_ENDINGS and not Path(output).is_dir():
+        raise InputError(f"-o: expected a folder, got {output}, which ends like a file, in {ending}")
+    there = next(path for path in (Path(output).absolute(), *Path(output).absolute().parents) if path.exists())
+    if not there.is_dir():
+        raise InputError(f"-o: expected a folder, got the file {there}")
+
+
+def _check_trainer(trainer: Any) -> None:
+    """Settings of Lightning that would leave a run without what the other commands need."""
+    if trainer.enable_checkpointing is False:
+        raise InputError("trainer.enable_checkpointing: expected true, checkpoints are what fit is for, got false")
+    if trainer.limit_val_batches == 0:
+        raise InputError("trainer.limit_val_batches: expected more than 0, validation chooses best.ckpt, got 0")
+
+
+def _check_verb(verb: str, model: Learner, data: LightningDataModule) -> None:
+    if verb == "predict" and type(model).predict_step is LightningModule.predict_step:
+        raise InputError(f"predict: expected a model that makes pictures, got {type(model).__name__}")
+    loader = _LOADERS[verb]
+    if getattr(type(data), loader) is getattr(LightningDataModule, loader):
+        scenes = f"{verb}: expected scenes whose truth is known, got {type(data).__name__}"
+        raise InputError(_NO_RECORDING if verb == "predict" else scenes)
+    if verb == "fit" and not any(parameter.requires_grad for parameter in model.network.parameters()):
+        raise InputError(f"fit: expected a network that learns, got {type(model.network).__name__}")
+
+
+def _check_continuation(path: str, model: Learner) -> None:
+    """Refuse to go on with another network, optimizer or schedule: the checkpoint's would win without a word."""
+    checkpoint = read_checkpoint(path)
+    check_settings(model.network, checkpoint["network"], "the checkpoint")
+    here = dict(flatten(model.recipe))
+    there = dict(flatten(checkpoint["recipe"] or model.recipe))  # older checkpoints do not say
+    for key in sorted({**there, **here}):
+        if there.get(key) != here.get(key):
+            name, expected = key.replace(".init_args", ""), f"{there.get(key)}, as {path} was trained with"
+            anew = "--model.weights starts anew with other settings"
+            raise InputError(f"model.{name}: expected {expected}, got {here.get(key)}; {anew}")
+
+
+def _check_agreement(model: Learner, data: LightningDataModule) -> None:
+    """What is not linked, because more than one kind of model has it; a recording has a Bayer phase of its own."""
+    if not isinstance(data, (StillScenes, FilmScenes)):
+        return
+    if data.workers < 0:
+        raise ValueError(f"data.workers: expected 0 or more, got {data.workers}")
+    for name, expected in model.needs.items():
+        got = data.options[name]
+        if got != expected:
+            raise ValueError(f"data.{name}: expected {expected}, as the model has it, got {got}")
+    if isinstance(model, SuperResolution) and model.network.takes_flow:
+        # linked to the frames and the window of CSCSR; other networks have no window
+        ends, got = model.network.flow_times[::2], tuple(data.options["flow_times"])
+        if got not in ((), ends):
+            name = type(model.network).__name__
+            raise ValueError(f"data.flow_times: expected {ends}, between which the flow of {name} runs, got {got}")
+
+
+def _precision(accelerator: str) -> str:
+    wanted = accelerator in ("auto", "gpu", "cuda") and torch.cuda.is_available() and torch.cuda.is_bf16_supported()
+    return "bf16-mixed" if wanted else "32-true"
+
+
+def run(args: Sequence[str] | None, command: type[Command]) -> Command:
+    """Run what was typed after ``lightning``, with one of Lightning's verbs; what is wrong with it is raised."""
+    lightning_says = logging.getLogger("pytorch_lightning.utilities.rank_zero")
+    lightning_says.addFilter(lambda line: not re.search("litlogger|litmodels", str(line.msg)))
+    for nothing_to_do in _NOTHING_TO_DO:
+        warnings.filterwarnings("ignore", nothing_to_do)
+    return command(
+        Learner,
+        LightningDataModule,
+        subclass_mode_model=True,
+        subclass_mode_data=True,
+        auto_configure_optimizers=False,
+        parser_class=Parser,
+        save_config_callback=Configuration,
+        save_config_kwargs={"save_to_log_dir": False},
+        args=None if args is None else list(args),
+    )

@@ -1,0 +1,55 @@
+"""Folder locks: one run at a time in a folder."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+
+class FolderError(ValueError):
+    """A folder that a run cannot write to."""
+
+
+class FolderInUseError(FolderError):
+    """A folder that another run is at work in."""
+
+
+def make_folder(folder: str | Path) -> None:
+    """Make a folder and try to write to it, so that a run does not notice at its end that it cannot.
+
+    Args:
+        folder: where.
+
+    Raises:
+        FolderError: it cannot be made, or not be written to.
+    """
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise FolderError(f"-o: {folder} cannot be written to ({error.strerror or error})") from error
+
+
+@contextmanager
+def locked_folder(folder: str | Path, what: str) -> Iterator[None]:
+    """Keep other runs out of a folder; the lock goes when the process does, however it ends.
+
+    Args:
+        folder: where; made when it is missing.
+        what: the kind of run, for the message.
+
+    Raises:
+        FolderInUseError: another process, or another run of this one, is at work there.
+        FolderError: the folder or the file ``lock`` in it cannot be made.
+    """
+    make_folder(folder)
+    try:
+        with FileLock(Path(folder) / "lock", timeout=0):
+            yield
+    except Timeout:
+        raise FolderInUseError(f"{folder}: another {what} is at work here; -o goes elsewhere") from None

@@ -1,0 +1,76 @@
+"""Rehearse a command: parse and build it without running it, and report what is wrong in one line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import yaml
+
+from lightning_modules.cli.arguments import flatten
+from lightning_modules.cli.command import Command
+
+
+class Rehearsal(Command):
+    """Parses and builds what a verb would, to find mistakes, which are raised; runs nothing and writes nothing."""
+
+    verb = "test"
+
+    @classmethod
+    def subcommands(cls) -> dict[str, set[str]]:
+        """One verb, so that only its parser is built."""
+        return {cls.verb: Command.subcommands()[cls.verb]}
+
+    def init_parser(self, **kwargs: Any) -> Any:  # noqa: D102
+        return super().init_parser(**kwargs, exit_on_error=False)
+
+    def _run_subcommand(self, subcommand: str) -> None:
+        pass
+
+
+def resolved(command: Rehearsal) -> dict[str, Any]:
+    """Return the whole configuration of a verb, as plain values."""
+    return yaml.safe_load(command.parser.dump(command.config, skip_none=False))[command.verb]
+
+
+def mistake(error: Exception, args: Sequence[str], names: Sequence[str]) -> str:
+    """Return in one line what is wrong with arguments.
+
+    Args:
+        error: what was raised on them.
+        args: they.
+        names: of all arguments that there are, of which the one that was meant is looked for.
+    """
+    unknown = [word[2:].partition("=")[0] for word in args if word.startswith("--")]
+    unknown = [key for key in unknown if names and key not in names]
+    return _reason(str(error)) + _suggestion(unknown, names)
+
+
+def _reason(message: str) -> str:
+    """Return jsonargparse's message, which is a tree of alternatives, as one line: the deepest, and where it is."""
+    lines = message.splitlines()
+    where = [key for line in lines for key in re.findall(r'[Pp]arser key "([^"]+)"', line)]
+    inner = [
+        line for line in lines if not re.match(r"\s*(- Expected a <class 'NoneType'>|Given value|.*arser key)", line)
+    ]
+    deepest = max(inner or lines, key=lambda line: len(line) - len(line.lstrip()))
+    deepest = re.sub(r'^- |[Pp]arser key "[^"]+":\s*', "", deepest.strip())
+    return ".".join(where) + (": " if where else "") + deepest
+
+
+def _suggestion(unknown: Sequence[str], names: Sequence[str]) -> str:
+    from difflib import get_close_matches
+
+    for key in unknown:
+        ends = {name.rpartition(".")[2] for name in names}
+        close = get_close_matches(key.rpartition(".")[2], ends, 1, 0.75)
+        meant = [name for name in names if close and name.rpartition(".")[2] == close[0]]
+        if meant:
+            return f"; {key}: did you mean {' or '.join(meant)}?"
+    return ""
+
+
+def argument_names(config: dict[str, Any]) -> list[str]:
+    """Return the keys of a configuration as they are typed: those of the objects in it have no ``init_args``."""
+    return sorted({key.replace(".init_args", "") for key, _ in flatten(config)})

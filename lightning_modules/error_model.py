@@ -1,0 +1,94 @@
+"""Error model of a network: how much less work costs in squared error, with constants fitted for its weights."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from spikekit.io.whole_file import whole_file
+
+#: the file, in the folder of the weights
+FILE = "scene_activity.json"
+
+
+@dataclass(frozen=True)
+class ErrorModel:
+    """Squared errors per squared statistic of a clip, all in units of a white pixel.
+
+    ``python -m lightning_modules.trade.adaptive WEIGHTS --fit`` fits them, to the side that spends more. The defaults
+    are the most careful of all weights of the package, for networks whose own were not measured.
+
+    Args:
+        flat: added by a smooth picture instead of the network's, per texture.
+        grainy: likewise, per grain that a network would average away.
+        blurred: likewise, per change.
+        still: added by a network that is told that nothing moves, per change.
+        textured: left by the network itself, per texture.
+        moved: likewise, per change.
+        faint: likewise, everywhere.
+
+    Raises:
+        ValueError: a constant that is no finite number of 0 or more.
+    """
+
+    flat: float = 12.0
+    grainy: float = 1.7
+    blurred: float = 0.25
+    still: float = 0.15
+    textured: float = 0.085
+    moved: float = 0.0019
+    faint: float = 1.3e-5
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < float("inf"):
+                raise ValueError(f"{name}: expected a finite number of 0 or more, got {value!r}")
+
+
+def read_error_model(weights: str | Path) -> ErrorModel:
+    """Return the constants of a file of weights, or the defaults where it has none.
+
+    Args:
+        weights: the file. That of a checkpoint, which training writes over, has none.
+
+    Raises:
+        ValueError: a damaged file of constants; the message is one line and names it.
+    """
+    path = Path(weights)
+    return _read(path.with_name(FILE)).get(path.name, ErrorModel()) if path.suffix == ".safetensors" else ErrorModel()
+
+
+def write_error_model(weights: str | Path, model: ErrorModel) -> Path:
+    """Write the constants of a file of weights beside it.
+
+    Args:
+        weights: the file, of safetensors.
+        model: the constants.
+
+    Returns:
+        The file that they are in, which holds those of all weights of the folder.
+
+    Raises:
+        ValueError: no file of safetensors, or a damaged file of constants.
+    """
+    path = Path(weights)
+    if path.suffix != ".safetensors":
+        raise ValueError(f"{path}: expected a file of safetensors, such as lightning export writes")
+    models = {**_read(path.with_name(FILE)), path.name: model}
+    content: dict[str, Any] = {name: asdict(models[name]) for name in sorted(models)}
+    with whole_file(path.with_name(FILE), "w") as file:
+        json.dump(content, file, indent=1)
+        file.write("\n")
+    return path.with_name(FILE)
+
+
+def _read(path: Path) -> dict[str, ErrorModel]:
+    if not path.is_file():
+        return {}
+    try:
+        return {name: ErrorModel(**constants) for name, constants in json.loads(path.read_text()).items()}
+    except (OSError, AttributeError, TypeError, ValueError, RecursionError) as error:
+        said = " ".join(str(error).split())[:300]
+        raise ValueError(f"{path}: expected the constants of weights, by their file ({said})") from error

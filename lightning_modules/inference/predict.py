@@ -1,0 +1,52 @@
+"""Predict a picture from a clip, with tiles, tolerance and self-ensemble."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from lightning_modules.inference.self_ensemble import self_ensemble as mean_of_views
+from lightning_modules.inference.tiles import TILE, forward_in_tiles
+from lightning_modules.networks import Network
+
+
+def predict(
+    network: Network,
+    spikes: Tensor,
+    flow: Tensor | None = None,
+    static: bool = False,
+    *,
+    tile: int = TILE,
+    psnr_tolerance: float = 0.0,
+    self_ensemble: int = 1,
+    exposure: float | Tensor = 1.0,
+) -> Tensor:
+    r"""Return the picture of the middle of a clip.
+
+    Args:
+        network: any of :mod:`lightning_modules.networks`.
+        spikes: :math:`(B, N, H, W)`.
+        flow: from the middle to the first and to the last time point, :math:`(B, 2, 2, H, W)`, in sensor pixels; when
+            not given, what the network's estimator sees.
+        static: nothing moves, instead of a flow.
+        tile: side of the tiles in sensor pixels, 0 for none, see
+            :func:`lightning_modules.inference.tiles.forward_in_tiles`.
+        psnr_tolerance: by how many dB the PSNR of the picture is expected to fall at most, see there.
+        self_ensemble: mean over so many views of the clip, 1, 2, 4 or 8, see
+            :func:`lightning_modules.inference.self_ensemble.self_ensemble`.
+        exposure: what the picture is multiplied by before it is clamped, a number or (B, 1, 1, 1).
+
+    Returns:
+        rgb :math:`(B, 3, s H, s W)`, clamped to [0, 1].
+
+    Example:
+        >>> import torch
+        >>> from lightning_modules.networks import ClassicalDecoder
+        >>> predict(ClassicalDecoder(scale=2), torch.ones(1, 41, 16, 16), self_ensemble=2).shape
+        torch.Size([1, 3, 32, 32])
+    """
+
+    def run(spikes: Tensor, flow: Tensor | None) -> Tensor:
+        return forward_in_tiles(network, spikes, tile, psnr_tolerance, flow, static)
+
+    rgb = mean_of_views(run, spikes, flow, network.pattern, network.scale, self_ensemble)
+    return (rgb * exposure).clamp(0, 1)

@@ -1,0 +1,305 @@
+"""Presets: weights with their settings, and the choice among them by speed or budget."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+import torch
+
+from lightning_modules import motion as estimators
+from lightning_modules.inference.predict import predict
+from lightning_modules.inference.tiles import FAR, TILE
+from lightning_modules.networks import CSCSR, ClassicalDecoder, Network
+from spikekit.timing import timer_of
+
+_FOLDER = Path(__file__).parents[1] / "weights"
+
+_DECODER = "ClassicalDecoder"
+
+#: how far a speed may be below the best, in dB of the table
+SPEEDS = {"fastest": float("inf"), "fast": 1.2, "balanced": 0.3, "best": 0.005}
+
+#: times this close cannot be told apart, and the better preset is picked
+_AS_FAST = 1.1
+
+#: MiB a sensor pixel that an estimate of motion takes, which is made on the whole frame: ClassicalFlow's, measured
+_MOTION = 240 / 2**20
+
+_UNITS = {
+    "ms": ("ms", 1.0),
+    "s": ("ms", 1e3),
+    "MB": ("mib", 1e6 / 2**20),
+    "GB": ("mib", 1e9 / 2**20),
+    "MiB": ("mib", 1.0),
+    "GiB": ("mib", 1024.0),
+}
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Weights, or a decoder without any, and how they are used; ``None`` leaves everything as it is by default.
+
+    Args:
+        weights: those of a network: a name of the package, or a file.
+        network: instead of weights, ``"ClassicalDecoder"``.
+        method: of the decoder, ``"tfi"`` or ``"tfp"``.
+        window: of the decoder.
+        order: of the decoder.
+        scale: super-resolution factor of the decoder; weights know theirs.
+        motion: class of the estimator, such as ``"ZeroFlow"``, in place of the one that the weights were trained with.
+        motion_weights: of that estimator.
+        motion_iterations: of that estimator.
+        steps: of the network's search, see :class:`lightning_modules.networks.CSCSR`.
+        tile: see :func:`lightning_modules.inference.predict.predict`.
+        psnr_tolerance: in dB, see there.
+        self_ensemble: number of views, see there.
+        precision: of the Trainer, such as ``"bf16-mixed"``.
+
+    Raises:
+        ValueError: weights and a decoder, or arguments of a decoder or of an estimator that is not named.
+
+    Example:
+        >>> Preset("cscsr_small_x4", motion="ZeroFlow").build().motion
+        ZeroFlow()
+        >>> Preset(method="tfi")
+        Traceback (most recent call last):
+            ...
+        ValueError: method: expected network='ClassicalDecoder' with it, got None
+    """
+
+    weights: str | None = None
+    network: str | None = None
+    method: str | None = None
+    window: int | None = None
+    order: int | None = None
+    scale: int | None = None
+    motion: str | None = None
+    motion_weights: str | None = None
+    motion_iterations: int | None = None
+    steps: int | None = None
+    tile: int | None = None
+    psnr_tolerance: float | None = None
+    self_ensemble: int | None = None
+    precision: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.network not in (None, _DECODER):
+            raise ValueError(f"network: expected {_DECODER!r}, or weights of another, got {self.network!r}")
+        if self.network and self.weights:
+            raise ValueError(f"weights: expected none with network={_DECODER!r}, got {self.weights!r}")
+        for name in self.given("method", "window", "order", "scale"):
+            if self.network is None:
+                raise ValueError(f"{name}: expected network={_DECODER!r} with it, got None")
+        for name in self.given("motion_weights", "motion_iterations"):
+            if self.motion is None:
+                raise ValueError(f"{name}: expected the estimator's class as motion with it, got None")
+
+    def given(self, *names: str) -> dict[str, Any]:
+        """Return those of some arguments that are not ``None``."""
+        values = {name: getattr(self, name) for name in names}
+        return {name: value for name, value in values.items() if value is not None}
+
+    @classmethod
+    def columns(cls) -> list[str]:
+        """Return the names of the arguments, which are columns of a table."""
+        return [field.name for field in fields(cls)]
+
+    @classmethod
+    def read(cls, row: Mapping[str, str]) -> Preset:
+        """Make a preset of a row of a table, in which an empty cell is ``None``.
+
+        Raises:
+            ValueError: a cell that is no number where one is expected.
+
+        Example:
+            >>> Preset.read({"weights": "cscsr_small_x4", "tile": "64", "psnr_tolerance": ""})
+            Preset(weights='cscsr_small_x4', ..., tile=64, psnr_tolerance=None, ...)
+        """
+        kinds = {name: get_args(hint)[0] for name, hint in get_type_hints(cls).items()}
+        return cls(**{name: kind(row[name]) for name, kind in kinds.items() if row.get(name)})
+
+    def write(self) -> dict[str, str]:
+        """Return the cells of a row, as :meth:`read` takes it."""
+        return {name: "" if value is None else str(value) for name, value in vars(self).items()}
+
+    def build(self) -> Network:
+        """Build the network in evaluation mode, on the CPU.
+
+        Tiles, tolerance, views and precision are not its own: see
+        :func:`lightning_modules.inference.predict.predict`.
+
+        Raises:
+            FileNotFoundError: there are no such weights.
+            ValueError: neither weights nor a decoder, weights of something else, or an unknown estimator.
+        """
+        if self.network is not None:
+            return ClassicalDecoder(**self.given("method", "window", "order", "scale")).eval()
+        if self.weights is None:
+            raise ValueError(f"preset: expected weights or network={_DECODER!r}, got {self}")
+        return CSCSR.from_pretrained(self.weights, self._estimator(), **self.given("steps"))
+
+    def _estimator(self) -> estimators.MotionEstimator | None:
+        if self.motion is None:
+            return None
+        if self.motion not in estimators.__all__:
+            raise ValueError(f"motion: expected one of {', '.join(estimators.__all__)}, got {self.motion!r}")
+        arguments = self.given("motion_weights", "motion_iterations")
+        arguments = {name.removeprefix("motion_"): value for name, value in arguments.items()}
+        return getattr(estimators, self.motion)(**arguments)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A preset that was measured.
+
+    Args:
+        name: what it is called.
+        preset: it.
+        psnr: dB, on the clips of the table.
+        below: dB below the best of the table.
+        ms: expected for a frame.
+        mib: memory, expected for a frame.
+        where: on which machine.
+    """
+
+    name: str
+    preset: Preset
+    psnr: float
+    below: float
+    ms: float
+    mib: float
+    where: str = "on the machine of the table"
+
+    def __str__(self) -> str:
+        time = f"{self.ms:.3g} ms" if self.ms < 1e3 else f"{self.ms / 1e3:.3g} s"
+        memory = f"{self.mib:.3g} MiB" if self.mib < 1e3 else f"{self.mib / 1024:.3g} GiB"
+        cost = f"about {time} and {memory} a frame {self.where}"
+        return f"{self.name}: {cost}, {self.below:.2f} dB below the best"
+
+
+def choices(scale: int, size: tuple[int, int]) -> list[Choice]:
+    """Return the presets of the table for a scale that leave the precision as it is, fastest first.
+
+    Time is taken to grow with the number of pixels; times are the table's ratios, taken times that of the row which it
+    names as the reference. Memory grows with them, too, until a tile is full, with all that motion may reach over; from
+    there on only by what the leanest preset takes, such as the picture itself, and by an estimate of motion. A preset
+    without tiles is left out: on recordings larger than the table's clips its memory has no bound, and on the clips
+    themselves it is the first one.
+
+    Args:
+        scale: super-resolution factor.
+        size: of a frame, (H, W) in sensor pixels.
+
+    Raises:
+        ValueError: no table comes with the package for this scale.
+    """
+    rows = _table(scale)
+    frame = min(float(row["mib"]) for row in rows)
+    found = []
+    for row in rows:
+        preset = Preset.read(row)
+        if preset.precision is not None or preset.tile == 0 or not (preset.weights or preset.network):
+            continue
+        measured = int(row["height"]) * int(row["width"])
+        pixels = size[0] * size[1] / measured
+        in_tile = min(pixels, ((preset.tile or TILE) + 2 * (CSCSR.halo + FAR)) ** 2 / measured)
+        psnr, ratio, mib = (float(row[name]) for name in ("psnr", "ratio", "mib"))
+        moves = preset.motion != "ZeroFlow" and preset.network is None
+        everywhere = frame + moves * _MOTION * measured
+        mib = everywhere * pixels + (mib - everywhere) * in_tile
+        ms = ratio * float(_reference(rows)["ms"]) * pixels
+        found.append(Choice(row["setting"], preset, psnr, 0.0, ms, mib))
+    best = max(choice.psnr for choice in found)
+    found = [replace(choice, below=best - choice.psnr) for choice in found]
+    return sorted(found, key=lambda choice: choice.ms)
+
+
+def _table(scale: int) -> list[dict[str, str]]:
+    path = _FOLDER / f"x{scale}.csv"
+    if not path.is_file():
+        there = ", ".join(sorted(path.stem for path in _FOLDER.glob("x*.csv"))) or "none"
+        raise ValueError(f"scale: expected one that was measured ({there}), got {scale}")
+    with open(path, newline="") as file:
+        return [row for row in csv.DictReader(file) if not row["failed"]]
+
+
+def _reference(rows: list[dict[str, str]]) -> dict[str, str]:
+    """Return the row that the ratios of all refer to."""
+    return next(row for row in rows if row["setting"] == row["reference"])
+
+
+def pace(scale: int) -> float:
+    """Measure how many times longer a frame takes here than in the table: its reference, on a quarter of a clip.
+
+    Args:
+        scale: super-resolution factor.
+
+    Returns:
+        1 on the machine of the table, 2 on one that takes twice as long.
+    """
+    row = _reference(_table(scale))
+    preset = Preset.read(row)
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    network = preset.build().to(device)
+    options = preset.given("tile", "psnr_tolerance", "self_ensemble")
+    height, width = int(row["height"]) // 2, int(row["width"]) // 2
+    spikes = torch.rand(1, network.frames, height, width, device=device) < network.settings["alpha"] / 2
+    timer, _ = timer_of(device, torch.get_num_threads())
+    predict(network, spikes, **options)
+    return 4e3 * timer(lambda: predict(network, spikes, **options), 3) / float(row["ms"])
+
+
+def choose(
+    scale: int, speed: str | None = None, budget: str | None = None, size: tuple[int, int] = (250, 400)
+) -> Choice:
+    """Pick the preset that serves best.
+
+    For a budget of time this machine is tried first, for a second or so, and the times of the table are taken times
+    :func:`pace`.
+
+    Args:
+        scale: super-resolution factor.
+        speed: ``"best"``, ``"balanced"`` or ``"fast"``, the fastest that is at most so many dB below the most exact as
+            :data:`SPEEDS` says, or ``"fastest"``; of those that take hardly longer the most exact.
+        budget: instead, what a frame may take: a time, such as ``"40ms"``, or memory, such as ``"200MB"``. Of what fits
+            it is the best.
+        size: of a frame, (H, W) in sensor pixels, which a budget depends on.
+
+    Raises:
+        ValueError: an unknown speed, a budget that cannot be read or that nothing fits, a scale without a table.
+
+    Example:
+        >>> choose(4, "fastest").ms <= choose(4, "best").ms
+        True
+        >>> choose(4, budget="1h")
+        Traceback (most recent call last):
+            ...
+        ValueError: budget: expected a time or memory, such as 40ms, 2s, 200MB or 1GiB, got '1h'
+    """
+    if (speed is None) == (budget is None):
+        raise ValueError(f"speed, budget: expected one of them, got {speed!r} and {budget!r}")
+    found = choices(scale, size)
+    if speed is not None:
+        if speed not in SPEEDS:
+            raise ValueError(f"speed: expected one of {', '.join(SPEEDS)}, got {speed!r}")
+        near = [choice for choice in found if choice.below <= SPEEDS[speed]]
+        return max((choice for choice in near if choice.ms <= _AS_FAST * near[0].ms), key=lambda choice: choice.psnr)
+    read = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([a-zA-Z]+)\s*", budget)
+    if read is None or read[2] not in _UNITS:
+        raise ValueError(f"budget: expected a time or memory, such as 40ms, 2s, 200MB or 1GiB, got {budget!r}")
+    what, unit = _UNITS[read[2]]
+    limit = float(read[1]) * unit
+    if what == "ms":
+        here = pace(scale)
+        where = f"on this machine, which takes {here:.2g} times as long as that of the table"
+        found = [replace(choice, ms=here * choice.ms, where=where) for choice in found]
+    fitting = [choice for choice in found if getattr(choice, what) <= limit]
+    if not fitting:
+        least = min(found, key=lambda choice: getattr(choice, what))
+        raise ValueError(f"budget: nothing fits {budget} for {size[0]} x {size[1]} sensor pixels; least takes {least}")
+    return max(fitting, key=lambda choice: choice.psnr)

@@ -1,0 +1,143 @@
+"""Helpers of the baselines: decoded pictures of a clip, padding to any size, common settings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from lightning_modules.motion import MotionEstimator
+from lightning_modules.networks.network import Network
+from spikekit import bayer_pattern, demosaic_along_motion, linear_motion, tfi_at, tfp_at
+from spikekit.check import check_planes, check_positive, check_whole
+
+Decoder = Literal["tfi", "tfp"]
+
+
+@torch.no_grad()
+def decode_pictures(
+    spikes: Tensor, times: Sequence[int], alpha: float, decoder: Decoder = "tfi", window: int = 41
+) -> Tensor:
+    """Decode the mosaics of a clip at some of its frames, white being 1; nothing is learned through them.
+
+    Args:
+        spikes: (B, N, H, W), any real dtype.
+        times: the frames, T of them.
+        alpha: gain of the camera, what a white pixel receives per clock in thresholds; the pictures are divided by it.
+        decoder: ``"tfi"`` or ``"tfp"``.
+        window: frames that TFP averages, odd; fewer at the ends of the clip.
+
+    Returns:
+        Mosaics (B, T, H, W).
+    """
+    decoded = [tfi_at(spikes, n) if decoder == "tfi" else tfp_at(spikes, n, window) for n in times]
+    return torch.stack(decoded, dim=1) / alpha
+
+
+def mirror_to_multiple(planes: Tensor, multiple: int) -> Tensor:
+    """Continue planes at the bottom and at the right until their sides are multiples of a number.
+
+    They are mirrored without repeating the outermost pixel, and so again where they are shorter than what is missing:
+    a mosaic keeps its Bayer phase.
+
+    Args:
+        planes: (*, H, W), H and W at least 2.
+        multiple: of what.
+
+    Returns:
+        (*, H', W').
+    """
+    for axis in (-2, -1):
+        length = planes.shape[axis]
+        missing = -length % multiple
+        if missing:
+            at = torch.arange(length + missing, device=planes.device) % (2 * length - 2)
+            planes = planes.index_select(axis, torch.minimum(at, 2 * length - 2 - at))
+    return planes
+
+
+class Baseline(Network):
+    r"""Base of the baselines that learn.
+
+    Args:
+        scale: super-resolution factor.
+        frames: spike frames N of a clip, odd, 9 or more.
+        pattern: Bayer phase.
+        alpha: gain of the camera, what a white pixel receives per clock in thresholds; pictures are divided by it.
+        more: the other arguments of the constructor, as plain values.
+        motion: estimator that is asked where no flow is given; ``ZeroFlow`` for a network that takes no flow.
+
+    Attributes:
+        flow_times: with 41 frames 5, 20 and 35, between which CSCSR's flows run as well.
+
+    Shape:
+        - Input: spikes :math:`(B, N, H, W)`, any real dtype, any H and W of at least 3; optionally flow
+          :math:`(B, 2, 2, H, W)`, from the middle to the first and to the last time point, in sensor pixels, or
+          ``static=True``
+        - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
+    """
+
+    def __init__(
+        self,
+        scale: int,
+        frames: int,
+        pattern: str,
+        alpha: float,
+        more: dict[str, Any],
+        motion: MotionEstimator | None = None,
+    ) -> None:
+        scale, frames = check_whole("scale", scale), check_whole("frames", frames)
+        check_positive("alpha", alpha)
+        if frames % 2 == 0 or frames < 9:
+            raise ValueError(f"frames: expected an odd number, 9 or more, got {frames}")
+        settings = {"scale": scale, "frames": frames, "pattern": bayer_pattern(pattern), "alpha": alpha, **more}
+        super().__init__(settings, (frames // 8, frames // 2, frames - 1 - frames // 8), motion)
+        self.alpha = alpha
+
+    def check_spikes(self, spikes: Tensor) -> None:
+        """Raise unless a clip is one that the network takes.
+
+        Raises:
+            TypeError: not a tensor of real numbers.
+            ValueError: another number of frames, or less than 3 x 3 pixels.
+        """
+        check_planes("spikes", spikes, 4, "(B, N, H, W)")
+        if spikes.ndim != 4 or spikes.shape[1] != self.frames or min(spikes.shape[-2:]) < 3:
+            expected = f"(B, {self.frames}, H, W) of at least 3 x 3 pixels"
+            raise ValueError(f"spikes: expected {expected}, got {tuple(spikes.shape)}")
+
+    def flow_or_estimate(self, spikes: Tensor, flow: Tensor | None, static: bool = False) -> Tensor:
+        """Return the flow that was given, what the network's estimator sees, or zeros, (B, 2, 2, H, W).
+
+        Raises:
+            ValueError: a flow of another size, or both a flow and ``static``.
+        """
+        flow = self.resolve_flow(spikes, flow, static)
+        return torch.zeros(len(spikes), 2, 2, *spikes.shape[-2:], device=spikes.device) if flow is None else flow
+
+
+@torch.no_grad()
+def along_motion(network: Baseline, spikes: Tensor, flow: Tensor) -> Tensor:
+    """Make the 3DRI-like picture of the middle frame; nothing is learned through it.
+
+    Args:
+        network: says pattern, alpha, and between which frames the flow runs.
+        spikes: (B, N, H, W), any real dtype.
+        flow: (B, 2, 2, H, W), in sensor pixels.
+
+    Returns:
+        The picture (B, 3, H, W) of five TFI mosaics, of the frames 10, 15, ..., 30 of 41.
+    """
+    first, middle, last = network.flow_times
+    times = [middle + n * (network.frames // 8) for n in range(-2, 3)]
+    raw = decode_pictures(spikes, times, network.alpha)
+    offsets = linear_motion(flow[:, 0], flow[:, 1], times, first=first, middle=middle, last=last)
+    return demosaic_along_motion(raw, offsets, network.pattern)
+
+
+def enlarge_picture(picture: Tensor, scale: int) -> Tensor:
+    """Bicubic: (B, C, H, W) to (B, C, s H, s W)."""
+    return picture if scale == 1 else F.interpolate(picture, scale_factor=scale, mode="bicubic", align_corners=False)

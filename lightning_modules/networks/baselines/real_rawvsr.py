@@ -1,0 +1,286 @@
+"""Real-RawVSR, joint demosaicing and super-resolution of raw video, behind TFI or TFP."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from lightning_modules.motion import ZeroFlow
+from lightning_modules.networks.baselines.deformable import DeformableConv2d
+from lightning_modules.networks.baselines.pictures import Baseline, Decoder, decode_pictures, mirror_to_multiple
+from lightning_modules.networks.baselines.skip import begin_at_zero, enlarged_raw
+from lightning_modules.networks.layers import conv, enlarge
+from spikekit import split_bayer
+from spikekit.check import check_whole
+
+_LEVELS = 3
+_FRAMES = 5
+
+
+class RealRawVSR(Baseline):
+    r"""Real-RawVSR (Yue et al., ECCV 2022), behind one of the decoders, as the paper's TFI+ and TFP+Real-RawVSR.
+
+    From the publication: two branches, of the mosaics and of the same packed as four channels of half the size;
+    features on three levels; neighbours aligned to the middle by deformable convolutions of which the packed branch
+    finds the offsets for both; the branches tell each other what they have; attention over time, fusion in time and
+    space as in EDVR, a selective kernel over the branches; ten residual blocks; what is added to the picture comes from
+    the middle mosaic of each branch by convolutions.
+
+    Ours: the five mosaics are what TFI or TFP makes of the frames 10, 15, 20, 25 and 30 of 41. Attention over time
+    is scaled by the root of the number of values, as attention is. The colour correction by the ground truth is left
+    out. Sides are mirrored to multiples of 8, on which the levels meet.
+
+    Attention and the selective kernel look at the whole picture: not run tile by tile.
+
+    Args:
+        decoder: ``"tfi"`` or ``"tfp"``.
+        scale: super-resolution factor s.
+        frames: spike frames N of a clip, odd, at least 9.
+        pattern: Bayer phase.
+        alpha: gain of the camera, what a white pixel receives per clock in thresholds; mosaics are divided by it.
+        tfp_window: spike frames that TFP averages, odd.
+        width: channels, a multiple of 8.
+        blocks: residual blocks after fusion; half as many make the features of every branch.
+        skip: learn what to add to the middle mosaic, demosaiced by residual interpolation and enlarged bicubically. The
+            publication has no such skip; with it training starts where a decoder ends.
+
+    Shape:
+        - Input: spikes :math:`(B, N, H, W)`, zeros and ones, any real dtype; a flow changes nothing
+        - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
+
+    Example:
+        >>> RealRawVSR(scale=2, width=8, blocks=2)(torch.zeros(1, 41, 8, 6)).shape
+        torch.Size([1, 3, 16, 12])
+    """
+
+    takes_flow = False
+
+    def __init__(
+        self,
+        decoder: Decoder = "tfi",
+        scale: int = 4,
+        frames: int = 41,
+        pattern: str = "RGGB",
+        alpha: float = 0.4,
+        tfp_window: int = 41,
+        width: int = 64,
+        blocks: int = 10,
+        skip: bool = False,
+    ) -> None:
+        if decoder not in ("tfi", "tfp"):
+            raise ValueError(f"decoder: expected 'tfi' or 'tfp', got {decoder!r}")
+        sizes = {"tfp_window": tfp_window, "width": width, "blocks": blocks}
+        sizes = {name: check_whole(name, size) for name, size in sizes.items()}
+        super().__init__(scale, frames, pattern, alpha, {"decoder": decoder, **sizes, "skip": skip}, ZeroFlow())
+        if frames < 9:
+            raise ValueError(f"frames: expected at least 9, got {frames}")
+        if tfp_window % 2 == 0:
+            raise ValueError(f"tfp_window: expected an odd number, got {tfp_window}")
+        self.decoder, self.tfp_window, self.skip = decoder, tfp_window, skip
+        self.times = tuple(frames // 2 + n * (frames // 8) for n in range(-(_FRAMES // 2), _FRAMES // 2 + 1))
+        self.raw_features, self.packed_features = (_Pyramid(inputs, width, blocks // 2) for inputs in (1, 4))
+        self.align = _Alignment(width)
+        self.to_raw = nn.Sequential(conv(width, 4 * width), nn.PixelShuffle(2), _relu())
+        self.to_packed = nn.Sequential(nn.Conv2d(width, width, 3, 2, 1), _relu())
+        self.raw_attention, self.packed_attention = _TemporalAttention(), _TemporalAttention()
+        self.fuse_raw, self.fuse_packed = _Fusion(2 * _FRAMES, width), _Fusion(2 * _FRAMES, width)
+        self.enlarge_packed = nn.Sequential(conv(width, 4 * width), nn.PixelShuffle(2), _relu(), conv(width, width))
+        self.select = _SelectiveKernel(width)
+        self.body = nn.Sequential(*(_ResBlock(width) for _ in range(blocks)))
+        self.enlarge = _Enlargement(width, self.scale)
+        if skip:
+            begin_at_zero(*self.enlarge.pictures)
+
+    def forward(self, spikes: Tensor, flow: Tensor | None = None, static: bool = False) -> Tensor:
+        """Return rgb; a flow changes nothing."""
+        self.check_spikes(spikes)
+        height, width = spikes.shape[-2:]
+        spikes = mirror_to_multiple(spikes, 8).to(self.align.cascade.weight.dtype)
+        raws = decode_pictures(spikes, self.times, self.alpha, self.decoder, self.tfp_window)  # (B, T, H, W)
+        packed = split_bayer(raws, self.pattern).movedim(0, 2)  # (B, T, 4, H / 2, W / 2)
+        fused = self._fuse(*self._align(raws.unsqueeze(2), packed))
+        middle = _FRAMES // 2
+        rgb = self.enlarge(self.body(fused), raws[:, middle : middle + 1], packed[:, middle])
+        rgb = rgb[..., : self.scale * height, : self.scale * width]
+        if self.skip:
+            rgb = rgb + enlarged_raw(raws[:, middle, :height, :width], self.pattern, self.scale)
+        return rgb.to(spikes.dtype)
+
+    def _align(self, raws: Tensor, packed: Tensor) -> tuple[Tensor, Tensor]:
+        """Features of both branches as they are in the middle, (B, T, C, H, W) and (B, T, C, H / 2, W / 2)."""
+        levels = []
+        for features, planes in ((self.raw_features, raws), (self.packed_features, packed)):
+            found = features(planes.flatten(0, 1))
+            levels.append([level.unflatten(0, planes.shape[:2]) for level in found])
+        middle = [level[:, _FRAMES // 2] for level in levels[1]]
+        aligned = [
+            self.align(*([level[:, n] for level in branch] for branch in levels), middle) for n in range(_FRAMES)
+        ]
+        return tuple(torch.stack(branch, dim=1) for branch in zip(*aligned, strict=True))
+
+    def _fuse(self, raw: Tensor, packed: Tensor) -> Tensor:
+        """Bring the times and the branches together: (B, C, H, W)."""
+        times = raw.shape[:2]
+        told_raw = self.to_raw(packed.flatten(0, 1)).unflatten(0, times)
+        told_packed = self.to_packed(raw.flatten(0, 1)).unflatten(0, times)
+        raw = self.fuse_raw(self.raw_attention(torch.cat([raw, told_raw], dim=1)), _FRAMES // 2)
+        packed = self.fuse_packed(self.packed_attention(torch.cat([packed, told_packed], dim=1)), _FRAMES // 2)
+        return self.select(raw, self.enlarge_packed(packed))
+
+
+def _relu() -> nn.LeakyReLU:
+    return nn.LeakyReLU(0.1)
+
+
+class _ResBlock(nn.Module):
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.body = nn.Sequential(conv(width, width), _relu(), conv(width, width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.body(x)
+
+
+class _Pyramid(nn.Module):
+    """Features on three levels, each half as large as the one before."""
+
+    def __init__(self, inputs: int, width: int, blocks: int) -> None:
+        super().__init__()
+        self.first = nn.Sequential(conv(inputs, width), _relu(), *(_ResBlock(width) for _ in range(blocks)))
+        self.shrink = nn.ModuleList(
+            nn.Sequential(nn.Conv2d(width, width, 3, 2, 1), _relu(), conv(width, width), _relu())
+            for _ in range(_LEVELS - 1)
+        )
+
+    def forward(self, planes: Tensor) -> list[Tensor]:
+        levels = [self.first(planes)]
+        for shrink in self.shrink:
+            levels.append(shrink(levels[-1]))
+        return levels
+
+
+class _Alignment(nn.Module):
+    """Pyramid, cascading and deformable alignment (EDVR) of two branches, one of which finds the offsets for both."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.compare = nn.ModuleList(conv(2 * width, width) for _ in range(_LEVELS))
+        self.join_offsets = nn.ModuleList(conv(2 * width, width) for _ in range(_LEVELS - 1))
+        self.offsets = nn.ModuleList(conv(width, width) for _ in range(_LEVELS))
+        self.move = nn.ModuleList(DeformableConv2d(width) for _ in range(_LEVELS))
+        self.join_features = nn.ModuleList(conv(2 * width, width) for _ in range(_LEVELS - 1))
+        self.compare_again, self.offsets_again = conv(2 * width, width), conv(width, width)
+        self.cascade = DeformableConv2d(width)
+        self.act = _relu()
+
+    def forward(self, raw: list[Tensor], packed: list[Tensor], middle: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Move what two branches have of one time to the middle, of which the packed branch is given."""
+        guide, moved = None, []
+        for level in reversed(range(_LEVELS)):
+            found = self.act(self.compare[level](torch.cat([packed[level], middle[level]], dim=1)))
+            if guide is not None:
+                found = self.act(self.join_offsets[level](torch.cat([found, 2 * enlarge(guide, 2)], dim=1)))
+            guide = self.act(self.offsets[level](found))
+            branches = []
+            for n, (branch, where) in enumerate(((raw, 2 * enlarge(guide, 2)), (packed, guide))):
+                features = self.move[level](branch[level], where)
+                if moved:
+                    features = self.join_features[level](torch.cat([features, enlarge(moved[n], 2)], dim=1))
+                branches.append(self.act(features) if level else features)
+            moved = branches
+        found = self.act(self.compare_again(torch.cat([moved[1], middle[0]], dim=1)))
+        guide = self.act(self.offsets_again(found))
+        return self.act(self.cascade(moved[0], 2 * enlarge(guide, 2))), self.act(self.cascade(moved[1], guide))
+
+
+class _TemporalAttention(nn.Module):
+    """Every map plus what it has in common with the others, from nothing on."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gamma = nn.Parameter(torch.zeros(1))
+
+    def forward(self, maps: Tensor) -> Tensor:
+        rows = maps.flatten(2).unsqueeze(1)  # one head
+        return maps + self.gamma * F.scaled_dot_product_attention(rows, rows, rows).squeeze(1).reshape(maps.shape)
+
+
+class _Fusion(nn.Module):
+    """Fusion with temporal and spatial attention (EDVR): (B, T, C, H, W) to (B, C, H, W), H and W divisible by 4."""
+
+    def __init__(self, times: int, width: int) -> None:
+        super().__init__()
+        self.middle, self.each = conv(width, width), conv(width, width)
+        self.merge = nn.Conv2d(times * width, width, 1)
+        self.look = nn.Conv2d(times * width, width, 1)
+        self.shrink = nn.Conv2d(2 * width, width, 1)
+        self.narrow = nn.Conv2d(width, width, 1)
+        self.shrink_again = conv(2 * width, width)
+        self.wide = conv(width, width)
+        self.near = conv(width, width)
+        self.join = nn.Conv2d(width, width, 1)
+        self.scale = conv(width, width)
+        self.shift = nn.Sequential(nn.Conv2d(width, width, 1), _relu(), nn.Conv2d(width, width, 1))
+        self.act = _relu()
+
+    def forward(self, maps: Tensor, middle: int) -> Tensor:
+        each = self.each(maps.flatten(0, 1)).unflatten(0, maps.shape[:2])
+        likeness = (each * self.middle(maps[:, middle]).unsqueeze(1)).sum(dim=2, keepdim=True).sigmoid()
+        maps = (maps * likeness).flatten(1, 2)
+        near = self.act(self.shrink(_pooled(self.act(self.look(maps)))))
+        far = self.act(self.wide(self.act(self.shrink_again(_pooled(self.act(self.narrow(near)))))))
+        seen = self.act(self.join(self.act(self.near(near)) + enlarge(far, 2)))
+        seen = self.scale(enlarge(seen, 2))
+        return self.act(self.merge(maps)) * 2 * seen.sigmoid() + self.shift(seen)
+
+
+def _pooled(maps: Tensor) -> Tensor:
+    """Maxima and means of half the size, side by side."""
+    return torch.cat([F.max_pool2d(maps, 3, 2, 1), F.avg_pool2d(maps, 3, 2, 1)], dim=1)
+
+
+class _SelectiveKernel(nn.Module):
+    """Two branches weighed channel by channel, going by the mean of both over the picture (Li et al., CVPR 2019)."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.squeeze = nn.Linear(width, 32)
+        self.weigh = nn.ModuleList(nn.Linear(32, width) for _ in range(2))
+
+    def forward(self, *branches: Tensor) -> Tensor:
+        seen = self.squeeze(sum(branches).mean(dim=(-2, -1)))
+        weights = torch.stack([weigh(seen) for weigh in self.weigh]).softmax(dim=0)[..., None, None]
+        return sum(weight * branch for weight, branch in zip(weights, branches, strict=True))
+
+
+class _Enlargement(nn.Module):
+    """From features to the picture, x4 in two steps; the middle mosaic of either branch has a way of its own to it."""
+
+    def __init__(self, width: int, scale: int) -> None:
+        super().__init__()
+        steps = [2, 2] if scale == 4 else [scale]
+        self.up = nn.ModuleList(_sub_pixel(width, width, step) for step in steps)
+        self.last = nn.Sequential(conv(width, width), _relu(), conv(width, 3))
+        wide = steps[0] if len(steps) > 1 else 1
+        self.raw = _sub_pixel(1, width, wide)
+        self.packed = nn.Sequential(_sub_pixel(4, width, 2), *(_sub_pixel(width, width, step) for step in steps[:-1]))
+        self.raw_picture, self.packed_picture = (_sub_pixel(width, 3, steps[-1]) for _ in range(2))
+        self.act = _relu()
+
+    @property
+    def pictures(self) -> list[nn.Conv2d]:
+        """The convolutions whose results add up to the picture."""
+        return [self.last[-1], self.raw_picture[0], self.packed_picture[0]]
+
+    def forward(self, features: Tensor, raw: Tensor, packed: Tensor) -> Tensor:
+        raw, packed = self.raw(raw), self.packed(packed)
+        for n, up in enumerate(self.up):
+            features = self.act(up(features))
+            if n + 1 < len(self.up):
+                features = features + raw + packed
+        return self.last(features) + self.raw_picture(self.act(raw)) + self.packed_picture(self.act(packed))
+
+
+def _sub_pixel(inputs: int, outputs: int, scale: int) -> nn.Sequential:
+    return nn.Sequential(conv(inputs, scale**2 * outputs), nn.PixelShuffle(scale))

@@ -1,0 +1,108 @@
+"""Configuration of CSCSR, a frozen dataclass."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from lightning_modules.networks.configuration import check_fields
+
+
+@dataclass(frozen=True)
+class CSCSRConfig:
+    """What a :class:`lightning_modules.networks.CSCSR` is made of: a YAML file fills it, and weights carry it.
+
+    Widths and depths are not in the paper; the defaults are size paper_base of this project, see ``configs/size``. The
+    fields from ``representation`` to ``reconstruction`` are the ablations of the paper's Table 3, see
+    ``configs/ablation``; the defaults are the full network (J).
+
+    Args:
+        scale: super-resolution factor s.
+        frames: spike frames N of a clip, odd.
+        window: spike frames that a time point sees, odd.
+        stride: spike frames between two time points; must divide frames - window.
+        pattern: Bayer phase of the streams.
+        width: channels of refinement and reconstruction.
+        representation_width: channels of the spike representation, at sensor resolution.
+        features: channels of every time point that are warped.
+        stages: fusions of the colours.
+        blocks: residual blocks of every colour before every fusion.
+        end_blocks: residual blocks after the last fusion.
+        end_width: channels after the last fusion; when not given, ``width``.
+        skip: learn what to add to a smooth, enlarged TFP picture instead of the picture itself. The paper has no
+            such skip; with it training starts where the classical decoder ends.
+        alpha: gain of the camera, what a white pixel receives per clock in thresholds. The skip divides by it; weights
+            trained with another are adapted when they are loaded.
+        neighbors: known pixels that the temporal pixel search weighs.
+        representation: features of a time point: ``"bssr"`` learns them; ``"spikes"``, without BSSR (A), averages the
+            spikes of the window; ``"interval"`` (C) takes the inverse of the spike interval. These two have no weights
+            and one feature.
+        global_perception: BSSR sees the whole clip beside the window; False is B.
+        motion_fusion: where no flow is given, ``"joint"`` moves all colours alike; ``"independent"`` (D) moves each
+            by the flow of its own sub-stream, green by the mean of its two; ``"assembled"`` (E) puts the sub-streams'
+            flows together as their pixels are in the Bayer pattern.
+        search: temporal pixel search along the motion. Without it no motion is estimated, a given one is ignored, and
+            the features of every time point are only enlarged; without refinement as well it is F, no MSR.
+        refinement: FR; False is G, which merges the time points by one convolution.
+        reconstruction: ``"correlated"`` is CCR; ``"separate"`` (H) lets every colour make its channel by itself;
+            ``"early"`` (I) fuses the colours once, at the beginning.
+        resolution: where refinement and reconstruction work. ``"output"`` is that of the picture, as in the paper;
+            ``"sensor"`` that of the sensor, with the s x s temporal pixels of a site as channels and a sub-pixel
+            convolution at the end: the same width then costs 1 / s^2 of the work.
+
+    Raises:
+        ValueError: sizes that do not fit each other, an unknown choice, or choices that would have no effect:
+            ``global_perception=False`` without BSSR, a ``motion_fusion`` without search, an ``end_width`` of separate
+            colours.
+
+    Example:
+        >>> CSCSRConfig(scale=2).times
+        (5, 8, 11, 14, 17, 20, 23, 26, 29, 32, 35)
+    """
+
+    scale: int = 4
+    frames: int = 41
+    window: int = 11
+    stride: int = 3
+    pattern: str = "RGGB"
+    width: int = 32
+    representation_width: int = 32
+    features: int = 4
+    stages: int = 3
+    blocks: int = 1
+    end_blocks: int = 3
+    end_width: int | None = None
+    skip: bool = False
+    alpha: float = 0.4
+    neighbors: int = 4
+    representation: Literal["bssr", "spikes", "interval"] = "bssr"
+    global_perception: bool = True
+    motion_fusion: Literal["joint", "independent", "assembled"] = "joint"
+    search: bool = True
+    refinement: bool = True
+    reconstruction: Literal["correlated", "separate", "early"] = "correlated"
+    resolution: Literal["output", "sensor"] = "output"
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        frames, window, stride = self.frames, self.window, self.stride
+        if frames % 2 == 0 or window % 2 == 0 or window >= frames or (frames - window) % stride:
+            raise ValueError(
+                "frames, window, stride: expected odd frames and window, and a stride that divides frames - window, "
+                f"got {frames}, {window}, {stride}"
+            )
+        if self.representation != "bssr" and not self.global_perception:
+            raise ValueError(
+                f"global_perception: part of representation bssr, cannot be taken from {self.representation}"
+            )
+        if self.motion_fusion != "joint" and not self.search:
+            raise ValueError(
+                f"motion_fusion: expected joint without search, which asks for no motion, got {self.motion_fusion}"
+            )
+        if self.end_width is not None and self.reconstruction == "separate":
+            raise ValueError(f"end_width: separate colours are never fused, expected none, got {self.end_width}")
+
+    @property
+    def times(self) -> tuple[int, ...]:
+        """Centres of the windows, in spike frames."""
+        return tuple(range(self.window // 2, self.frames - self.window // 2, self.stride))

@@ -1,0 +1,76 @@
+"""The weights that come with the package, by name."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from functools import lru_cache
+from math import prod
+from pathlib import Path
+
+from safetensors import safe_open
+
+FOLDER = Path(__file__).parent / "weights"
+
+
+@dataclass(frozen=True)
+class Pretrained:
+    """Weights that come with the package: a row of ``weights/index.csv``.
+
+    Args:
+        name: what ``from_pretrained`` and ``--model.weights`` call them, such as ``"cscsr_small_x4"``.
+        path: their file.
+        former: an older name, which goes on working; None where there is none.
+        scale: super-resolution factor; None for an estimator of motion.
+        size: of the network, as in ``configs/size``; None for an estimator of motion.
+    """
+
+    name: str
+    path: Path
+    former: str | None = None
+    scale: int | None = None
+    size: str | None = None
+
+    @property
+    def parameters(self) -> int:
+        """How many numbers were learned, an estimator of motion inside included."""
+        with safe_open(self.path, "pt") as file:
+            return sum(prod(file.get_slice(name).get_shape()) for name in file.keys())  # noqa: SIM118
+
+
+@lru_cache(maxsize=1)
+def _index() -> tuple[Pretrained, ...]:
+    with open(FOLDER / "index.csv", newline="") as file:
+        return tuple(
+            Pretrained(
+                row["name"],
+                FOLDER / row["file"],
+                row["former"] or None,
+                int(row["scale"]) if row["scale"] else None,
+                row["size"] or None,
+            )
+            for row in csv.DictReader(file)
+        )
+
+
+def list_pretrained(scale: int | None = None) -> list[Pretrained]:
+    """List the weights that come with the package, smaller scales and smaller networks first.
+
+    Args:
+        scale: only those of this super-resolution factor; when not given, all, and the estimators of motion.
+
+    Example:
+        >>> [(weights.name, weights.scale, weights.size, weights.parameters) for weights in list_pretrained(4)][:2]
+        [('cscsr_tiny_x4', 4, 'tiny', 300963), ('cscsr_small_x4', 4, 'small', 1080294)]
+    """
+    return [weights for weights in _index() if scale is None or weights.scale == scale]
+
+
+def shipped_weights() -> dict[str, Path]:
+    """Return the files of weights that come with the package, by name."""
+    return {weights.name: weights.path for weights in _index()}
+
+
+def find_shipped(name: str) -> Pretrained | None:
+    """Find weights that come with the package, by their name or a former one."""
+    return next((weights for weights in _index() if name in (weights.name, weights.former)), None)

@@ -1,0 +1,171 @@
+"""Settings stored with weights: known classes, known arguments, plain values with bounds."""
+
+from __future__ import annotations
+
+import math
+import types
+from collections.abc import Mapping, Sequence
+from inspect import signature
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin
+
+import torch
+from torch import Tensor, nn
+
+_DEEPEST, _MOST, _LONGEST = 16, 1000, 1000  # of plain values: nesting, items of a list or dictionary, characters
+_LARGEST = 4096  # of whole numbers that are not listed here
+_LARGEST_OF = {
+    "scale": 16,
+    "stages": 16,
+    "blocks": 32,
+    "end_blocks": 64,
+    "groups": 16,
+    "layers": 16,
+    "low": 16,
+    "high": 16,
+    "neighbors": 16,
+    "maps": 64,
+    "corrections": 16,
+    "order": 16,
+    "levels": 8,
+    "radius": 16,
+    "iterations": 64,
+    "warps": 100,
+}
+_ITEMS = 16  # of a list of whole numbers
+_NOT_STORED = ("weights",)  # would make one file read another
+
+
+def own_class(
+    settings: Mapping[str, Any], source: str | Path, kinds: Mapping[str, type[nn.Module]]
+) -> tuple[type[nn.Module], dict[str, Any]]:
+    """Return the class that stored settings name and the arguments to build it with.
+
+    Args:
+        settings: ``"class"``, the name of a network or an estimator of this package, and its arguments.
+        source: the file that they come from.
+        kinds: the classes that the file may name, by name.
+
+    Raises:
+        ValueError: another class, an argument that it does not take, or a value that is not of the argument's type or
+            too large; the message is one line and names the file.
+    """
+    name = settings.get("class")
+    kind = kinds.get(name) if isinstance(name, str) else None
+    if kind is None:
+        raise ValueError(f"{source}: class: expected one of {', '.join(kinds)}, got {_short(name)}")
+    arguments = {key: value for key, value in settings.items() if key != "class"}
+    parameters = signature(kind, eval_str=True).parameters
+    known = {key: parameter.annotation for key, parameter in parameters.items() if key not in _NOT_STORED}
+    for key, value in arguments.items():
+        if key not in known:
+            hint = "written by another version of this package?"
+            raise ValueError(f"{source}: {name} takes no {_short(key)} out of a file ({hint})")
+        most = _LARGEST_OF.get(key, _LARGEST)
+        if not _fits(value, known[key], most):
+            raise ValueError(
+                f"{source}: {key} of {name}: expected {_said(known[key])}, at most {most}, got {_short(value)}"
+            )
+    return kind, arguments
+
+
+def check_shapes(
+    settings: Mapping[str, Any],
+    tensors: Mapping[str, Tensor],
+    source: str | Path,
+    kinds: Mapping[str, type[nn.Module]],
+) -> None:
+    """Compare weights with the network that they are said to be of, before that takes any memory.
+
+    Args:
+        settings: as for :func:`own_class`.
+        tensors: weights by name, without those of an estimator inside a network.
+        source: the file that they come from.
+        kinds: as for :func:`own_class`.
+
+    Raises:
+        ValueError: as :func:`own_class`, settings that contradict each other, or other names, shapes or kinds of
+            numbers; the message is one line and names the file.
+    """
+    kind, arguments = own_class(settings, source, kinds)
+    try:
+        with torch.device("meta"):
+            expected = kind(**arguments).state_dict()
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{source}: settings that do not make a {kind.__name__} ({_one_line(error)})") from error
+    for name in sorted(expected.keys() | tensors.keys()):
+        wanted, got = expected.get(name), tensors.get(name)
+        if wanted is None or got is None:
+            trouble = "missing" if got is None else "unknown"
+        elif wanted.shape != got.shape:
+            trouble = f"expected {tuple(wanted.shape)}, got {tuple(got.shape)}"
+        elif wanted.is_floating_point() != got.is_floating_point():
+            trouble = f"expected {wanted.dtype}, got {got.dtype}"
+        else:
+            continue
+        raise ValueError(f"{source}: weights that do not fit ({_short(name)[1:-1]}: {trouble})")
+
+
+def check_plain(name: str, value: Any, depth: int = 0) -> None:
+    """Refuse anything but finite numbers, short texts, and short lists and dictionaries of them.
+
+    Args:
+        name: what it is called.
+        value: what a file says.
+        depth: of the nesting around it.
+
+    Raises:
+        ValueError: something else; the message is one line.
+    """
+    good = value is None or type(value) in (bool, int)
+    if isinstance(value, float):
+        good = math.isfinite(value)
+    elif isinstance(value, str):
+        good = len(value) <= _LONGEST and value.isprintable()
+    elif isinstance(value, (dict, list, tuple)) and depth < _DEEPEST and len(value) <= _MOST:
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        for key, item in items:
+            if isinstance(value, dict) and not (isinstance(key, str) and key.isprintable() and len(key) <= _LONGEST):
+                raise ValueError(f"{name}: expected names, got {_short(key)}")
+            check_plain(f"{name}.{key}"[:_LONGEST], item, depth + 1)
+        good = True
+    if not good:
+        raise ValueError(f"{name[:80]}: expected plain values, got {_short(value)}")
+
+
+def _fits(value: Any, hint: Any, most: int) -> bool:
+    """Say whether a value is of the type of an argument, and no larger than it may be."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin in (Union, types.UnionType):
+        return any(_fits(value, choice, most) for choice in inner)
+    if origin is Literal:
+        return any(type(value) is type(choice) and value == choice for choice in inner)
+    if origin in (list, tuple, Sequence):
+        return (
+            isinstance(value, (list, tuple)) and len(value) <= _ITEMS and all(_fits(n, inner[0], most) for n in value)
+        )
+    if hint is float:
+        return type(value) in (int, float) and abs(value) <= most
+    if hint is int:
+        return type(value) is int and abs(value) <= most
+    if hint is str:
+        return isinstance(value, str) and len(value) <= _LONGEST
+    return hint in (bool, types.NoneType) and type(value) is hint
+
+
+def _said(hint: Any) -> str:
+    return hint.__name__ if isinstance(hint, type) and not get_args(hint) else str(hint).replace("typing.", "")
+
+
+def _short(value: Any) -> str:
+    """Return a value for a message of one line; a tensor or a long list would fill pages."""
+    if not isinstance(value, (str, int, float, bool, types.NoneType)):
+        return f"a {type(value).__name__}"
+    if isinstance(value, int) and value.bit_length() > 200:
+        return f"a number of {value.bit_length()} bits"
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:300]

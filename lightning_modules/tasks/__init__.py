@@ -1,0 +1,1 @@
+"""LightningModules: super-resolution and optical flow."""

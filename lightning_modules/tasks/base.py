@@ -1,0 +1,84 @@
+"""Base class of the LightningModules: optimizer, schedule, checkpoints that know their network."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import torch
+from pytorch_lightning import Callback, LightningModule
+from pytorch_lightning.cli import LRSchedulerCallable, OptimizerCallable
+from torch import nn
+
+from lightning_modules.checkpoint import read_checkpoint
+from lightning_modules.pretrained import check_settings, motion_of, settings_of
+
+
+def step_schedule(optimizer: torch.optim.Optimizer) -> torch.optim.lr_scheduler.StepLR:
+    """Times 0.8 every 7500 steps, as in the paper."""
+    return torch.optim.lr_scheduler.StepLR(optimizer, 7500, 0.8)
+
+
+class Learner(LightningModule):
+    """Base of the LightningModules.
+
+    Args:
+        network: what learns; its ``settings`` say, as plain values, what it was built with.
+        needs: options of the data, by name, that must be as they are here.
+        optimizer: builds the optimizer from the parameters.
+        lr_scheduler: builds the schedule from the optimizer, counted in steps.
+
+    Attributes:
+        recipe: what a configuration says of optimizer and schedule, which ``lightning fit`` fills in; a checkpoint
+            remembers it, because it goes on with its own.
+    """
+
+    #: the figure of validation that says which checkpoint is the best, and whether it is the "min" or the "max"
+    best: ClassVar[tuple[str, str]]
+    #: shows clips of every validation in TensorBoard
+    pictures: ClassVar[type[Callback]]
+    #: prints the table of ``test``; made with the folder of the run
+    report: ClassVar[type[Callback]]
+
+    def __init__(
+        self, network: nn.Module, needs: dict[str, Any], optimizer: OptimizerCallable, lr_scheduler: LRSchedulerCallable
+    ) -> None:
+        super().__init__()
+        self.network = network
+        self.needs = needs
+        self.make_optimizer = optimizer
+        self.make_lr_scheduler = lr_scheduler
+        self.recipe: dict[str, Any] = {}
+
+    @classmethod
+    def load_from_checkpoint(cls, checkpoint_path: str | Path, **arguments: Any) -> Self:
+        """Build a module from arguments and give it the weights of a checkpoint; nothing else is taken out of that.
+
+        Args:
+            checkpoint_path: a checkpoint of ``lightning fit``.
+            arguments: those of the constructor; Lightning would take them out of the file, and build what it names.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: the file is damaged or of something else.
+        """
+        checkpoint = read_checkpoint(checkpoint_path)
+        module = cls(**arguments)
+        module.on_load_checkpoint(checkpoint)
+        module.load_state_dict(checkpoint["state_dict"])
+        return module
+
+    def configure_optimizers(self) -> Any:  # noqa: D102
+        optimizer = self.make_optimizer(self.network.parameters())
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": self.make_lr_scheduler(optimizer), "interval": "step"},
+        }
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:  # noqa: D102
+        checkpoint["network"] = settings_of(self.network)
+        checkpoint["motion"] = motion_of(self.network)
+        checkpoint["recipe"] = self.recipe
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:  # noqa: D102
+        check_settings(self.network, checkpoint.get("network", {}), "the checkpoint")

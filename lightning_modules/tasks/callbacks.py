@@ -1,0 +1,168 @@
+"""Callbacks for super-resolution: pictures in TensorBoard, the table of a test, the pictures of a prediction."""
+
+from __future__ import annotations
+
+import csv
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from pytorch_lightning import Callback, LightningModule, Trainer
+from pytorch_lightning.loggers import TensorBoardLogger
+from torch import Tensor
+
+from lightning_modules.metrics.image import measures, why_no_lpips
+from lightning_modules.networks import ClassicalDecoder
+from spikekit import panel, write_picture
+from spikekit.io.whole_file import whole_file
+from spikekit.tables import table
+
+_MOST_TABLES = 20
+
+
+class ValidationPictures(Callback):
+    """Show the first clips of every validation in TensorBoard: decoded input (TFI), result and truth side by side.
+
+    Args:
+        clips: how many.
+    """
+
+    title = "tfi, result, truth"
+
+    def __init__(self, clips: int = 4) -> None:
+        self.clips = clips
+        self._rows: list[list[Tensor]] = []
+
+    def rows(self, module: LightningModule, outputs: Any, batch: dict[str, Tensor]) -> list[list[Tensor]]:
+        """Return the pictures of every clip of a batch."""
+        settings = module.network.settings
+        decoded = ClassicalDecoder("tfi", settings["scale"], settings["pattern"], settings["alpha"])(batch["spikes"])
+        return [list(row) for row in zip(decoded.clamp(0, 1), outputs, batch["rgb"], strict=True)]
+
+    def on_validation_batch_end(  # noqa: D102
+        self, trainer: Trainer, module: LightningModule, outputs: Any, batch: dict[str, Tensor], *_: Any
+    ) -> None:
+        if len(self._rows) < self.clips:
+            self._rows += self.rows(module, outputs, batch)[: self.clips - len(self._rows)]
+
+    def on_validation_epoch_end(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
+        if self._rows and isinstance(trainer.logger, TensorBoardLogger) and trainer.is_global_zero:
+            picture = panel(self._rows)
+            trainer.logger.experiment.add_image(f"val/{self.title}", picture, trainer.global_step)
+        self._rows = []
+
+
+class TestReport(Callback):
+    """Print one table of a test, every method on the same clips, and write ``test.csv`` and ``test.png``.
+
+    PSNR and SSIM as :func:`spikekit.psnr` and :func:`spikekit.ssim`, averaged over clips, and LPIPS where it is to be
+    had, see :mod:`lightning_modules.metrics.image`. Data that name their clips, in ``test_names``, get a table for each
+    of them, too, where they are no more than 20.
+
+    Args:
+        output: the folder that they are written to.
+        clips: how many clips the picture shows.
+    """
+
+    __test__ = False  # not a test for pytest
+
+    def __init__(self, output: str | Path, clips: int = 6) -> None:
+        self.output = Path(output)
+        self.clips = clips
+
+    def columns(self) -> list[tuple[str, str, int]]:
+        """Columns of ``test.csv``, their headings in the table, and how many digits it shows."""
+        return [(measure.name, measure.heading, measure.digits) for measure in measures()]
+
+    def score(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, list[tuple[float, ...]]]:
+        """Return the measures of every clip of a batch, by method."""
+        truth = batch["rgb"]
+        return {
+            method: list(zip(*(measure.of(rgb, truth).tolist() for measure in measures()), strict=True))
+            for method, rgb in outputs.items()
+        }
+
+    def missing(self) -> str | None:
+        """Return in a line what was not measured, and why."""
+        return why_no_lpips()
+
+    def rows(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> list[list[Tensor]]:
+        """Return the pictures of every clip of a batch: one of every method, and the truth."""
+        return [[rgb.clamp(0, 1).cpu() for rgb in row] for row in zip(*outputs.values(), batch["rgb"], strict=True)]
+
+    def on_test_start(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
+        self._scores: dict[str, list[tuple[float, ...]]] = defaultdict(list)
+        self._rows: list[list[Tensor]] = []
+
+    def on_test_batch_end(  # noqa: D102
+        self, trainer: Trainer, module: LightningModule, outputs: dict[str, Any], batch: dict[str, Tensor], *_: Any
+    ) -> None:
+        for method, scores in self.score(outputs, batch).items():
+            self._scores[method] += scores
+        if len(self._rows) < self.clips:
+            self._rows += self.rows(outputs, batch)[: self.clips - len(self._rows)]
+
+    def on_test_end(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
+        if not trainer.is_global_zero:
+            return
+        clips = len(next(iter(self._scores.values())))
+        named = getattr(trainer.datamodule, "test_names", None)
+        names = range(clips) if named is None else named[:clips]
+        means = {
+            method: torch.tensor(scores, dtype=torch.float64).mean(dim=0).tolist()
+            for method, scores in self._scores.items()
+        }
+        tables = [self._table(f"mean of {clips} clips", means)]
+        if named and clips <= _MOST_TABLES:
+            for clip, name in enumerate(names):
+                tables.append(self._table(name, {method: scores[clip] for method, scores in self._scores.items()}))
+        with whole_file(self.output / "test.csv", "w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(["method", "clip", *(column for column, _, _ in self.columns())])
+            for method, scores in self._scores.items():
+                writer.writerows([method, n, *map(_rounded, score)] for n, score in zip(names, scores, strict=True))
+                writer.writerow([method, "mean", *map(_rounded, means[method])])
+        write_picture(self.output / "test.png", panel(self._rows))
+        missing = self.missing()
+        print("\n" + "\n\n".join([*tables, missing or ""]))  # noqa: T201
+        print(f"{self.output / 'test.csv'}, {self.output / 'test.png'} (columns: {', '.join(self._scores)}, truth)")  # noqa: T201
+
+    def _table(self, clips: str, scores: dict[str, Sequence[float]]) -> str:
+        lines = []
+        for method, values in scores.items():
+            columns = zip(values, self.columns(), strict=True)
+            lines.append([method, *(f"{value:.{digits}f}" for value, (_, _, digits) in columns)])
+        return table([clips, *(title for _, title, _ in self.columns())], lines)
+
+
+def _rounded(value: float) -> str:
+    return f"{value:.4f}"
+
+
+class PredictionPictures(Callback):
+    """Write every predicted picture as PNG, named after the spike frame that it shows.
+
+    Args:
+        output: the folder that they are written to.
+    """
+
+    def __init__(self, output: str | Path) -> None:
+        self.output = Path(output)
+
+    def on_predict_start(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
+        self._written = 0
+
+    def on_predict_batch_end(  # noqa: D102
+        self, trainer: Trainer, module: LightningModule, outputs: Tensor, batch: dict[str, Tensor], *_: Any
+    ) -> None:
+        self._white = batch["white"][0].item()
+        for rgb, frame in zip(outputs, batch["frame"].tolist(), strict=True):
+            write_picture(self.output / f"frame_{frame:06d}.png", trainer.datamodule.show(rgb))
+            self._written += 1
+
+    def on_predict_end(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
+        if trainer.is_global_zero:
+            white = f", {self._white:.4g} spikes a frame are white" if self._written else ""
+            print(f"{self.output}: {self._written} pictures{white}")  # noqa: T201

@@ -1,0 +1,76 @@
+"""Callbacks for optical flow: colour-coded flow in TensorBoard, and the table of a test."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pytorch_lightning import LightningModule
+from torch import Tensor
+
+from lightning_modules.metrics.flow import end_point_error, outliers
+from lightning_modules.tasks.callbacks import TestReport, ValidationPictures
+from spikekit import flow_to_rgb
+
+
+class FlowPictures(ValidationPictures):
+    """Show the first clips of every validation in TensorBoard: the estimated flow to the last time point, and the true.
+
+    The direction is the hue and the length the saturation; both pictures of a clip have one scale.
+
+    Args:
+        clips: how many.
+    """
+
+    title = "flow, truth"
+
+    def rows(self, module: LightningModule, outputs: Any, batch: dict[str, Tensor]) -> list[list[Tensor]]:  # noqa: D102
+        return [flow_row([flow[1]], truth[1]) for flow, truth in zip(outputs, batch["flow"], strict=True)]
+
+
+class FlowReport(TestReport):
+    """Print one table of a test, every estimator on the same clips, and write ``test.csv`` and ``test.png``.
+
+    The end-point error and the share of pixels where it is above one pixel are in sensor pixels, and so are KITTI's
+    outliers, :func:`lightning_modules.metrics.flow.outliers`; both flows of a clip count. The time is that of a batch,
+    shared by its clips.
+
+    Args:
+        output: the folder that they are written to.
+        clips: how many clips the picture shows.
+    """
+
+    def columns(self) -> list[tuple[str, str, int]]:  # noqa: D102
+        return [
+            ("epe", "EPE (px)", 3),
+            ("over_1px", ">1 px (%)", 2),
+            ("outliers", "out (%)", 2),
+            ("milliseconds", "ms/clip", 1),
+        ]
+
+    def missing(self) -> None:
+        """Nothing is missing."""
+
+    def score(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, list[tuple[float, ...]]]:  # noqa: D102
+        truth = batch["flow"]
+        scores = {}
+        for method, (flow, seconds) in outputs.items():
+            error = end_point_error(flow, truth)
+            measures = error, 100 * (error > 1).float(), 100 * outliers(error, truth).float()
+            columns = [measure.flatten(1).mean(dim=1).tolist() for measure in measures]
+            scores[method] = [(*row, 1000 * seconds / len(truth)) for row in zip(*columns, strict=True)]
+        return scores
+
+    def rows(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> list[list[Tensor]]:  # noqa: D102
+        flows = [flow[:, 1] for flow, _ in outputs.values()]
+        return [flow_row(row[:-1], row[-1]) for row in zip(*flows, batch["flow"][:, 1], strict=True)]
+
+
+def flow_row(flows: list[Tensor], truth: Tensor) -> list[Tensor]:
+    """Return pictures of estimated flows (2, H, W) and of the true one, all of one scale: the longest true one.
+
+    Args:
+        flows: the estimates.
+        truth: the true flow.
+    """
+    longest = max(truth.norm(dim=0).max().item(), 1.0)
+    return [flow_to_rgb(flow.float().cpu(), longest) for flow in (*flows, truth)]

@@ -1,0 +1,97 @@
+"""The LightningModule that trains and judges estimators of motion, on clips whose flow is known exactly."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+
+import torch
+from pytorch_lightning.cli import LRSchedulerCallable, OptimizerCallable
+from torch import Tensor, nn
+
+from lightning_modules.metrics.flow import end_point_error, outliers
+from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
+from lightning_modules.tasks.base import Learner, step_schedule
+from lightning_modules.tasks.flow_callbacks import FlowPictures, FlowReport
+from spikekit import bayer_pattern, split_bayer
+
+_DISCOUNT = 0.8  # of every iteration against the one after it
+
+
+# no lambda, so that a module can be pickled
+def _adamw(parameters: Iterable[nn.Parameter]) -> torch.optim.AdamW:
+    return torch.optim.AdamW(parameters, lr=1e-3)
+
+
+class FlowTraining(Learner):
+    """Train Spike2Flow on clips whose flow is known, judge it beside the estimators without weights.
+
+    Every sub-stream learns its own flow, on the way of every iteration: the mean absolute error of the last one counts
+    fully, that of every one before 0.8 times as much (RAFT's sequence loss). The flows on the way to the ends are
+    compared with the shares of the true one that steady motion would have. Validation measures the joint flow, in
+    sensor pixels.
+
+    Args:
+        network: the estimator.
+        frames: spike frames of a clip, odd.
+        window: spike frames that a time point of CSCSR sees, odd: the flow runs from the middle frame to the middle of
+            the first and of the last window.
+        pattern: Bayer phase of the streams; the data's must be the same.
+        optimizer: builds the optimizer from the parameters.
+        lr_scheduler: builds the schedule from the optimizer, counted in steps.
+    """
+
+    best = ("val/epe", "min")
+    pictures = FlowPictures
+    report = FlowReport
+
+    def __init__(
+        self,
+        network: Spike2Flow,
+        frames: int = 41,
+        window: int = 11,
+        pattern: str = "RGGB",
+        optimizer: OptimizerCallable = _adamw,
+        lr_scheduler: LRSchedulerCallable = step_schedule,
+    ) -> None:
+        first, last = window // 2, frames - 1 - window // 2
+        needs = {"pattern": bayer_pattern(pattern), "frames": frames, "flow_times": (first, last)}
+        super().__init__(network, needs, optimizer, lr_scheduler)
+        if frames % 2 == 0 or window % 2 == 0 or not 1 <= window < frames:
+            raise ValueError(f"frames, window: expected odd numbers, window below frames, got {frames}, {window}")
+        if not any(parameter.requires_grad for parameter in network.parameters()):
+            raise ValueError("network: expected one that learns, got a frozen one")
+        self.pattern, self.times = needs["pattern"], (first, frames // 2, last)
+
+    def forward(self, spikes: Tensor) -> Tensor:
+        """Estimate the joint flows to the first and to the last time point, (B, 2, 2, H, W)."""
+        return torch.stack(self.network(spikes, self.times, self.pattern), dim=1)
+
+    def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:  # noqa: D102
+        truth = split_bayer(batch["flow"], self.pattern) / 2  # (4, B, 2, 2, h, w) in Bayer cells
+        flows = self.network.refinements(batch["spikes"], self.times, self.pattern)
+        shares = truth.new_tensor([1 / 3, 2 / 3, 1]).reshape(3, 1, 1, 1)
+        errors = [(flow - shares * truth.unsqueeze(3)).abs().mean() for flow in flows]
+        loss = sum(_DISCOUNT**age * error for age, error in enumerate(reversed(errors)))
+        self.log("train/loss", loss, prog_bar=True)
+        return loss
+
+    def validation_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:  # noqa: D102
+        flow, truth = self(batch["spikes"]), batch["flow"]
+        for name, estimate in (("", flow), ("_zero", torch.zeros_like(flow))):
+            error = end_point_error(estimate, truth)
+            measures = {"epe": error, "over_1px": (error > 1).float(), "outliers": outliers(error, truth).float()}
+            for measure, value in measures.items():
+                self.log(f"val/{measure}{name}", value.mean(), batch_size=len(flow), sync_dist=True)
+        return flow
+
+    def test_step(self, batch: dict[str, Tensor], batch_index: int) -> dict[str, tuple[Tensor, float]]:
+        """Return the joint flows of every estimator, (B, 2, 2, H, W), and the seconds that they took, by name."""
+        results = {}
+        for estimator in (self.network, ClassicalFlow(), ZeroFlow()):
+            start = time.perf_counter()
+            flow = torch.stack(estimator(batch["spikes"], self.times, self.pattern), dim=1)
+            if flow.is_cuda:
+                torch.cuda.synchronize(flow.device)
+            results[type(estimator).__name__] = flow, time.perf_counter() - start
+        return results

@@ -1,0 +1,176 @@
+"""Measure what a tolerance saves and costs, on scenes whose ground truth is known.
+
+``python -m lightning_modules.trade.adaptive WEIGHTS`` prints the table; with ``--fit`` it fits what the tolerance is
+kept by, the constants of ``WEIGHTS``, writes them beside the weights, and prints what held-out clips lose.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from statistics import mean
+
+import torch
+from torch import Tensor
+
+from lightning_modules.data.pictures import cached_picture, embedded_pictures, folder_pictures, split_pictures
+from lightning_modules.error_model import write_error_model
+from lightning_modules.inference.scene_activity import look, required
+from lightning_modules.inference.tiles import forward_in_tiles
+from lightning_modules.networks import CSCSR, Network
+from lightning_modules.pretrained import read_weights
+from lightning_modules.trade import error_fit
+from lightning_modules.trade.error_fit import Clip, Errors, fit_error_model, loss, make_clips, measure_errors
+from spikekit import psnr
+from spikekit.arguments import whole
+from spikekit.scenes.analytic import Layer, Motion, Scene
+from spikekit.sensor.simulate import simulate_spikes
+from spikekit.timing import interleave, ratio, timer_of
+
+TOLERANCES = 0.05, 0.1, 0.5, 1.0
+_LEGEND = """time: as a share of that without a tolerance (least to most of {rounds} rounds; {timer}).
+network, motion: share of the cells that get them. look: share of the time that is spent on looking.
+loss: fall of the PSNR against the truth, in dB; it should stay below the tolerance.
+"""
+
+
+def scenes(ground: Tensor, thing: Tensor, height: int, width: int, scale: int) -> Iterator[tuple[str, Scene]]:
+    """Yield three scenes of so many sensor pixels and their names: still, mixed, fast.
+
+    Args:
+        ground: ``rgb`` of the background, mirrored where it ends.
+        thing: ``rgb`` of the object that moves over a still background, by 3 sensor pixels to the last time point.
+        height: rows of the sensor.
+        width: columns of the sensor.
+        scale: how many view pixels a sensor pixel is wide.
+    """
+    side = scale * min(height, width) // 4
+    thing = thing[:, :side, :side]
+    y, x = (torch.linspace(-1, 1, length) for length in thing.shape[1:])
+    disc = (y[:, None].square() + x.square() <= 1).to(thing)
+    position = scale * width // 3, scale * height // 3
+    moving = Layer(thing, Motion(velocity=(0.2 * scale, 0.1 * scale)), position, disc)
+    view = scale * height, scale * width
+    yield "still", Scene([Layer(ground)], *view)
+    yield "mixed", Scene([Layer(ground), moving], *view)
+    yield "fast", Scene([Layer(ground, Motion(velocity=(0.4 * scale, 0.2 * scale)))], *view)
+
+
+def rows(
+    network: Network, scene: Scene, tolerances: Sequence[float], tile: int, rounds: int
+) -> Iterator[tuple[float, ...]]:
+    """Yield tolerance, time (median, least and most), network, motion, look and loss; the legend says what they are."""
+    settings = network.settings
+    light = scene.light(network.pattern, scale=network.scale, alpha=settings["alpha"])
+    spikes = simulate_spikes(light, generator=torch.Generator().manual_seed(0))[None]
+    truth = scene.rgb(scene.middle)[None]
+    seeing = partial(look, spikes, network.scale, network.pattern, settings["alpha"], network.error_model)
+    runs = {value: partial(forward_in_tiles, network, spikes, tile, value) for value in (0.0, *tolerances)}
+    timer, _ = timer_of(spikes.device, torch.get_num_threads())
+    times = interleave({**runs, -1.0: seeing}, rounds, timer)
+    best = psnr(runs[0.0]().clamp(0, 1), truth).item()
+    for value in tolerances:
+        cells = (part.float().mean().item() for part in required(seeing(), value))
+        lost = best - psnr(runs[value]().clamp(0, 1), truth).item()
+        yield value, *ratio(times[value], times[0.0]), *cells, ratio(times[-1.0], times[value]).median, lost
+
+
+def fit(sources: Sequence[str], pictures: Sequence[Path], held_out: Sequence[Path], count: int) -> Iterator[str]:
+    """Fit the error models of weights, write them beside the weights, and yield the lines of a table.
+
+    Args:
+        sources: names or files of safetensors. Those whose networks take the same clips share them.
+        pictures: what the clips show that are fitted.
+        held_out: what the others show.
+        count: how many clips there are of either.
+
+    Raises:
+        FileNotFoundError: neither a file nor the name of one.
+        ValueError: weights that are in no file of safetensors, or whose networks are not run in tiles.
+    """
+    groups: dict[tuple, list[tuple[str, Path, Network]]] = {}
+    for source in sources:
+        path, network = read_weights(source).source, CSCSR.from_pretrained(source)
+        if path.suffix != ".safetensors":
+            raise ValueError(f"{source}: expected a file of safetensors, such as lightning export writes")
+        alike = network.scale, network.pattern, network.settings["alpha"], network.frames
+        groups.setdefault(alike, []).append((source, path, network))
+    yield "| weights | tolerance | worst loss | mean loss | network | motion |"
+    yield "|---|---|---|---|---|---|"
+    for alike, members in groups.items():
+        fitted, others = (_errors(members, make_clips(shown, count, *alike)) for shown in (pictures, held_out))
+        for source, path, _ in members:
+            model = fit_error_model(fitted[source])
+            write_error_model(path, model)
+            for tolerance in error_fit.TOLERANCES:
+                losses, some, moving = zip(*(loss(clip, model, tolerance) for clip in others[source]), strict=True)
+                shares = f"{mean(losses):.3f} | {mean(some):.0%} | {mean(moving):.0%}"
+                yield f"| {source} | {tolerance:g} | {max(losses):.3f} | {shares} |"
+
+
+def _errors(members: Sequence[tuple[str, Path, Network]], clips: Iterable[Clip]) -> dict[str, list[Errors]]:
+    found: dict[str, list[Errors]] = {source: [] for source, _, _ in members}
+    for clip in clips:
+        flows: dict[tuple[int, int, int], Tensor] = {}
+        for source, _, network in members:
+            if network.flow_times not in flows:
+                flows[network.flow_times] = network.estimate_flow(clip.spikes)
+            found[source].append(measure_errors(network, clip, flows[network.flow_times]))
+    return found
+
+
+def _tile(text: str) -> int:
+    side = whole(0)(text)
+    if side % 2:
+        raise argparse.ArgumentTypeError(f"expected an even number of sensor pixels, or 0 for no tiles, got {text}")
+    return side
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(prog="python -m lightning_modules.trade.adaptive", description=__doc__)
+    parser.add_argument(
+        "weights", nargs="+", help="those of CSCSR: names, files of safetensors or, without --fit, checkpoints"
+    )
+    parser.add_argument(
+        "--pictures", help="folder of pictures; without it, those of scikit-image, held-out ones for the table"
+    )
+    parser.add_argument(
+        "--fit", action="store_true", help="fit the constants of the weights, and write them beside them"
+    )
+    parser.add_argument(
+        "--clips", type=whole(1), default=8, help="with --fit: clips that are fitted, and as many others"
+    )
+    parser.add_argument("--height", type=int, default=250, help="sensor rows")
+    parser.add_argument("--width", type=int, default=400, help="sensor columns")
+    parser.add_argument("--tile", type=_tile, default=128, help="as of lightning predict")
+    parser.add_argument("--rounds", type=int, default=3, help="timings of each")
+    parser.add_argument("--tolerances", type=float, nargs="+", default=TOLERANCES, metavar="DB")
+    args = parser.parse_args(arguments)
+    given = None if args.pictures is None else folder_pictures(args.pictures)
+    if args.fit:
+        shown, others = (
+            (embedded_pictures(), embedded_pictures(held_out=True)) if given is None else split_pictures(given, 0)
+        )
+        for line in fit(args.weights, shown, others, args.clips):
+            print(line, flush=True)  # noqa: T201
+        return
+    pictures = embedded_pictures(held_out=True) if given is None else given
+    ground, thing = (cached_picture(pictures[i % len(pictures)]) for i in (0, 1))
+    _, timer = timer_of(torch.device("cpu"), torch.get_num_threads())
+    print(_LEGEND.format(rounds=args.rounds, timer=timer))  # noqa: T201
+    for weights in args.weights:
+        print(f"| {weights} | tolerance | time | network | motion | look | loss |\n|---|---|---|---|---|---|---|")  # noqa: T201
+        network = CSCSR.from_pretrained(weights)
+        for name, scene in scenes(ground, thing, args.height, args.width, network.scale):
+            for value, median, least, most, some, moving, seen, lost in rows(
+                network, scene, args.tolerances, args.tile, args.rounds
+            ):
+                shares = f"{median:.2f} ({least:.2f} to {most:.2f}) | {some:.0%} | {moving:.0%} | {seen:.1%}"
+                print(f"| {name} | {value:g} | {shares} | {lost:.3f} |", flush=True)  # noqa: T201
+
+
+if __name__ == "__main__":
+    main()

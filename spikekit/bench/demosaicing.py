@@ -1,0 +1,103 @@
+"""How good the demosaicings are: pictures whose truth is known, as mosaics and as TFI of what a camera sees of films.
+
+``python -m spikekit.bench.demosaicing --pictures FOLDER --films FOLDER`` prints the table.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from spikekit.color import demosaic, demosaic_residual, mosaic
+from spikekit.decoders import tfi_at
+from spikekit.flow import linear_motion
+from spikekit.io import read_picture, read_video
+from spikekit.metrics import psnr
+from spikekit.scenes import Film
+from spikekit.warp import demosaic_along_motion
+
+FRAMES, TIMES, ENDS = 41, (10, 15, 20, 25, 30), (5, 35)
+_PICTURES = {".bmp", ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"}
+_SEED = 0
+
+
+def picture_row(folder: Path) -> list[float]:
+    """Return the mean PSNR of a folder of pictures whose mosaics are filled in by ``demosaic`` and its residual kin."""
+    paths = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in _PICTURES]
+    if not paths:
+        raise ValueError(f"{folder}: holds no pictures")
+    found = []
+    for path in paths:
+        rgb = read_picture(path)
+        found.append([_decibels(fill(mosaic(rgb)), rgb) for fill in (demosaic, demosaic_residual)])
+    return torch.tensor(found).mean(0).tolist()
+
+
+def film_row(folder: Path, clocks: int, alpha: float) -> list[float]:
+    """Return the PSNR of the middle frame of a film, by TFI and all three demosaicings.
+
+    The sensor has a pixel for each of the film. The motion is that which the film's latent frames are made with.
+
+    Args:
+        folder: its frames.
+        clocks: of the camera, from one frame to the next.
+        alpha: light of a white pixel per clock, in thresholds.
+    """
+    frames = read_video(folder)
+    middle = len(frames) // 2
+    around = -(-(FRAMES // 2) // clocks)
+    if middle < around or middle + around >= len(frames):
+        raise ValueError(f"{folder}: expected {2 * around + 1} frames or more, got {len(frames)}")
+    film = Film(frames[middle - around : middle + around + 1], scale=1, alpha=alpha, clocks=clocks)
+    clip = film.clip(around, FRAMES)
+    spikes = torch.cat(list(film.spikes(clip.first, FRAMES, seed=_SEED)))
+    raw = torch.stack([tfi_at(spikes, n) for n in TIMES]) / alpha
+    flow = linear_motion(*(clip.flow(n) for n in ENDS), TIMES, first=ENDS[0], middle=FRAMES // 2, last=ENDS[1])
+    alone, truth = raw[len(TIMES) // 2], clip.rgb(clip.middle)
+    pictures = demosaic(alone), demosaic_residual(alone), demosaic_along_motion(raw, flow)
+    return [_decibels(rgb, truth) for rgb in pictures]
+
+
+def _decibels(rgb: Tensor, truth: Tensor) -> float:
+    return psnr(rgb.clamp(0, 1), truth).item()
+
+
+def lines(pictures: Path | None, films: Path | None, clocks: int, alpha: float) -> Iterator[str]:
+    """Yield the table as Markdown, each line as soon as it is known."""
+    names = "demosaic", "demosaic_residual", "demosaic_along_motion"
+    yield f"| mosaic of | {' | '.join(names)} |"
+    yield f"|{'---|' * (len(names) + 1)}"
+    rows: list[tuple[str, Sequence[float]]] = []
+    if pictures is not None:
+        rows.append((pictures.name, picture_row(pictures)))
+        yield _line(*rows[-1])
+    for folder in sorted(path for path in films.iterdir() if path.is_dir()) if films is not None else []:
+        rows.append((f"{folder.name}, TFI, {clocks} clocks, alpha {alpha:g}", film_row(folder, clocks, alpha)))
+        yield _line(*rows[-1])
+
+
+def _line(name: str, decibels: Sequence[float]) -> str:
+    cells = [f"{value:.2f}" for value in decibels] + ["-"] * (3 - len(decibels))
+    return f"| {name} | {' | '.join(cells)} |"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(prog="python -m spikekit.bench.demosaicing", description=__doc__)
+    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="pictures, whose own mosaics are filled in")
+    parser.add_argument("--films", type=Path, metavar="FOLDER", help="a folder of frames for every film")
+    parser.add_argument("--clocks", type=int, default=20, help="of the camera from one frame to the next; default 20")
+    parser.add_argument("--alpha", type=float, default=0.4, help="light of a white pixel per clock; default 0.4")
+    asked = parser.parse_args(arguments)
+    if asked.pictures is None and asked.films is None:
+        parser.error("expected --pictures or --films")
+    for line in lines(asked.pictures, asked.films, asked.clocks, asked.alpha):
+        print(line, flush=True)  # noqa: T201
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,210 @@
+"""``spikekit simulate``: from pictures or a video to a spike stream, its ground truth and its side-car."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from spikekit.arguments import UsageError, positive, whole
+from spikekit.cli.simulation import Settings, Source, is_own, simulate
+from spikekit.color.cfa import PATTERNS
+from spikekit.io.sidecar import Sidecar, read_sidecar
+from spikekit.sensor.noise import SensorNoise
+
+_NOISE = {
+    "photons": "electrons that make a threshold: light comes in photons",
+    "dark_current": "charge that leaks into a pixel per clock, in thresholds",
+    "dark_spread": "standard deviation of the dark current between pixels, relative to its mean",
+    "gain_spread": "standard deviation of the gain between pixels: fixed-pattern noise",
+    "hot": "share of pixels that always fire",
+    "dead": "share of pixels that never fire",
+}
+
+
+def run(args: argparse.Namespace) -> None:
+    """Record a film with a simulated colour spike camera.
+
+    OUT.dat gets the stream, 8 pixels a byte: a clip around one frame of the film, or all of it. OUT.png gets the
+    ground truth, that frame in 8 bits, cropped to whole cells of the sensor; with --all, the folder OUT gets every
+    frame. OUT.json, the side-car, gets every setting, what of the scene was modelled, and hashes of the source and of
+    the stream.
+
+    With OUT.json as INPUT, the same stream is made again, bit for bit, which is checked. An interpolation that is not
+    spikekit's runs code, so it must be typed again, with --interpolation and the same text.
+
+    All appear under their names when they are complete, the side-car last: a stream without one is not to be
+    believed.
+    """
+    if args.output.is_dir():
+        raise ValueError(f"{args.output}: expected a stream to write, got a folder")
+    given = {name: value for name, value in vars(args).items() if name in _names(Settings) | _names(SensorNoise)}
+    replayed = None
+    if args.input.suffix.lower() == ".json":
+        replayed = read_sidecar(args.input)
+        settings = _settings_of(args.input, replayed, given)
+        path = args.source or args.input.parent / replayed.source["path"]
+    else:
+        if args.source is not None:
+            raise UsageError(f"--source: expected a side-car as INPUT with it, got {args.input}")
+        if "scale" not in given:
+            raise UsageError("--scale: needed, unless INPUT is a side-car")
+        settings, path = _settings(given), args.input
+    for line in simulate(Source(path, settings), settings, args.output, replayed):
+        print(line)
+
+
+def _names(kind: Any) -> set[str]:
+    return {field.name for field in fields(kind)}
+
+
+def _settings(given: dict[str, Any]) -> Settings:
+    noise = {name: value for name, value in given.items() if name in _names(SensorNoise)}
+    try:
+        return Settings(
+            **{name: value for name, value in given.items() if name not in noise}, noise=SensorNoise(**noise)
+        )
+    except UsageError:
+        raise
+    except ValueError as error:
+        raise UsageError(f"--{str(error).replace('_', '-', 1)}") from error
+
+
+def _settings_of(path: Path, sidecar: Sidecar, given: dict[str, Any]) -> Settings:
+    others = [f"--{name.replace('_', '-')}" for name in given if name != "interpolation"]
+    if others:
+        raise UsageError(f"{path}: a side-car has its own settings, got {', '.join(others)} as well")
+    stored = sidecar.settings.get("interpolation", Settings.interpolation)
+    typed = given.get("interpolation")
+    if typed is not None and typed != stored:
+        raise UsageError(f"--interpolation: expected {stored!r}, as {path} has it, or none, got {typed!r}")
+    if typed is None and not is_own(stored):
+        raise UsageError(
+            f"{path}: its interpolation is not spikekit's and would run code: {stored[:200]!r}; if you trust it, give "
+            "--interpolation with the same text"
+        )
+    try:
+        return Settings(**sidecar.settings | {"noise": SensorNoise(**sidecar.settings["noise"])})
+    except (TypeError, ValueError, KeyError) as error:
+        raise ValueError(f"{path}: not settings of a simulation ({error})") from error
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    add, default = parser.add_argument, argparse.SUPPRESS
+    add("input", type=Path, metavar="INPUT", help="a folder of pictures, a video file, a picture, or a side-car")
+    add("-o", "--output", required=True, type=_stream, metavar="OUT.dat", help="the stream to write, .dat or .npz")
+    add("--scale", type=whole(1), default=default, metavar="S", help="pixels of a frame that a sensor pixel is wide")
+    add(
+        "--pattern",
+        type=str.upper,
+        choices=PATTERNS,
+        default=default,
+        help=f"Bayer phase of the sensor; {Settings.pattern} if not given",
+    )
+    add(
+        "--alpha",
+        type=positive,
+        default=default,
+        metavar="A",
+        help=f"times that a white pixel fires per clock; {Settings.alpha} if not given",
+    )
+    add(
+        "--clocks",
+        type=whole(1),
+        default=default,
+        metavar="N",
+        help=f"clocks from one frame to the next; {Settings.clocks} if not given",
+    )
+    part = parser.add_mutually_exclusive_group()
+    part.add_argument(
+        "--frames",
+        type=whole(1),
+        default=default,
+        metavar="N",
+        help=f"frames of the stream, around one of the film; {Settings.frames} if not given",
+    )
+    part.add_argument("--all", dest="frames", action="store_const", const=None, default=default, help="the whole film")
+    add(
+        "--frame",
+        type=whole(0),
+        default=default,
+        metavar="M",
+        help="which frame of the film is in the middle, from 0; that in its middle if not given",
+    )
+    add(
+        "--readout",
+        type=whole(1),
+        default=default,
+        metavar="N",
+        help=f"clocks for every frame of the stream; {Settings.readout} if not given",
+    )
+    add(
+        "--seed",
+        type=whole(0),
+        default=default,
+        metavar="N",
+        help=f"where chance begins: first charge and noise; {Settings.seed} if not given",
+    )
+    add("--source", type=Path, metavar="PATH", help="where the frames of a side-car are, if they have moved")
+
+    model = parser.add_argument_group("what is modelled")
+    model.add_argument(
+        "--plan",
+        type=_plan,
+        default=default,
+        metavar="scene|everything|K",
+        help="what the scene requires, every clock and all noise, or K latent frames between two frames; "
+        f"{Settings.plan} if not given",
+    )
+    model.add_argument(
+        "--spike-tolerance",
+        "--tolerance",
+        dest="tolerance",
+        type=positive,
+        default=default,
+        metavar="SHARE",
+        help=f"share of the spikes that may change by not modelling more; {Settings.tolerance} if not given; "
+        "--tolerance is its old name",
+    )
+    model.add_argument(
+        "--step",
+        type=positive,
+        default=default,
+        metavar="PIXELS",
+        help=f"largest displacement between latent frames, in sensor pixels; {Settings.step} if not given",
+    )
+    model.add_argument(
+        "--interpolation",
+        default=default,
+        metavar="CLASS",
+        help="what makes latent frames: package.module.Class, or package.module.Class(name=value); "
+        f"{Settings.interpolation} if not given",
+    )
+
+    noise = parser.add_argument_group("noise of the sensor, none if not given")
+    for name, said in _NOISE.items():
+        noise.add_argument(f"--{name.replace('_', '-')}", type=_number, default=default, metavar="X", help=said)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected a number, got {text}") from None
+
+
+def _plan(text: str) -> str | int:
+    if text in ("scene", "everything"):
+        return text
+    if text.isascii() and text.isdigit():
+        return int(text)
+    raise argparse.ArgumentTypeError(f"expected scene, everything or a number of latent frames, got {text}")
+
+
+def _stream(text: str) -> Path:
+    path = Path(text)
+    if path.suffix.lower() not in (".dat", ".npz"):
+        raise argparse.ArgumentTypeError(f"expected a stream that ends in .dat or .npz, got {text}")
+    return path

@@ -1,0 +1,413 @@
+"""Simulations on disk: from frames to a stream, its ground truth and its side-car."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import importlib
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from spikekit.arguments import UsageError, one_line
+from spikekit.io.files import write_spikes
+from spikekit.io.formats import SpikeFileError, dat_bytes
+from spikekit.io.image_bytes import png_bytes
+from spikekit.io.sidecar import Sidecar, published, versions
+from spikekit.io.video import VideoFrames, read_video
+from spikekit.io.whole_file import whole_file
+from spikekit.scenes.adaptive_sampling import Plan, SceneProfile
+from spikekit.scenes.frame_sequence import Film
+from spikekit.sensor.noise import SensorNoise
+
+_SHOWN = 2  # intervals whose plans are told one by one
+_LARGEST = 64  # number among the arguments of an interpolation that a file names
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a stream depends on beside its source.
+
+    Args:
+        scale: how many pixels a sensor pixel is wide.
+        pattern: Bayer phase of the sensor.
+        alpha: light of a white pixel per clock, in thresholds.
+        clocks: clocks from one source frame to the next.
+        frame: the source frame at the middle of a clip; the middle one when not given.
+        frames: frames of the stream; ``None`` for the whole film.
+        readout: clocks for every frame of the stream.
+        seed: where chance begins.
+        plan: what is modelled: ``scene`` for what the scene requires, ``everything``, or a number of latent frames.
+        tolerance: share of the spikes that may change by not modelling more, under this name in side-cars.
+        step: displacement between latent frames, in sensor pixels.
+        interpolation: what makes latent frames: a class by its path, with arguments or without.
+        noise: what the sensor adds.
+
+    Raises:
+        UsageError: a plan that is unknown or has more latent frames than clocks.
+    """
+
+    scale: int
+    pattern: str = "RGGB"
+    alpha: float = 0.4
+    clocks: int = 20
+    frame: int | None = None
+    frames: int | None = 41
+    readout: int = 1
+    seed: int = 0
+    plan: str | int = "scene"
+    tolerance: float = 0.05
+    step: float = 0.5
+    interpolation: str = "FlowInterpolation"
+    noise: SensorNoise = field(default_factory=SensorNoise)
+
+    def __post_init__(self) -> None:
+        if not (self.plan in ("scene", "everything") or self.plan in range(self.clocks)):
+            raise UsageError(
+                f"--plan: expected scene, everything or 0 to {self.clocks - 1} latent frames in {self.clocks} clocks, "
+                f"got {self.plan}"
+            )
+
+    def film(self, frames: Sequence[Tensor]) -> Film:
+        """Return the film of these frames."""
+        plan = None
+        if self.plan != "scene":
+            plan = Plan.everything(self.clocks) if self.plan == "everything" else Plan(self.plan)
+        return Film(
+            frames,
+            scale=self.scale,
+            pattern=self.pattern,
+            alpha=self.alpha,
+            clocks=self.clocks,
+            interpolation=build(self.interpolation),
+            plan=plan,
+            spike_tolerance=self.tolerance,
+            step=self.step,
+        )
+
+
+class Source:
+    """The frames that a stream is made of, read when they are needed.
+
+    Args:
+        path: a folder of pictures, a video file, or a picture, which stands still.
+        settings: which of its frames.
+
+    Raises:
+        VideoError: there are no frames to read.
+        UsageError: a frame that is not there, or too few around it.
+    """
+
+    def __init__(self, path: Path, settings: Settings) -> None:
+        self.path, self.film_frames = path, read_video(path)
+        total, clocks = len(self.film_frames), settings.clocks
+        self.still = total == 1
+        self.frame = None
+        if settings.frames is None:
+            if settings.frame is not None:
+                raise UsageError(f"--frame: not with --all, got {settings.frame}")
+            if self.still:
+                raise UsageError(f"{path}: one picture, which has no end: give --frames instead of --all")
+            self.first, self.span = 0, range(total)
+            self.clocks = ((total - 1) * clocks + 1) // settings.readout * settings.readout
+            self.truth = {index: index * clocks for index in range(total) if index * clocks < self.clocks}
+            return
+        self.clocks = settings.frames * settings.readout
+        before, after = self.clocks // 2, (self.clocks - 1) // 2
+        needed = -(-before // clocks), -(-after // clocks)
+        frame = total // 2 if settings.frame is None else settings.frame
+        least, most = (0, 0) if self.still else (needed[0], total - 1 - needed[1])
+        if not least <= frame <= most:
+            fits = f"--frame {least} to {most}" if least <= most else "more frames, or fewer with --frames"
+            raise UsageError(
+                f"{path}: {self.clocks} clocks, {clocks} from one frame to the next, need {needed[0]} frames before "
+                f"the middle and {needed[1]} after it: of {total} frames, expected {fits}, got frame {frame}"
+            )
+        self.frame = frame
+        self.span = range(frame - needed[0], frame + needed[1] + 1)
+        self.first = needed[0] * clocks - before
+        self.truth = {needed[0]: before}
+
+    @property
+    def used(self) -> VideoFrames:
+        """The frames that are looked at, each once."""
+        return self.film_frames if self.still else self.film_frames[self.span.start : self.span.stop]
+
+    @property
+    def frames(self) -> Sequence[Tensor]:
+        """The frames of the film; a still picture as often as it takes."""
+        return [self.film_frames[0]] * len(self.span) if self.still else self.used
+
+    def file(self, name: str) -> Path:
+        """Return where the frame of this name is read from."""
+        return self.path / name if self.path.is_dir() else self.path
+
+
+def build(text: str) -> Any:
+    """Build what makes latent frames.
+
+    Args:
+        text: ``package.module.Class`` or ``package.module.Class(name=value, ...)``; without a module, one of
+            :mod:`spikekit.flow.interpolate`.
+
+    Returns:
+        An object of the class.
+
+    Raises:
+        UsageError: no such class, or arguments that it does not take.
+    """
+    try:
+        module, name, values = _parts(text)
+        made = getattr(importlib.import_module(module or "spikekit.flow.interpolate"), name)(**values)
+        if not callable(made):
+            raise TypeError(f"expected what looks at two frames, got a {type(made).__name__}")
+    except Exception as error:
+        raise UsageError(f"--interpolation: {text} cannot be made ({one_line(error)})") from error
+    return made
+
+
+def is_own(text: str) -> bool:
+    """Say whether what makes latent frames is of this package, so that a file may ask for it.
+
+    Args:
+        text: as for :func:`build`, but from a file that somebody else may have written.
+
+    Returns:
+        True for an interpolation of :mod:`spikekit.flow.interpolate` by its bare name, with numbers as arguments or
+        without; :func:`build` would import and call anything else.
+
+    Example:
+        >>> is_own("FlowInterpolation(shrink=2)"), is_own("os.system(command='id')")
+        (True, False)
+    """
+    own = {"Blend": (), "FlowInterpolation": ("shrink",), "Still": ()}
+    try:
+        module, name, values = _parts(text)
+    except Exception:  # what the parser raises depends on the text
+        return False
+    numbers = all(type(value) is int and 1 <= value <= _LARGEST for value in values.values())
+    return not module and name in own and numbers and all(key in own[name] for key in values)
+
+
+def _parts(text: str) -> tuple[str, str, dict[str, Any]]:
+    """Return the module, the class and the arguments in a text, without importing anything."""
+    path, bracket, rest = text.partition("(")
+    module, _, name = path.rpartition(".")
+    call = ast.parse(f"make({rest}" if bracket else "make()", mode="eval").body
+    if not isinstance(call, ast.Call) or call.args:
+        raise ValueError("arguments need names")
+    return module, name, {keyword.arg: ast.literal_eval(keyword.value) for keyword in call.keywords}
+
+
+def simulate(source: Source, settings: Settings, output: Path, replayed: Sidecar | None = None) -> list[str]:
+    """Write a stream, its ground truth and its side-car.
+
+    Args:
+        source: the frames.
+        settings: all else.
+        output: the stream, a ``.dat`` or an ``.npz``; the truth and the side-car get its name with other endings.
+        replayed: a side-car that the source and the stream must agree with.
+
+    Returns:
+        What was done, line by line.
+
+    Raises:
+        ValueError: a frame that cannot be read, a file that cannot be written, or not what the side-car says.
+    """
+    stem = output.stem
+    names = source.used.names
+    pictures = {index: Path(f"{stem}.png") for index in source.truth}
+    if settings.frames is None:
+        bare = [Path(name).stem for name in names]
+        bare = bare if len(set(bare)) == len(bare) else names
+        pictures = {index: Path(stem, f"{bare[index]}.png") for index in source.truth}
+    sources = {os.path.realpath(source.file(name)) for name in names}
+    for picture in pictures.values():
+        if os.path.realpath(output.parent / picture) in sources:
+            raise ValueError(f"{output}: its ground truth, {picture}, would replace the source; choose another name")
+    try:
+        film = settings.film(source.frames)
+    except UsageError:
+        raise
+    except ValueError as error:
+        raise ValueError(f"{source.path}: {error}") from error
+    with _one_thread(), published(output) as part:
+        prints = _look(source, film, pictures, part, output, replayed)
+        noise, told = _needed_noise(source, settings, film)
+        plans: list[Plan] = []
+        shape, bits, digest = _expose(source, settings, film, noise, part, output, plans)
+        stream = {"file": output.name, "frames": shape[0], "height": shape[1], "width": shape[2], "sha256": digest}
+        if replayed is not None and replayed.stream["sha256"] != digest:
+            ours = versions()
+            changed = [
+                f"{name} {was}, now {ours.get(name)}"
+                for name, was in replayed.versions.items()
+                if was != ours.get(name)
+            ]
+            raise ValueError(
+                f"{output}: not the stream of its side-car, though the source is the same "
+                f"({'; '.join(changed) or 'by the same versions'})"
+            )
+        sidecar = Sidecar(
+            stream=stream,
+            truth={path.as_posix(): source.truth[index] / settings.readout for index, path in pictures.items()},
+            source={"path": _relative(source.path, output.parent), "frames": prints},
+            settings=asdict(replace(settings, frame=source.frame)),
+            plan={
+                "noise": asdict(noise),
+                "intervals": [{"latent": plan.latent, "region": plan.region} for plan in plans],
+            },
+            versions=versions(),
+        )
+        with _writing(output.with_suffix(".json")), whole_file(part / f"{stem}.json", "w", encoding="utf-8") as file:
+            file.write(sidecar.dumps())
+    return _report(source, settings, film, sidecar, bits, [*_plan_lines(plans, source), *told], output)
+
+
+def _look(
+    source: Source, film: Film, pictures: dict[int, Path], part: Path, output: Path, replayed: Sidecar | None
+) -> dict[str, str]:
+    """Read every frame once, so that a damaged one shows now; write the truth; return the hashes of the frames."""
+    expected = None if replayed is None else replayed.source["frames"]
+    names = source.used.names
+    if expected is not None and list(expected) != names:
+        raise ValueError(f"{source.path}: not the frames of the side-car: expected {_few(expected)}, got {_few(names)}")
+    prints = {}
+    still = source.still
+    for index, name in enumerate(tqdm(names, "frames read", disable=None, leave=False)):
+        frame = source.used[index]
+        prints[name] = hashlib.sha256(frame.numpy().tobytes()).hexdigest()
+        if expected is not None and expected[name] != prints[name]:
+            where = f" (frame {name})" if source.file(name) == source.path else ""
+            raise ValueError(f"{source.file(name)}: changed since the side-car was written{where}")
+        index = next(iter(pictures)) if still else index
+        if index in pictures:
+            with _writing(output.parent / pictures[index]), whole_file(part / pictures[index]) as file:
+                file.write(png_bytes(frame[:, : film.height, : film.width]))
+    return prints
+
+
+def _needed_noise(source: Source, settings: Settings, film: Film) -> tuple[SensorNoise, list[str]]:
+    """Return the noise that changes spikes, and a line about it."""
+    if settings.noise == SensorNoise():
+        return settings.noise, []
+    if settings.frames is None or settings.plan == "everything":
+        return settings.noise, ["noise: all that was asked for"]
+    last = -(-(source.first + source.clocks - 1) // settings.clocks)
+    profile = SceneProfile.join(film.profile(n) for n in range(source.first // settings.clocks, last or 1))
+    plan = profile.plan(spike_tolerance=settings.tolerance, noise=settings.noise, frames=settings.frames)
+    return plan.noise, [plan.because[-1]]
+
+
+def _expose(
+    source: Source, settings: Settings, film: Film, noise: SensorNoise, part: Path, output: Path, plans: list[Plan]
+) -> tuple[tuple[int, int, int], int, str]:
+    """Write the stream; return its shape, how many bits are set, and its hash."""
+    digest = hashlib.sha256()
+    shape, bits, clock = (0, 0, 0), 0, source.first
+
+    def passing() -> Iterator[Tensor]:
+        nonlocal shape, bits, clock
+        chunks = film.spikes(
+            source.first,
+            source.clocks,
+            noise=noise,
+            readout=settings.readout,
+            seed=settings.seed,
+            chunk=settings.clocks,
+        )
+        for spikes in chunks:
+            bar.update(len(spikes))
+            digest.update(dat_bytes(spikes.numpy()))
+            shape = shape[0] + len(spikes), *spikes.shape[1:]
+            bits += int(spikes.sum())
+            begin, clock = clock, clock + len(spikes) * settings.readout
+            for interval in range(begin // settings.clocks, -(-(clock - 1) // settings.clocks)):
+                if interval == source.first // settings.clocks + len(plans):
+                    plans.append(film.plan(interval))
+            yield spikes
+
+    frames = source.clocks // settings.readout
+    try:
+        with tqdm(desc=f"frames of {output.name}", total=frames, disable=None, leave=False) as bar:
+            write_spikes(part / output.name, passing())
+    except SpikeFileError as error:
+        raise ValueError(str(error).replace(str(part / output.name), str(output))) from error
+    return shape, bits, digest.hexdigest()
+
+
+def _plan_lines(plans: list[Plan], source: Source) -> list[str]:
+    if source.still:
+        return str(plans[0]).splitlines()
+    if len(plans) <= _SHOWN:
+        told = zip(plans, source.used.names, strict=False)
+        return [
+            line for plan, name in told for line in (f"from {name}:", *(f"  {said}" for said in str(plan).split("\n")))
+        ]
+    latent = [plan.latent for plan in plans]
+    return [
+        f"latent frames: {min(latent)} to {max(latent)} an interval, {sum(latent) / len(latent):.1f} on average, none "
+        f"in {latent.count(0)} of {len(latent)} intervals"
+    ]
+
+
+def _report(
+    source: Source, settings: Settings, film: Film, sidecar: Sidecar, bits: int, plan: list[str], output: Path
+) -> list[str]:
+    frames, height, width = (sidecar.stream[key] for key in ("frames", "height", "width"))
+    stored, seen = (source.used.height, source.used.width), (film.height, film.width)
+    where = f"{source.path}, {_few(source.used.names)}" if source.path.is_dir() else f"{source.path}"
+    cropped = "" if stored == seen else f", the first {seen[0]} x {seen[1]} of them"
+    picture, frame = next(iter(sidecar.truth.items()))
+    others = len(sidecar.truth) - 1
+    report = {
+        "source": [f"{where}: {stored[0]} x {stored[1]} (H x W){cropped}"],
+        "sensor": [f"{height} x {width}, {film.pattern}, a white pixel fires {settings.alpha:g} times a clock"],
+        "plan": plan,
+        "stream": [f"{output}: {frames} frames, {bits / (frames * height * width):.2%} of the bits set"],
+        "truth": [
+            f"{output.parent / picture}" + (f" and {others} more" if others else f", seen at frame {int(frame)}")
+        ],
+        "side-car": [f"{output.with_suffix('.json')}: all settings, and SHA-256 {sidecar.stream['sha256'][:16]}..."],
+    }
+    return [f"{'' if n else name:12} {line}" for name, lines in report.items() for n, line in enumerate(lines)]
+
+
+def _few(names: Sequence[str] | dict[str, str]) -> str:
+    names = list(names)
+    return names[0] if len(names) == 1 else f"{names[0]} .. {names[-1]} ({len(names)} frames)"
+
+
+def _relative(path: Path, folder: Path) -> str:
+    """Return the way from a folder to a path, so that both may move together."""
+    try:
+        return Path(os.path.relpath(os.path.realpath(path), os.path.realpath(folder))).as_posix()
+    except ValueError:  # another drive
+        return Path(os.path.realpath(path)).as_posix()
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Turn whatever goes wrong with a file into one line that names it."""
+    try:
+        yield
+    except Exception as error:  # what a picture library raises depends on the ending
+        raise ValueError(f"{path}: cannot be written ({one_line(error)})") from error
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Sum in one order, however many cores there are: sums in another order differ in their last bits."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

@@ -1,0 +1,452 @@
+"""The colour filter array: which colour every sensor pixel sees, and how pictures become mosaics and back."""
+
+from __future__ import annotations
+
+import torch
+from kornia.color import CFA
+from torch import Tensor, nn
+
+from spikekit.check import check_planes, check_whole
+
+#: Bayer phases by name, read along the rows of the top-left 2 x 2 cell.
+PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
+
+_PATTERN_OF_CFA = {CFA.BG: "RGGB", CFA.RG: "BGGR", CFA.GB: "GRBG", CFA.GR: "GBRG"}
+
+
+def bayer_pattern(pattern: str | CFA) -> str:
+    """Return the name of a Bayer phase.
+
+    Args:
+        pattern: one of :data:`PATTERNS`, or a :class:`kornia.color.CFA`, whose members are named after the pixel at
+            (1, 1) as in OpenCV: ``CFA.BG`` is RGGB.
+
+    Returns:
+        One of :data:`PATTERNS`.
+
+    Raises:
+        ValueError: neither of these.
+
+    Example:
+        >>> from kornia.color import CFA
+        >>> bayer_pattern(CFA.BG), bayer_pattern("bggr")
+        ('RGGB', 'BGGR')
+    """
+    name = _PATTERN_OF_CFA.get(pattern, pattern) if isinstance(pattern, CFA) else pattern
+    name = name.upper() if isinstance(name, str) else name
+    if name not in PATTERNS:
+        raise ValueError(f"pattern: expected one of {', '.join(PATTERNS)} or a kornia.color.CFA, got {pattern!r}")
+    return name
+
+
+def bayer_sites(pattern: str | CFA) -> tuple[tuple[int, int, int], ...]:
+    """Return ``(colour, row, column)`` of R, G1, G2 and B in the 2 x 2 cell; colour is 0, 1, 2 for R, G, B.
+
+    G1 is the green pixel of the upper row, G2 that of the lower row.
+
+    Args:
+        pattern: Bayer phase, see :func:`bayer_pattern`.
+
+    Returns:
+        Four triples, in the order R, G1, G2, B.
+
+    Raises:
+        ValueError: the pattern is unknown.
+
+    Example:
+        >>> bayer_sites("BGGR")
+        ((0, 1, 1), (1, 0, 1), (1, 1, 0), (2, 0, 0))
+    """
+    name = bayer_pattern(pattern)
+    sites = [("RGB".index(letter), i // 2, i % 2) for i, letter in enumerate(name)]
+    return tuple(sorted(sites, key=lambda site: site[0]))
+
+
+def bayer_mask(
+    height: int,
+    width: int,
+    pattern: str | CFA = "RGGB",
+    *,
+    scale: int = 1,
+    device: torch.device | str | None = None,
+    dtype: torch.dtype | None = None,
+) -> Tensor:
+    r"""Which pixels of a Bayer sensor are known, colour by colour, optionally after upsampling.
+
+    .. math:: M_C(x, y) = [\text{the sensor's pixel } (\lfloor x / s \rfloor, \lfloor y / s \rfloor)
+        \text{ sees the colour } C]
+
+    Convention:
+        Planes are R, G, B. One known sensor pixel becomes a block of ``scale`` x ``scale`` known pixels. The three
+        planes add up to one everywhere. The pattern begins at the top left, pixel (0, 0), whatever the size; with an
+        odd size the last cell is cut. A constant: there is no gradient.
+
+    Args:
+        height: rows of the sensor.
+        width: columns of the sensor.
+        pattern: Bayer phase, see :func:`bayer_pattern`.
+        scale: super-resolution factor.
+        device: where to put the mask.
+        dtype: its type; torch's default type when not given.
+
+    Returns:
+        Zeros and ones of shape :math:`(3, scale \cdot height, scale \cdot width)`.
+
+    Raises:
+        TypeError: ``dtype`` is not a type of torch.
+        ValueError: a size or the scale is below 1, or the pattern is unknown.
+
+    Example:
+        >>> bayer_mask(2, 2, "RGGB", dtype=torch.uint8).tolist()
+        [[[1, 0], [0, 0]], [[0, 1], [1, 0]], [[0, 0], [0, 1]]]
+        >>> bayer_mask(2, 2, "RGGB", scale=2, dtype=torch.uint8)[0].tolist()
+        [[1, 1, 0, 0], [1, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]
+
+    Reference:
+        Dong et al., Super-Resolution Reconstruction from Bayer-Pattern Spike Streams, CVPR 2024, Fig. 5 (b).
+    """
+    if not (dtype is None or isinstance(dtype, torch.dtype)):
+        raise TypeError(f"dtype: expected a type of torch, got {dtype!r}")
+    scale = check_whole("scale", scale)
+    height, width = check_whole("height", height), check_whole("width", width)
+    rows = torch.arange(scale * height, device=device) // scale % 2
+    columns = torch.arange(scale * width, device=device) // scale % 2
+    planes: list[Tensor | None] = [None, None, None]
+    for colour, row, column in bayer_sites(pattern):
+        site = (rows == row)[:, None] & (columns == column)[None, :]
+        plane = planes[colour]
+        planes[colour] = site if plane is None else plane | site
+    return torch.stack(planes).to(dtype or torch.get_default_dtype())  # type: ignore[arg-type]
+
+
+class BayerMask(nn.Module):
+    r"""See the Convention block on :func:`bayer_mask`.
+
+    Shape:
+        - Input: any tensor :math:`(*, H, W)`; only its size, device and dtype are read.
+        - Output: :math:`(3, scale \cdot H, scale \cdot W)`.
+
+    Example:
+        >>> BayerMask("GRBG", scale=2)(torch.zeros(1, 41, 4, 6)).shape
+        torch.Size([3, 8, 12])
+    """
+
+    def __init__(self, pattern: str | CFA = "RGGB", *, scale: int = 1) -> None:
+        super().__init__()
+        scale = check_whole("scale", scale)
+        self.pattern = bayer_pattern(pattern)
+        self.scale = scale
+
+    def forward(self, raw: Tensor) -> Tensor:  # noqa: D102
+        check_planes("raw", raw, 2, "(*, H, W)")
+        height, width = raw.shape[-2:]
+        return bayer_mask(height, width, self.pattern, scale=self.scale, device=raw.device, dtype=raw.dtype)
+
+    def extra_repr(self) -> str:  # noqa: D102
+        return f"pattern={self.pattern!r}, scale={self.scale}"
+
+
+def mosaic(rgb: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
+    r"""Keep, at every pixel, the one colour that a Bayer sensor sees there.
+
+    .. math:: R(x, y) = I_{C(x, y)}(x, y)
+
+    Convention:
+        C(x, y) is the colour of :func:`bayer_mask`. Values are copied, in any real dtype, as by
+        :func:`kornia.color.rgb_to_raw`, whose channel axis is dropped. The two colours that are not seen do not matter,
+        NaN included, and their gradient is 0; that of the seen one is passed on.
+
+    Args:
+        rgb: colour image :math:`(*, 3, H, W)`; odd sizes are legal.
+        pattern: Bayer phase, see :func:`bayer_pattern`.
+
+    Returns:
+        The mosaic :math:`(*, H, W)`, in the dtype of ``rgb``.
+
+    Raises:
+        TypeError: ``rgb`` is not a tensor of real numbers.
+        ValueError: ``rgb`` has no three channels, or the pattern is unknown.
+
+    Example:
+        >>> mosaic(torch.tensor([1.0, 2.0, 3.0]).reshape(3, 1, 1).expand(3, 2, 2)).tolist()
+        [[1.0, 2.0], [2.0, 3.0]]
+
+    Reference:
+        Bayer, Color imaging array, US patent 3,971,065, 1976.
+    """
+    return bin_to_sensor(rgb, pattern, scale=1)
+
+
+class Mosaic(nn.Module):
+    r"""See the Convention block on :func:`mosaic`.
+
+    Shape:
+        - Input: :math:`(*, 3, H, W)`
+        - Output: :math:`(*, H, W)`
+
+    Example:
+        >>> Mosaic("BGGR")(torch.rand(2, 3, 4, 4)).shape
+        torch.Size([2, 4, 4])
+    """
+
+    def __init__(self, pattern: str | CFA = "RGGB") -> None:
+        super().__init__()
+        self.pattern = bayer_pattern(pattern)
+
+    def forward(self, rgb: Tensor) -> Tensor:  # noqa: D102
+        return mosaic(rgb, self.pattern)
+
+    def extra_repr(self) -> str:  # noqa: D102
+        return f"pattern={self.pattern!r}"
+
+
+def bin_to_sensor(rgb: Tensor, pattern: str | CFA = "RGGB", *, scale: int) -> Tensor:
+    r"""What a Bayer sensor of ``scale`` times coarser pixels sees of a high-resolution picture.
+
+    .. math:: R(x, y) = \frac{1}{s^2} \sum_{0 \le a, b < s} I_{C(x, y)}(s x + a, s y + b)
+
+    Convention:
+        The sensor pixel (x, y) covers the block that starts at (s x, s y), and averages the block's pixels of its own
+        colour C(x, y) only. The sum runs in float32 or wider. The gradient of a picture pixel is :math:`1 / s^2` of
+        its sensor pixel's in that colour, and 0 in the other two.
+
+    Args:
+        rgb: colour image :math:`(*, 3, H, W)`, H and W multiples of ``scale``.
+        pattern: Bayer phase of the sensor, see :func:`bayer_pattern`.
+        scale: how many picture pixels a sensor pixel is wide.
+
+    Returns:
+        The mosaic :math:`(*, H / s, W / s)`, in the dtype of ``rgb`` (integer pictures need ``scale=1``).
+
+    Raises:
+        TypeError: ``rgb`` is not a tensor of real numbers, or not a floating-point one where ``scale`` is above 1.
+        ValueError: no three channels, a size that ``scale`` does not divide, a scale below 1, an unknown pattern.
+
+    Example:
+        >>> bin_to_sensor(torch.arange(48.0).reshape(3, 4, 4), scale=2).tolist()
+        [[2.5, 20.5], [26.5, 44.5]]
+
+    Reference:
+        Dong et al., CVPR 2024, section 5.1: "accumulate signals of 4 pixels to generate the signal of one target
+        pixel in the x2 case ... the 4 pixels come from one of the channels".
+    """
+    scale = check_whole("scale", scale)
+    check_planes("rgb", rgb, 3, "(*, 3, H, W)", floating=scale > 1)
+    channels, height, width = rgb.shape[-3:]
+    if channels != 3 or height % scale or width % scale:
+        multiples = f" with H and W multiples of {scale}" if scale > 1 else ""
+        raise ValueError(f"rgb: expected (*, 3, H, W){multiples}, got {tuple(rgb.shape)}")
+    wide = torch.promote_types(rgb.dtype, torch.float32)
+    raw = rgb.new_empty(*rgb.shape[:-3], height // scale, width // scale)
+    for colour, row, column in bayer_sites(pattern):
+        plane, step = rgb[..., colour, :, :], 2 * scale
+        seen = _sum([plane[..., scale * row + a :: step, :] for a in range(scale)], wide)
+        seen = _sum([seen[..., scale * column + b :: step] for b in range(scale)], wide)
+        raw[..., row::2, column::2] = seen / scale**2 if scale > 1 else seen
+    return raw
+
+
+def _sum(parts: list[Tensor], dtype: torch.dtype) -> Tensor:
+    # stacked: torch.compile would guard how the strides of two views compare
+    return torch.stack(parts).sum(dim=0, dtype=dtype) if len(parts) > 1 else parts[0]
+
+
+class BinToSensor(nn.Module):
+    r"""See the Convention block on :func:`bin_to_sensor`.
+
+    Shape:
+        - Input: :math:`(*, 3, H, W)`
+        - Output: :math:`(*, H / scale, W / scale)`
+
+    Example:
+        >>> BinToSensor(scale=4)(torch.rand(2, 3, 16, 8)).shape
+        torch.Size([2, 4, 2])
+    """
+
+    def __init__(self, pattern: str | CFA = "RGGB", *, scale: int) -> None:
+        super().__init__()
+        scale = check_whole("scale", scale)
+        self.pattern = bayer_pattern(pattern)
+        self.scale = scale
+
+    def forward(self, rgb: Tensor) -> Tensor:  # noqa: D102
+        return bin_to_sensor(rgb, self.pattern, scale=self.scale)
+
+    def extra_repr(self) -> str:  # noqa: D102
+        return f"pattern={self.pattern!r}, scale={self.scale}"
+
+
+def split_colors(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
+    r"""Split a mosaic, or a stream of mosaics, into three full-size ones that hold one colour each and 0 elsewhere.
+
+    .. math:: S^C = M_C \, S, \quad C \in \{R, G, B\}
+
+    Convention:
+        M is the mask of :func:`bayer_mask`. The colour is the **first** axis of the result, so that
+        ``red, green, blue = split_colors(spikes)`` leaves time at -3. Their sum is the input. The gradient of a pixel
+        is that of its own colour's plane.
+
+    Args:
+        raw: mosaic or spike stream :math:`(*, H, W)`, any dtype.
+        pattern: Bayer phase, see :func:`bayer_pattern`.
+
+    Returns:
+        :math:`(3, *, H, W)`, in the dtype of ``raw``.
+
+    Raises:
+        TypeError: ``raw`` is not a tensor of real numbers.
+        ValueError: fewer than two dimensions, or an unknown pattern.
+
+    Example:
+        >>> red, green, blue = split_colors(torch.tensor([[1, 2], [3, 4]]))
+        >>> green.tolist()
+        [[0, 2], [3, 0]]
+
+    Reference:
+        Dong et al., CVPR 2024, section 4.2.
+    """
+    check_planes("raw", raw, 2, "(*, H, W)")
+    colors = raw.new_zeros(3, *raw.shape)
+    for colour, row, column in bayer_sites(pattern):
+        colors[colour, ..., row::2, column::2] = raw[..., row::2, column::2]
+    return colors
+
+
+class SplitColors(nn.Module):
+    r"""See the Convention block on :func:`split_colors`.
+
+    Shape:
+        - Input: :math:`(*, H, W)`
+        - Output: :math:`(3, *, H, W)`
+
+    Example:
+        >>> SplitColors()(torch.ones(2, 41, 8, 6)).shape
+        torch.Size([3, 2, 41, 8, 6])
+    """
+
+    def __init__(self, pattern: str | CFA = "RGGB") -> None:
+        super().__init__()
+        self.pattern = bayer_pattern(pattern)
+
+    def forward(self, raw: Tensor) -> Tensor:  # noqa: D102
+        return split_colors(raw, self.pattern)
+
+    def extra_repr(self) -> str:  # noqa: D102
+        return f"pattern={self.pattern!r}"
+
+
+def split_bayer(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
+    r"""Split a mosaic, or a stream of mosaics, into its four half-size sub-streams R, G1, G2, B.
+
+    .. math:: S^k(x, y) = S(2 x + \text{column}_k, 2 y + \text{row}_k)
+
+    Convention:
+        The sub-stream is the **first** axis of the result, so that ``r, g1, g2, b = split_bayer(spikes)`` leaves time
+        at -3. Rows and columns are those of :func:`bayer_sites`: G1 is the green of the row that the cell begins
+        with, G2 that of the row below. Every pixel goes to one place, and its gradient comes from there.
+        :func:`merge_bayer` is the inverse.
+
+    Args:
+        raw: mosaic or spike stream :math:`(*, H, W)`, any dtype, H and W even.
+        pattern: Bayer phase, see :func:`bayer_pattern`.
+
+    Returns:
+        :math:`(4, *, H / 2, W / 2)`, in the dtype of ``raw``.
+
+    Raises:
+        TypeError: ``raw`` is not a tensor of real numbers.
+        ValueError: fewer than two dimensions, H or W is odd, or the pattern is unknown.
+
+    Example:
+        >>> r, g1, g2, b = split_bayer(torch.tensor([[1, 2], [3, 4]]), "GBRG")
+        >>> r.item(), g1.item(), g2.item(), b.item()
+        (3, 1, 4, 2)
+
+    Reference:
+        Dong et al., CVPR 2024, section 4.3, joint motion estimation.
+    """
+    check_planes("raw", raw, 2, "(*, H, W)")
+    if raw.shape[-2] % 2 or raw.shape[-1] % 2:
+        raise ValueError(f"raw: expected (*, H, W) with H and W even, got {tuple(raw.shape)}")
+    return torch.stack([raw[..., row::2, column::2] for _, row, column in bayer_sites(pattern)])
+
+
+class SplitBayer(nn.Module):
+    r"""See the Convention block on :func:`split_bayer`.
+
+    Shape:
+        - Input: :math:`(*, H, W)`
+        - Output: :math:`(4, *, H / 2, W / 2)`
+
+    Example:
+        >>> SplitBayer()(torch.ones(2, 41, 8, 6)).shape
+        torch.Size([4, 2, 41, 4, 3])
+    """
+
+    def __init__(self, pattern: str | CFA = "RGGB") -> None:
+        super().__init__()
+        self.pattern = bayer_pattern(pattern)
+
+    def forward(self, raw: Tensor) -> Tensor:  # noqa: D102
+        return split_bayer(raw, self.pattern)
+
+    def extra_repr(self) -> str:  # noqa: D102
+        return f"pattern={self.pattern!r}"
+
+
+def merge_bayer(planes: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
+    r"""Put the four sub-streams R, G1, G2, B back into one mosaic; the inverse of :func:`split_bayer`.
+
+    .. math:: S(2 x + \text{column}_k, 2 y + \text{row}_k) = S^k(x, y)
+
+    Convention:
+        The sub-stream is the **first** axis of the input, in the order and at the places of :func:`bayer_sites`.
+        Every pixel goes to one place, and its gradient comes from there.
+
+    Args:
+        planes: :math:`(4, *, H, W)`, any dtype.
+        pattern: Bayer phase, see :func:`bayer_pattern`.
+
+    Returns:
+        :math:`(*, 2 H, 2 W)`, in the dtype of ``planes``.
+
+    Raises:
+        TypeError: ``planes`` is not a tensor of real numbers.
+        ValueError: fewer than three dimensions, a first axis that is not of length 4, or an unknown pattern.
+
+    Example:
+        >>> raw = torch.rand(5, 4, 6)
+        >>> bool((merge_bayer(split_bayer(raw, "GRBG"), "GRBG") == raw).all())
+        True
+    """
+    check_planes("planes", planes, 2, "(4, *, H, W)")
+    if planes.ndim < 3 or planes.shape[0] != 4:
+        raise ValueError(f"planes: expected (4, *, H, W), got {tuple(planes.shape)}")
+    cell = [planes[0]] * 4
+    for plane, (_, row, column) in zip(planes, bayer_sites(pattern), strict=True):
+        cell[2 * row + column] = plane
+    rows = torch.stack(cell[:2], dim=-1).flatten(-2), torch.stack(cell[2:], dim=-1).flatten(-2)
+    return torch.stack(rows, dim=-2).flatten(-3, -2)
+
+
+class MergeBayer(nn.Module):
+    r"""See the Convention block on :func:`merge_bayer`.
+
+    Shape:
+        - Input: :math:`(4, *, H, W)`
+        - Output: :math:`(*, 2 H, 2 W)`
+
+    Example:
+        >>> MergeBayer()(torch.ones(4, 41, 4, 3)).shape
+        torch.Size([41, 8, 6])
+    """
+
+    def __init__(self, pattern: str | CFA = "RGGB") -> None:
+        super().__init__()
+        self.pattern = bayer_pattern(pattern)
+
+    def forward(self, planes: Tensor) -> Tensor:  # noqa: D102
+        return merge_bayer(planes, self.pattern)
+
+    def extra_repr(self) -> str:  # noqa: D102
+        return f"pattern={self.pattern!r}"

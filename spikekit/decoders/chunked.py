@@ -1,0 +1,102 @@
+"""Decode streams longer than the memory, chunk by chunk, with the result of the whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+
+import torch
+from torch import Tensor
+
+from spikekit.check import check_index, check_planes
+
+
+def decode_in_chunks(decode: Callable[[Tensor], Tensor], chunks: Iterable[Tensor], overlap: int) -> Iterator[Tensor]:
+    r"""Decode a stream that comes in chunks, in bounded memory, as if it came at once.
+
+    Convention:
+        Every frame is decoded with at least ``overlap`` frames before and after it, as far as the recording has them.
+        So the pieces, laid behind each other, equal ``decode`` of the whole stream, however it is cut, wherever frame
+        n of the result depends on frames n - overlap .. n + overlap and on the ends of the recording alone:
+
+        * :func:`spikekit.tfp`: everywhere, with an overlap of ``window // 2``;
+        * :func:`spikekit.tfi` and :func:`spikekit.spike_interval`: at every pixel and frame n for which the frames
+          n - overlap .. n + overlap hold the last spike before n and the first at or after n. Where the recording
+          has none on one side, they must reach its end there, and hold the two nearest spikes of the other side, or
+          all there are. In particular everywhere, if no pixel is silent for ``overlap // 2`` frames on end. A pixel
+          that is silent for longer is decoded as if the recording ended with the frames that were at hand.
+
+        Pieces are as long as the chunks allow, and not shorter than the overlap but for the last: at most two thirds
+        of the work is done twice. At most 3 overlap + 1 chunk frames are held.
+
+    Args:
+        decode: a function of spikes :math:`(*, T, H, W)`, such as ``tfi`` or ``lambda spikes: tfp(spikes, 41)``, or of
+            packed ones; it keeps the number of frames.
+        chunks: chunks :math:`(*, T_i, H, W)`, of any lengths, such as :func:`spikekit.iter_spikes` reads.
+        overlap: frames of context on each side, 0 or more.
+
+    Returns:
+        An iterator over consecutive pieces of the result; together they have as many frames as the chunks.
+
+    Raises:
+        TypeError: ``overlap`` is not a whole number; when iterated, a chunk that is not a tensor of real numbers, or a
+            ``decode`` that returns no tensor.
+        ValueError: an overlap below 0; when iterated, an empty chunk, chunks that do not fit each other, or a
+            ``decode`` that changes the number of frames.
+
+    Example:
+        >>> from spikekit import tfp
+        >>> spikes = (torch.rand(100, 3, 7) < 0.3).to(torch.uint8)
+        >>> pieces = decode_in_chunks(lambda part: tfp(part, 11), spikes.split(30), overlap=5)
+        >>> torch.cat(list(pieces)).equal(tfp(spikes, 11))
+        True
+
+    Reference:
+        The overlap-save method of convolution.
+    """
+    overlap = check_index("overlap", overlap)
+    if overlap < 0:
+        raise ValueError(f"overlap: expected 0 or more frames, got {overlap}")
+    return _pieces(decode, chunks, overlap)
+
+
+def _pieces(decode: Callable[[Tensor], Tensor], chunks: Iterable[Tensor], overlap: int) -> Iterator[Tensor]:
+    held: list[Tensor] = []
+    length = past = 0  # frames held, and how many of them are decoded already
+    for chunk in chunks:
+        check_planes("chunks", chunk, 3, "(*, T, H, W)")
+        _check_fits(held, chunk)
+        held.append(chunk)
+        length += chunk.shape[-3]
+        ready = length - past - overlap
+        if ready < max(overlap, 1):
+            continue
+        span = torch.cat(held, dim=-3)
+        piece = _decoded(decode, span, past, ready)
+        kept = min(overlap, past + ready)
+        held = [span[..., past + ready - kept :, :, :].clone()]  # a view would keep the whole span
+        del span
+        length, past = held[0].shape[-3], kept
+        yield piece
+    if length > past:
+        yield _decoded(decode, torch.cat(held, dim=-3), past, length - past)
+
+
+def _decoded(decode: Callable[[Tensor], Tensor], span: Tensor, past: int, count: int) -> Tensor:
+    result = decode(span)
+    if not isinstance(result, Tensor):
+        raise TypeError(f"decode: expected a function that returns a tensor, got {type(result).__name__}")
+    if result.ndim < 3 or result.shape[-3] != span.shape[-3]:
+        raise ValueError(f"decode: expected {span.shape[-3]} frames as given, got a result of {tuple(result.shape)}")
+    return result[..., past : past + count, :, :]
+
+
+def _check_fits(held: list[Tensor], chunk: Tensor) -> None:
+    def kind(part: Tensor) -> tuple[object, ...]:
+        return (*part.shape[:-3], "T", *part.shape[-2:]), part.dtype, part.device
+
+    if held and kind(held[0]) != kind(chunk):
+        shapes = tuple(held[0].shape), tuple(chunk.shape)
+        raise ValueError(
+            f"chunks: expected all of one size, type and device, got {shapes[0]} of {held[0].dtype} on "
+            f"{held[0].device} before {shapes[1]} of {chunk.dtype} on {chunk.device}"
+        )

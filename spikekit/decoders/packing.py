@@ -1,0 +1,121 @@
+"""Packed spikes: one bit a pixel, an eighth of the memory and of the transfers to a GPU."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from spikekit.check import check_planes, check_whole
+from spikekit.kernels import batch_first
+
+_NOT_BITS = "spikes: expected zeros and ones, got other values"
+
+
+@torch.library.custom_op("spikekit::pack_bits", mutates_args=())
+def _pack_bits(spikes: Tensor) -> Tensor:
+    bits = spikes != 0
+    if not torch.equal(bits.to(spikes.dtype), spikes):
+        raise ValueError(_NOT_BITS)
+    eights = F.pad(bits.to(torch.uint8), (0, -spikes.shape[-1] % 8)).unflatten(-1, (-1, 8))
+    return (eights << torch.arange(8, dtype=torch.uint8, device=spikes.device)).sum(-1, dtype=torch.uint8)
+
+
+@_pack_bits.register_kernel("cpu")
+def _(spikes: Tensor) -> Tensor:
+    values = (spikes.float() if spikes.dtype is torch.bfloat16 else spikes).numpy()  # NumPy has no bfloat16
+    bits = values if values.dtype == np.uint8 else values != 0
+    if not (values.max(initial=0) <= 1 if bits is values else np.array_equal(bits, values)):
+        raise ValueError(_NOT_BITS)
+    return torch.from_numpy(np.packbits(bits, axis=-1, bitorder="little"))
+
+
+@_pack_bits.register_fake
+def _(spikes: Tensor) -> Tensor:
+    return spikes.new_empty((*spikes.shape[:-1], (spikes.shape[-1] + 7) // 8), dtype=torch.uint8)
+
+
+@torch.library.custom_op("spikekit::unpack_bits", mutates_args=())
+def _unpack_bits(packed: Tensor, width: int) -> Tensor:
+    places = torch.arange(8, dtype=torch.uint8, device=packed.device)
+    return ((packed[..., None] >> places) & 1).flatten(-2)[..., :width].contiguous()
+
+
+@_unpack_bits.register_kernel("cpu")
+def _(packed: Tensor, width: int) -> Tensor:
+    return torch.from_numpy(np.unpackbits(packed.numpy(), axis=-1, count=width, bitorder="little"))
+
+
+@_unpack_bits.register_fake
+def _(packed: Tensor, width: int) -> Tensor:
+    return packed.new_empty((*packed.shape[:-1], width))
+
+
+batch_first(_pack_bits)
+batch_first(_unpack_bits)
+
+
+def pack_spikes(spikes: Tensor) -> Tensor:
+    r"""Put 8 neighbouring pixels of a row into a byte.
+
+    .. math:: P_{y, j} = \sum_{i=0}^{7} 2^i S_{y, 8 j + i}
+
+    Convention:
+        The leftmost pixel is the least significant bit, as in a ``.dat``. Every row begins with a byte of its own:
+        where 8 does not divide W, the last bits of a row are 0. Nothing is lost, so values other than 0 and 1 are an
+        error; on a GPU, finding out takes a wait. No gradient.
+
+    Args:
+        spikes: :math:`(*, H, W)`, zeros and ones, any real dtype; mostly :math:`(T, H, W)`.
+
+    Returns:
+        Bytes :math:`(*, H, \lceil W / 8 \rceil)`, uint8, on the device of ``spikes``.
+
+    Raises:
+        TypeError: ``spikes`` is not a tensor of real numbers.
+        ValueError: fewer than two dimensions, no pixels, or values other than 0 and 1.
+
+    Example:
+        >>> pack_spikes(torch.tensor([[1, 0, 0, 0, 0, 0, 0, 0, 1, 1]]))
+        tensor([[1, 3]], dtype=torch.uint8)
+    """
+    check_planes("spikes", spikes, 2, "(*, H, W)")
+    return _pack_bits(spikes.detach())
+
+
+def unpack_spikes(packed: Tensor, width: int, *, dtype: torch.dtype = torch.uint8) -> Tensor:
+    r"""Undo :func:`pack_spikes`: one pixel a value.
+
+    Convention:
+        The inverse of :func:`pack_spikes`, bit for bit. What stands in the last byte of a row beyond ``width`` is not
+        looked at.
+
+    Args:
+        packed: bytes :math:`(*, H, \lceil W / 8 \rceil)`, uint8; mostly :math:`(T, H, \lceil W / 8 \rceil)`.
+        width: W, pixels in a row.
+        dtype: of the result; any real type.
+
+    Returns:
+        Zeros and ones :math:`(*, H, W)` on the device of ``packed``.
+
+    Raises:
+        TypeError: ``packed`` is not a tensor of bytes.
+        ValueError: fewer than two dimensions, no bytes, or a width that takes another number of bytes.
+
+    Example:
+        >>> packed = torch.tensor([[1, 3]], dtype=torch.uint8)
+        >>> unpack_spikes(packed, 10)
+        tensor([[1, 0, 0, 0, 0, 0, 0, 0, 1, 1]], dtype=torch.uint8)
+    """
+    check_planes("packed", packed, 2, "(*, H, ceil(W / 8))")
+    if packed.dtype is not torch.uint8:
+        raise TypeError(f"packed: expected bytes, torch.uint8, got {packed.dtype}")
+    width = check_whole("width", width)
+    if packed.shape[-1] != (width + 7) // 8:
+        raise ValueError(
+            f"width: expected {8 * packed.shape[-1] - 7} .. {8 * packed.shape[-1]} for rows of {packed.shape[-1]} "
+            f"bytes, got {width}"
+        )
+    spikes = _unpack_bits(packed, width)
+    return spikes.view(dtype) if dtype is torch.bool else spikes.to(dtype=dtype)

@@ -1,0 +1,281 @@
+"""The decoders at a single frame, reading only the few frames that decide it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from itertools import accumulate
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from spikekit.check import check_dtype, check_index, check_planes, check_positive, check_whole, default_float
+from spikekit.decoders.dense import cast_light, check_window, interval_dtype
+from spikekit.kernels import batch_first
+
+
+@torch.library.custom_op("spikekit::spike_interval_at", mutates_args=())
+def _spike_interval_at(spikes: Tensor, frame: int) -> Tensor:
+    fired = spikes != 0
+    after, gap_after = _look(fired[..., frame:, :, :])
+    before, gap_before = _look(fired[..., :frame, :, :].flip(-3))
+    frames = spikes.shape[-3]
+    gap = torch.where(before == frame, gap_after, torch.where(after == frames - frame, gap_before, 0))
+    return torch.maximum(before + after + 1, gap).to(interval_dtype(frames))
+
+
+def _look(fired: Tensor) -> tuple[Tensor, Tensor]:
+    """Count the planes before the first spike, all where there is none; and from it to the second, 0 if none."""
+    planes = fired.shape[-3]
+    if planes == 0:
+        none = fired.new_zeros(fired.shape[:-3] + fired.shape[-2:], dtype=torch.int64)
+        return none, none
+    first = torch.where(fired.any(-3), fired.byte().argmax(-3), planes)
+    later = fired & (torch.arange(planes, device=fired.device)[:, None, None] > first.unsqueeze(-3))
+    return first, torch.where(later.any(-3), later.byte().argmax(-3) - first, 0)
+
+
+@_spike_interval_at.register_kernel("cpu")
+def _(spikes: Tensor, frame: int) -> Tensor:
+    frames = spikes.shape[-3]
+    planes = spikes.detach().movedim(-3, 0)
+    if spikes.dtype in (torch.uint8, torch.bool):
+        return torch.from_numpy(search(planes.view(torch.uint8).numpy().__getitem__, frame, range(frames)))
+    return torch.from_numpy(search(lambda n: (planes[n] != 0).view(torch.uint8).numpy(), frame, range(frames)))
+
+
+@_spike_interval_at.register_fake
+def _(spikes: Tensor, frame: int) -> Tensor:
+    size = spikes.shape[:-3] + spikes.shape[-2:]
+    return spikes.new_empty(size, dtype=interval_dtype(spikes.shape[-3]))
+
+
+batch_first(_spike_interval_at)
+
+
+def search(plane: Callable[[int], np.ndarray], frame: int, clip: range) -> np.ndarray:
+    """Find the intervals at one frame of a clip whose frames are made when they are needed.
+
+    Args:
+        plane: gives the frame of a number: an array of any shape, uint8, anything but 0 is a spike.
+        frame: where to find the intervals.
+        clip: the numbers of the clip's frames, consecutive.
+
+    Returns:
+        The intervals as :func:`spikekit.spike_interval` gives them for the clip.
+    """
+    size = plane(frame).shape
+    onwards, backwards = range(frame, clip.stop), range(frame - 1, clip.start - 1, -1)
+    after, none_after = _silence(map(plane, onwards), size, len(clip))
+    before, none_before = _silence(map(plane, backwards), size, len(clip))
+    interval = after + before + 1
+    # where one of the two spikes is missing, the nearest complete interval lies on the other side
+    for order, alone in ((onwards, none_before & ~none_after), (backwards, none_after & ~none_before)):
+        if alone.any():
+            np.maximum(interval, _first_interval(map(plane, order), alone, len(clip)), out=interval)
+    return interval
+
+
+class _Counter:
+    """Counts planes, at every pixel, in bytes as long as these will do."""
+
+    def __init__(self, size: tuple[int, ...], most: int) -> None:
+        self._few = np.zeros(size, np.uint8)
+        self.total = np.zeros(size, np.int16 if most < 32767 else np.int32)
+        self._steps = 0
+
+    def add(self, mask: np.ndarray) -> None:
+        self._few += mask.view(np.uint8)
+        self._steps += 1
+        if self._steps == 255:
+            self.close()
+
+    def close(self) -> np.ndarray:
+        self.total += self._few
+        self._few.fill(0)
+        self._steps = 0
+        return self.total
+
+
+def _silence(planes: Iterable[np.ndarray], size: tuple[int, ...], most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Count the planes before the first spike of every pixel, all where there is none; and say where there is none."""
+    silent, count = np.ones(size, bool), _Counter(size, most)
+    for plane in planes:
+        np.greater(silent.view(np.uint8), plane, out=silent)
+        count.add(silent)
+        if not silent.any():
+            break
+    return count.close(), silent
+
+
+def _first_interval(planes: Iterable[np.ndarray], wanted: np.ndarray, most: int) -> np.ndarray:
+    """Count the planes from the first spike to the second, at the wanted pixels; 0 where there is no second."""
+    waiting, once, count = wanted.copy(), np.zeros_like(wanted), _Counter(wanted.shape, most)
+    for plane in planes:
+        fired = plane != 0
+        np.greater(waiting, once & fired, out=waiting)
+        once |= fired
+        count.add(waiting & once)
+        if not waiting.any():
+            break
+    return count.close() * ~waiting
+
+
+def spike_interval_at(spikes: Tensor, frame: int) -> Tensor:
+    r"""Distance between the two spikes that enclose one frame.
+
+    .. math:: \Psi_n = \min\{k \mid S_k = 1, k \ge n\} - \max\{k \mid S_k = 1, k < n\}
+
+    Convention:
+        ``spike_interval(spikes)[..., frame, :, :]``, ends of the clip and all, for the work of a few frames: on the
+        CPU, frames are read outwards from this one until every pixel has fired on both sides. No gradient.
+
+    Args:
+        spikes: :math:`(*, T, H, W)`, zeros and ones, any real dtype.
+        frame: n, from 0 to T - 1.
+
+    Returns:
+        The intervals in frames, :math:`(*, H, W)`, in the dtype that :func:`spikekit.spike_interval` gives.
+
+    Raises:
+        TypeError: ``spikes`` is not a tensor of real numbers, or ``frame`` no whole number.
+        ValueError: fewer than three dimensions, an empty clip, or a frame that is not in it.
+
+    Example:
+        >>> spikes = torch.tensor([0, 1, 0, 0, 1, 0], dtype=torch.uint8).reshape(6, 1, 1)
+        >>> spike_interval_at(spikes, 3).item()
+        3
+
+    Reference:
+        Dong et al., CVPR 2024, eq. (4); Zhu et al., ICME 2019.
+    """
+    interval = _interval(spikes, frame)
+    return interval.to(spikes.dtype) if spikes.is_floating_point() else interval
+
+
+def tfi_at(spikes: Tensor, frame: int, max_range: float = 1.0, *, dtype: torch.dtype | None = None) -> Tensor:
+    r"""Texture from interval at one frame, the key frame.
+
+    .. math:: R_n = \delta / \Psi_n
+
+    Convention:
+        ``tfi(spikes, max_range, dtype=dtype)[..., frame, :, :]``, bit for bit, for the work of a few frames; see
+        :func:`spike_interval_at`. No gradient.
+
+    Args:
+        spikes: :math:`(*, T, H, W)`, zeros and ones, any real dtype.
+        frame: n, from 0 to T - 1.
+        max_range: :math:`\delta`, the value of a pixel that fires at every clock.
+        dtype: of the result, floating or uint8; that of ``spikes`` where it is floating, else torch's default type.
+
+    Returns:
+        Raw intensities :math:`(*, H, W)`.
+
+    Raises:
+        TypeError: as :func:`spike_interval_at`, or another dtype.
+        ValueError: as :func:`spike_interval_at`, or ``max_range`` not above 0.
+
+    Example:
+        >>> tfi_at(torch.tensor([0, 1, 0, 1]).reshape(4, 1, 1), 2)
+        tensor([[0.5000]])
+
+    Reference:
+        Dong et al., CVPR 2024, eq. (5); Zhu et al., ICME 2019.
+    """
+    check_dtype(dtype, torch.uint8)
+    check_positive("max_range", max_range)
+    interval = _interval(spikes, frame)
+    dtype = dtype or default_float(spikes)
+    # a tensor over a tensor: torch divides a number by a tensor through the inverse, and 255 / 5 is not 51 then
+    rate = torch.full_like(interval, max_range, dtype=torch.promote_types(dtype, torch.float32)) / interval
+    return cast_light(rate, dtype)
+
+
+def tfp_at(
+    spikes: Tensor,
+    frame: int,
+    window: int,
+    max_range: float = 1.0,
+    *,
+    order: int = 1,
+    dtype: torch.dtype | None = None,
+) -> Tensor:
+    r"""Texture from playback at one frame, the key frame: one weighted sum of the frames that it sees.
+
+    .. math:: R_n = \delta \sum_k w_k S_{n + k}, \quad \sum_k w_k = 1
+
+    Convention:
+        ``tfp(spikes, window, max_range, order=order, dtype=dtype)[..., frame, :, :]``, to rounding; sums run in
+        float32 or wider. Linear in the spikes, and differentiable as such.
+
+    Args:
+        spikes: :math:`(*, T, H, W)`, zeros and ones, any real dtype.
+        frame: n, from 0 to T - 1.
+        window: number of frames of the mean, odd.
+        max_range: :math:`\delta`, the value of a pixel that fires at every clock.
+        order: how often the mean is taken, see :func:`spikekit.tfp`.
+        dtype: of the result, floating or uint8; that of ``spikes`` where it is floating, else torch's default type.
+
+    Returns:
+        Raw intensities :math:`(*, H, W)`.
+
+    Raises:
+        TypeError: ``spikes`` is not a tensor of real numbers, ``frame`` no whole number, ``dtype`` neither floating
+            nor uint8.
+        ValueError: fewer than three dimensions, an empty clip, a frame that is not in it, an even window or one below
+            1, an order below 1, ``max_range`` not above 0.
+
+    Example:
+        >>> tfp_at(torch.tensor([0, 1, 0, 1]).reshape(4, 1, 1), 2, 3)
+        tensor([[0.6667]])
+
+    Reference:
+        Dong et al., CVPR 2024, eq. (6); Zhu et al., ICME 2019.
+    """
+    frame = _check_frame(spikes, frame)
+    window, order = check_window(window), check_whole("order", order)
+    check_positive("max_range", max_range)
+    check_dtype(dtype, torch.uint8)
+    dtype = dtype or default_float(spikes)
+    first, weights = tfp_weights(spikes.shape[-3], frame, window, order)
+    between = torch.float64 if torch.float64 in (dtype, spikes.dtype) else torch.float32
+    light = spikes[..., first, :, :].to(between) * (max_range * weights[0])
+    for n, weight in enumerate(weights[1:], first + 1):  # frame by frame: what is larger than the result costs more
+        light.add_(spikes[..., n, :, :], alpha=max_range * weight)
+    return cast_light(light, dtype)
+
+
+def tfp_weights(frames: int, frame: int, window: int, order: int) -> tuple[int, list[float]]:
+    """Find what the mean of means at one frame of a clip is a sum of.
+
+    Args:
+        frames: of the clip.
+        frame: where the mean is taken.
+        window: frames of a mean, odd.
+        order: how often it is taken.
+
+    Returns:
+        The first frame that counts, and the weights of it and those that follow.
+    """
+    half = window // 2
+    first, last = max(frame - order * half, 0), min(frame + order * half, frames - 1)
+    seen = range(first, last + 1)
+    weights = [float(n == frame) for n in seen]
+    for _ in range(order):
+        shares = [w / (min(n + half, frames - 1) - max(n - half, 0) + 1) for n, w in zip(seen, weights, strict=True)]
+        total = [0.0, *accumulate(shares)]
+        weights = [total[min(n + half, last) - first + 1] - total[max(n - half, first) - first] for n in seen]
+    return first, weights
+
+
+def _interval(spikes: Tensor, frame: int) -> Tensor:
+    frame = _check_frame(spikes, frame)
+    return _spike_interval_at(spikes.detach(), frame)
+
+
+def _check_frame(spikes: Tensor, frame: int) -> int:
+    check_planes("spikes", spikes, 3, "(*, T, H, W)")
+    frame = check_index("frame", frame)
+    if not 0 <= frame < spikes.shape[-3]:
+        raise ValueError(f"frame: expected 0 .. {spikes.shape[-3] - 1}, got {frame}")
+    return frame

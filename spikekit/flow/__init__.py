@@ -1,0 +1,17 @@
+"""Motion fields, latent frames between two frames, and optical flow."""
+
+from spikekit.flow.fields import JointFlow, LinearMotion, UpsampleFlow, joint_flow, linear_motion, upsample_flow
+from spikekit.flow.interpolate import Between, Blend, FlowInterpolation, Still
+
+__all__ = [
+    "Between",
+    "Blend",
+    "FlowInterpolation",
+    "JointFlow",
+    "LinearMotion",
+    "Still",
+    "UpsampleFlow",
+    "joint_flow",
+    "linear_motion",
+    "upsample_flow",
+]

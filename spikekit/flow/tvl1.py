@@ -1,0 +1,104 @@
+"""TV-L1 optical flow between two moments, of pictures whose noise is known."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from spikekit.kernels import loops
+from spikekit.warp import flow_warp
+
+SMOOTHINGS, ROUNDS = 2, 10  # steps towards a smooth flow in a round, and rounds in a warp
+COUPLING = 0.25  # how far the flow that the pictures want and the smooth one may part
+STEP = 0.15  # of the dual variable; converges up to a quarter
+
+_SMALLEST = 16  # pixels, the shorter side of the smallest picture that motion is looked for in
+
+
+@torch.no_grad()
+def tvl1_flow(
+    pictures: Tensor,
+    times: Tensor,
+    attachment: Tensor,
+    start: Tensor | None = None,
+    warps: int = 5,
+) -> Tensor:
+    r"""Motion v of which two pictures are two moments: :math:`I_0(x + t_0 v) = I_1(x + t_1 v)`.
+
+    Least :math:`\int |\nabla v_x| + |\nabla v_y| + \lambda |I_1(x + t_1 v) - I_0(x + t_0 v)|`, from coarse pictures to
+    fine ones, linearized around what is known of v and solved alternately, :math:`\theta = 0.25` coupling the flow that
+    follows the pictures to the smooth one. With the times 0 and 1 that is optical flow from the first picture to the
+    second, with -1/2 and 1/2 that of the moment between.
+
+    Args:
+        pictures: (B, 2, H, W), finite, of at least 2 x 2 pixels, float32 or wider.
+        times: (B, 2), :math:`t_0` and :math:`t_1`, about 1 apart: the units of the other arguments are of them.
+        attachment: (B, H, W), the weight :math:`\lambda` of the difference of the pictures.
+        start: (B, 2, H, W) to begin with at full size; without it 0, at the coarsest size.
+        warps: times that every level is linearized around what is known by then.
+
+    Returns:
+        (B, 2, H, W), in pixels per unit of the times, order (x, y).
+
+    Reference:
+        Zach, Pock and Bischof, A duality based approach for realtime TV-L1 optical flow, DAGM 2007.
+    """
+    size = pictures.shape[-2:]
+    sizes = [size]
+    while start is None and min(sizes[-1]) >= 2 * _SMALLEST:
+        sizes.append(tuple((side + 1) // 2 for side in sizes[-1]))
+    levels = [torch.cat([pictures, attachment[:, None]], dim=1)]
+    for smaller in sizes[1:]:
+        levels.append(F.interpolate(levels[-1], smaller, mode="bilinear", antialias=True))
+    flow = pictures.new_zeros(len(pictures), 2, *sizes[-1]) if start is None else start
+    compiled = loops.import_loops("spikekit.flow.cpu_tvl1") if pictures.device.type == "cpu" else None
+    improve = refine if compiled is None else compiled.refine
+    for level in reversed(levels):
+        if flow.shape[-2:] != level.shape[-2:]:
+            ratio = flow.new_tensor([new / old for new, old in zip(level.shape[:1:-1], flow.shape[:1:-1], strict=True)])
+            flow = F.interpolate(flow, level.shape[-2:], mode="bilinear") * ratio.reshape(2, 1, 1)
+        flow = improve(level[:, :2], times, level[:, 2] * COUPLING, flow, warps)
+    return flow
+
+
+def refine(pictures: Tensor, times: Tensor, limit: Tensor, flow: Tensor, warps: int) -> Tensor:
+    """Improve the flow of a level.
+
+    Args:
+        pictures: (B, 2, H, W).
+        times: (B, 2).
+        limit: (B, H, W), how far, in slopes, a round may follow the pictures.
+        flow: (B, 2, H, W).
+        warps: how often.
+
+    Returns:
+        (B, 2, H, W).
+    """
+    time = times.to(pictures)[..., None, None, None]
+    height, width = flow.shape[-2:]
+    # by component and direction: what to add to the right and below, kept with a zero on the other side
+    dual = flow.new_zeros(*flow.shape[:2], 2, height + 1, width + 1)
+    inner, ahead = dual[..., 1:, 1:], torch.zeros_like(dual[..., 1:, 1:])
+    for _ in range(warps):
+        moved = flow_warp(pictures.unsqueeze(2), flow.unsqueeze(1) * time).squeeze(2)
+        slopes = torch.stack(torch.gradient(moved, dim=(-1, -2)), dim=2) * time
+        slope = slopes[:, 1] - slopes[:, 0]
+        rest = moved[:, 1] - moved[:, 0] - (slope * flow).sum(dim=1)
+        square = slope.square().sum(dim=1).neg_() - 1e-30
+        for _ in range(ROUNDS):
+            differs = torch.addcmul(rest, slope[:, 0], flow[:, 0]).addcmul_(slope[:, 1], flow[:, 1])
+            near = torch.addcmul(flow, differs.div_(square).clamp_(-limit, limit).unsqueeze(1), slope)
+            flow = near + _divergence(dual)
+            for _ in range(SMOOTHINGS):
+                torch.sub(flow[..., 1:], flow[..., :-1], out=ahead[:, :, 0, :, :-1])
+                torch.sub(flow[..., 1:, :], flow[..., :-1, :], out=ahead[:, :, 1, :-1])
+                share = torch.hypot(*ahead.unbind(2)).mul_(STEP / COUPLING).add_(1)
+                inner.add_(ahead, alpha=STEP).div_(share.unsqueeze(2))
+                flow = _divergence(dual).add_(near)
+    return flow
+
+
+def _divergence(dual: Tensor) -> Tensor:
+    to_right, down = dual.unbind(dim=2)
+    return (to_right[..., 1:, 1:] - to_right[..., 1:, :-1]).add_(down[..., 1:, 1:]).sub_(down[..., :-1, 1:])

@@ -1,0 +1,215 @@
+"""Camera presets: file layout, Bayer phase and display of known cameras, read from JSON."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass, fields
+from importlib.resources import files
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from spikekit.arguments import one_line
+from spikekit.check import check_planes, check_positive, check_whole
+from spikekit.color.cfa import bayer_pattern
+
+_PRESETS = files("spikekit.io") / "camera_presets"
+
+#: The names that :func:`camera` knows.
+CAMERAS = tuple(sorted(preset.name[: -len(".json")] for preset in _PRESETS.iterdir() if preset.name.endswith(".json")))
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A kind of spike camera: what one must know of it to read a recording and to show a picture.
+
+    Convention:
+        A recording goes through :meth:`prepare` in this order: columns that are no pixels are dropped, frames that are
+        stored upside down are turned, the border is cropped. ``pattern`` is the Bayer phase between the last two, and
+        ``prepared_pattern`` that of what comes out.
+
+    Args:
+        name: what it is called.
+        title: what it is.
+        height: rows.
+        width: columns, without those that are dropped.
+        drop: columns of a raw stream that are no pixels, as (first, last + 1), in order.
+        rate: clocks a second.
+        flip: whether frames are stored upside down.
+        pattern: Bayer phase of upright frames; ``None`` for a grey camera.
+        crop: rows and columns to cut off: (top, bottom, left, right).
+        gain: what a picture is multiplied by when it is shown.
+        gamma: what its values are then encoded with.
+        source: where all this is known from.
+
+    Raises:
+        TypeError: a text, a number or a flip that is none.
+        ValueError: another value that makes no sense; the message names it.
+    """
+
+    name: str
+    title: str
+    height: int
+    width: int
+    drop: tuple[tuple[int, int], ...]
+    rate: float
+    flip: bool
+    pattern: str | None
+    crop: tuple[int, int, int, int]
+    gain: float
+    gamma: float
+    source: str
+
+    def __post_init__(self) -> None:
+        kinds = {"name": str, "title": str, "source": str, "flip": bool}
+        kinds |= dict.fromkeys(("rate", "gain", "gamma"), int | float)
+        for name, kind in kinds.items():
+            if not isinstance(getattr(self, name), kind):
+                said = "a number" if name in ("rate", "gain", "gamma") else kind.__name__
+                raise TypeError(f"{name}: expected {said}, got {repr(getattr(self, name))[:80]}")
+        for name in ("rate", "gain", "gamma"):
+            check_positive(name, getattr(self, name))
+            if getattr(self, name) > sys.float_info.max:  # a whole number has no end
+                raise ValueError(f"{name}: expected a finite number, got more than {sys.float_info.max:g}")
+        for name in ("height", "width"):
+            check_whole(name, getattr(self, name))
+        if self.pattern is not None:
+            bayer_pattern(self.pattern)
+        good = isinstance(self.drop, tuple) and all(_are_places(part, 2) for part in self.drop)
+        if not good or list(self._edges) != sorted(self._edges):
+            raise ValueError(f"drop: expected pairs [first, last + 1] of columns, in order, got {self.drop}")
+        if not _are_places(self.crop, 4) or min(self.prepared_size) < 1:
+            raise ValueError(f"crop: expected [top, bottom, left, right] that leaves pixels, got {self.crop}")
+
+    @property
+    def stored_width(self) -> int:
+        """Columns of a raw stream, with those that are no pixels."""
+        return self.width + sum(stop - start for start, stop in self.drop)
+
+    @property
+    def _edges(self) -> tuple[int, ...]:
+        """Where, in a raw stream, columns that are pixels begin and end, in turn."""
+        return (0, *(edge for part in self.drop for edge in part), self.stored_width)
+
+    @property
+    def prepared_size(self) -> tuple[int, int]:
+        """(H, W) of what :meth:`prepare` gives."""
+        top, bottom, left, right = self.crop
+        return self.height - top - bottom, self.width - left - right
+
+    @property
+    def prepared_pattern(self) -> str | None:
+        """Bayer phase of what :meth:`prepare` gives; ``None`` for a grey camera."""
+        if self.pattern is None:
+            return None
+        pattern = bayer_pattern(self.pattern)
+        top, _, left, _ = self.crop
+        return "".join(pattern[2 * ((top + y) % 2) + (left + x) % 2] for y in (0, 1) for x in (0, 1))
+
+    def prepare(self, spikes: Tensor, *, flip: bool | None = None) -> Tensor:
+        """Make of stored frames what the camera saw: only pixels, upright, without the border.
+
+        Args:
+            spikes: frames :math:`(*, H, W)` as they are stored, with or without the columns that are no pixels.
+            flip: turn them upside down; as the camera needs it when not given. ``False`` where reading has done it.
+
+        Returns:
+            Frames :math:`(*, H', W')` of :attr:`prepared_size`, in the dtype of ``spikes``.
+
+        Raises:
+            TypeError: ``spikes`` is not a tensor of real numbers.
+            ValueError: frames of another size.
+        """
+        check_planes("spikes", spikes, 2, "(*, H, W)")
+        height, width = spikes.shape[-2:]
+        if height != self.height or width not in (self.width, self.stored_width):
+            widths = " or ".join(str(w) for w in dict.fromkeys((self.width, self.stored_width)))
+            raise ValueError(
+                f"spikes: expected {self.height} x {widths} of the camera {self.name}, got {height} x {width}"
+            )
+        if width != self.width:
+            kept = [spikes[..., a:b] for a, b in zip(self._edges[::2], self._edges[1::2], strict=True)]
+            spikes = torch.cat(kept, dim=-1)
+        if self.flip if flip is None else flip:
+            spikes = spikes.flip(-2)
+        top, bottom, left, right = self.crop
+        return spikes[..., top : self.height - bottom, left : self.width - right]
+
+    def display(self, picture: Tensor) -> Tensor:
+        r"""Return a picture as it is shown.
+
+        .. math:: \operatorname{clip}(\text{gain} \cdot I, 0, 1)^{1 / \text{gamma}}
+
+        Args:
+            picture: light of a decoder or a network, white being 1; any shape, floating.
+
+        Returns:
+            The same shape, in [0, 1].
+
+        Raises:
+            TypeError: ``picture`` is not a floating-point tensor.
+        """
+        check_planes("picture", picture, 2, "(*, H, W)", floating=True)
+        return (picture * self.gain).clamp(0, 1) ** (1 / self.gamma)
+
+
+def camera(name: str | Path) -> Camera:
+    """Load a camera: one of :data:`CAMERAS` by its name, or another from a file of the same form.
+
+    Args:
+        name: a name, or a path that ends in ``.json``.
+
+    Returns:
+        The camera.
+
+    Raises:
+        ValueError: an unknown name, or a file that cannot be read or does not describe a camera.
+
+    Example:
+        >>> CAMERAS
+        ('m1k40', 'm1k40-bayer', 'uhsr', 'vidar')
+        >>> colour = camera("m1k40-bayer")
+        >>> colour.prepare(torch.zeros(2, 1000, 1024, dtype=torch.uint8)).shape, colour.prepared_pattern
+        (torch.Size([2, 992, 992]), 'RGGB')
+    """
+    own = str(name).endswith(".json")
+    if not own and name not in CAMERAS:
+        raise ValueError(f"camera: expected {', '.join(CAMERAS)}, or a .json file, got {name}")
+    file = Path(name) if own else _PRESETS / f"{name}.json"
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except RecursionError as error:
+        raise ValueError(f"{name}: nested too deeply for what describes a camera") from error
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{name}: {one_line(error)}") from error
+    wanted = [field.name for field in fields(Camera) if field.name != "name"]
+    if not isinstance(data, dict) or set(data) != set(wanted):
+        got = " ".join(_differences(data, wanted).split())[:300]
+        raise ValueError(f"{name}: expected an object with {', '.join(wanted)}, got {got}")
+    try:
+        return Camera(**{"name": file.name.removesuffix(".json")} | {key: _frozen(data[key]) for key in wanted})
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"{name}: {one_line(error)[:300]}") from error
+
+
+def _frozen(value: object) -> object:
+    return tuple(map(_frozen, value)) if isinstance(value, list) else value
+
+
+def _are_places(values: object, count: int) -> bool:
+    """Whether these are as many whole numbers, 0 or more."""
+    return (
+        isinstance(values, tuple)
+        and len(values) == count
+        and all(isinstance(value, int) and not isinstance(value, bool) and value >= 0 for value in values)
+    )
+
+
+def _differences(data: object, wanted: list[str]) -> str:
+    if not isinstance(data, dict):
+        return type(data).__name__
+    missing, extra = [w for w in wanted if w not in data], [d for d in data if d not in wanted]
+    said = [f"{what} {', '.join(names)}" for what, names in (("none of", missing), ("also", extra)) if names]
+    return "; ".join(said)

@@ -1,0 +1,299 @@
+"""Recordings on disk: the field's packed ``.dat`` and NumPy's ``.npz``, read and written in bounded memory."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from spikekit.check import check_index, check_planes, check_whole
+from spikekit.io.formats import (
+    SpikeFileError,
+    Wanted,
+    binary,
+    dat_blocks,
+    dat_bytes,
+    dat_shape,
+    npz_blocks,
+    npz_shape,
+    reading,
+    stored_blocks,
+    write_npz,
+    writing,
+)
+from spikekit.io.whole_file import whole_file
+
+# Pixels that are written at a time, so that a tensor of any dtype needs no copy of itself as bits.
+_BLOCK = 1 << 22
+
+
+def read_spikes(
+    path: str | Path,
+    height: int | None = None,
+    width: int | None = None,
+    *,
+    flip: bool = False,
+    start: int = 0,
+    frames: int | None = None,
+    packed: bool = False,
+) -> Tensor:
+    """Read a recording, or some frames of it.
+
+    Convention:
+        ``.dat`` has no header: frame after frame, row by row, 8 neighbouring pixels a byte, the leftmost in the least
+        significant bit. Where 8 does not divide H x W, every frame is padded to whole bytes. ``.npz`` holds one array
+        (T, H, W) of zeros and ones, named ``spk`` or ``spikes``, or the only 3-D array of the file.
+
+        Real cameras store frames upside down, which neither format records: ``flip`` turns them. Pixel (0, 0) of the
+        result is then the top left of the scene, and the Bayer phase counts from there.
+
+        Of a ``.dat``, only the bytes of the frames asked for are read.
+
+    Args:
+        path: a file ending in ``.dat`` or ``.npz``.
+        height: rows; needed for ``.dat``, checked against the file for ``.npz``.
+        width: columns; likewise.
+        flip: turn the stored frames upside down.
+        start: the first frame to read.
+        frames: how many; up to the end when not given.
+        packed: leave 8 pixels in a byte, as :func:`spikekit.pack_spikes` would make of the result.
+
+    Returns:
+        ``spikes`` of shape (T, H, W), uint8, zeros and ones; (T, H, ceil(W / 8)) where packed.
+
+    Raises:
+        SpikeFileError: no such file, not a recording, damaged, truncated, of another size, or without these frames.
+        TypeError: a size or a number of frames that is not a whole number.
+
+    Example:
+        >>> import tempfile
+        >>> spikes = (torch.rand(5, 3, 7) < 0.3).to(torch.uint8)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_spikes(f"{folder}/clip.dat", spikes)
+        ...     read_spikes(f"{folder}/clip.dat", 3, 7, start=2).equal(spikes[2:])
+        True
+    """
+    (whole,) = _open(path, height, width, flip, start, frames, None, packed)
+    return torch.from_numpy(whole)
+
+
+def iter_spikes(
+    path: str | Path,
+    height: int | None = None,
+    width: int | None = None,
+    *,
+    flip: bool = False,
+    start: int = 0,
+    frames: int | None = None,
+    chunk: int | None = None,
+    packed: bool = False,
+) -> Iterator[Tensor]:
+    """Read a recording frame by frame, or a chunk of frames at a time, for what is longer than the memory.
+
+    Convention:
+        Formats and arguments as in :func:`read_spikes`. What can be known without reading the frames is checked at
+        the call, not at the first frame.
+
+    Args:
+        path: a file ending in ``.dat`` or ``.npz``.
+        height: rows; needed for ``.dat``, checked against the file for ``.npz``.
+        width: columns; likewise.
+        flip: turn the stored frames upside down.
+        start: the first frame to read.
+        frames: how many; up to the end when not given.
+        chunk: frames in a chunk; the last one may be shorter. Single frames when not given.
+        packed: leave 8 pixels in a byte, as :func:`spikekit.pack_spikes` would make of the result.
+
+    Returns:
+        An iterator over frames (H, W) or chunks (chunk, H, W), uint8, zeros and ones; over (H, ceil(W / 8)) or
+        (chunk, H, ceil(W / 8)) where packed.
+
+    Raises:
+        SpikeFileError: as :func:`read_spikes`.
+        TypeError: as :func:`read_spikes`.
+        ValueError: a chunk that is not a whole number of frames, 1 or more.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_spikes(f"{folder}/clip.dat", torch.ones(5, 3, 7))
+        ...     [tuple(part.shape) for part in iter_spikes(f"{folder}/clip.dat", 3, 7, chunk=2)]
+        [(2, 3, 7), (2, 3, 7), (1, 3, 7)]
+    """
+    if chunk is None:
+        return (torch.from_numpy(one[0]) for one in _open(path, height, width, flip, start, frames, 1, packed))
+    chunk = check_whole("chunk", chunk)
+    return map(torch.from_numpy, _open(path, height, width, flip, start, frames, chunk, packed))
+
+
+def spikes_shape(path: str | Path, height: int | None = None, width: int | None = None) -> tuple[int, int, int]:
+    """Return (T, H, W) of a recording without reading its frames.
+
+    Args:
+        path: a file ending in ``.dat`` or ``.npz``.
+        height: rows; needed for ``.dat``, checked against the file for ``.npz``.
+        width: columns; likewise.
+
+    Returns:
+        Frames, rows and columns.
+
+    Raises:
+        SpikeFileError: as :func:`read_spikes`.
+        TypeError: as :func:`read_spikes`.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_spikes(f"{folder}/clip.npz", torch.ones(5, 3, 7))
+        ...     spikes_shape(f"{folder}/clip.npz")
+        (5, 3, 7)
+    """
+    path = Path(path)
+    height = None if height is None else check_index("height", height)
+    width = None if width is None else check_index("width", width)
+    with reading(path):
+        if path.is_dir():
+            raise SpikeFileError(f"{path}: expected a recording, got a folder")
+        if not path.is_file():
+            raise SpikeFileError(f"{path}: no such file")
+        size = path.stat().st_size
+    if size == 0:
+        raise SpikeFileError(f"{path}: an empty file, 0 bytes")
+    if _check_suffix(path) == ".dat":
+        return dat_shape(path, size, height, width)
+    return npz_shape(path, height, width)
+
+
+def write_spikes(path: str | Path, spikes: Tensor | Iterable[Tensor], *, flip: bool = False) -> None:
+    """Write a recording; the folder is made when it is missing.
+
+    Convention:
+        Formats as in :func:`read_spikes`; the array of an ``.npz`` is called ``spk``. The file appears under its name
+        once it is complete, so a run that is killed leaves no half recording.
+
+        A recording that is longer than the memory comes in chunks, of any lengths, and one chunk is held at a time.
+        An ``.npz`` tells its length before its frames, so they wait on the disk, packed, until the last has come.
+
+    Args:
+        path: where to, ending in ``.dat`` or ``.npz``.
+        spikes: (T, H, W), zeros and ones, any real dtype; or an iterable of such chunks, or of frames (H, W).
+        flip: store the frames upside down, as real cameras do.
+
+    Raises:
+        SpikeFileError: another ending, or the file cannot be written.
+        TypeError: ``spikes`` is not a tensor of real numbers, nor an iterable of such.
+        ValueError: another shape, an empty clip, frames of several sizes, or values other than 0 and 1.
+
+    Example:
+        The sensor, for as long as the light lasts:
+
+        >>> import tempfile
+        >>> from spikekit import spike_integrate_fire
+        >>> def expose(lights):
+        ...     charge = None
+        ...     for light in lights:
+        ...         spikes, charge = spike_integrate_fire(light, charge=charge)
+        ...         yield spikes
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_spikes(f"{folder}/long.dat", expose(torch.rand(100, 3, 7) for _ in range(9)))
+        ...     spikes_shape(f"{folder}/long.dat", 3, 7)
+        (900, 3, 7)
+    """
+    path = Path(path)
+    suffix = _check_suffix(path)
+    with _opened(path) as file:
+        if suffix == ".dat":
+            _write_bits(path, file, spikes, flip)
+            return
+        with writing(path):  # the header of an .npz says how many frames there are; a file without a name needs no care
+            bits = tempfile.TemporaryFile(dir=path.parent)  # noqa: SIM115
+        with bits:
+            frames, height, width = _write_bits(path, bits, spikes, flip)
+            with writing(path):
+                stored = stored_blocks(bits, Wanted(path, height, width, 0, frames, 1))
+                write_npz(file, (frames, height, width), stored)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[IO[bytes]]:
+    """Open a whole file; what goes wrong with it is said in one line, and what the chunks raise is not about it."""
+    whole = whole_file(path)
+    with writing(path):
+        file = whole.__enter__()
+    try:
+        yield file
+    except BaseException as error:
+        whole.__exit__(type(error), error, error.__traceback__)
+        raise
+    with writing(path):
+        whole.__exit__(None, None, None)
+
+
+def _write_bits(path: Path, file: IO[bytes], spikes: Tensor | Iterable[Tensor], flip: bool) -> tuple[int, int, int]:
+    """Write packed frames to a file, on the way to ``path``; return (T, H, W)."""
+    written = 0
+    for chunk in _chunks(spikes):
+        height, width = chunk.shape[1:]
+        for block in chunk.split(max(1, _BLOCK // (height * width))):
+            block = block.float() if block.dtype is torch.bfloat16 else block  # NumPy has no bfloat16
+            bits = binary(block.cpu().resolve_neg().numpy(), "spikes", written, ValueError)[:, :: -1 if flip else 1]
+            with writing(path):
+                file.write(dat_bytes(bits))
+            written += len(bits)
+    with writing(path):
+        file.flush()
+    return written, height, width
+
+
+def _chunks(spikes: Tensor | Iterable[Tensor]) -> Iterator[Tensor]:
+    """Give (T, H, W) after (T, H, W), of one size; raise for anything else, and where there is nothing."""
+    if isinstance(spikes, Tensor):
+        check_planes("spikes", spikes, 3, "(T, H, W)")
+        spikes = [spikes]
+    elif not isinstance(spikes, Iterable):
+        raise TypeError(f"spikes: expected a tensor of shape (T, H, W), or chunks of it, got {type(spikes).__name__}")
+    size = None
+    for chunk in spikes:
+        check_planes("spikes", chunk, 2, "(T, H, W)")
+        if chunk.ndim > 3 or 0 in chunk.shape:
+            raise ValueError(f"spikes: expected (T, H, W), got {tuple(chunk.shape)}")
+        size = size or chunk.shape[-2:]
+        if chunk.shape[-2:] != size:
+            raise ValueError(f"spikes: expected frames of {size[0]} x {size[1]} as before, got {tuple(chunk.shape)}")
+        yield chunk.detach().reshape(-1, *size)
+    if size is None:
+        raise ValueError("spikes: expected at least one chunk (T, H, W), got none")
+
+
+def _open(
+    path: str | Path,
+    height: int | None,
+    width: int | None,
+    flip: bool,
+    start: int,
+    frames: int | None,
+    chunk: int | None,
+    packed: bool,
+) -> Iterator[np.ndarray]:
+    """Check everything but the frames themselves; return them, ``chunk`` at a time or all at once."""
+    path = Path(path)
+    total, height, width = spikes_shape(path, height, width)
+    start = check_index("start", start)
+    frames = total - start if frames is None else check_index("frames", frames)
+    if start < 0 or frames < 1 or start + frames > total:
+        raise SpikeFileError(f"{path}: expected frames within 0 .. {total - 1}, got {frames} from frame {start} on")
+    read = dat_blocks if path.suffix.lower() == ".dat" else npz_blocks
+    return read(Wanted(path, height, width, start, frames, chunk or frames, flip, packed))
+
+
+def _check_suffix(path: Path) -> str:
+    suffix = path.suffix.lower()
+    if suffix not in (".dat", ".npz"):
+        raise SpikeFileError(f"{path}: expected a recording that ends in .dat or .npz, got {suffix or 'no ending'}")
+    return suffix

@@ -1,0 +1,259 @@
+"""The bytes of recordings: the field's packed ``.dat`` and NumPy's ``.npz``, in blocks of frames."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from itertools import islice
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import numpy as np
+
+from spikekit.io.quiet import quiet
+
+# What the field calls the array of a recording; without either name, the only 3-D array is taken.
+_ARRAY_NAMES = ("spk", "spikes")
+
+# Deflate makes at most 1,032 bytes of one.
+_MOST_DEFLATED = 1032
+
+# Bytes that are held of an array in Fortran order: as bits, and as they are read.
+_HELD, _PIECE = 1 << 26, 1 << 22
+
+
+class SpikeFileError(ValueError):
+    """A recording that cannot be read or written; the message is one line and names the file."""
+
+
+class Wanted(NamedTuple):
+    """What to read of a file: ``frames`` from ``start`` on, ``chunk`` at a time, turned over or left packed."""
+
+    path: Path
+    height: int
+    width: int
+    start: int
+    frames: int
+    chunk: int
+    flip: bool = False
+    packed: bool = False
+
+    def chunks(self) -> Iterator[tuple[int, int]]:
+        """Return the first frame and the number of frames of every block."""
+        stop = self.start + self.frames
+        return ((n, min(self.chunk, stop - n)) for n in range(self.start, stop, self.chunk))
+
+    def assemble(self, planes: Iterable[np.ndarray], count: int) -> np.ndarray:
+        """Lay frames (H, W) of zeros and ones, as stored, behind each other."""
+        block = np.empty((count, self.height, -(-self.width // 8) if self.packed else self.width), np.uint8)
+        for place, plane in zip(block, planes, strict=True):
+            upright = plane[::-1] if self.flip else plane
+            place[:] = np.packbits(upright, axis=-1, bitorder="little") if self.packed else upright
+        return block
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn whatever goes wrong with the bytes of a file into one line."""
+    try:
+        yield
+    except SpikeFileError:
+        raise
+    except MemoryError as error:
+        raise SpikeFileError(f"{path}: takes more memory than there is") from error
+    except OSError as error:
+        raise SpikeFileError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except Exception as error:
+        raise SpikeFileError(f"{path}: damaged ({' '.join(str(error).split()) or type(error).__name__})") from error
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn what the system says of a file that it cannot write into one line."""
+    try:
+        yield
+    except OSError as error:
+        raise SpikeFileError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def binary(frames: np.ndarray, name: str, first: int, error: type[ValueError]) -> np.ndarray:
+    """Return frames (N, H, W) as uint8; raise ``error`` unless they hold zeros and ones only."""
+    if frames.dtype == np.bool_ or (frames.dtype == np.uint8 and frames.max() <= 1):
+        return frames.view(np.uint8)
+    bits = (frames != 0).view(np.uint8)
+    if not np.array_equal(bits, frames):
+        n = int((bits != frames).any(axis=(1, 2)).argmax())
+        low, high = frames[n].min(), frames[n].max()
+        raise error(f"{name}: expected zeros and ones, got values from {low} to {high} in frame {first + n}")
+    return bits
+
+
+# --- .dat -------------------------------------------------------------------------------------------------------------
+
+
+def dat_shape(path: Path, size: int, height: int | None, width: int | None) -> tuple[int, int, int]:
+    """Return (T, H, W) of a file of ``size`` bytes."""
+    if height is None or width is None:
+        raise SpikeFileError(f"{path}: a .dat has no header, expected height and width, got {height} and {width}")
+    if height < 1 or width < 1:
+        raise SpikeFileError(f"{path}: expected a height and a width of at least 1, got {height} and {width}")
+    step = _frame_bytes(height, width)
+    whole, rest = divmod(size, step)
+    if rest:
+        raise SpikeFileError(
+            f"{path}: truncated, or not {height} x {width}: {size} bytes at {step} bytes a frame make {whole} whole "
+            f"frames and {rest} bytes left over"
+        )
+    return whole, height, width
+
+
+def dat_blocks(wanted: Wanted) -> Iterator[np.ndarray]:
+    """Read blocks of frames (N, H, W), uint8."""
+    with reading(wanted.path), open(wanted.path, "rb") as file:
+        yield from stored_blocks(file, wanted)
+
+
+def stored_blocks(file: IO[bytes], wanted: Wanted) -> Iterator[np.ndarray]:
+    """Read the same from an open file."""
+    path, height, width = wanted[:3]
+    step = _frame_bytes(height, width)
+    with reading(path):
+        file.seek(wanted.start * step)
+        for n, count in wanted.chunks():
+            stored = np.fromfile(file, np.uint8, count * step)
+            if stored.size < count * step:
+                raise SpikeFileError(f"{path}: truncated while it was read, at frame {n + stored.size // step}")
+            if width % 8:  # rows begin within a byte
+                frames = stored.reshape(count, step)
+                bits = (np.unpackbits(frame, count=height * width, bitorder="little") for frame in frames)
+                yield wanted.assemble((plane.reshape(height, width) for plane in bits), count)
+            else:  # rows of bytes are turned over faster than rows of pixels
+                rows = stored.reshape(count, height, width // 8)
+                rows = rows[:, ::-1].copy() if wanted.flip else rows
+                yield rows if wanted.packed else np.unpackbits(rows, axis=-1, bitorder="little")
+
+
+def dat_bytes(frames: np.ndarray) -> bytes:
+    """Pack frames (N, H, W) of zeros and ones."""
+    return np.packbits(frames.reshape(len(frames), -1), axis=-1, bitorder="little").tobytes()
+
+
+def _frame_bytes(height: int, width: int) -> int:
+    return -(-height * width // 8)
+
+
+# --- .npz -------------------------------------------------------------------------------------------------------------
+
+
+def npz_shape(path: Path, height: int | None, width: int | None) -> tuple[int, int, int]:
+    """Return (T, H, W) of the recording in a file."""
+    with _npz_array(path) as (_, shape, _, _):
+        pass
+    if height not in (None, shape[1]) or width not in (None, shape[2]):
+        raise SpikeFileError(f"{path}: holds frames of {shape[1]} x {shape[2]}, got height {height} and width {width}")
+    return shape
+
+
+def npz_blocks(wanted: Wanted) -> Iterator[np.ndarray]:
+    """Read blocks of frames (N, H, W), uint8."""
+    path, height, width, start, frames = wanted[:5]
+    with _npz_array(path) as (stream, shape, dtype, fortran):
+        if fortran:
+            planes = _fortran_planes(stream, path, shape, dtype, range(start, start + frames))
+        else:
+            step = height * width * dtype.itemsize
+            stream.seek(start * step, 1)
+            array = (np.frombuffer(stream.read(step), dtype).reshape(height, width) for _ in range(frames))
+            planes = (binary(plane[None], str(path), n, SpikeFileError)[0] for n, plane in enumerate(array, start))
+        for _, count in wanted.chunks():
+            yield wanted.assemble(islice(planes, count), count)
+
+
+def _fortran_planes(
+    stream: IO[bytes], path: Path, shape: tuple[int, int, int], dtype: np.dtype, wanted: range
+) -> Iterator[np.ndarray]:
+    """Read frames of an array in which those of a pixel are neighbours: in passes, each of as many as fit as bits."""
+    frames, height, width = shape
+    begin, pixels, run = stream.tell(), height * width, frames * dtype.itemsize
+    for start in range(wanted.start, wanted.stop, in_pass := max(1, 8 * _HELD // pixels)):
+        part = range(start, min(start + in_pass, wanted.stop))
+        stream.seek(begin)
+        bits = np.empty((pixels, -(-len(part) // 8)), np.uint8)
+        for first in range(0, pixels, at_once := max(1, _PIECE // run)):
+            count = min(at_once, pixels - first)
+            # the runs of several pixels are read whole, of a long one only what is needed
+            skipped = part.start if run > _PIECE else 0
+            length = len(part) if run > _PIECE else frames
+            stream.seek(skipped * dtype.itemsize, 1)
+            read = np.frombuffer(stream.read(count * length * dtype.itemsize), dtype).reshape(count, length)
+            if run > _PIECE:
+                stream.seek((frames - skipped - length) * dtype.itemsize, 1)
+            read = read[:, part.start - skipped : part.stop - skipped]
+            read = binary(read.T[:, :, None], str(path), start, SpikeFileError)[:, :, 0].T
+            bits[first : first + count] = np.packbits(read, axis=1, bitorder="little")
+        for n in range(len(part)):
+            yield (bits[:, n // 8] >> n % 8 & 1).reshape(width, height).T
+
+
+def write_npz(file: IO[bytes], shape: tuple[int, int, int], blocks: Iterable[np.ndarray]) -> None:
+    """Write blocks of frames, (T, H, W) in all, to an open file."""
+    with (
+        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open(f"{_ARRAY_NAMES[0]}.npy", "w", force_zip64=True) as stream,
+    ):
+        np.lib.format.write_array_header_1_0(stream, {"descr": "|u1", "fortran_order": False, "shape": shape})
+        for block in blocks:
+            stream.write(block)
+
+
+@contextmanager
+def _npz_array(path: Path) -> Iterator[tuple[IO[bytes], tuple[int, int, int], np.dtype, bool]]:
+    """Open the recording in an ``.npz`` at its first number: the stream, shape, dtype, and whether in Fortran order."""
+    with reading(path), zipfile.ZipFile(path) as archive:
+        headers = {}
+        for member in archive.infolist():
+            if not member.filename.endswith(".npy"):
+                continue
+            if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise SpikeFileError(f"{path}: packed as NumPy never does (method {member.compress_type})")
+            with archive.open(member) as stream:
+                headers[member.filename.removesuffix(".npy")] = member, *_npy_header(stream)
+        named = [name for name in _ARRAY_NAMES if name in headers]
+        solid = [name for name, (_, shape, _, _) in headers.items() if len(shape) == 3]
+        name = (named or solid or [""])[0]
+        if name not in solid or (not named and len(solid) > 1):
+            found = ", ".join(f"{name} {shape}" for name, (_, shape, _, _) in headers.items())
+            raise SpikeFileError(
+                f"{path}: expected one array (T, H, W) of zeros and ones, named {' or '.join(_ARRAY_NAMES)} or the "
+                f"only one of three dimensions, got {found or 'no array'}"
+            )
+        member, shape, fortran, dtype = headers[name]
+        if member.file_size > _most_bytes(member, path.stat().st_size):
+            raise SpikeFileError(f"{path}: damaged, {name} claims {member.file_size} bytes of {member.compress_size}")
+        if dtype.kind not in "buif":
+            raise SpikeFileError(f"{path}: expected an array of zeros and ones, got {name} of type {dtype}")
+        if 0 in shape:
+            raise SpikeFileError(f"{path}: an empty recording, {name} is {shape}")
+        with archive.open(member) as stream:
+            _npy_header(stream)
+            present, needed = member.file_size - stream.tell(), math.prod(shape) * dtype.itemsize
+            if present != needed:
+                raise SpikeFileError(
+                    f"{path}: truncated, {name} of {shape} takes {needed} bytes, the file holds {present}"
+                )
+            yield stream, shape, dtype, fortran
+
+
+def _most_bytes(member: zipfile.ZipInfo, size: int) -> int:
+    """Return how many bytes a member of a file can be at most, whatever the directory claims."""
+    there = min(member.compress_size, size)
+    return there if member.compress_type == zipfile.ZIP_STORED else _MOST_DEFLATED * there
+
+
+def _npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    with quiet():
+        version = np.lib.format.read_magic(stream)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        return read(stream)

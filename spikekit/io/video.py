@@ -1,0 +1,375 @@
+"""Video input: folders of pictures and video files as lazy sequences of frames."""
+
+from __future__ import annotations
+
+import copy
+import operator
+import os
+import re
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol, overload
+from weakref import WeakSet
+
+import torch
+from torch import Tensor
+
+from spikekit.check import check_whole
+from spikekit.io.images import MOST_PIXELS, read_picture
+from spikekit.io.quiet import quiet
+
+#: Endings of pictures, which may stand for frames.
+PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+
+#: Endings of video files, which PyAV reads.
+VIDEO_ENDINGS = (".mp4", ".m4v", ".mkv", ".webm", ".avi", ".mov", ".y4m", ".mpg", ".mpeg", ".ts", ".wmv", ".flv")
+
+# Frames of a video file that stay decoded, so that a step back needs no second start.
+_KEPT = 8
+
+
+class VideoError(ValueError):
+    """Frames that cannot be read; the message is one line and names the file."""
+
+
+class _Source(Protocol):
+    """Where frames come from: all of a folder, or all of a file."""
+
+    path: Path
+    names: Sequence[str]
+    size: tuple[int, int]
+    fps: float | None
+
+    def read(self, index: int) -> Tensor:
+        """Return frame ``index`` as ``rgb`` (3, H, W), float32."""
+        ...
+
+
+class VideoFrames(Sequence[Tensor]):
+    """The frames of a folder of pictures or of a video file, each read when it is asked for.
+
+    Convention:
+        A frame is ``rgb`` (3, H, W), float32, in [0, 1], gamma-encoded as it was stored. Grey pictures get three equal
+        channels, alpha is laid over white (an opaque one changes nothing), 16-bit files keep their depth; see
+        :func:`spikekit.read_picture`. All frames have the size of the first.
+
+        In a folder the pictures are the PNG, JPEG, BMP and TIFF files, told by their endings, in natural order (``f2``
+        before ``f10``); folders, hidden files and files with other endings are left out. A single picture is a film
+        of one frame.
+
+        Video files need PyAV (``pip install 'spikekit[video]'``). Frames are counted without decoding them. Reading on
+        is cheap, a few frames back too; further back the file is decoded from its start again, so that frame n is
+        always the same one.
+
+        A slice is again a lazy sequence. The object can be pickled and used in other processes; each opens the files
+        for itself.
+
+    Args:
+        path: a folder, a picture or a video file.
+        start: the first frame.
+        count: how many; up to the end when not given.
+
+    Raises:
+        VideoError: no such file, no pictures in it, pictures of several sizes, PyAV is missing, or there are fewer
+            frames. A frame that is damaged raises it when it is asked for.
+        TypeError: ``start`` is not a whole number.
+        ValueError: ``count`` is not a whole number, 1 or more.
+
+    Example:
+        >>> import tempfile
+        >>> from spikekit import write_picture
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for n in range(12):
+        ...         write_picture(f"{folder}/{n}.png", torch.full((3, 4, 6), n / 255))
+        ...     frames = VideoFrames(folder, start=1)
+        ...     len(frames), frames.height, frames.width, frames[3:9:4].names, round(frames[-1].max().item() * 255)
+        (11, 4, 6, ['4.png', '8.png'], 11)
+    """
+
+    def __init__(self, path: str | Path, *, start: int = 0, count: int | None = None) -> None:
+        start = operator.index(start)
+        self._source = _open(Path(path))
+        total = len(self._source.names)
+        stop = total if count is None else start + check_whole("count", count)
+        if start < 0 or start >= total or stop > total:
+            wanted = f"frame {start}" if count is None else f"{count} frames from frame {start} on"
+            raise VideoError(f"{path}: expected {wanted}, got {total} {'frame' if total == 1 else 'frames'}")
+        self._chosen = range(start, stop)
+
+    @property
+    def height(self) -> int:
+        """Rows of every frame."""
+        return self._source.size[0]
+
+    @property
+    def width(self) -> int:
+        """Columns of every frame."""
+        return self._source.size[1]
+
+    @property
+    def fps(self) -> float | None:
+        """Frames a second, where a video file tells; not changed by a slice."""
+        return self._source.fps
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the frames, of files in a folder, and numbers in a video file."""
+        return [self._source.names[i] for i in self._chosen]
+
+    def __len__(self) -> int:
+        return len(self._chosen)
+
+    @overload
+    def __getitem__(self, index: int) -> Tensor: ...
+    @overload
+    def __getitem__(self, index: slice) -> VideoFrames: ...
+    def __getitem__(self, index: int | slice) -> Tensor | VideoFrames:
+        if isinstance(index, slice):
+            part = copy.copy(self)
+            part._chosen = self._chosen[index]
+            return part
+        return self._source.read(self._chosen[operator.index(index)])
+
+    def __repr__(self) -> str:
+        return f"VideoFrames({str(self._source.path)!r}, {len(self)} frames of {self.height} x {self.width})"
+
+
+def read_video(path: str | Path, *, start: int = 0, count: int | None = None) -> VideoFrames:
+    """Open a folder of pictures or a video file; see :class:`VideoFrames`.
+
+    Args:
+        path: a folder, a picture or a video file.
+        start: the first frame.
+        count: how many; up to the end when not given.
+
+    Returns:
+        The frames, none of which is read yet.
+
+    Raises:
+        VideoError: as :class:`VideoFrames`.
+        TypeError: as :class:`VideoFrames`.
+        ValueError: as :class:`VideoFrames`.
+
+    Example:
+        >>> import tempfile
+        >>> from spikekit import write_picture
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for n in range(3):
+        ...         write_picture(f"{folder}/{n}.png", torch.full((3, 4, 6), n / 2))
+        ...     [frame.mean().round(decimals=1).item() for frame in read_video(folder)]
+        [0.0, 0.5, 1.0]
+    """
+    return VideoFrames(path, start=start, count=count)
+
+
+def _open(path: Path) -> _Source:
+    with _reading(path):
+        if path.is_dir():
+            return _Pictures(path, _pictures_of(path))
+        if not path.exists():
+            raise VideoError(f"{path}: no such file or folder")
+    ending = path.suffix.lower()
+    if ending in PICTURE_ENDINGS:
+        return _Pictures(path, [path])
+    if ending in VIDEO_ENDINGS:
+        return _Film(path)
+    raise VideoError(
+        f"{path}: expected a folder of pictures, a picture ({', '.join(PICTURE_ENDINGS)}) or a video "
+        f"({', '.join(VIDEO_ENDINGS)})"
+    )
+
+
+@contextmanager
+def _reading(path: Path, what: str = "") -> Iterator[None]:
+    """Turn whatever goes wrong with a file into one line that names it."""
+    try:
+        yield
+    except VideoError:
+        raise
+    except MemoryError as error:  # also what PyAV says of damaged sizes
+        raise VideoError(f"{path}: {what}takes more memory than there is") from error
+    except OSError as error:
+        raise VideoError(f"{path}: {what}cannot be read ({error.strerror or error})") from error
+    except Exception as error:
+        said = " ".join(str(getattr(error, "strerror", None) or error).split()).removeprefix(f"{path}: ")
+        raise VideoError(f"{path}: {what}{said or type(error).__name__}") from error
+
+
+# --- folders ----------------------------------------------------------------------------------------------------------
+
+
+def _natural(path: Path) -> tuple[list[str | int], str]:
+    """Sort digits by their number: text and numbers take turns, so that like is compared with like."""
+    parts = re.split(r"([0-9]+)", path.name)
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
+
+
+def _pictures_of(folder: Path) -> list[Path]:
+    seen = sorted((entry for entry in folder.iterdir() if not entry.name.startswith(".")), key=_natural)
+    folders = [entry.name for entry in seen if entry.is_dir()]
+    pictures = [entry for entry in seen if entry.suffix.lower() in PICTURE_ENDINGS and entry.name not in folders]
+    if not pictures:
+        inside = f"folders ({', '.join(folders[:3])}{', ...' if len(folders) > 3 else ''})" if folders else "none"
+        raise VideoError(f"{folder}: expected pictures ({', '.join(PICTURE_ENDINGS)}), got {inside}")
+    return pictures
+
+
+class _Pictures:
+    """Pictures in a folder; their sizes are compared from the headers, before any of them is read."""
+
+    fps = None
+
+    def __init__(self, path: Path, files: list[Path]) -> None:
+        self.path, self.files = path, files
+        self.names = [file.name for file in files]
+        # what has no header that can be read is damaged, and raises when it is its turn
+        sizes = {file: size for file in files if (size := _header_size(file))}
+        if not sizes:
+            sizes = {files[0]: tuple(_load(files[0]).shape[1:])}
+        self.like, self.size = next(iter(sizes.items()))
+        for file, size in sizes.items():
+            self._check_size(file, size)
+
+    def _check_size(self, file: Path, size: tuple[int, ...]) -> None:
+        if size != self.size:
+            (h, w), (height, width) = size, self.size
+            raise VideoError(f"{file}: expected {height} x {width} (H x W) as in {self.like}, got {h} x {w}")
+
+    def read(self, index: int) -> Tensor:
+        rgb = _load(self.files[index])
+        self._check_size(self.files[index], tuple(rgb.shape[1:]))
+        return rgb
+
+
+def _header_size(file: Path) -> tuple[int, int] | None:
+    from PIL import Image
+
+    try:
+        with quiet(), Image.open(file) as picture:
+            return picture.height, picture.width
+    except Exception:
+        return None
+
+
+def _load(file: Path) -> Tensor:
+    with _reading(file):
+        rgb = read_picture(file)
+        low, high = rgb.min().item(), rgb.max().item()
+        if not (low >= 0 and high <= 1):
+            raise VideoError(f"{file}: expected values in [0, 1], got {low:g} to {high:g}")
+        return rgb
+
+
+# --- video files ------------------------------------------------------------------------------------------------------
+
+
+class _Numbers(Sequence[str]):
+    """Names of the frames of a video file, made when they are asked for: a damaged header promises many."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> str:
+        return f"{range(self.count)[index]:0{len(str(self.count - 1))}}"
+
+
+_films: WeakSet[_Film] = WeakSet()
+_parents: list[Any] = []
+
+
+def _leave_to_parent() -> None:
+    """A forked process neither moves its parent's place in a file nor closes a decoder whose threads it has not got."""
+    for film in list(_films):
+        _parents.append((film._decoder, film._kept))
+        film._rewind()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_leave_to_parent)
+
+
+class _Film:
+    """A video file, decoded on from the frame that was asked for last."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            import av
+        except ImportError as error:
+            raise VideoError(f"{path}: reading a video needs PyAV, pip install 'spikekit[video]'") from error
+        with _reading(path), av.open(str(path)) as container:
+            stream = next(iter(container.streams.video), None)
+            if stream is None or stream.codec_context is None:
+                raise VideoError(f"{path}: expected a video, got none that can be decoded")
+            total = sum(packet.size > 0 and not packet.is_discard for packet in container.demux(stream))
+            total = max(total, stream.frames)  # what the header promises and the file lacks is told when it is reached
+            self.size = stream.height, stream.width
+            self.fps = float(stream.average_rate) if stream.average_rate else None
+        if not total or 0 in self.size:
+            raise VideoError(f"{path}: expected frames, got none")
+        if self.size[0] * self.size[1] > MOST_PIXELS:
+            raise VideoError(f"{path}: expected at most {MOST_PIXELS} pixels, got {self.size[0]} x {self.size[1]}")
+        self.names = _Numbers(total)
+        self._rewind()
+
+    def _rewind(self) -> None:
+        _films.add(self)
+        self._decoder: Iterator[Any] | None = None
+        self._next = 0
+        self._kept: deque[Any] = deque(maxlen=_KEPT)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name in ("path", "size", "fps", "names")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._rewind()
+
+    def read(self, index: int) -> Tensor:
+        if index < self._next - len(self._kept):
+            self._rewind()
+        if self._decoder is None and self._next <= index:
+            self._decoder = _decoded(self.path)
+        while self._next <= index:
+            try:
+                with _reading(self.path, f"frame {self._next}: "):
+                    frame = next(self._decoder, None)
+                    if frame is None:
+                        raise VideoError(f"{self.path}: ends after {self._next} of {len(self.names)} frames")
+                    if frame.is_corrupt:
+                        raise VideoError(f"{self.path}: frame {self._next}: damaged")
+                    if (frame.height, frame.width) != self.size:
+                        height, width = self.size
+                        raise VideoError(
+                            f"{self.path}: frame {self._next}: expected {height} x {width} (H x W) as before, got "
+                            f"{frame.height} x {frame.width}"
+                        )
+            except VideoError:
+                self._rewind()  # whoever asks for an earlier frame again gets it
+                raise
+            self._kept.append(frame)
+            self._next += 1
+        if self._next == len(self.names):
+            self._decoder = None  # whose file is closed with it
+        with _reading(self.path, f"frame {index}: "):
+            return _rgb(self._kept[index - self._next])
+
+
+def _decoded(path: Path) -> Iterator[Any]:
+    """Decode a file; no method, so that the file is closed when the frames are let go, without a garbage collector."""
+    import av
+
+    with av.open(str(path)) as container:
+        yield from container.decode(container.streams.video[0])
+
+
+def _rgb(frame: Any) -> Tensor:
+    deep = frame.format.components[0].bits > 8
+    pixels = frame.to_ndarray(format="rgb48le" if deep else "rgb24")
+    rgb = torch.from_numpy(pixels.astype("float32") / (65535 if deep else 255))
+    return rgb.permute(2, 0, 1).contiguous()

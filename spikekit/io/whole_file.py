@@ -1,0 +1,132 @@
+"""Files that are written whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from itertools import chain, count
+from pathlib import Path
+from typing import IO, Any
+
+try:
+    import fcntl
+except ImportError:  # Windows, which removes no file that is open
+    fcntl = None
+
+_SIDE_BY_SIDE = 8  # writers of one file whose leftovers are found
+
+
+@contextmanager
+def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[Any]]:
+    """Open a file for writing that appears under its name when it is complete, or not at all.
+
+    Convention:
+        What is written goes to a hidden file beside the target, which is flushed to the disk and then takes the
+        target's place by one renaming. So a full disk, an error or ``kill -9`` leaves the file that was there before,
+        or none. The hidden file is removed where the writing fails; that of a killed process ends in ``.part``, and the
+        next writing of the same name removes it. Two processes that write the same name do not disturb each other: the
+        last one wins.
+
+        The file keeps the mode of the one that it replaces. A link keeps pointing where it does. What is no regular
+        file, such as ``/dev/stdout``, is written directly.
+
+    Args:
+        path: the file; its folder is made when it is missing.
+        mode: ``"wb"`` or ``"w"``.
+        how: further arguments of ``open``, such as ``encoding``.
+
+    Returns:
+        A context that yields the open file.
+
+    Raises:
+        ValueError: another mode.
+        OSError: the file or its folder cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with whole_file(f"{folder}/new/a.txt", "w") as file:
+        ...         _ = file.write("all of it")
+        ...         early = Path(folder, "new", "a.txt").exists()
+        ...     early, Path(folder, "new", "a.txt").read_text()
+        (False, 'all of it')
+    """
+    if mode not in ("w", "wb"):
+        raise ValueError(f"mode: expected 'w' or 'wb', got {mode!r}")
+    target = Path(os.path.realpath(path))
+    if target.exists() and not target.is_file():  # a folder says so
+        with open(target, mode, **how) as file:
+            yield file
+        return
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(path)) from error
+    part, file = _open_part(target, mode, **how)
+    try:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
+        with suppress(OSError):  # not every file system has modes
+            if target.exists():
+                os.chmod(part, target.stat().st_mode & 0o7777)
+        if fcntl is None:
+            file.close()
+        os.replace(part, target)
+    except BaseException:
+        with suppress(OSError):
+            file.close()
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise
+    file.close()  # so late, because the lock that says that somebody is at work ends here
+    _flush_folder(target.parent)
+
+
+def _open_part(target: Path, mode: str, **how: Any) -> tuple[Path, IO[Any]]:
+    """Open a file beside the target, and lock it; remove what killed processes have left of others.
+
+    Names are counted, so that leftovers are found without a look at the whole folder.
+    """
+    parts = [target.with_name(f".{target.name}.{n}.part") for n in range(_SIDE_BY_SIDE)]
+    for leftover in parts:
+        with suppress(OSError), open(leftover, "rb") as file:
+            if _lock(file):
+                leftover.unlink()
+    more = (target.with_name(f".{target.name}.{secrets.token_hex(4)}.part") for _ in count())
+    for part in chain(parts, more):
+        try:
+            file = open(part, mode.replace("w", "x"), **how)  # noqa: SIM115 - closed when it is complete
+        except FileExistsError:
+            continue
+        with suppress(OSError):
+            if _lock(file) is not False and os.path.samestat(os.fstat(file.fileno()), os.stat(part)):
+                return part, file
+        file.close()  # another process took it for a leftover before it was locked
+    raise AssertionError("unreachable")
+
+
+def _lock(file: IO[Any]) -> bool | None:
+    """Hold the lock of a file until it is closed; return False where somebody else does, None where there are none."""
+    if fcntl is None:
+        return True
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
+
+
+def _flush_folder(folder: Path) -> None:
+    """Make the renaming last through a loss of power, where the system can."""
+    with suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

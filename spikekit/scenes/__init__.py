@@ -1,0 +1,15 @@
+"""Scenes: analytic ones, and sequences of frames."""
+
+from spikekit.scenes.adaptive_sampling import Plan, SceneProfile
+from spikekit.scenes.analytic import Layer, Motion, Scene
+from spikekit.scenes.frame_sequence import Film, FilmClip
+
+__all__ = [
+    "Film",
+    "FilmClip",
+    "Layer",
+    "Motion",
+    "Plan",
+    "Scene",
+    "SceneProfile",
+]

@@ -1,0 +1,297 @@
+"""Analytic scenes: moving pictures whose light, ground truth and flow are exact at every clock."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from kornia.color import CFA
+from torch import Tensor
+
+from spikekit.check import check_planes, check_positive, check_whole
+from spikekit.color.cfa import bayer_sites
+
+_CHUNK = 1 << 16  # positions sampled at a time: what they need stays in the cache
+
+
+@dataclass(frozen=True)
+class Motion:
+    r"""How a layer moves: translation, rotation and zoom about a centre, steady in time but for an acceleration.
+
+    .. math:: x(\tau) = c + z^\tau R(\omega \tau) (x - c) + v \tau + \tfrac12 a \tau^2
+
+    Convention:
+        :math:`\tau` is the clock, counted from the middle of the clip, where the motion is the identity. Positions are
+        (x, y), x right, y down, pixel centres at whole numbers. A positive rotation turns x towards y: clockwise on
+        the screen.
+
+    Args:
+        velocity: v, pixels per clock, (x, y).
+        rotation: :math:`\omega`, radians per clock.
+        zoom: z, growth per clock, above 0; 1 keeps the size.
+        center: c, (x, y).
+        acceleration: a, pixels per clock squared, (x, y).
+
+    Raises:
+        ValueError: a zoom that is not above 0.
+
+    Example:
+        >>> Motion(velocity=(0.25, 0.0), rotation=0.01, center=(16.0, 16.0)).zoom
+        1.0
+    """
+
+    velocity: tuple[float, float] = (0.0, 0.0)
+    rotation: float = 0.0
+    zoom: float = 1.0
+    center: tuple[float, float] = (0.0, 0.0)
+    acceleration: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        check_positive("zoom", self.zoom)
+
+    def _turn_and_shift(self, tau: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions as complex numbers x + iy: every position goes to ``turn * position + shift``."""
+        center, velocity = complex(*self.center), complex(*self.velocity)
+        turn = torch.exp(tau * complex(math.log(self.zoom), self.rotation))
+        return turn, center + (velocity + complex(*self.acceleration) / 2 * tau) * tau - center * turn
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """A picture in motion: the background of a scene, or an object in front of it.
+
+    Args:
+        picture: ``rgb`` (3, h, w), float32 or float64.
+        motion: how it moves.
+        position: (x, y) of the picture's pixel (0, 0) in the view, at the middle of the clip.
+        mask: (h, w), how much of the object there is, 0 to 1; 0 beyond its border. ``None`` for a background, which
+            has no end: beyond its border it is mirrored.
+
+    Raises:
+        TypeError: not a float32 or float64 picture.
+        ValueError: sizes that do not fit.
+
+    Example:
+        >>> coin = Layer(torch.rand(3, 9, 9), Motion(velocity=(1.0, 0.0)), position=(4, 4), mask=torch.ones(9, 9))
+    """
+
+    picture: Tensor
+    motion: Motion = Motion()
+    position: tuple[int, int] = (0, 0)
+    mask: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        check_planes("picture", self.picture, 3, "(3, h, w)", floating=True)
+        if self.picture.ndim != 3 or self.picture.shape[0] != 3:
+            raise ValueError(f"picture: expected (3, h, w), got {tuple(self.picture.shape)}")
+        if self.picture.dtype not in (torch.float32, torch.float64):
+            raise TypeError(f"picture: expected float32 or float64, got {self.picture.dtype}")
+        size = tuple(self.picture.shape[1:])
+        if self.mask is not None and getattr(self.mask, "shape", None) != size:
+            got = tuple(self.mask.shape) if isinstance(self.mask, Tensor) else type(self.mask).__name__
+            raise ValueError(f"mask: expected {size}, got {got}")
+
+    def _planes(self) -> tuple[Tensor, complex]:
+        """What is sampled, and where its pixel (0, 0) is: an object gets its mask as fourth plane, and an empty rim."""
+        if self.mask is None:
+            return self.picture, complex(*self.position)
+        picture = F.pad(self.picture, (1, 1, 1, 1), "replicate")
+        mask = F.pad(self.mask.to(self.picture), (1, 1, 1, 1))
+        return torch.cat([picture, mask[None]]), complex(*self.position) - (1 + 1j)
+
+
+def _inside(position: Tensor, length: int, padding: str) -> Tensor:
+    """Whole positions on an axis, brought inside as grid_sample does."""
+    index = position.long()
+    if padding == "border":
+        return index.clamp(0, length - 1)
+    index = index.remainder(2 * length)
+    return torch.minimum(index, 2 * length - 1 - index)
+
+
+def _sample(
+    planes: Tensor, corner: complex, turn: Tensor, shift: Tensor, rows: Tensor, columns: Tensor, padding: str
+) -> Tensor:
+    """Sample moved planes (C, h, w) at every one of ``rows`` x ``columns`` of the view: (n, C, rows, columns)."""
+    height, width = planes.shape[-2:]
+    if (turn == 1).all() and (shift == 0).all() and all((axis == axis.round()).all() for axis in (rows, columns)):
+        # at rest, pixels are copied, so that the ground truth has the picture's own values to the last bit
+        i = _inside(rows - corner.imag, height, padding)
+        j = _inside(columns - corner.real, width, padding)
+        return planes[:, i[:, None], j].repeat(len(turn), 1, 1, 1)
+    to_centre = corner + complex(width - 1, height - 1) / 2
+
+    def normalized(position: Tensor) -> Tensor:
+        kind = torch.complex64 if planes.dtype == torch.float32 else torch.complex128
+        return torch.complex(position.real * (2 / width), position.imag * (2 / height)).to(kind)
+
+    # Where the pixels of the view come from is affine: a part that the column gives plus one that the row gives.
+    across = normalized(columns / turn[:, None])
+    down = normalized((1j * rows - shift[:, None]) / turn[:, None] - to_centre)
+    grid = torch.view_as_real(across[:, None, :] + down[:, :, None])
+    return F.grid_sample(planes.expand(len(turn), *planes.shape), grid, "bilinear", padding, align_corners=False)
+
+
+class Scene:
+    r"""A stack of pictures in motion, seen by a colour spike camera.
+
+    Convention:
+        The view has high-resolution pixels, centres at whole numbers. The scene is the bilinear interpolant of its
+        pictures (and masks) and is evaluated exactly at every clock, so nothing is interpolated in time. At the
+        middle, clock ``frames // 2``, every motion is the identity: there the view shows the pictures' own pixels,
+        and this is the ground truth. Objects lie over each other in the order given, the last on top.
+
+        A sensor pixel averages the s x s view pixels of its own colour, see :func:`spikekit.bin_to_sensor`; the
+        sensor pixel (x, y) is centred at (s x + (s - 1) / 2, s y + (s - 1) / 2) of the view.
+
+    Args:
+        layers: the background, then the objects from back to front.
+        height: rows of the view.
+        width: columns of the view.
+        frames: clocks of the clip.
+
+    Raises:
+        ValueError: no layer, a background with a mask, an object without one, sizes below 1.
+
+    Example:
+        >>> picture = torch.rand(3, 40, 40)
+        >>> scene = Scene([Layer(picture, Motion(velocity=(0.25, 0.0)), position=(-4, -4))], 32, 32)
+        >>> bool((scene.rgb(20) == picture[:, 4:36, 4:36]).all())
+        True
+        >>> scene.light("RGGB", scale=4, alpha=0.4).shape
+        torch.Size([41, 8, 8])
+        >>> scene.flow(40, scale=4)[:, 0, 0].tolist()
+        [1.25, 0.0]
+    """
+
+    def __init__(self, layers: Sequence[Layer], height: int, width: int, frames: int = 41) -> None:
+        if not layers or layers[0].mask is not None or any(layer.mask is None for layer in layers[1:]):
+            raise ValueError("layers: expected a background without a mask, then objects with one")
+        if height < 1 or width < 1 or frames < 1:
+            raise ValueError(f"height, width, frames: expected at least 1, got {height}, {width}, {frames}")
+        self.layers = list(layers)
+        self.height, self.width = height, width
+        self.frames, self.middle = frames, frames // 2
+        self._planes = [layer._planes() for layer in layers]
+
+    def rgb(self, clock: float) -> Tensor:
+        """Return the view at a clock.
+
+        Args:
+            clock: any; whole numbers from 0 to ``frames - 1`` are what the sensor sees.
+
+        Returns:
+            ``rgb`` of shape (3, height, width).
+        """
+        rows, columns = self._axis(self.height), self._axis(self.width)
+        return self._render([0, 1, 2], rows, columns, self._tau([clock]))[0]
+
+    def light(self, pattern: str | CFA = "RGGB", *, scale: int, alpha: float = 1.0) -> Tensor:
+        """Return the light that arrives at the sensor at every clock.
+
+        Equals ``alpha * bin_to_sensor(scene.rgb(clock), pattern, scale=scale)``, but evaluates, of every view pixel,
+        only the one colour that the sensor sees there.
+
+        Args:
+            pattern: Bayer phase, see :func:`spikekit.bayer_pattern`.
+            scale: how many view pixels a sensor pixel is wide; it divides the view.
+            alpha: light of a white pixel per clock.
+
+        Returns:
+            ``light`` of shape (frames, height / scale, width / scale).
+
+        Raises:
+            ValueError: an unknown pattern, a scale that does not divide the view, an alpha that is not above 0.
+        """
+        height, width = self._sensor(scale)
+        check_positive("alpha", alpha)
+        light = self.layers[0].picture.new_empty(self.frames, height, width)
+        for colour, row, column in bayer_sites(pattern):
+            rows = self._axis(self.height).reshape(height, scale)[row::2].flatten()
+            columns = self._axis(self.width).reshape(width, scale)[column::2].flatten()
+            if 0 in (len(rows), len(columns)):
+                continue
+            chunk = max(1, _CHUNK // (len(rows) * len(columns)))
+            for start in range(0, self.frames, chunk):
+                clocks = range(start, min(start + chunk, self.frames))
+                seen = self._render([colour], rows, columns, self._tau(clocks))[:, 0]
+                light[start : clocks.stop, row::2, column::2] = F.avg_pool2d(seen, scale)
+        return light * alpha
+
+    def flow(self, clock: float, *, scale: int) -> Tensor:
+        """Return the true flow from the middle to a clock, at the sensor's resolution.
+
+        Convention:
+            In sensor pixels, order (x, y). At every sensor pixel it is the motion of what is seen, in the middle, at
+            the pixel's centre; at an object's edge, that of the object where the mask is one half or more.
+
+        Args:
+            clock: to when.
+            scale: how many view pixels a sensor pixel is wide; it divides the view.
+
+        Returns:
+            ``flow`` of shape (2, height / scale, width / scale).
+
+        Raises:
+            ValueError: a scale that does not divide the view.
+        """
+        height, width = self._sensor(scale)
+        rows, columns = self._axis(height) * scale + (scale - 1) / 2, self._axis(width) * scale + (scale - 1) / 2
+        here = columns + 1j * rows[:, None]
+        still = Motion()._turn_and_shift(self._tau([self.middle]))
+        moved = torch.zeros_like(here)
+        for layer, (planes, corner) in zip(self.layers, self._planes, strict=True):
+            turn, shift = layer.motion._turn_and_shift(self._tau([clock]))
+            moves = turn * here + shift - here
+            if layer.mask is not None:
+                seen = _sample(planes[3:], corner, *still, rows, columns, "border")[0, 0] >= 0.5
+                moves = torch.where(seen, moves, moved)
+            moved = moves
+        return torch.stack([moved.real, moved.imag]).to(self.layers[0].picture.dtype) / scale
+
+    def _tau(self, clocks: Sequence[float]) -> Tensor:
+        device = self.layers[0].picture.device
+        return torch.tensor(list(clocks), dtype=torch.float64, device=device) - self.middle
+
+    def _axis(self, length: int) -> Tensor:
+        return torch.arange(length, dtype=torch.float64, device=self.layers[0].picture.device)
+
+    def _sensor(self, scale: int) -> tuple[int, int]:
+        scale = check_whole("scale", scale)
+        if self.height % scale or self.width % scale:
+            raise ValueError(f"scale: expected a divisor of the view {self.height} x {self.width}, got {scale}")
+        return self.height // scale, self.width // scale
+
+    def _render(self, colours: list[int], rows: Tensor, columns: Tensor, tau: Tensor) -> Tensor:
+        """Evaluate some colours at ``rows`` x ``columns`` of the view: (n, colours, rows, columns)."""
+        view = None
+        for layer, (planes, corner) in zip(self.layers, self._planes, strict=True):
+            turn, shift = layer.motion._turn_and_shift(tau)
+            if view is None:
+                view = _sample(planes[colours], corner, turn, shift, rows, columns, "reflection")
+                continue
+            box = _touched(planes, corner, turn, shift, rows, columns)
+            part = view[(..., *box)]
+            if part.numel():
+                picked = planes[[*colours, 3]]
+                found = _sample(picked, corner, turn, shift, rows[box[0]], columns[box[1]], "border")
+                part.lerp_(found[:, :-1], found[:, -1:].expand(part.shape))
+        return view
+
+
+def _touched(
+    planes: Tensor, corner: complex, turn: Tensor, shift: Tensor, rows: Tensor, columns: Tensor
+) -> tuple[slice, slice]:
+    """Which of the rows and columns of the view moved planes can touch."""
+    height, width = planes.shape[-2:]
+    ends = corner + torch.tensor([0, width - 1, 1j * (height - 1), width - 1 + 1j * (height - 1)]).to(turn)
+    ends = turn[:, None] * ends + shift[:, None]
+
+    def between(axis: Tensor, position: Tensor) -> slice:
+        low, high = torch.searchsorted(axis.contiguous(), torch.stack([position.amin(), position.amax() + 1]))
+        return slice(int(low), int(high))
+
+    return between(rows, ends.imag), between(columns, ends.real)

@@ -1,0 +1,426 @@
+"""Films as scenes: light, ground truth and flow of a sequence of frames at every clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from kornia.color import CFA
+from torch import Tensor
+
+from spikekit._renamed import renamed_argument
+from spikekit.check import check_planes, check_positive, check_whole
+from spikekit.color.cfa import bayer_pattern, bin_to_sensor
+from spikekit.flow.interpolate import Blend, FlowInterpolation, Still
+from spikekit.scenes.adaptive_sampling import Plan, SceneProfile, profile_interval
+from spikekit.scenes.frame_interval import Interval
+from spikekit.sensor.noise import SensorNoise
+from spikekit.sensor.simulate import SpikeSensor
+from spikekit.warp.warp import flow_warp
+
+#: Version of what a film and the sensor make of frames. Whoever changes light, spikes or flow, in whatever module,
+#: counts it up: clips that were kept are simulated again, and a test that knows every version's output passes again.
+SIMULATOR_VERSION = 1
+
+_KEPT = 2  # frames and intervals that stay in memory: a clip and its flow look at two intervals
+
+
+class Film:
+    r"""A sequence of frames, seen by a colour spike camera.
+
+    Convention:
+        Frame f is what the sensor sees at clock ``f * clocks``; the film ends with the clock of its last frame. In
+        between, an interval of two frames is interpolated as far as its :class:`Plan` says: the light of the latent
+        frames, and of the two ends, is blended linearly in time. Every interval has its own plan, made from its
+        :class:`SceneProfile`, unless one is given for all of them.
+
+        Light at the clock of a frame or latent frame is ``alpha * bin_to_sensor(rgb, pattern, scale=scale)``; nothing
+        is linearised.
+
+        The view is the largest part of the frames whose sides are multiples of ``2 * scale``, from the top left:
+        rows and columns are left out at the bottom and at the right, so that positions and the Bayer phase stay.
+
+        What is computed for one clock depends on the two frames around it alone; spans, chunks and their order change
+        nothing. Two frames and two intervals are held.
+
+    Args:
+        frames: ``rgb`` (3, H, W) each, floating, in [0, 1], such as :class:`spikekit.VideoFrames`.
+        scale: how many pixels a sensor pixel is wide.
+        pattern: Bayer phase of the sensor, see :func:`spikekit.bayer_pattern`.
+        alpha: light of a white pixel per clock, in thresholds.
+        clocks: clocks from one frame to the next.
+        interpolation: what makes latent frames; :class:`spikekit.FlowInterpolation` by default.
+        plan: what is modelled, in every interval; ``Plan.everything(clocks)`` for all there is.
+        spike_tolerance: share of the spikes that may change by not modelling more, see :meth:`SceneProfile.plan`;
+            ``tolerance`` is its old name.
+        step: displacement between latent frames in sensor pixels, likewise.
+        motion: what finds motion for the profile, see ``spikekit.scenes.adaptive_sampling.profile_interval``.
+
+    Raises:
+        TypeError: frames that are not floating-point tensors.
+        ValueError: no frames, frames that are smaller than a cell of the sensor or of several sizes, an unknown
+            pattern, a scale or a number of clocks that is not a whole number, an alpha, a tolerance or a step that is
+            not above 0.
+
+    Example:
+        >>> picture = torch.rand(3, 34, 41)
+        >>> film = Film([picture.roll(n, -1) for n in range(3)], scale=4)
+        >>> film.height, film.width, film.clock_count
+        (32, 40, 41)
+        >>> bool((film.rgb(1) == picture.roll(1, -1)[:, :32, :40]).all())
+        True
+        >>> film.light(18, 5).shape
+        torch.Size([5, 8, 10])
+
+    Reference:
+        Dong et al., CVPR 2024, section 5.1.
+    """
+
+    @renamed_argument("tolerance", "spike_tolerance")
+    def __init__(
+        self,
+        frames: Sequence[Tensor],
+        *,
+        scale: int,
+        pattern: str | CFA = "RGGB",
+        alpha: float = 0.4,
+        clocks: int = 20,
+        interpolation: Callable[[Tensor, Tensor], Any] | None = None,
+        plan: Plan | None = None,
+        spike_tolerance: float = 0.05,
+        step: float = 0.5,
+        motion: Callable[[Tensor, Tensor], Any] | None = None,
+    ) -> None:
+        if len(frames) == 0:
+            raise ValueError("frames: expected at least one, got none")
+        scale = check_whole("scale", scale)
+        for name, value in (("alpha", alpha), ("spike_tolerance", spike_tolerance), ("step", step)):
+            check_positive(name, value)
+        self.frames, self.scale, self.pattern = frames, scale, bayer_pattern(pattern)
+        self.alpha, self.clocks = alpha, check_whole("clocks", clocks)
+        self.interpolation = FlowInterpolation() if interpolation is None else interpolation
+        self.spike_tolerance, self.step, self.motion = spike_tolerance, step, motion
+        self.fixed = plan
+        if plan is None and isinstance(self.interpolation, (Blend, Still)):  # these know no motion
+            self.fixed = Plan() if isinstance(self.interpolation, Blend) else Plan.everything(self.clocks)
+        self._views: dict[int, Tensor] = {}
+        self._intervals: dict[int, Interval] = {}
+        self._size = tuple(self._read(0).shape[1:])
+        cell = 2 * scale
+        self.height, self.width = (side // cell * cell for side in self._size)
+        if 0 in (self.height, self.width):
+            raise ValueError(f"frames: expected {cell} x {cell} pixels or more, got {self._size[0]} x {self._size[1]}")
+
+    @property
+    def clock_count(self) -> int:
+        """Clocks from the first frame to the last, both included."""
+        return (len(self.frames) - 1) * self.clocks + 1
+
+    def rgb(self, frame: int) -> Tensor:
+        """Return the view of a source frame, bit for bit.
+
+        Args:
+            frame: which, 0 to ``len(frames) - 1``.
+
+        Returns:
+            ``rgb`` of shape (3, height, width).
+
+        Raises:
+            ValueError: there is no such frame, or it has another size than the first.
+        """
+        return self._view(frame).clone()
+
+    def light(self, first: int = 0, count: int | None = None) -> Tensor:
+        """Return the light that arrives at the sensor, clock by clock.
+
+        Args:
+            first: the first clock.
+            count: how many; up to the film's end when not given.
+
+        Returns:
+            ``light`` of shape (count, height / scale, width / scale).
+
+        Raises:
+            ValueError: clocks that the film does not have, a frame of another size than the first.
+        """
+        count = self._count(first, count)
+        light = []
+        for clock in range(first, first + count):
+            frame, phase = divmod(clock, self.clocks)
+            light.append(self._interval(frame).light(phase) if phase else self._seen(self._view(frame)))
+        return torch.stack(light)
+
+    def chunks(self, first: int = 0, count: int | None = None, *, chunk: int = 64) -> Iterator[Tensor]:
+        """Iterate over the light of a span, a chunk of clocks at a time, in bounded memory.
+
+        Args:
+            first: the first clock.
+            count: how many; up to the film's end when not given.
+            chunk: clocks in a chunk; the last may be shorter.
+
+        Returns:
+            An iterator over chunks of :meth:`light`.
+
+        Raises:
+            ValueError: as :meth:`light`, and a chunk below 1.
+        """
+        last, chunk = first + self._count(first, count), check_whole("chunk", chunk)
+        return (self.light(start, min(chunk, last - start)) for start in range(first, last, chunk))
+
+    def spikes(
+        self,
+        first: int = 0,
+        count: int | None = None,
+        *,
+        noise: SensorNoise | None = None,
+        readout: int = 1,
+        seed: int = 0,
+        chunk: int = 64,
+    ) -> Iterator[Tensor]:
+        """Let a sensor look at a span of the film.
+
+        :func:`spikekit.write_spikes` takes what comes; ``torch.cat(list(film.spikes()))`` is all of it.
+
+        Args:
+            first: the first clock.
+            count: how many, a multiple of ``readout``; up to the film's end when not given.
+            noise: what the sensor adds, see :class:`spikekit.SensorNoise`.
+            readout: clocks for every frame of spikes, see :class:`spikekit.SpikeSensor`.
+            seed: where chance begins: the first charge and all noise.
+            chunk: clocks of light that are held.
+
+        Returns:
+            An iterator over chunks of spikes (T, height / scale, width / scale), uint8.
+
+        Raises:
+            ValueError: as :meth:`chunks` and :class:`spikekit.SpikeSensor`.
+        """
+        sensor = SpikeSensor(noise, readout=readout, seed=seed)
+        count = self._count(first, count) // readout * readout if count is None else count
+        return map(sensor.expose, self.chunks(first, count, chunk=-(-check_whole("chunk", chunk) // readout) * readout))
+
+    def clip(self, frame: int, frames: int = 41) -> FilmClip:
+        """Return a clip that is centred on a source frame.
+
+        Args:
+            frame: the source frame at clock ``frames // 2`` of the clip.
+            frames: clocks of the clip.
+
+        Returns:
+            A scene like :class:`spikekit.Scene`.
+
+        Raises:
+            ValueError: the film does not have all frames that the clip needs.
+        """
+        half = check_whole("frames", frames) // 2
+        first, last = frame - -(-half // self.clocks), frame + -(-(frames - 1 - half) // self.clocks)
+        if first < 0 or last >= len(self.frames):
+            raise ValueError(
+                f"frame: a clip of {frames} clocks, {self.clocks} an interval, needs frames {first} to {last} of "
+                f"0 to {len(self.frames) - 1}, got {frame}"
+            )
+        return FilmClip(self, frame, frames)
+
+    def profile(self, interval: int | None = None) -> SceneProfile:
+        """Look at what happens between frame ``interval`` and the next, or in the whole film.
+
+        Args:
+            interval: 0 to ``len(frames) - 2``; all of them, joined, when not given.
+
+        Returns:
+            The profile; that of a film of one frame is that of a static scene.
+
+        Raises:
+            ValueError: no such interval, a frame of another size than the first.
+        """
+        if interval is not None:
+            return self._interval(interval).profile
+        if len(self.frames) == 1:
+            return self._profile(self._view(0), self._view(0))
+        return SceneProfile.join(self._interval(n).profile for n in range(len(self.frames) - 1))
+
+    def plan(self, interval: int) -> Plan:
+        """Return what is modelled between frame ``interval`` and the next.
+
+        Args:
+            interval: 0 to ``len(frames) - 2``.
+
+        Returns:
+            The plan.
+
+        Raises:
+            ValueError: no such interval, a frame of another size than the first.
+        """
+        return self._interval(interval).plan
+
+    def flow(self, frame: int, clock: float) -> Tensor:
+        """Return the flow from a source frame to a clock, as far as the interpolation knows it.
+
+        Convention:
+            As :meth:`spikekit.Scene.flow`: sensor pixels, order (x, y). Within an interval motion is steady; over
+            several, flows are followed one after the other. 0 where a plan was made and nothing moves.
+
+        Args:
+            frame: from which.
+            clock: to when, counted from the film's first frame.
+
+        Returns:
+            ``flow`` of shape (2, height / scale, width / scale).
+
+        Raises:
+            ValueError: a clock that the film does not have, or to which there is no flow.
+        """
+        if not 0 <= clock < self.clock_count:
+            raise ValueError(f"clock: expected 0 to {self.clock_count - 1}, got {clock}")
+        way = clock / self.clocks - frame
+        moved = self._view(frame).new_zeros(1, 2, self.height, self.width)
+        while way:
+            share = min(abs(way), 1.0)
+            interval = self._interval(frame if way > 0 else frame - 1)
+            if self.fixed is not None or interval.profile.region is not None:
+                between = interval.between(None)
+                flow = between.forward if way > 0 else between.backward
+                if flow is None:
+                    raise ValueError(f"clock: there is no flow from frame {frame}: a cut, or an interpolation without")
+                moved = moved + share * flow_warp(flow[None], moved)
+            frame, way = (frame + 1, way - share) if way > 0 else (frame - 1, way + share)
+        return F.avg_pool2d(moved, self.scale)[0] / self.scale
+
+    def _count(self, first: int, count: int | None) -> int:
+        left = self.clock_count - first
+        count = left if count is None else count
+        if first < 0 or not 1 <= count <= left:
+            raise ValueError(
+                f"first, count: expected clocks of the film, 0 to {self.clock_count - 1}, got {count} from {first} on"
+            )
+        return count
+
+    def _read(self, frame: int) -> Tensor:
+        rgb = self.frames[frame]
+        check_planes(f"frames[{frame}]", rgb, 3, "(3, H, W)", floating=True)
+        if rgb.ndim != 3 or rgb.shape[0] != 3:
+            raise ValueError(f"frames[{frame}]: expected (3, H, W), got {tuple(rgb.shape)}")
+        return rgb
+
+    def _view(self, frame: int) -> Tensor:
+        if not 0 <= frame < len(self.frames):
+            raise ValueError(f"frame: expected 0 to {len(self.frames) - 1}, got {frame}")
+        if frame not in self._views:
+            rgb = self._read(frame)
+            if tuple(rgb.shape[1:]) != self._size:
+                expected, got = (f"{height} x {width}" for height, width in (self._size, rgb.shape[1:]))
+                raise ValueError(f"frames[{frame}]: expected {expected} as the first, got {got}")
+            _keep(self._views, frame, rgb[:, : self.height, : self.width].contiguous())
+        return self._views[frame]
+
+    def _seen(self, rgb: Tensor) -> Tensor:
+        return self.alpha * bin_to_sensor(rgb, self.pattern, scale=self.scale)
+
+    def _profile(self, first: Tensor, second: Tensor) -> SceneProfile:
+        return profile_interval(
+            first,
+            second,
+            scale=self.scale,
+            pattern=self.pattern,
+            alpha=self.alpha,
+            clocks=self.clocks,
+            spike_tolerance=self.spike_tolerance,
+            motion=self.motion,
+        )
+
+    def _plan(self, profile: SceneProfile) -> Plan:
+        return profile.plan(spike_tolerance=self.spike_tolerance, step=self.step)
+
+    def _interval(self, index: int) -> Interval:
+        if not 0 <= index < len(self.frames) - 1:
+            raise ValueError(f"interval: expected 0 to {len(self.frames) - 2}, got {index}")
+        if index not in self._intervals:
+            first, second = self._view(index), self._view(index + 1)
+            settings = self._seen, self.interpolation, self._profile, self._plan
+            _keep(self._intervals, index, Interval(first, second, self.clocks, self.scale, *settings, self.fixed))
+        return self._intervals[index]
+
+
+def _keep(kept: dict[int, Any], index: int, value: Any) -> None:
+    """Add the newest and forget the oldest."""
+    kept[index] = value
+    if len(kept) > _KEPT:
+        del kept[next(iter(kept))]
+
+
+@dataclass(frozen=True)
+class FilmClip:
+    """Some clocks of a film around a source frame: a scene like :class:`spikekit.Scene`, see :meth:`Film.clip`.
+
+    Args:
+        film: the film.
+        frame: the source frame at the middle.
+        frames: clocks of the clip.
+    """
+
+    film: Film
+    frame: int
+    frames: int = 41
+
+    @property
+    def middle(self) -> int:
+        """The clock of the source frame."""
+        return self.frames // 2
+
+    @property
+    def first(self) -> int:
+        """The clip's first clock in the film."""
+        return self.frame * self.film.clocks - self.middle
+
+    @property
+    def height(self) -> int:
+        """Rows of the view."""
+        return self.film.height
+
+    @property
+    def width(self) -> int:
+        """Columns of the view."""
+        return self.film.width
+
+    def rgb(self, clock: int) -> Tensor:
+        """Return the view at a clock that has a source frame: at the middle, the ground truth.
+
+        Raises:
+            ValueError: a clock without one.
+        """
+        frame, phase = divmod(self.first + clock, self.film.clocks)
+        if phase:
+            raise ValueError(f"clock: expected that of a source frame, as {self.middle}, got {clock}")
+        return self.film.rgb(frame)
+
+    def light(
+        self, pattern: str | CFA | None = None, *, scale: int | None = None, alpha: float | None = None
+    ) -> Tensor:
+        """Return the light at every clock, (frames, height / scale, width / scale).
+
+        Args:
+            pattern: that of the film, if given; so are the others.
+            scale: that of the film.
+            alpha: that of the film.
+
+        Raises:
+            ValueError: another pattern, scale or alpha than the film's.
+        """
+        wanted = pattern and bayer_pattern(pattern), scale, alpha
+        own = self.film.pattern, self.film.scale, self.film.alpha
+        if any(value is not None and value != has for value, has in zip(wanted, own, strict=True)):
+            raise ValueError(f"pattern, scale, alpha: expected those of the film, {own}, got {wanted}")
+        return self.film.light(self.first, self.frames)
+
+    def flow(self, clock: float, *, scale: int | None = None) -> Tensor:
+        """Return the flow from the middle to a clock, see :meth:`Film.flow`.
+
+        Raises:
+            ValueError: another scale than the film's, or as :meth:`Film.flow`.
+        """
+        if scale not in (None, self.film.scale):
+            raise ValueError(f"scale: expected that of the film, {self.film.scale}, got {scale}")
+        return self.film.flow(self.frame, self.first + clock)

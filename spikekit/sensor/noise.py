@@ -1,0 +1,279 @@
+"""Noise of a real sensor: photon noise, dark current, fixed-pattern noise, hot and dead pixels."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from spikekit._renamed import renamed_argument
+from spikekit.check import check_positive, check_whole
+
+# Each has its own random numbers. The place in the list tells them apart: append, never reorder.
+_PURPOSES = ("charge", "gain", "dark current", "defects", "photons", "electrons")
+
+_MEAN_SIZE = math.sqrt(2 / math.pi)  # E|x| of a standard normal x
+_MOST_PHOTONS = 1e18  # NumPy's Poisson numbers end at 9.2e18, and one photon more or less is no longer seen here
+
+
+class SpikeChange(NamedTuple):
+    """How much one source of noise changes, see :meth:`SensorNoise.spike_changes`.
+
+    Args:
+        charge: mean size of the error of a pixel's charge at the end of the clip, in thresholds: by how many spikes
+            its count is off.
+        share: the share of the stream's bits that differ, at most.
+    """
+
+    charge: float
+    share: float
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    r"""What a real sensor adds to light; every source is off unless it is asked for.
+
+    .. math:: I'_t = \theta \, (g \, P_t + D_t), \quad
+        P_t \sim \operatorname{Poisson}(p I_t / \theta) / p, \quad
+        D_t \sim \operatorname{Poisson}(p \, d) / p, \quad
+        \mathrm{E} g = 1, \; \sigma(g) = \sigma_g, \quad \mathrm{E} d = \bar d, \; \sigma(d) = \sigma_d \bar d
+
+    Convention:
+        :math:`I_t` is the light of a pixel at a clock, :math:`\theta` the threshold, :math:`I'_t` the charge that the
+        pixel integrates. Charges are counted in thresholds, so that a setting means the same at every threshold.
+        Without ``photons``, light and dark current arrive evenly: :math:`P_t = I_t / \theta`, :math:`D_t = d`.
+
+        Gain g and dark current d are a pixel's own and stay as they are. They are log-normal: hardly to be told from
+        normal for a spread of some per cent, but above 0 and with the mean that was asked for, however wide.
+
+        A hot pixel fires at every clock, as one does whose leak fills a threshold each time; a dead one never fires.
+        No pixel is both. With a larger share, the same pixels fail and others with them.
+
+        Light below 0 has no photons and stays as it is, so do NaN and infinity.
+
+        Every source has random numbers of its own, drawn from the seed, and those in time anew for every clock. So
+        one source switched on or off changes nothing about the others, and neither does a cut between two clocks.
+        They are drawn on the CPU, and are the same wherever the light is.
+
+    Args:
+        photons: p, electrons that make one threshold; ``None`` for no photon noise.
+        dark_current: :math:`\bar d`, mean charge that leaks in per clock, in thresholds.
+        dark_spread: :math:`\sigma_d`, standard deviation of the dark current between pixels, relative to its mean.
+        gain_spread: :math:`\sigma_g`, standard deviation of the gain between pixels: fixed-pattern noise.
+        hot: share of pixels that always fire.
+        dead: share of pixels that never fire.
+
+    Raises:
+        ValueError: a number of photons that is not above 0, a negative or infinite one elsewhere, shares of hot and
+            dead pixels that together exceed 1, a spread of a dark current of 0.
+
+    Example:
+        The constants of Hu et al. for a camera of 250 x 400 pixels at 20 kHz, which are bare numbers, read as fF, V and
+        pA: a threshold is a charge of 4.35 fF x 1.09 V or 30 000 electrons; 0.44 pA of dark current, with a standard
+        deviation of 39 %, make 0.0047 of it in a clock; the gains of pixels spread by 6 %:
+
+        >>> typical = SensorNoise(photons=30_000, dark_current=0.0047, dark_spread=0.39, gain_spread=0.06)
+        >>> for source, change in typical.spike_changes(light=0.2, frames=41).items():
+        ...     print(f"{source}: {change.charge:.3f} thresholds, at most {change.share:.1%} of the bits")
+        photons: 0.013 thresholds, at most 1.8% of the bits
+        dark_current: 0.193 thresholds, at most 19.3% of the bits
+        gain_spread: 0.393 thresholds, at most 29.8% of the bits
+
+    Reference:
+        Hu et al., SCSim: a realistic spike cameras simulator, arXiv:2405.16790, 2024 (constants: ``v2s.py`` of its
+        code, after measurements in Hu et al., Spike stream denoising via spike camera simulation, arXiv:2304.03129,
+        2023); Gao et al., The analysis and suppressing of non-uniformity in a high-speed spike-based image sensor,
+        Sensors 18(12), 4232, 2018: shot noise, and gain and dark current that differ between pixels.
+    """
+
+    photons: float | None = None
+    dark_current: float = 0.0
+    dark_spread: float = 0.0
+    gain_spread: float = 0.0
+    hot: float = 0.0
+    dead: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.photons is not None:
+            check_positive("photons", self.photons)
+        for name in ("dark_current", "dark_spread", "gain_spread", "hot", "dead"):
+            value = getattr(self, name)
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{name}: expected a finite number, 0 or more, got {value}")
+        if self.hot + self.dead > 1:
+            raise ValueError(f"hot, dead: expected shares that add up to 1 at most, got {self.hot}, {self.dead}")
+        if self.dark_spread and not self.dark_current:
+            raise ValueError(f"dark_spread: expected a dark_current above 0 with it, got {self.dark_spread} of none")
+
+    def spike_changes(self, light: float, frames: int) -> dict[str, SpikeChange]:
+        r"""Tell how much each source that is on changes a clip, without simulating it.
+
+        .. math:: \text{share} \le \frac{1}{T} \sum_{t=1}^{T} \min(\mathrm{E}|E_{t-1}| + \mathrm{E}|E_t|, \;
+            r + r', \; 1)
+
+        Convention:
+            Let :math:`E_t` be the charge that the source has added to a pixel up to clock t. Without it, the pixel
+            fires at clock t if a multiple of the threshold lies in :math:`(Q_{t-1}, Q_t]`, with the source, if one
+            lies in :math:`(Q_{t-1} + E_{t-1}, Q_t + E_t]`. The bits can only differ if one lies between the
+            beginnings or between the ends, and as the charge begins uniform in [0, threshold), whatever the light,
+            that has the probabilities :math:`\min(1, |E_{t-1}|)` and :math:`\min(1, |E_t|)`. Nor can more bits differ
+            than are set with (:math:`r'`) and without (:math:`r`) the source. In light that does not change, the bound
+            is nearly reached until the errors become as large as the light of one clock or what it lacks of a
+            threshold.
+
+            Mean errors, in thresholds: that of a Poisson number for photons, :math:`\sqrt{2 t I / \pi p}` where many
+            arrive; :math:`t \bar d` for dark current; at most :math:`\sqrt{2 / \pi} \, t I \sigma_g` for gains. Hot
+            pixels change :math:`1 - I` of their bits and dead ones I, with errors of :math:`(1 - I) T` and
+            :math:`I T`.
+
+            The mean over pixels may stand for light that differs from pixel to pixel, below the threshold. The
+            shares of several sources together add up to a bound of what all of them change.
+
+        Args:
+            light: mean light per clock, in thresholds.
+            frames: T, clocks of the clip.
+
+        Returns:
+            One :class:`SpikeChange` for every source that is on, by the name of its field; ``dark_spread`` goes with
+            ``dark_current``.
+
+        Raises:
+            ValueError: light that is negative or not finite, frames below 1.
+        """
+        if not 0 <= light < math.inf:
+            raise ValueError(f"light: expected a finite number, 0 or more, got {light}")
+        clocks = np.arange(check_whole("frames", frames) + 1)
+        rate = min(1.0, light)
+
+        def change(errors: np.ndarray, noisy: float = rate) -> SpikeChange:
+            bound = np.minimum(errors[:-1] + errors[1:], min(1.0, rate + noisy))
+            return SpikeChange(float(errors[-1]), float(bound.mean()))
+
+        changes = {}
+        if self.photons is not None:
+            changes["photons"] = change(_poisson_error(clocks * light * self.photons) / self.photons)
+        if self.dark_current:
+            changes["dark_current"] = change(clocks * self.dark_current, min(1.0, light + self.dark_current))
+        if self.gain_spread:
+            changes["gain_spread"] = change(_MEAN_SIZE * self.gain_spread * light * clocks)
+        if self.hot:
+            changes["hot"] = SpikeChange(self.hot * (1 - rate) * frames, self.hot * (1 - rate))
+        if self.dead:
+            changes["dead"] = SpikeChange(self.dead * rate * frames, self.dead * rate)
+        return changes
+
+    @renamed_argument("tolerance", "spike_tolerance")
+    def required(self, light: float, frames: int, spike_tolerance: float) -> SensorNoise:
+        """Leave only the sources that may change more than a share of the bits, see :meth:`spike_changes`.
+
+        What is left out changes at most ``spike_tolerance`` of the bits each.
+
+        Args:
+            light: mean light per clock, in thresholds.
+            frames: clocks of the clip.
+            spike_tolerance: the share; ``tolerance`` is its old name.
+
+        Returns:
+            This noise without the rest.
+
+        Raises:
+            ValueError: as :meth:`spike_changes`.
+
+        Example:
+            >>> SensorNoise(photons=1e6, hot=0.01).required(light=0.2, frames=41, spike_tolerance=0.005)
+            SensorNoise(photons=None, dark_current=0.0, dark_spread=0.0, gain_spread=0.0, hot=0.01, dead=0.0)
+        """
+        changes = self.spike_changes(light, frames)
+        off = {source for source, change in changes.items() if change.share <= spike_tolerance}
+        if "dark_current" in off:
+            off.add("dark_spread")
+        return replace(self, **{field.name: field.default for field in fields(self) if field.name in off})
+
+
+def random_numbers(seed: int, purpose: str, clock: int = 0) -> np.random.Generator:
+    """Return the random numbers of one purpose at one clock; they depend on nothing else."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_PURPOSES.index(purpose), clock)))
+
+
+class NoisyPixels:
+    """The pixels of one sensor: what noise gives them for good, and what it does to them at every clock.
+
+    Args:
+        noise: its sources.
+        size: (*, H, W), how many pixels there are.
+        seed: where chance begins, 0 or more.
+    """
+
+    def __init__(self, noise: SensorNoise, size: tuple[int, ...], seed: int) -> None:
+        self.noise, self.size, self.seed = noise, size, seed
+
+    def charge(self, light: Tensor, threshold: float, clock: int) -> Tensor:
+        """Return what the pixels integrate of light (*, T, H, W), whose first frame is that of ``clock``."""
+        noise = self.noise
+        if noise.photons is None and not noise.dark_current and not noise.gain_spread:
+            return light
+        charge = light.detach().to(torch.promote_types(light.dtype, torch.float32), copy=True)
+        quantum = threshold / (noise.photons or math.inf)
+        gain = torch.from_numpy(self._gain).to(charge) if noise.gain_spread else None
+        dark = torch.from_numpy(self._dark * threshold) if noise.dark_current else None
+        for t, now in enumerate(charge.unbind(-3), clock):
+            if noise.photons is not None:
+                now.copy_(_arrive(now, quantum, random_numbers(self.seed, "photons", t)))
+            if gain is not None:
+                now.mul_(gain)
+            if dark is not None and noise.photons is not None:
+                now.add_(_arrive(dark, quantum, random_numbers(self.seed, "electrons", t)).to(now))
+            elif dark is not None:
+                now.add_(dark.to(now))
+        return charge
+
+    def spikes(self, spikes: Tensor) -> Tensor:
+        """Set the bits (*, T, H, W) of hot and dead pixels, in place, and return all of them."""
+        for share, bit in ((self.noise.hot, 1), (self.noise.dead, 0)):
+            if share:
+                fails = self._defects < share if bit else self._defects >= 1 - share
+                spikes.masked_fill_(torch.from_numpy(fails).to(spikes.device).unsqueeze(-3), bit)
+        return spikes
+
+    @cached_property
+    def _gain(self) -> np.ndarray:
+        return self._around_one("gain", self.noise.gain_spread)
+
+    @cached_property
+    def _dark(self) -> np.ndarray:
+        return self.noise.dark_current * self._around_one("dark current", self.noise.dark_spread)
+
+    @cached_property
+    def _defects(self) -> np.ndarray:
+        return random_numbers(self.seed, "defects").random(self.size)
+
+    def _around_one(self, purpose: str, spread: float) -> np.ndarray:
+        # of the logarithm; the second form is for squares that no number holds
+        variance = math.log1p(spread**2) if spread < 1e150 else 2 * math.log(spread)
+        normal = random_numbers(self.seed, purpose).standard_normal(self.size)
+        return np.exp(math.sqrt(variance) * normal - variance / 2)
+
+
+def _poisson_error(means: np.ndarray) -> np.ndarray:
+    """E|N - mean| of Poisson numbers N; where they are large, that of normal ones."""
+
+    def error(mean: float) -> float:
+        if mean > 1e4:
+            return _MEAN_SIZE * math.sqrt(mean)
+        most = math.floor(mean)
+        return 2 * math.exp((most + 1) * math.log(mean) - mean - math.lgamma(most + 1)) if mean else 0.0
+
+    return np.array([error(mean) for mean in means.tolist()])
+
+
+def _arrive(charge: Tensor, quantum: float, numbers: np.random.Generator) -> Tensor:
+    """Let a mean charge (*, H, W) arrive in whole quanta; what has no number of quanta stays as it is."""
+    mean = charge.double().cpu().numpy() / quantum
+    known = (mean > 0) & (mean < _MOST_PHOTONS)
+    counts = numbers.poisson(np.where(known, mean, 0))
+    return torch.where(torch.from_numpy(known).to(charge.device), torch.from_numpy(counts * quantum).to(charge), charge)

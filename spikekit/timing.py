@@ -1,0 +1,151 @@
+"""Timing: several functions in turn in one process, with their memory and the bandwidth floor."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import re
+import statistics
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+Run = Callable[[], object]
+
+#: Takes a run and how often to call it; returns the seconds of one call.
+Timer = Callable[[Run, int], float]
+
+_SHORTEST = 2e-3  # seconds: what is faster is called several times within one timing
+_FEWEST_ROUNDS = 3
+
+
+def cpu_timer(now: Callable[[], float]) -> Timer:
+    """Time by a clock of this process: :func:`time.process_time` for one thread, :func:`time.perf_counter` for more."""
+
+    def timer(run: Run, number: int) -> float:
+        begin = now()
+        for _ in range(number):
+            run()
+        return (now() - begin) / number
+
+    return timer
+
+
+def cuda_timer(run: Run, number: int) -> float:
+    """Time by CUDA events, with nothing else under way before the first one and after the last."""
+    begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    torch.cuda.synchronize()
+    begin.record()
+    for _ in range(number):
+        run()
+    end.record()
+    torch.cuda.synchronize()
+    return begin.elapsed_time(end) / 1e3 / number
+
+
+def timer_of(device: torch.device, threads: int) -> tuple[Timer, str]:
+    """Return the timer for a device and a number of threads, and what it counts."""
+    if device.type == "cuda":
+        return cuda_timer, "CUDA events, synchronised"
+    if threads == 1:
+        return cpu_timer(time.process_time), "process CPU time"
+    return cpu_timer(time.perf_counter), "wall time"
+
+
+def interleave(runs: Mapping[str, Run], rounds: int, timer: Timer, seconds: float = math.inf) -> dict[str, list[float]]:
+    """Time all runs in turn, A B C A B C ..., so that whatever else the machine does falls on all of them alike.
+
+    Every run is called once before, to warm up and to learn how often it must be called for a timing of a few
+    milliseconds.
+
+    Args:
+        runs: what to time, by name.
+        rounds: how many timings of each.
+        timer: how.
+        seconds: no further round is begun after so much time, from the third one on.
+
+    Returns:
+        The seconds of one call, by name, as many as there were rounds.
+    """
+    number = {}
+    for name, run in runs.items():
+        number[name] = min(100, math.ceil(_SHORTEST / max(timer(run, 1), 1e-9)))
+    times: dict[str, list[float]] = {name: [] for name in runs}
+    spent = 0.0
+    for done in range(rounds):
+        if done >= _FEWEST_ROUNDS and spent > seconds:
+            break
+        for name, run in runs.items():
+            took = timer(run, number[name])
+            times[name].append(took)
+            spent += took * number[name]
+    return times
+
+
+class Ratio(NamedTuple):
+    """How many times as long one run takes as another: median, least and most of the rounds."""
+
+    median: float
+    least: float
+    most: float
+
+
+def ratio(times: Sequence[float], reference: Sequence[float]) -> Ratio:
+    """Compare round by round, as the two timings of one round saw the same machine.
+
+    Example:
+        >>> ratio([2.0, 30.0, 4.0], [1.0, 10.0, 1.0])
+        Ratio(median=3.0, least=2.0, most=4.0)
+    """
+    ratios = [a / max(b, 1e-9) for a, b in zip(times, reference, strict=True)]
+    return Ratio(statistics.median(ratios), min(ratios), max(ratios))
+
+
+def floor_run(read: float, written: float, device: torch.device) -> Run:
+    """Return a run that reads so many bytes once and writes so many bytes once, in memory that is already there."""
+    source, target = (torch.ones(math.ceil(size / 4), device=device) for size in (read, written))
+
+    def run() -> tuple[Tensor, Tensor]:
+        return source.sum(), target.fill_(1)
+
+    return run
+
+
+def peak_memory(run: Run, device: torch.device) -> float | None:
+    """Return by how many MiB a call raises the memory in use at its worst moment, its result included.
+
+    CUDA: what torch's allocator hands out. CPU: the resident memory of the process, which NumPy's and every other
+    library's share is part of; on Linux, where the kernel keeps its high-water mark and lets it be reset. Elsewhere,
+    or where that is not allowed, None.
+    """
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated()
+        run()
+        torch.cuda.synchronize()
+        return (torch.cuda.max_memory_allocated() - before) / 2**20
+    if sys.platform != "linux":
+        return None
+    with suppress(OSError, AttributeError):  # not with glibc: free pages that the heap keeps would hide a part
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+        before = _resident("VmRSS")
+        run()
+        return max(0, _resident("VmHWM") - before) / 1024
+    except (OSError, LookupError):
+        return None
+
+
+def _resident(field: str) -> int:
+    found = re.search(rf"^{field}:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
+    if found is None:
+        raise LookupError(field)
+    return int(found[1])

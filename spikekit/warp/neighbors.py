@@ -1,0 +1,309 @@
+"""The known pixels nearest to where flow points to, and their weights by inverse distance.
+
+Everything that warps with the same flow and mask can share them::
+
+    index, weight = idw_neighbors(flow, mask)
+    warped = Gather.apply(features.flatten(2), index, weight).reshape(features.shape)
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
+
+from spikekit.kernels import cpu_warp, gpu_kernel, register_on_gpu
+from spikekit.kernels.position_table import PositionTable
+from spikekit.warp.gather import fold_into_batch
+
+_FARTHEST = 2.0**30  # flow beyond it is cut: positions must fit an integer
+_CHUNK = 1 << 15  # positions searched at a time: in the cache, and by one thread, without waiting for another
+
+# The tables of the rows and of the columns of a product, (k, 2 H) and (k, 2 W), see _nearest_on_axis.
+Product = tuple[Tensor, Tensor]
+
+
+def finite(flow: Tensor) -> Tensor:
+    """Count NaN as 0 and cut what is too far; the gradient is 0 there."""
+    return flow.nan_to_num(0.0).clamp(-_FARTHEST, _FARTHEST)
+
+
+def _nearest_on_axis(known: np.ndarray, length: int, neighbors: int) -> np.ndarray:
+    """Positions of the nearest known indices, nearest first, for every interval ((h - 1) / 2, h / 2].
+
+    Between two half-integers the order of whole numbers by distance does not change; at h / 2 itself two may be
+    equally far, and the lower one wins. So the order at q depends on ceil(2 q) alone, and beyond the axis it does not
+    change any more: 2 * length rows are enough for every q.
+    """
+    h = np.arange(2 * length)
+    # known positions that can be among the nearest: as many to the left of h / 2 as to the right
+    start = np.searchsorted(known, h / 2)[:, None] + np.arange(-neighbors, neighbors)
+    outside = (start < 0) | (start >= len(known))
+    position = known[start.clip(0, len(known) - 1)]
+    distance = np.where(outside, np.inf, np.abs(2 * position - h[:, None]))
+    order = np.argsort(distance, axis=1, kind="stable")[:, : min(neighbors, len(known))]
+    return np.take_along_axis(position, order, axis=1)
+
+
+# What was seen of a mask, as (bits, height, width, device). By identity: a WeakKeyDictionary would compare with ==.
+_Key = tuple[bytes, int, int, str]
+_key_of_mask = WeakTensorKeyDictionary()
+
+
+def _key(mask: Tensor) -> _Key:
+    """Return what to look up the tables of a mask by; a GPU is waited for only where it is new or has changed."""
+    # inference tensors do not count their changes, and memory on the CPU may be another's, such as NumPy's
+    uncounted = mask.is_inference() or mask.device.type == "cpu"
+    version = None if uncounted else mask._version
+    kept, key = _key_of_mask.get(mask, (None, None))
+    if version is None or version != kept:
+        key = (mask.detach() != 0).cpu().numpy().tobytes(), *mask.shape, str(mask.device)
+        if version is not None:
+            _key_of_mask[mask] = version, key
+    return key
+
+
+@lru_cache(maxsize=32)
+def _products(key: _Key, neighbors: int) -> list[Product]:
+    """Write a mask as products of known rows and known columns, and return the tables of each.
+
+    Rows with the same known columns belong together, so that every mask is a union of such products: one for red and
+    for blue of a Bayer filter, two for green.
+    """
+    bits, height, width, device = key
+    rows_of_pattern: dict[bytes, list[int]] = {}
+    for row in range(height):
+        rows_of_pattern.setdefault(bits[row * width : (row + 1) * width], []).append(row)
+    products = []
+    for pattern, rows in rows_of_pattern.items():
+        columns = np.flatnonzero(np.frombuffer(pattern, dtype=bool))
+        if len(columns):
+            axes = (np.array(rows), height), (columns, width)
+            tables = [torch.from_numpy(_nearest_on_axis(*axis, neighbors).T.astype(np.int32)) for axis in axes]
+            products.append((tables[0].to(device), tables[1].to(device)))
+    if not products:
+        raise ValueError("mask: expected at least one known pixel, got none")
+    return products
+
+
+def products_of(mask: Tensor, neighbors: int) -> list[Product]:
+    """Return the tables of a mask, kept between calls."""
+    return _products(_key(mask), neighbors)
+
+
+def _on_axis(table: Tensor, cell: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
+    """Nearest positions on one axis, and their squared distance less that of a common reference: both (k, n)."""
+    top = table.shape[1] - 1
+    half = (2 * cell + torch.ceil(2 * part).long()).clamp(0, top)
+    position = table.index_select(1, half)
+    reference = cell.clamp(0, top // 2)
+    step = (position - reference).to(part.dtype)
+    # (p - q)^2 - (r - q)^2 without squaring what is far away; q = cell + part
+    return position, step * (step + 2 * ((reference - cell).to(part.dtype) - part))
+
+
+def _search(products: list[Product], neighbors: int, width: int, cell: Tensor, part: Tensor) -> Tensor:
+    """Flat indices (neighbors, n) of the known pixels nearest to cell + part, (2, n): the nearest again where none is.
+
+    Nearest first, exact, row-major order among equals.
+    """
+    best: list[tuple[Tensor, Tensor]] = []
+    for rows, columns in products:
+        row, row_distance = _on_axis(rows, cell[1], part[1])
+        column, column_distance = _on_axis(columns, cell[0], part[0])
+        for i in range(len(row)):
+            for j in range(min(len(column), neighbors // (i + 1))):
+                before = (i + 1) * (j + 1) - 1  # so many pixels of this product are at least as near
+                _insert(best, row_distance[i] + column_distance[j], row[i] * width + column[j], before, neighbors)
+    best += best[:1] * (neighbors - len(best))
+    return torch.stack([index for _, index in best]).long()
+
+
+def _insert(best: list[tuple[Tensor, Tensor]], distance: Tensor, index: Tensor, before: int, most: int) -> None:
+    """Keep the smallest (distance, index), in order; the new one cannot be among the first ``before``."""
+    for slot in range(before, len(best)):
+        other, other_index = best[slot]
+        closer = (distance < other) | ((distance == other) & (index < other_index))
+        best[slot] = torch.where(closer, distance, other), torch.where(closer, index, other_index)
+        if slot + 1 < most:
+            distance, index = torch.where(closer, other, distance), torch.where(closer, other_index, index)
+    if len(best) < most:
+        best.append((distance, index))
+
+
+def _search_and_weigh(
+    products: list[Product], neighbors: int, width: int, cell: Tensor, part: Tensor
+) -> tuple[Tensor, Tensor]:
+    index = _search(products, neighbors, width, cell, part)
+    return index, _weigh(index, width, cell, part)
+
+
+@lru_cache(maxsize=8)
+def _table(key: _Key, neighbors: int, steps: int, dtype: torch.dtype) -> PositionTable:
+    bits, height, width, device = key
+    known = np.frombuffer(bits, dtype=bool).reshape(height, width)
+    return PositionTable(known, neighbors, steps, _search_in, dtype, device)
+
+
+def table_of(mask: Tensor, neighbors: int, steps: int, dtype: torch.dtype) -> PositionTable:
+    """Return the table of a mask, with weights in ``dtype``, kept between calls."""
+    return _table(_key(mask), neighbors, steps, dtype)
+
+
+def _search_in(known: np.ndarray, neighbors: int, cell: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
+    products = _products((known.tobytes(), *known.shape, "cpu"), neighbors)
+    return _search_and_weigh(products, neighbors, known.shape[1], cell, part)
+
+
+def _weigh(index: Tensor, width: int, cell: Tensor, part: Tensor) -> Tensor:
+    """Weights by inverse distance, of sum 1, that pixels (neighbors, n) have at cell + part, (2, n)."""
+    row = index // width
+    dx = (index - row * width - cell[0]).to(part.dtype) - part[0]
+    dy = (row - cell[1]).to(part.dtype) - part[1]
+    distance = (dx * dx + dy * dy).sqrt()
+    # 1 / d, relative to the nearest: no overflow next to a known pixel, and nothing for the others on it
+    weight = torch.where(index[1:] == index[0], 0, distance[0] / distance[1:])
+    weight = torch.cat([torch.ones_like(distance[:1]), weight])
+    return weight / weight.sum(dim=0)
+
+
+def _nearest_known(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
+    """Flat indices of the ``neighbors`` known pixels nearest to where flow points to, and their weights.
+
+    Args:
+        flow: (N, 2, H, W), float32 or float64, finite and less than 2^30.
+        mask: (H, W).
+        neighbors: how many known pixels to weigh, K.
+        steps: positions per pixel and axis that flow is rounded to, so that a table can be asked; 0: no rounding.
+
+    Returns:
+        Index, int64, and weight, in the dtype of ``flow``: both (N, K, H W), the nearest first. Where fewer pixels
+        are known, the nearest is repeated with weight 0.
+    """
+    count, _, height, width = flow.shape
+    if steps:
+        find = table_of(mask, neighbors, steps, flow.dtype).find
+    else:
+        find = partial(_search_and_weigh, products_of(mask, neighbors), neighbors, width)
+    # double, so that what is nearer does not depend on rounding
+    double = torch.float32 if flow.device.type == "mps" else torch.float64
+    plane = height * width
+    flat = flow.movedim(1, 0).reshape(2, -1)
+    index = flow.new_empty(neighbors, count * plane, dtype=torch.int64)
+    weight = flow.new_empty(neighbors, count * plane)
+    size = _CHUNK if flow.device.type == "cpu" else 128 * _CHUNK  # elsewhere a launch costs more than the cache saves
+    for begin in range(0, count * plane, size):
+        moved = flat[:, begin : begin + size].to(double)
+        whole = moved.round()
+        pixel = torch.arange(begin, begin + moved.shape[1], device=flow.device) % plane
+        cell, part = torch.stack([pixel % width, pixel // width]) + whole.long(), moved - whole
+        chunk = slice(begin, begin + size)
+        index[:, chunk], weight[:, chunk] = find(cell, part)
+    shape = neighbors, count, plane
+    return index.reshape(shape).movedim(0, 1).contiguous(), weight.reshape(shape).movedim(0, 1).contiguous()
+
+
+nearest_known = torch.library.custom_op("spikekit::nearest_known", _nearest_known, mutates_args=())
+
+
+@nearest_known.register_fake
+def _(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
+    shape = flow.shape[0], neighbors, flow.shape[2] * flow.shape[3]
+    return flow.new_empty(shape, dtype=torch.int64), flow.new_empty(shape)
+
+
+@nearest_known.register_kernel("cpu")
+def _(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
+    if steps:
+        return cpu_warp.nearest_in_table(flow, table_of(mask, neighbors, steps, flow.dtype))
+    if neighbors == 4:
+        products = products_of(mask, neighbors)
+        if len(products) <= 2 and all(len(table) == 4 for product in products for table in product):
+            return cpu_warp.nearest_four(flow, products)
+    return _nearest_known(flow, mask, neighbors, steps)
+
+
+def _on_gpu(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
+    if steps:
+        return _nearest_known(flow, mask, neighbors, steps)
+    return gpu_kernel("nearest_known")(flow, products_of(mask, neighbors), neighbors)
+
+
+register_on_gpu(nearest_known, _on_gpu)
+fold_into_batch(nearest_known, 1)
+
+
+def _rounded(flow: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+    """Return the flow that a table stands for, with the gradient of what was rounded, and where it is not cut."""
+    height, width = flow.shape[-2:]
+    y, x = (torch.arange(length, device=flow.device, dtype=flow.dtype) for length in (height, width))
+    pixel = torch.stack([x.expand(height, width), y[:, None].expand(height, width)])
+    position = flow.detach() + pixel
+    moved = position.clamp(min=-0.5).minimum(pixel[:, -1:, -1:] + 0.5)
+    rounded = ((moved - pixel) * steps).round() / steps
+    return flow + (rounded - flow.detach()), moved == position
+
+
+class NearestKnown(torch.autograd.Function):
+    """:func:`nearest_known` with the derivative of the weights in the flow."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:  # noqa: D102
+        return nearest_known(flow, mask, neighbors, steps)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:  # noqa: D102
+        index, weight = output
+        ctx.mark_non_differentiable(index)
+        ctx.steps = inputs[3]
+        ctx.save_for_backward(inputs[0], index, weight)
+
+    @staticmethod
+    def backward(ctx: Any, _: Tensor, grad: Tensor) -> tuple[Tensor, None, None, None]:  # noqa: D102
+        return NearestKnown.of_flow(*ctx.saved_tensors, grad, ctx.steps), *[None] * 3
+
+    @staticmethod
+    def of_flow(flow: Tensor, index: Tensor, weight: Tensor, grad: Tensor, steps: int) -> Tensor:
+        """Derivative in the flow, from that in the weights."""
+        _, _, height, width = flow.shape
+        inside = 1
+        if steps:
+            flow, inside = _rounded(flow, steps)
+        whole = flow.detach().round()
+        part = (flow - whole).flatten(2)
+        pixel = torch.arange(height * width, device=flow.device)
+        row = index // width
+        cell_x, cell_y = (whole.long().flatten(2) + torch.stack([pixel % width, pixel // width])).split(1, dim=1)
+        dx = (index - row * width - cell_x).to(flow.dtype) - part[:, :1]
+        dy = (row - cell_y).to(flow.dtype) - part[:, 1:]
+        square = dx * dx + dy * dy
+        # sum over i of w_i (g_i - mean g) (p_i - q) / d_i^2; for the nearest, whose d may be tiny, without cancellation
+        first, others = weight.split([1, weight.shape[1] - 1], dim=1)
+        near = first * (others * (grad[:, :1] - grad[:, 1:])).sum(dim=1, keepdim=True)
+        far = others * (grad[:, 1:] - (weight * grad).sum(dim=1, keepdim=True))
+        factor = torch.cat([near, far], dim=1) / torch.where(square < torch.finfo(flow.dtype).tiny, 1, square)
+        result = torch.stack([(factor * dx).sum(dim=1), (factor * dy).sum(dim=1)], dim=1).reshape(flow.shape)
+        return result * inside
+
+
+def idw_neighbors(flow: Tensor, mask: Tensor, neighbors: int = 4, steps: int | None = None) -> tuple[Tensor, Tensor]:
+    """Known pixels nearest to where flow points to, and their weights by inverse distance.
+
+    Args:
+        flow: (N, 2, H, W), floating.
+        mask: (H, W); a pixel is known where it is not 0.
+        neighbors: how many known pixels to weigh, K.
+        steps: positions per pixel and axis that flow is rounded to, even, so that a table can be asked; None: exact.
+
+    Returns:
+        Flat indices, int64, and weights, in the dtype of ``flow`` but float32 at least: both (N, K, H W). The weights
+        are differentiable in the flow. Where fewer pixels are known, the nearest is repeated with weight 0.
+    """
+    flow = finite(flow.to(torch.promote_types(flow.dtype, torch.float32)))
+    return NearestKnown.apply(flow, mask, neighbors, steps or 0)

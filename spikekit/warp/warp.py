@@ -1,0 +1,172 @@
+"""Warping: sample a picture, or the known pixels of one, where flow points to."""
+
+from __future__ import annotations
+
+import torch
+from kornia.geometry import create_meshgrid
+from kornia.geometry.transform import remap
+from torch import Tensor, nn
+
+from spikekit.check import check_planes, check_whole
+from spikekit.warp.gather import Gather
+from spikekit.warp.neighbors import finite, idw_neighbors
+from spikekit.warp.table_warp import in_one_go, warp_by_table
+
+
+def _check_warp(name: str, image: Tensor, flow: Tensor) -> None:
+    check_planes(name, image, 3, "(*, C, H, W)", floating=True)
+    check_planes("flow", flow, 3, "(*, 2, H, W)", floating=True)
+    if flow.shape[-3] != 2 or flow.shape[-2:] != image.shape[-2:] or flow.shape[:-3] != image.shape[:-3]:
+        expected = (*image.shape[:-3], 2, *image.shape[-2:])
+        raise ValueError(f"flow: expected {expected} for {name} {tuple(image.shape)}, got {tuple(flow.shape)}")
+
+
+def flow_warp(image: Tensor, flow: Tensor) -> Tensor:
+    r"""Sample an image where flow points to, bilinearly.
+
+    .. math:: O(x, y) = I(x + u(x, y), y + v(x, y))
+
+    Convention:
+        Flow in pixels, order (x, y), x right, y down. Pixel centres are at whole numbers; positions outside the image
+        are moved to its border. Coordinates are computed in float32 or wider. NaN flow counts as 0, infinite flow as
+        very far, both with gradient 0. Built on :func:`kornia.geometry.transform.remap`.
+
+    Args:
+        image: :math:`(*, C, H, W)`, floating.
+        flow: :math:`(*, 2, H, W)`.
+
+    Returns:
+        As ``image``.
+
+    Raises:
+        TypeError: not floating-point tensors.
+        ValueError: sizes that do not fit each other.
+
+    Example:
+        >>> image = torch.tensor([[[[0.0, 1.0, 2.0, 3.0]]]])
+        >>> flow_warp(image, torch.tensor([1.5, 0.0]).reshape(1, 2, 1, 1).expand(1, 2, 1, 4)).flatten().tolist()
+        [1.5, 2.5, 3.0, 3.0]
+    """
+    _check_warp("image", image, flow)
+    height, width = image.shape[-2:]
+    wide = torch.promote_types(torch.promote_types(image.dtype, flow.dtype), torch.float32)
+    planes = image.reshape(-1, *image.shape[-3:]).to(wide)
+    grid = create_meshgrid(height, width, normalized_coordinates=False, device=flow.device, dtype=wide)
+    x, y = (grid + finite(flow.reshape(-1, 2, height, width).to(wide)).movedim(1, -1)).unbind(-1)
+    warped = remap(planes, x, y, mode="bilinear", padding_mode="border", align_corners=True)
+    return warped.to(image.dtype).reshape(image.shape)
+
+
+class FlowWarp(nn.Module):
+    r"""See the Convention block on :func:`flow_warp`.
+
+    Shape:
+        - Input: image :math:`(*, C, H, W)` and flow :math:`(*, 2, H, W)`
+        - Output: :math:`(*, C, H, W)`
+
+    Example:
+        >>> FlowWarp()(torch.rand(2, 3, 8, 8), torch.zeros(2, 2, 8, 8)).shape
+        torch.Size([2, 3, 8, 8])
+    """
+
+    def forward(self, image: Tensor, flow: Tensor) -> Tensor:  # noqa: D102
+        return flow_warp(image, flow)
+
+
+def flow_warp_idw(
+    features: Tensor, flow: Tensor, mask: Tensor, *, neighbors: int = 4, steps: int | None = None
+) -> Tensor:
+    r"""Sample features where flow points to, from the nearest known pixels, weighted by inverse distance.
+
+    .. math::
+        T(x, y) = \sum_{i=1}^{n} \frac{\phi_i}{\sum_j \phi_j} F(x_i, y_i), \quad
+        \phi_i = \frac{1}{\sqrt{(x_m - x_i)^2 + (y_m - y_i)^2}}, \quad (x_m, y_m) = (x, y) + w(x, y)
+
+    Convention:
+        Flow in pixels, order (x, y), x right, y down. The neighbours are the exact nearest known pixels of any mask,
+        also for positions outside the image; among equally distant ones the first in row-major order wins. Where
+        fewer than ``neighbors`` pixels are known, all of them count. A position that hits a known pixel gives that
+        pixel. Positions are kept as a whole and a fractional part in float32 or wider, so that they are as exact at
+        column 4000 as at column 0, in half precision too.
+
+        Unknown pixels are never read; known ones are to be finite, or what hits another known pixel may be NaN. NaN
+        flow counts as 0, infinite flow as very far.
+
+        Differentiable in the features and in the flow, twice; the neighbours themselves are constants. On a known
+        pixel the gradient with respect to the flow, a cone's tip, is 0, and so it is where the flow is not finite.
+
+        With ``steps`` the flow is rounded to that many positions per pixel and axis, and positions outside the image
+        are moved to its edge, so that neighbours and weights can be looked up in a table, made once for a mask. The
+        gradient is that of the rounded flow, 0 where a position was moved. Fewer than 32 channels on a CPU are warped
+        in loops that Numba compiles, where it is installed (``pip install 'spikekit[fast]'``): the same result sooner.
+
+    Args:
+        features: :math:`(*, C, H, W)`, floating.
+        flow: :math:`(*, 2, H, W)`.
+        mask: :math:`(H, W)`; a pixel is known where it is not 0. The tables of a mask are kept between calls; on a GPU
+            they are made anew where the mask counts a change, which one through ``mask.data`` does not.
+        neighbors: how many known pixels to weigh.
+        steps: positions per pixel and axis that the flow is rounded to, an even number such as 16; None for the exact
+            search.
+
+    Returns:
+        As ``features``, also in memory: channels-last features give a channels-last result.
+
+    Raises:
+        TypeError: features or flow are not floating-point tensors.
+        ValueError: sizes that do not fit each other, ``neighbors`` below 1, ``steps`` that are odd or below 1, a mask
+            without a known pixel, ``steps`` for a large mask that does not repeat along rows and columns as those of a
+            Bayer filter do, whose table would be huge.
+
+    Example:
+        >>> features = torch.tensor([[[[1.0, 0.0, 5.0, 0.0]]]])
+        >>> known = torch.tensor([[1, 0, 1, 0]])
+        >>> flow_warp_idw(features, torch.zeros(1, 2, 1, 4), known).flatten().tolist()
+        [1.0, 3.0, 5.0, 4.0]
+
+    Reference:
+        Dong et al., CVPR 2024, eq. (9)-(10).
+    """
+    _check_warp("features", features, flow)
+    height, width = features.shape[-2:]
+    if not isinstance(mask, Tensor) or mask.shape != features.shape[-2:]:
+        got = tuple(mask.shape) if isinstance(mask, Tensor) else type(mask).__name__
+        raise ValueError(f"mask: expected {(height, width)} for features {tuple(features.shape)}, got {got}")
+    neighbors, steps = _check_search(neighbors, steps)
+    dtype = torch.promote_types(features.dtype, flow.dtype)
+    flow = flow.reshape(-1, 2, height, width).to(dtype)
+    values = features.reshape(-1, features.shape[-3], height * width)
+    if steps and in_one_go(values):
+        flow = flow.to(torch.promote_types(dtype, torch.float32))
+        return warp_by_table(values, flow, mask, neighbors, steps).reshape(features.shape)
+    index, weight = idw_neighbors(flow, mask, neighbors, steps)
+    return Gather.apply(values, index, weight).reshape(features.shape)
+
+
+def _check_search(neighbors: int, steps: int | None) -> tuple[int, int | None]:
+    if steps is not None and check_whole("steps", steps) % 2:
+        raise ValueError(f"steps: expected an even number of positions, or none for the exact search, got {steps}")
+    return check_whole("neighbors", neighbors), steps
+
+
+class FlowWarpIdw(nn.Module):
+    r"""See the Convention block on :func:`flow_warp_idw`.
+
+    Shape:
+        - Input: features :math:`(*, C, H, W)`, flow :math:`(*, 2, H, W)` and mask :math:`(H, W)`
+        - Output: :math:`(*, C, H, W)`
+
+    Example:
+        >>> FlowWarpIdw()(torch.rand(2, 3, 8, 8), torch.zeros(2, 2, 8, 8), torch.ones(8, 8)).shape
+        torch.Size([2, 3, 8, 8])
+    """
+
+    def __init__(self, *, neighbors: int = 4, steps: int | None = None) -> None:
+        super().__init__()
+        self.neighbors, self.steps = _check_search(neighbors, steps)
+
+    def forward(self, features: Tensor, flow: Tensor, mask: Tensor) -> Tensor:  # noqa: D102
+        return flow_warp_idw(features, flow, mask, neighbors=self.neighbors, steps=self.steps)
+
+    def extra_repr(self) -> str:  # noqa: D102
+        return f"neighbors={self.neighbors}, steps={self.steps}"

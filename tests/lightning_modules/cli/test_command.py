@@ -1,0 +1,418 @@
+"""The ``lightning`` command, as its users type it."""
+
+import csv
+import re
+import shutil
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+import torch
+import yaml
+from pytorch_lightning.callbacks import LearningRateMonitor
+
+import spikekit
+from lightning_modules import list_pretrained
+from lightning_modules.__main__ import main
+from lightning_modules.cli.arguments import behind_configurations, options
+from lightning_modules.cli.command import run as run_command
+from lightning_modules.cli.errors import InputError
+from lightning_modules.cli.rehearsal import Rehearsal
+from lightning_modules.cli.renamed_overlays import FORMER_SIZES, _current, with_current_overlays
+from lightning_modules.networks import CSCSR
+from lightning_modules.tasks.callbacks import PredictionPictures
+from spikekit import read_picture, write_spikes
+
+TINY = """
+model:
+  network:
+    init_args: {width: 4, representation_width: 4, features: 1, stages: 1, blocks: 1, end_blocks: 1}
+data:
+  init_args: {patch: 8, val_patch: 12, train_clips: 8, val_clips: 3, batch_size: 2, workers: 0}
+trainer:
+  max_steps: 6
+  check_val_every_n_epoch: 1
+  log_every_n_steps: 2
+  enable_progress_bar: false
+"""
+
+
+@pytest.fixture(scope="module")
+def overlay(tmp_path_factory):
+    path = tmp_path_factory.mktemp("overlay") / "tiny.yaml"
+    path.write_text(TINY)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def _argv(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["lightning"])
+
+
+@pytest.fixture(scope="module")
+def trained(overlay, tmp_path_factory):
+    from pathlib import Path
+
+    output = tmp_path_factory.mktemp("run")
+    x4 = Path(__file__).parents[3] / "configs" / "x4.yaml"
+    done = run("fit", "-c", x4, "-c", overlay, "-o", output)
+    assert done.returncode == 0, done.stderr
+    return output
+
+
+class Fit(Rehearsal):
+    """All of ``lightning fit`` but the training."""
+
+    verb = "fit"
+
+
+def run(*args):
+    command = [sys.executable, "-m", "lightning_modules", *map(str, args)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+def weights(output, name="last"):
+    return torch.load(output / "checkpoints" / f"{name}.ckpt", weights_only=True)
+
+
+@pytest.mark.slow
+def test_fit_leaves_checkpoints_and_pictures(trained):
+    assert weights(trained)["global_step"] == 6
+    assert weights(trained, "best")["network"]["scale"] == 4
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(trained)).Reload()
+    assert {"train/loss", "val/psnr", "val/ssim"} <= set(events.Tags()["scalars"])
+    assert events.Tags()["images"] == ["val/tfi, result, truth"]
+    config = yaml.safe_load((trained / "config.yaml").read_text())
+    assert config["model"]["init_args"]["network"]["init_args"]["width"] == 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stop", [3, 4])  # in the middle of an epoch of four steps, and at its end
+def test_resumed_run_equals_an_unbroken_one(trained, overlay, configs, tmp_path, stop):
+    args = ["fit", "-c", configs / "x4.yaml", "-c", overlay, "-o", tmp_path]
+    main([*map(str, args), "--trainer.max_steps", str(stop)])
+    assert weights(tmp_path)["global_step"] == stop
+    main([*map(str, args), "--ckpt_path", "last"])
+    resumed, unbroken = weights(tmp_path), weights(trained)
+    assert resumed["global_step"] == unbroken["global_step"] == 6
+    for name, value in unbroken["state_dict"].items():
+        assert resumed["state_dict"][name].equal(value), name
+    before = weights(tmp_path, "best")["state_dict"]
+    assert any(not before[name].equal(value) for name, value in unbroken["state_dict"].items())
+
+
+@pytest.mark.slow
+def test_test_prints_a_table_and_writes_it(trained, overlay, configs, capsys):
+    args = ["test", "-c", configs / "x4.yaml", "-c", overlay, "-o", trained, "--ckpt_path", "best"]
+    main([*map(str, args)])
+    printed = capsys.readouterr().out
+    methods = ["TFI", "TFP", "CSCSR", "CSCSR, true flow"]
+    assert all(f"\n| {method} " in printed for method in methods)
+    rows = list(csv.DictReader((trained / "test.csv").open()))
+    assert [row["clip"] for row in rows] == ["0", "1", "2", "mean"] * 4
+    for method in methods:
+        *clips, mean = [float(row["psnr"]) for row in rows if row["method"] == method]
+        assert mean == pytest.approx(sum(clips) / 3, abs=1e-4)
+        shown = re.search(rf"\n\| {method} +\| (\d+\.\d\d) ", printed)
+        assert float(shown[1]) == pytest.approx(mean, abs=0.0051)  # the file has four decimals
+    assert read_picture(trained / "test.png").shape == (3, 3 * 48 + 2 * 4, 5 * 48 + 4 * 4)
+
+
+@pytest.mark.slow
+def test_predict_writes_a_picture_per_clip(trained, overlay, configs, tmp_path):
+    write_spikes(tmp_path / "clip.dat", torch.rand(62, 10, 13) < 0.3)
+    done = run(
+        *("predict", "-c", configs / "x4.yaml", "-c", overlay, "--ckpt_path", trained / "checkpoints/last.ckpt"),
+        *("--data", "Recording", "--data.path", tmp_path / "clip.dat", "--data.height", 10, "--data.width", 13),
+        *("-o", tmp_path / "out"),
+    )
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in (tmp_path / "out").glob("*.png")) == ["frame_000020.png", "frame_000040.png"]
+    assert read_picture(tmp_path / "out" / "frame_000040.png").shape == (3, 40, 52)
+
+
+@pytest.mark.slow
+def test_a_checkpoint_of_another_scale_is_refused(trained, overlay, configs, tmp_path):
+    done = run(
+        *("validate", "-c", configs / "x2.yaml", "-c", overlay, "-o", tmp_path),
+        *("--ckpt_path", trained / "checkpoints/last.ckpt"),
+    )
+    assert done.returncode == 1
+    assert done.stderr.endswith("lightning: the checkpoint was trained with scale=4; this run asks for scale=2\n")
+
+
+@pytest.mark.slow
+def test_a_finished_run_is_not_written_over(trained, overlay, configs):
+    before = weights(trained)["state_dict"]
+    with pytest.raises(SystemExit, match="holds a run already"):
+        main(["fit", "-c", str(configs / "x4.yaml"), "-c", str(overlay), "-o", str(trained)])
+    assert all(weights(trained)["state_dict"][name].equal(value) for name, value in before.items())
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["test", "--ckpt_path", "best"], "checkpoints/best.ckpt: no such checkpoint"),
+        (["fit", "--data.root", "nowhere"], "nowhere"),
+        (["fit", "--data.motion", "-1"], "motion: expected 0 or more, got -1"),
+        (["fit", "--model.network.frames", "40"], "frames, window, stride: expected odd frames"),
+        (["fit", "--data.pattern", "BGGR"], "pattern"),
+        (["fit", "--model.network.motion_fusion", "assembled"], "flow: expected 'estimated' with motion_fusion"),
+        (["predict"], "--data Recording --data.path FILE"),
+        (["predict", "--data", "Recording", "--data.path", "nowhere.dat"], "nowhere.dat: no such file"),
+        (["predict", "--model.weights", "spike2flow"], "expected weights of a network, got spike2flow, of"),
+        (["fit", "--data", "Recording", "--data.path", "X"], "expected scenes whose truth is known, got Recording"),
+        (["test", "--data", "Recording", "--data.path", "X"], "test: expected scenes whose truth is known"),
+        (["validate", "--data", "Recording", "--data.path", "X"], "validate: expected scenes whose truth is known"),
+        (["fit", "--model.network", "ClassicalDecoder"], "fit: expected a network that learns, got ClassicalDecoder"),
+        (["fit", "--trainer.enable_checkpointing", "false"], "trainer.enable_checkpointing: expected true"),
+        (["fit", "--trainer.limit_val_batches", "0"], "trainer.limit_val_batches: expected more than 0"),
+        (["fit", "--data.workers", "-1"], "data.workers: expected 0 or more, got -1"),
+    ],
+)
+def test_errors_are_one_line(args, message, configs, tmp_path, overlay):
+    with pytest.raises(SystemExit) as exit:
+        main([args[0], "-c", str(configs / "x4.yaml"), *args[1:], "-o", str(tmp_path / "run")])
+    assert message in str(exit.value)
+    assert str(exit.value).startswith("lightning: ")
+    assert "\n" not in str(exit.value)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("verb", ["fit", "validate", "test", "predict", "sweep"])
+@pytest.mark.parametrize("inside", ["", "run"])
+def test_a_file_is_no_folder_for_the_output(verb, inside, configs, tmp_path):
+    (tmp_path / "file").touch()
+    config = [str(configs / "x4.yaml")] if verb == "sweep" else ["-c", str(configs / "x4.yaml")]
+    with pytest.raises(SystemExit) as exit:
+        main([verb, *config, "-o", str(tmp_path / "file" / inside)])
+    assert exit.value.code == f"lightning: -o: expected a folder, got the file {tmp_path / 'file'}"
+
+
+@pytest.mark.parametrize("name", ["film.mp4", "picture.PNG", "a/film.gif"])
+def test_what_looks_like_a_file_becomes_no_folder(name, tmp_path, decoder):
+    with pytest.raises(SystemExit, match=f"^lightning: -o: expected a folder, got .*{name}, which ends like a file"):
+        main([*decoder[:-1], str(tmp_path / name)])
+    assert [path.name for path in tmp_path.iterdir()] == ["clip.npz"]
+
+
+@pytest.mark.parametrize("typed", [[], ["foo"]])
+def test_every_verb_is_named_where_none_was_typed(typed):
+    with pytest.raises(SystemExit) as exit:
+        main(typed)
+    verbs = "fit, validate, test, predict, sweep, trade, export, models"
+    got = typed[0] if typed else "none"
+    assert exit.value.code == f"lightning: expected a verb, one of {verbs}, got {got} (see lightning --help)"
+
+
+def test_version(capsys):
+    main(["--version"])
+    assert capsys.readouterr().out == f"lightning of spikekit {spikekit.__version__}\n"
+
+
+def test_models_lists_the_weights_of_the_package(capsys):
+    main(["models"])
+    head, _, *rows = capsys.readouterr().out.splitlines()
+    assert [cell.strip() for cell in head.strip("|").split("|")] == ["weights", "scale", "size", "parameters", "MB"]
+    assert [row.split()[1] for row in rows] == [weights.name for weights in list_pretrained()]
+    assert re.search(r"\| cscsr_tiny_x4 +\| x4 +\| tiny +\| 300,963 ", "\n".join(rows))
+
+
+def test_no_network_is_said_in_one_line(decoder):
+    with pytest.raises(SystemExit) as exit:
+        main(["predict", *decoder[3:]])
+    assert exit.value.code.startswith("lightning: expected a network: --speed")
+    assert "\n" not in exit.value.code
+
+
+def test_predict_says_nothing_that_nobody_can_act_upon(decoder):
+    done = run(*decoder)
+    assert done.returncode == 0, done.stderr
+    for said in ("litmodels", "treespec", "many workers", "deprecated"):
+        assert said not in done.stderr + done.stdout
+
+
+def test_the_package_offers_its_names_without_importing_torch():
+    seen = "import sys, lightning_modules as l; assert 'CSCSR' in dir(l) and 'torch' not in sys.modules; "
+    seen += "from lightning_modules import CSCSR, SuperResolution, list_pretrained; CSCSR.from_pretrained"
+    done = subprocess.run([sys.executable, "-c", seen], capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_config_yaml_stays_the_record_of_the_training(trained, overlay, configs):
+    before = (trained / "config.yaml").read_text()
+    args = ["-c", configs / "x4.yaml", "-c", overlay, "-o", trained, "--ckpt_path", "best", "--data.val_clips", 1]
+    for verb in ("validate", "test"):
+        main([verb, *map(str, args)])
+        assert (trained / "config.yaml").read_text() == before
+
+
+@pytest.fixture(name="checkpoint")
+def _checkpoint(overlay, configs, tmp_path):
+    """A command that goes on from a checkpoint, and the checkpoint."""
+    words = ["fit", "-c", str(configs / "x4.yaml"), "-c", str(overlay), "-o", str(tmp_path)]
+    model = run_command(words, Fit).model
+    content = {"state_dict": model.state_dict(), "epoch": 0, "global_step": 1, "loops": {"fit_loop": {}}}
+    content |= {"optimizer_states": [{"state": {}, "param_groups": []}], "lr_schedulers": []}
+    model.on_save_checkpoint(content)
+    (tmp_path / "checkpoints").mkdir()
+    path = tmp_path / "checkpoints" / "last.ckpt"
+    torch.save(content, path)
+    return [*words, "--ckpt_path", "last"], path
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("--model.optimizer.lr=1e-3", "model.optimizer.lr: expected 0.0001, as .*last.ckpt was .* with, got 0.001"),
+        ("--model.lr_scheduler.step_size=5", "model.lr_scheduler.step_size: expected 7500, .* got 5"),
+        ("--model.optimizer=SGD", "model.optimizer.class_path: expected torch.optim.Adam, .* got torch.optim.SGD"),
+        ("--model.network.width=6", "the checkpoint was trained with width=4; this run asks for width=6"),
+    ],
+)
+def test_a_run_does_not_go_on_with_what_the_checkpoint_would_override(checkpoint, change, said):
+    words, path = checkpoint
+    with pytest.raises(InputError, match=said) as refused:
+        run_command([*words, change], Fit)
+    assert "\n" not in str(refused.value)
+    assert [file.name for file in path.parents[1].iterdir()] == ["checkpoints"]
+
+
+@pytest.mark.parametrize("lacking", ["epoch", "global_step", "optimizer_states", "lr_schedulers", "loops"])
+def test_a_run_does_not_go_on_from_weights_alone(checkpoint, lacking):
+    words, path = checkpoint
+    content = torch.load(path, weights_only=True)
+    del content[lacking]
+    torch.save(content, path)
+    with pytest.raises(InputError, match=rf"last.ckpt: not a checkpoint .* go on with: expected {lacking}") as refused:
+        run_command(words, Fit)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_run_goes_on_for_longer_with_other_data_and_from_older_checkpoints(checkpoint):
+    words, path = checkpoint
+    run_command([*words, "--trainer.max_steps=9", "--data.motion=1"], Fit)
+    content = torch.load(path, weights_only=True)
+    del content["recipe"]
+    torch.save(content, path)
+    run_command([*words, "--model.optimizer.lr=1e-3"], Fit)
+
+
+@pytest.mark.parametrize(("logger", "expected"), [("null", 1), ("true", 1), ("false", 0)])
+def test_the_learning_rate_is_monitored_where_there_is_a_logger(logger, expected, overlay, configs, tmp_path):
+    words = ["fit", "-c", str(configs / "x4.yaml"), "-c", str(overlay), "-o", str(tmp_path)]
+    trainer = run_command([*words, f"--trainer.logger={logger}"], Fit).trainer
+    assert sum(isinstance(callback, LearningRateMonitor) for callback in trainer.callbacks) == expected
+
+
+class Predict(Rehearsal):
+    """All of ``lightning predict`` but the pictures."""
+
+    verb = "predict"
+
+
+@pytest.fixture(name="decoder")
+def _decoder(tmp_path):
+    """What is typed to decode a recording, without weights."""
+    write_spikes(tmp_path / "clip.npz", torch.rand(62, 10, 13) < 0.3)
+    data = ["--data", "Recording", "--data.path", str(tmp_path / "clip.npz")]
+    return ["predict", "--model.network", "ClassicalDecoder", *data, "-o", str(tmp_path / "out")]
+
+
+def test_predictions_are_not_kept_in_memory(decoder):
+    assert run_command(decoder, Predict).config["predict"]["return_predictions"] is False
+    assert run_command([*decoder, "--return_predictions=true"], Predict).config["predict"]["return_predictions"] is True
+
+
+def test_configurations_are_found_however_they_are_typed():
+    words = ["fit", "-cA.yaml", "-c=B.yaml", "-c", "C.yaml", "--config=D=.yaml", "--data.motion", "-1"]
+    found = [value for _, option, value in options(words) if option in ("-c", "--config")]
+    assert found == ["A.yaml", "B.yaml", "C.yaml", "D=.yaml"]
+    assert behind_configurations(["fit", "-cA.yaml", "--x=1"], ["more"]) == ["fit", "-cA.yaml", "more", "--x=1"]
+
+
+def test_pictures_are_counted_that_were_written(tmp_path, capsys):
+    (tmp_path / "frame_000099.png").touch()
+    pictures, trainer = PredictionPictures(tmp_path), SimpleNamespace(is_global_zero=True)
+    trainer.datamodule = SimpleNamespace(show=lambda rgb: rgb)
+    pictures.on_predict_start(trainer, None)
+    for frame in (20, 40):
+        batch = {"frame": torch.tensor([frame]), "white": torch.tensor([0.25])}
+        pictures.on_predict_batch_end(trainer, None, torch.zeros(1, 3, 4, 4), batch)
+    pictures.on_predict_end(trainer, None)
+    assert capsys.readouterr().out == f"{tmp_path}: 2 pictures, 0.25 spikes a frame are white\n"
+
+
+def test_help_explains_every_option(configs, capsys):
+    with pytest.raises(SystemExit):
+        main(["fit", "-c", str(configs / "x4.yaml"), "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    for option, words in (
+        ("--model.network.width", "channels of refinement and reconstruction"),
+        ("--model.network.stride", "spike frames between two time points"),
+        ("--data.brightness", "darkest and brightest exposure"),
+        ("--data.height", "rows; needed for"),
+        ("--model.tile", "side of the tiles"),
+        ("--output", "Folder of the run"),
+        ("--trainer.max_steps", "Stop training after this number of steps"),
+    ):
+        assert option in text
+        assert words in text
+
+
+def test_the_scales_differ_in_the_scale_alone(configs):
+    x2, x3, x4 = (yaml.safe_load((configs / f"x{scale}.yaml").read_text()) for scale in (2, 3, 4))
+    for scale, config in ((2, x2), (3, x3), (4, x4)):
+        assert config.pop("output") == f"runs/x{scale}"
+        assert config["model"]["network"]["init_args"].pop("scale") == scale
+    assert x2 == x3 == x4
+
+
+def test_the_paper_is_the_default(configs, capsys):
+    with pytest.raises(SystemExit):
+        main(["fit", "-c", str(configs / "x4.yaml"), "--print_config"])
+    config = yaml.safe_load(capsys.readouterr().out)
+    model, data = config["model"]["init_args"], config["data"]["init_args"]
+    network = model["network"]["init_args"]
+    assert [network[name] for name in ("scale", "frames", "window", "stride", "pattern")] == [4, 41, 11, 3, "RGGB"]
+    assert network["alpha"] == 0.4
+    assert [data[name] for name in ("patch", "batch_size", "pattern")] == [96, 4, "RGGB"]
+    assert model["optimizer"]["class_path"] == "torch.optim.Adam"
+    assert model["optimizer"]["init_args"]["lr"] == 1e-4
+    assert model["lr_scheduler"]["init_args"]["step_size"] == 7500
+    assert model["lr_scheduler"]["init_args"]["gamma"] == 0.8
+
+
+@pytest.mark.parametrize("overlay", ["quick", *(f"size/{size}" for size in FORMER_SIZES.values())])
+@pytest.mark.parametrize("scale", [2, 3, 4])
+def test_overlays_build(overlay, scale, configs):
+    base, over = (
+        yaml.safe_load((configs / f"{name}.yaml").read_text())["model"]["network"]["init_args"]
+        for name in (f"x{scale}", overlay)
+    )
+    assert CSCSR(**{**base, **over}).scale == scale
+
+
+@pytest.mark.parametrize("option", [["-c", "{}"], ["--config={}"], ["-c{}"]])
+@pytest.mark.parametrize(("former", "size"), FORMER_SIZES.items())
+def test_overlays_of_sizes_are_found_by_their_former_names(former, size, option, configs, tmp_path, capsys):
+    folder = tmp_path / "size"  # a place of its own: the line is said once a path
+    shutil.copytree(configs / "size", folder)
+    asked = [word.format(folder / f"{former}.yaml") for word in option]
+    found = [word.format(folder / f"{size}.yaml") for word in option]
+    for _ in range(2):
+        assert with_current_overlays(["fit", "-c", "x.yaml", *asked]) == ["fit", "-c", "x.yaml", *found]
+    assert capsys.readouterr().err == f"{folder / former}.yaml: called {folder / size}.yaml now\n"
+    (folder / f"{former}.yaml").touch()  # somebody's own
+    _current.cache_clear()
+    assert with_current_overlays(["fit", *asked]) == ["fit", *asked]
+
+
+def test_fit_takes_a_former_overlay(configs, capsys):
+    with pytest.raises(SystemExit):
+        main(["fit", "-c", str(configs / "x4.yaml"), "-c", str(configs / "size/t.yaml"), "--print_config"])
+    assert yaml.safe_load(capsys.readouterr().out)["model"]["init_args"]["network"]["init_args"]["stride"] == 6

@@ -1,0 +1,252 @@
+"""The cache of clips: what is not whole is never believed, whoever writes, is killed, or damages it."""
+
+import os
+import signal
+import time
+import warnings
+from multiprocessing import get_context
+
+import numpy as np
+import pytest
+import torch
+
+from lightning_modules.data.cache import ClipCache, clip_key, file_digest, pack_clip, unpack_clip
+
+KEY = clip_key(frames=["a", "b"], scale=4)
+
+
+def arrays(seed=0, size=1000):
+    rng = np.random.default_rng(seed)
+    return {"spikes": rng.integers(0, 256, (3, size), "uint8"), "flow": rng.normal(size=(2, size)).astype("float16")}
+
+
+def same(one, other):
+    return one is not None and one.keys() == other.keys() and all(np.array_equal(one[n], other[n]) for n in other)
+
+
+def files(folder):
+    return sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
+
+
+def test_a_clip_comes_back(tmp_path):
+    cache = ClipCache(tmp_path / "new" / "folder")
+    assert cache.load(KEY) is None
+    cache.store(KEY, arrays())
+    assert same(cache.load(KEY), arrays())
+    assert same(ClipCache(tmp_path / "new" / "folder").load(KEY), arrays())
+    assert cache.load(clip_key(frames=["b", "a"], scale=4)) is None
+    assert [path.suffix for path in files(tmp_path)] == [".clip"]
+
+
+def test_every_flipped_bit_shows(tmp_path):
+    cache = ClipCache(tmp_path)
+    cache.store(KEY, arrays(size=30))
+    (path,) = tmp_path.glob("*/*.clip")
+    whole = path.read_bytes()
+    rng = np.random.default_rng(0)
+    for place in range(len(whole)):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << rng.integers(8)
+        path.write_bytes(damaged)
+        with pytest.warns(UserWarning, match=r"\.clip: damaged, made again"):
+            assert cache.load(KEY) is None
+        assert not path.exists()
+    path.write_bytes(whole)
+    assert same(cache.load(KEY), arrays(size=30))
+
+
+@pytest.mark.parametrize("length", [0, 1, 31, 32, 33, 500, -1])
+def test_a_part_of_a_clip_is_no_clip(tmp_path, length):
+    cache = ClipCache(tmp_path)
+    cache.store(KEY, arrays())
+    (path,) = tmp_path.glob("*/*.clip")
+    path.write_bytes(path.read_bytes()[:length])
+    with pytest.warns(UserWarning, match="damaged"):
+        assert cache.load(KEY) is None
+    cache.store(KEY, arrays())
+    assert same(cache.load(KEY), arrays())
+
+
+def test_a_clip_under_the_name_of_another(tmp_path):
+    cache, other = ClipCache(tmp_path), clip_key(scale=2)
+    cache.store(KEY, arrays())
+    cache._path(other).parent.mkdir(exist_ok=True)
+    cache._path(KEY).rename(cache._path(other))
+    with pytest.warns(UserWarning, match="damaged"):
+        assert cache.load(other) is None
+
+
+def _write(folder, rounds, size):
+    cache = ClipCache(folder)
+    for n in range(rounds):
+        cache.store(clip_key(n=n % 3), arrays(seed=n % 3, size=size))
+
+
+def _wait_for_a_new_file(folder, writer):
+    """However busy the machine is."""
+    before = set(folder.rglob("*"))
+    while not set(folder.rglob("*")) - before:
+        assert writer.is_alive()
+        time.sleep(0.001)
+
+
+FORK = get_context("fork")  # a new interpreter would take seconds to come to the point
+
+
+def test_killed_writers_leave_nothing_that_is_believed(tmp_path):
+    rng, unfinished = np.random.default_rng(0), 0
+    expected = [arrays(seed=n, size=200_000) for n in range(3)]
+    for _ in range(25):
+        writer = FORK.Process(target=_write, args=(tmp_path, 10**6, 200_000))
+        writer.start()
+        _wait_for_a_new_file(tmp_path, writer)
+        time.sleep(rng.choice([0, 0.001, 0.01, 0.05]))
+        os.kill(writer.pid, signal.SIGKILL)
+        writer.join()
+        unfinished = max(unfinished, len(list(tmp_path.rglob("*.part"))))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # nothing has even to be recognised as damaged
+            cache = ClipCache(tmp_path)
+            for n in range(3):
+                clip = cache.load(clip_key(n=n))
+                assert clip is None or same(clip, expected[n])
+    assert unfinished  # some were killed in the middle
+    for part in tmp_path.rglob("*.part"):  # made again, which removes them
+        number = next(n for n in range(10**6) if part.name.startswith(f".{cache._path(clip_key(n=n)).name}."))
+        cache.store(clip_key(n=number), expected[0])
+    assert not list(tmp_path.rglob("*.part"))
+
+
+def test_two_writers_and_a_reader(tmp_path):
+    writers = [FORK.Process(target=_write, args=(tmp_path, 30, 200_000)) for _ in range(2)]
+    cache, read = ClipCache(tmp_path), 0
+    for writer in writers:
+        writer.start()
+    expected = [arrays(seed=n, size=200_000) for n in range(3)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        while any(writer.is_alive() for writer in writers) or read < 3:
+            for n in range(3):
+                clip = cache.load(clip_key(n=n))
+                assert clip is None or same(clip, expected[n])
+                read += clip is not None
+    assert [writer.exitcode for writer in writers] == [0, 0]
+    assert len(files(tmp_path)) == 3
+
+
+def test_a_full_disk_is_warned_of_once(tmp_path, monkeypatch):
+    cache = ClipCache(tmp_path)
+    cache.store(clip_key(n=1), arrays())
+
+    def fails(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fails)
+    with pytest.warns(UserWarning, match=r"\.clip: cannot be written \(No space left on device\)"):
+        cache.store(KEY, arrays())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cache.store(KEY, arrays())
+    assert cache.load(KEY) is None
+    assert same(cache.load(clip_key(n=1)), arrays())
+    assert len(files(tmp_path)) == 1
+
+
+def test_a_cache_that_cannot_be_made(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match="file"):
+        ClipCache(tmp_path / "file")
+
+
+def test_a_clip_that_cannot_be_read(tmp_path):
+    cache = ClipCache(tmp_path)
+    cache._path(KEY).mkdir(parents=True)
+    with pytest.warns(UserWarning, match="cannot be read"):
+        assert cache.load(KEY) is None
+
+
+# --- keys -------------------------------------------------------------------------------------------------------------
+
+
+def test_keys_tell_values_apart():
+    assert clip_key(a=1, b=[2, 3]) == clip_key(b=[2, 3], a=1)
+    others = [
+        clip_key(),
+        clip_key(a=1),
+        clip_key(a=2),
+        clip_key(b=1),
+        clip_key(a="1"),
+        clip_key(a=None),
+        clip_key(a=[1]),
+    ]
+    assert len(set(others)) == len(others)
+    assert all(len(key) == 64 for key in others)
+
+
+def test_digest_of_a_file_follows_its_bytes(tmp_path):
+    path, other = tmp_path / "a", tmp_path / "b"
+    path.write_bytes(b"frame")
+    other.write_bytes(b"frame")
+    assert file_digest(path) == file_digest(other)
+    path.write_bytes(b"another frame")
+    assert file_digest(path) != file_digest(other)
+    with pytest.raises(FileNotFoundError):
+        file_digest(tmp_path / "c")
+
+
+# --- packing ----------------------------------------------------------------------------------------------------------
+
+
+def clip(levels, height=6, width=22, scale=2, flow=True):
+    rng = np.random.default_rng(levels)
+    values = np.sort(rng.random(levels, "float32"))
+    rgb = values[rng.integers(0, levels, (3, scale * height, scale * width))]
+    made = {
+        "spikes": torch.from_numpy(rng.integers(0, 2, (41, height, width), "uint8")),
+        "rgb": torch.from_numpy(rgb),
+        "flow": torch.from_numpy(rng.normal(0, 5, (2, 2, height, width)).astype("float16").astype("float32")),
+    }
+    return made if flow else {name: made[name] for name in ("spikes", "rgb")}
+
+
+@pytest.mark.parametrize(("levels", "dtype"), [(256, "uint8"), (257, "uint16")])
+@pytest.mark.parametrize("flow", [True, False])
+def test_packing_loses_nothing(levels, dtype, flow):
+    original = clip(levels, 60, 70, flow=flow)
+    packed = pack_clip(original)
+    assert packed["rgb"].dtype == dtype
+    assert packed["spikes"].nbytes == 41 * 60 * 9
+    again = unpack_clip(packed, (0, 0, 60, 70), 2)
+    assert again.keys() == original.keys()
+    for name in again:
+        assert again[name].dtype == original[name].dtype
+        assert torch.equal(again[name], original[name]), name
+
+
+def test_more_shades_than_sixteen_bits():
+    original = {"spikes": torch.ones(2, 200, 200), "rgb": torch.rand(3, 200, 200, dtype=torch.float64).float()}
+    packed = pack_clip(original)
+    assert packed["rgb"].dtype == "float32"
+    assert torch.equal(unpack_clip(packed, (2, 4, 100, 90), 1)["rgb"], original["rgb"][:, 2:102, 4:94])
+
+
+@pytest.mark.parametrize(
+    "part", [(0, 0, 6, 22), (2, 8, 4, 8), (1, 7, 3, 2), (0, 6, 6, 13), (5, 21, 1, 1), (2, 3, 2, 19)]
+)
+def test_a_part_is_cut_out(part):
+    original, (top, left, height, width) = clip(200), part
+    cut = unpack_clip(pack_clip(original), part, 2)
+    rows, columns = slice(top, top + height), slice(left, left + width)
+    assert torch.equal(cut["spikes"], original["spikes"][:, rows, columns])
+    assert torch.equal(cut["flow"], original["flow"][:, :, rows, columns])
+    rows, columns = slice(2 * top, 2 * (top + height)), slice(2 * left, 2 * (left + width))
+    assert torch.equal(cut["rgb"], original["rgb"][:, rows, columns])
+
+
+def test_eight_bits_stay_eight_bits(tmp_path):
+    """Whatever the reader makes of a file of 8 bits, it has at most 256 values."""
+    from spikekit import read_picture, write_picture
+
+    write_picture(tmp_path / "a.png", torch.rand(3, 90, 90))
+    rgb = read_picture(tmp_path / "a.png")
+    assert pack_clip({"spikes": torch.ones(1, 45, 45), "rgb": rgb})["rgb"].dtype == "uint8"

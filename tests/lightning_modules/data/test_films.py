@@ -1,0 +1,314 @@
+"""Films: a clip is the same by content and seed, in whatever process, from the cache or fresh."""
+
+import functools
+import importlib
+import shutil
+import types
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from skimage import io
+
+from lightning_modules.data import films
+from lightning_modules.data.films import ClipRecipe, FilmScenes
+from lightning_modules.data.layouts import find_films
+from spikekit import bin_to_sensor, read_picture
+from spikekit.flow.interpolate import FlowInterpolation
+from spikekit.sensor.noise import SensorNoise
+
+SMALL = {"scale": 2, "patch": 8, "batch_size": 2, "workers": 0}
+
+
+def scenes(root, stage=None, **options):
+    data = FilmScenes(str(root), **{**SMALL, **options})
+    data.setup(stage)
+    return data
+
+
+def equal(one, other):
+    return one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_a_clip_is_what_the_network_reads(tmp_path, write_film):
+    write_film(tmp_path / "film", 5, (37, 51))
+    data = scenes(tmp_path, clips=1)
+    clip = data.test_set[0]
+    assert {name: (tuple(value.shape), value.dtype) for name, value in clip.items()} == {
+        "spikes": ((41, 18, 24), torch.uint8),  # 37 x 51 without what 4 does not divide
+        "rgb": ((3, 36, 48), torch.float32),
+        "flow": ((2, 2, 18, 24), torch.float32),
+    }
+    assert torch.equal(clip["rgb"], read_picture(tmp_path / "film/00000002.png")[:, :36, :48])
+    light = 0.4 * bin_to_sensor(clip["rgb"], scale=2)
+    ground = (slice(0, 4), slice(0, 24))  # where no disc comes by
+    assert (clip["spikes"].float().sum(0) - 41 * light)[ground].abs().max() < 1.001
+
+
+def test_clips_are_spread_over_a_film(tmp_path, write_film):
+    write_film(tmp_path / "film", 22)
+    data = scenes(tmp_path, clips=5)
+    assert data.test_names == [f"film/{n:08d}" for n in (3, 7, 11, 15, 19)]
+    assert scenes(tmp_path, clips=1).test_names == ["film/00000011"]
+    assert len(scenes(tmp_path, clips=99).test_set) == 20
+    assert scenes(tmp_path, clips=5, clocks=5).test_names[0] == "film/00000005"  # four frames before the middle
+    frames = [int(name[-8:]) for name in data.train_set.names]
+    assert [first <= n < end for n, (_, first, end) in zip(frames, data.train_set.places, strict=True)] == [True] * 5
+    others = [int(name[-8:]) for name in scenes(tmp_path, clips=5, seed=1).train_set.names]
+    assert frames != others
+
+
+def test_patches_keep_the_phase_and_are_others_every_time(tmp_path, monkeypatch, reds):
+    reds(tmp_path)
+    clips = scenes(tmp_path, clips=2).train_set
+    whole = {}
+    monkeypatch.setattr(
+        ClipRecipe, "clip", lambda self, film, n: whole.setdefault((film, n), clip_of(self, film, n)), raising=True
+    )
+    corners = set()
+    for index in range(12):
+        patch = clips[index]
+        turn, place = divmod(index, 4)
+        film, middle = clips.place(int(np.random.default_rng([0, turn]).permutation(4)[place]))
+        everything = whole[film, middle]
+        fits = [
+            (top, left)
+            for top in range(9)
+            for left in range(17)
+            if torch.equal(patch["rgb"], everything["rgb"][:, 2 * top : 2 * top + 16, 2 * left : 2 * left + 16])
+        ]
+        ((top, left),) = fits
+        assert top % 2 == left % 2 == 0
+        corners.add((top, left))
+        assert torch.equal(patch["spikes"], everything["spikes"][:, top : top + 8, left : left + 8])
+        assert torch.equal(patch["flow"], everything["flow"][:, :, top : top + 8, left : left + 8].half().float())
+    assert len(corners) > 5
+    assert len(whole) == 4  # every film has two clips, and every round has all of them
+
+
+original_clip = ClipRecipe.clip
+
+
+def clip_of(recipe, film, middle):
+    return original_clip(recipe, film, middle)
+
+
+def test_chance_is_that_of_the_content_and_the_seed(tmp_path, write_film):
+    write_film(tmp_path / "one" / "film", 3)
+    shutil.copytree(tmp_path / "one" / "film", tmp_path / "two" / "elsewhere")
+    first = scenes(tmp_path / "one").test_set[0]
+    torch.manual_seed(3)
+    assert equal(scenes(tmp_path / "two").test_set[0], first)
+    assert not torch.equal(scenes(tmp_path / "one", seed=1).test_set[0]["spikes"], first["spikes"])
+    write_film(tmp_path / "two" / "elsewhere", 1, first=2, seed=5)
+    assert not torch.equal(scenes(tmp_path / "two").test_set[0]["spikes"], first["spikes"])
+
+
+def test_without_flow(tmp_path, reds):
+    reds(tmp_path)
+    data = scenes(tmp_path, flow=False)
+    assert all(set(batch) == {"spikes", "rgb"} for batch in data.train_dataloader())
+    assert set(data.val_set[0]) == {"spikes", "rgb"}
+
+
+def test_flow_is_that_of_the_film(tmp_path, write_pan):
+    write_pan(tmp_path / "film", 2)
+    flow = scenes(tmp_path).test_set[0]["flow"]
+    inside = flow[:, :, 16:-16, 16:-16].mean((2, 3))
+    assert torch.allclose(inside, torch.tensor([[-0.75, 0.0], [0.75, 0.0]]), atol=0.15)  # x: 15 clocks, 2 / 2 / 20 each
+
+
+def test_there_is_no_flow_beyond_a_cut(tmp_path, write_pan):
+    write_pan(tmp_path / "film", 2, (64, 64))
+    other = np.random.default_rng(1).integers(0, 256, (64, 64, 3), "uint8")
+    io.imsave(tmp_path / "film" / "2.png", other, check_contrast=False)
+    back, ahead = scenes(tmp_path).test_set[0]["flow"]
+    assert back[0].mean() < -0.3
+    assert not ahead.any()
+    with pytest.raises(ValueError, match="interpolation"):
+        scenes(tmp_path, interpolation=First()).test_set[0]
+
+
+def test_noise_and_interpolation_reach_the_film(tmp_path, write_pan):
+    write_pan(tmp_path / "film", 6, (64, 64))
+    plain = scenes(tmp_path).test_set[0]
+    noisy = scenes(tmp_path, noise=SensorNoise(hot=0.2)).test_set[0]
+    hot = noisy["spikes"].bool().all(0)
+    assert 0.1 < hot.float().mean() < 0.3
+    assert torch.equal(noisy["spikes"][:, ~hot], plain["spikes"][:, ~hot])
+    still = scenes(tmp_path, interpolation=First(), flow=False, noise=SensorNoise()).test_set[0]
+    assert torch.equal(still["rgb"], plain["rgb"])
+    assert not torch.equal(still["spikes"], plain["spikes"])
+
+
+class First:
+    """An interpolation that shows the first frame throughout."""
+
+    forward = backward = None
+
+    def __call__(self, first, second):
+        between = First()
+        between.at = lambda tau: first if tau < 1 else second
+        return between
+
+
+# --- data module ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
+def test_same_clips_whatever_the_workers(tmp_path, reds):
+    reds(tmp_path)
+    alone = scenes(tmp_path, clips=2)
+    expected = list(alone.train_dataloader())
+    assert [len(batch["spikes"]) for batch in expected] == [2, 2]
+    assert torch.equal(expected[1]["rgb"][0], alone.train_set[2]["rgb"])
+    for workers in (1, 2):
+        data = scenes(tmp_path, clips=2, workers=workers, cache=str(tmp_path / "cache"))
+        loader = data.train_dataloader()
+        assert loader.num_workers == workers
+        for _ in range(2):
+            assert all(equal(*pair) for pair in zip(loader, expected, strict=True))
+        val = zip(data.val_dataloader(), alone.val_dataloader(), strict=True)
+        assert all(equal(*pair) for pair in val)
+    assert len(list((tmp_path / "cache").glob("*/*.clip"))) == 6
+
+
+def test_spawned_workers_make_the_same_clips(tmp_path, write_film):
+    write_film(tmp_path / "film", 4)
+    loader = scenes(tmp_path, workers=1).test_dataloader()
+    loader.multiprocessing_context = "spawn"
+    assert all(equal(*pair) for pair in zip(loader, scenes(tmp_path).test_dataloader(), strict=True))
+
+
+def test_training_goes_on_where_it_stands(tmp_path, reds):
+    reds(tmp_path)
+    data = scenes(tmp_path, "fit", clips=2)
+    sampler = data.train_dataloader().sampler
+    assert list(sampler) == [0, 1, 2, 3]
+    data.trainer = types.SimpleNamespace(global_step=3, accumulate_grad_batches=1, world_size=1)
+    assert list(sampler) == [6, 7, 8, 9]
+
+
+# --- cache ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def film(tmp_path, write_film):
+    write_film(tmp_path / "films" / "film", 5)
+    return tmp_path / "films"
+
+
+@pytest.fixture
+def simulated(monkeypatch):
+    """How many clips were simulated."""
+    count = types.SimpleNamespace(clips=0)
+
+    @functools.wraps(original_clip)
+    def counted(*args):
+        count.clips += 1
+        return original_clip(*args)
+
+    monkeypatch.setattr(ClipRecipe, "clip", counted)
+    return count
+
+
+def test_cached_clips_equal_fresh_ones(film, tmp_path, simulated):
+    fresh = scenes(film)
+    cached = scenes(film, cache=str(tmp_path / "cache"))
+    clips = len(fresh.test_set)
+    for _ in range(2):
+        assert all(equal(*pair) for pair in zip(fresh.test_set, cached.test_set, strict=True))
+    assert simulated.clips == 3 * clips
+    again = scenes(film, cache=str(tmp_path / "cache"))
+    assert all(equal(again.train_set[n], fresh.train_set[n]) for n in range(4))
+    moved = shutil.copytree(film, tmp_path / "moved")
+    simulated.clips = 0
+    assert equal(scenes(moved, cache=str(tmp_path / "cache")).test_set[0], cached.test_set[0])
+    assert simulated.clips == 0
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"scale": 1},
+        {"frames": 39},
+        {"pattern": "BGGR"},
+        {"alpha": 0.41},
+        {"clocks": 21},
+        {"flow_times": (5, 34)},
+        {"flow": False},
+        {"noise": SensorNoise(photons=100)},
+        {"interpolation": FlowInterpolation(shrink=1)},
+        {"seed": 1},
+    ],
+    ids=lambda changed: next(iter(changed)),
+)
+def test_another_setting_is_another_clip(film, tmp_path, simulated, changed):
+    cache = str(tmp_path / "cache")
+    scenes(film, cache=cache, clips=1).test_set[0]
+    clip = scenes(film, cache=cache, clips=1, **changed).test_set[0]
+    assert simulated.clips == 2
+    assert equal(clip, scenes(film, cache=cache, clips=1, **changed).test_set[0])
+    assert simulated.clips == 2
+    scenes(film, cache=cache, clips=1).test_set[0]
+    assert simulated.clips == 2
+
+
+def test_a_recipe_takes_a_scale_of_numpy():
+    scale = ClipRecipe(scale=np.uint8(2)).scale
+    assert scale == 2
+    assert type(scale) is int
+
+
+def test_keys_tell_versions_and_kinds_of_films_apart(film, tmp_path, monkeypatch):
+    (one,) = find_films(film, lambda found: (found, found)).test
+    recipe = ClipRecipe()
+    keys = {recipe.key(kind, 2) for kind in (one, replace(one, shrink=4), replace(one, truth=one.folder))}
+    keys.add(ClipRecipe(interpolation=First()).key(one, 2))
+    assert recipe.key(replace(one, name="other"), 2) in keys
+    monkeypatch.setattr(films, "SIMULATOR_VERSION", films.SIMULATOR_VERSION + 1)
+    keys.add(recipe.key(one, 2))
+    assert len(keys) == 5
+
+
+def test_an_interpolation_of_ones_own_that_changes_makes_another_clip(film, tmp_path, monkeypatch):
+    """That of the package has the version of the simulator instead."""
+    (one,) = find_films(film, lambda found: (found, found)).test
+    monkeypatch.syspath_prepend(tmp_path)
+    written = tmp_path / "mine_own.py"
+    written.write_text("class Mine:\n    pass\n\n\ndef halfway(first, second):\n    pass\n")
+    mine = importlib.import_module("mine_own")
+    kinds = [mine.Mine(), mine.halfway, FlowInterpolation()]
+    before = [ClipRecipe(interpolation=kind).key(one, 2) for kind in kinds]
+    with open(written, "a") as file:
+        file.write("# changed\n")
+    after = [ClipRecipe(interpolation=kind).key(one, 2) for kind in kinds]
+    assert [old == new for old, new in zip(before, after, strict=True)] == [False, False, True]
+
+
+def test_other_frames_are_another_clip(film, tmp_path, simulated, write_film):
+    cache = str(tmp_path / "cache")
+    scenes(film, cache=cache, clips=1).test_set[0]
+    write_film(film / "film", 1, seed=3, first=4)  # not a frame of the clip
+    scenes(film, cache=cache, clips=1).test_set[0]
+    assert simulated.clips == 1
+    write_film(film / "film", 1, seed=3, first=3)
+    scenes(film, cache=cache, clips=1).test_set[0]
+    assert simulated.clips == 2
+
+
+def test_a_damaged_clip_is_made_again(film, tmp_path, simulated):
+    cache = tmp_path / "cache"
+    clips = scenes(film, cache=str(cache), clips=1).test_set
+    fresh = clips[0]
+    (path,) = cache.glob("*/*.clip")
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.warns(UserWarning, match="damaged, made again"):
+        assert equal(clips[0], fresh)
+    assert simulated.clips == 2
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert equal(clips[0], fresh)
+    assert simulated.clips == 2

@@ -1,0 +1,344 @@
+"""The still-picture clips: the same by seed and index everywhere, fresh every epoch, from any folder."""
+
+import hashlib
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+import pytorch_lightning as pl
+import torch
+from skimage import io
+
+from lightning_modules.data.pictures import (
+    cached_picture,
+    embedded_pictures,
+    folder_pictures,
+    split_pictures,
+)
+from lightning_modules.data.stills import StillClips, StillScenes
+from lightning_modules.data.textures import outline_mask, texture
+from spikekit import bin_to_sensor
+
+SHARED = Path(__file__).parents[3].parent / "shared" / "data"
+SMALL = {"patch": 8, "val_patch": 8, "train_clips": 8, "val_clips": 4, "batch_size": 2}
+
+
+def scenes(**options):
+    data = StillScenes(**{**SMALL, "workers": 0, **options})
+    data.setup("fit")
+    return data
+
+
+def digest(clip):
+    return hashlib.sha256(b"".join(clip[name].numpy().tobytes() for name in sorted(clip))).hexdigest()
+
+
+def clips_of(loader):
+    return [digest({name: value[i] for name, value in batch.items()}) for batch in loader for i in range(2)]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Pictures of every kind, in a folder and one inside it; one hidden, and a file that is no picture."""
+    rng = np.random.default_rng(0)
+    (tmp_path / "inside" / "deep").mkdir(parents=True)
+    (tmp_path / ".hidden").mkdir()
+    io.imsave(tmp_path / "colour.png", rng.integers(0, 256, (40, 50, 3), "uint8"), check_contrast=False)
+    io.imsave(tmp_path / "grey.JPG", rng.integers(0, 256, (90, 60), "uint8"), check_contrast=False)
+    io.imsave(tmp_path / "rgba.png", rng.integers(0, 256, (33, 64, 4), "uint8"), check_contrast=False)
+    io.imsave(tmp_path / "inside" / "deep.png", rng.integers(0, 2**16, (50, 50), "uint16"), check_contrast=False)
+    io.imsave(tmp_path / "inside" / "deep" / "tiny.tif", rng.integers(0, 256, (3, 2, 3), "uint8"), check_contrast=False)
+    io.imsave(tmp_path / ".hidden" / "not.png", rng.integers(0, 256, (9, 9), "uint8"), check_contrast=False)
+    (tmp_path / "notes.txt").write_text("no picture")
+    return tmp_path
+
+
+def test_a_clip_is_what_the_network_reads():
+    clip = scenes(scale=3, patch=10, brightness=(1.0, 1.0)).train_set[5]
+    assert {name: (value.shape, value.dtype) for name, value in clip.items()} == {
+        "spikes": ((41, 10, 10), torch.uint8),
+        "rgb": ((3, 30, 30), torch.float32),
+        "flow": ((2, 2, 10, 10), torch.float32),
+    }
+    assert 0 <= clip["rgb"].min() < clip["rgb"].max() <= 1
+    assert clip["spikes"].max() == 1
+
+
+def test_clip_is_its_scene():
+    data = scenes(patch=12, flow_times=(5, 35, 20), alpha=0.7, pattern="GBRG")
+    scene, clip = data.train_set.scene(3), data.train_set[3]
+    assert torch.equal(clip["rgb"], scene.rgb(20))
+    assert torch.equal(clip["flow"], torch.stack([scene.flow(t, scale=4) for t in (5, 35, 20)]))
+    assert not clip["flow"][2].any()
+    light = torch.stack([bin_to_sensor(scene.rgb(t), "GBRG", scale=4) for t in range(41)]).sum(0) * 0.7
+    assert (clip["spikes"].float().sum(0) - light).abs().max() < 1.001
+
+
+def test_mean_of_the_spikes_is_the_brightness():
+    data = scenes(patch=16, motion=0.0, rotation=0.0, zoom=0.0)
+    for i in range(6):
+        clip = data.train_set[i]
+        truth = bin_to_sensor(clip["rgb"], scale=4).mean()
+        assert abs(clip["spikes"].float().mean() / 0.4 - truth) < 0.02
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
+def test_same_clips_whatever_the_workers():
+    alone = scenes()
+    expected = clips_of(alone.train_dataloader())
+    assert expected == [digest(alone.train_set[i]) for i in range(8)]
+    assert expected[::-1] == [digest(alone.train_set[i]) for i in range(7, -1, -1)]
+    assert len(set(expected)) == 8
+    for workers in (1, 3):
+        data = scenes(workers=workers)
+        loader = data.train_dataloader()
+        assert loader.num_workers == workers
+        assert clips_of(loader) == expected
+        assert clips_of(loader) == expected  # workers stay, the second round starts anew
+        assert clips_of(data.val_dataloader()) == clips_of(alone.val_dataloader())
+
+
+def test_spawned_workers_make_the_same_clips():
+    loader = scenes(workers=1, train_clips=2).train_dataloader()
+    loader.multiprocessing_context = "spawn"
+    assert clips_of(loader) == clips_of(scenes(train_clips=2).train_dataloader())
+
+
+def test_chance_of_others_does_not_matter():
+    torch.manual_seed(1)
+    np.random.seed(1)  # noqa: NPY002
+    first = digest(scenes().train_set[0])
+    torch.manual_seed(2)
+    assert digest(scenes().train_set[0]) == first
+    assert torch.initial_seed() == 2
+    assert digest(scenes(seed=1).train_set[0]) != first
+    assert digest(scenes().val_set[0]) != first
+
+
+def test_fresh_clips_follow_the_steps():
+    data = scenes()
+    sampler = data.train_dataloader().sampler
+    assert list(sampler) == list(range(8))
+    data.trainer = types.SimpleNamespace(global_step=7, accumulate_grad_batches=3, world_size=1)
+    assert list(sampler) == list(range(42, 50))
+
+
+class Watcher(pl.LightningModule):
+    """Takes steps and remembers what it saw."""
+
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(1))
+        self.seen, self.validated = [], []
+
+    def training_step(self, batch):
+        self.seen.append(digest(batch))
+        return (self.weight * batch["rgb"].mean()).sum()
+
+    def validation_step(self, batch):
+        self.validated.append(digest(batch))
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), 0.1)
+
+
+@pytest.mark.parametrize(("workers", "stop"), [(0, 3), (1, 4), (1, 6)])
+def test_resumed_training_sees_what_unbroken_training_would(tmp_path, workers, stop):
+    def train(steps, **how):
+        watcher = Watcher()
+        trainer = pl.Trainer(
+            max_steps=steps,
+            accelerator="cpu",
+            logger=False,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            num_sanity_val_steps=1,
+            default_root_dir=tmp_path,
+        )
+        trainer.fit(watcher, StillScenes(**SMALL, workers=workers), **how)
+        return watcher, trainer
+
+    unbroken, _ = train(10)  # two and a half epochs of four batches
+    assert len(set(unbroken.seen)) == 10
+    assert unbroken.validated[1:3] == unbroken.validated[3:5]
+    broken, trainer = train(stop)
+    trainer.save_checkpoint(tmp_path / "at.ckpt")
+    resumed, _ = train(10, ckpt_path=tmp_path / "at.ckpt")
+    assert broken.seen + resumed.seen == unbroken.seen
+
+
+def test_workers_run_one_thread():
+    class Threads(StillClips):
+        def __getitem__(self, index):
+            return {"threads": torch.tensor(torch.get_num_threads())}
+
+    data = scenes(workers=1)
+    data.train_set.__class__ = Threads
+    assert next(iter(data.train_dataloader()))["threads"].tolist() == [1, 1]
+
+
+def test_motion_keeps_to_its_bounds():
+    clips = scenes(motion=2.0, rotation=0.0, zoom=0.0, objects=0).train_set
+    flows = torch.stack([clips.scene(i).flow(40, scale=4)[:, 0, 0] for i in range(30)])
+    assert 1.2 < flows.norm(dim=1).max() <= 2.0 + 1e-5
+    assert (flows.amin(0) < -0.8).all()
+    assert (flows.amax(0) > 0.8).all()
+    still = scenes(motion=0.0, rotation=0.0, zoom=0.0).train_set[1]
+    assert not still["flow"].any()
+
+
+def test_bend_keeps_to_its_bounds_and_leaves_clips_without_it_alone():
+    """Where nothing else moves, what acceleration adds is the same before and after the middle."""
+    still = {"motion": 0.0, "rotation": 0.0, "zoom": 0.0, "objects": 0}
+    clips = scenes(bend=2.0, **still).train_set
+    first, last = (torch.stack([clips.scene(i).flow(t, scale=4)[:, 0, 0] for i in range(30)]) for t in (0, 40))
+    torch.testing.assert_close(first, last)
+    assert 1.2 < last.norm(dim=1).max() <= 2.0 + 1e-5
+    plain, none = scenes().train_set[3], scenes(bend=0.0).train_set[3]
+    assert all(torch.equal(plain[name], none[name]) for name in plain)
+
+
+def test_options_do_what_they_say():
+    assert {len(scenes(objects=3).train_set.scene(i).layers) for i in range(40)} == {1, 2, 3, 4}
+    dark, bright = (scenes(brightness=(b, b)).train_set[4] for b in (0.5, 1.0))
+    torch.testing.assert_close(dark["rgb"] * 2, bright["rgb"])
+    assert abs(dark["spikes"].float().mean() * 2 - bright["spikes"].float().mean()) < 0.02
+    glare = scenes(brightness=(1.5, 1.5)).train_set[4]
+    torch.testing.assert_close(glare["rgb"], 1.5 * bright["rgb"])
+    clean, noisy = (scenes(photons=p).train_set[4] for p in (None, 10.0))
+    assert torch.equal(clean["rgb"], noisy["rgb"])
+    assert not torch.equal(clean["spikes"], noisy["spikes"])
+    turned = scenes(motion=0.0, rotation=5.0, zoom=0.0, objects=0)
+    assert turned.train_set[0]["flow"][0, :, 0, 0].norm() > 0
+    assert scenes(frames=11, flow_times=(0, 10)).train_set[0]["spikes"].shape[0] == 11
+
+
+def test_margins_are_wide_enough():
+    """Whatever comes into view is picture, not its mirror image, when the picture is large."""
+    for i in range(20):
+        data = scenes(patch=16, motion=4.0, rotation=10.0, zoom=0.2, objects=0)
+        scene = data.train_set.scene(i)
+        layer = scene.layers[0]
+        corners = torch.tensor([[0.0, 0.0], [63.0, 0.0], [0.0, 63.0], [63.0, 63.0]], dtype=torch.float64)
+        for clock in (0, 40):
+            turn, shift = layer.motion._turn_and_shift(torch.tensor([clock - 20.0], dtype=torch.float64))
+            source = (torch.complex(corners[:, 0], corners[:, 1]) - shift) / turn - complex(*layer.position)
+            places = torch.stack([source.real, source.imag])
+            assert places.min() >= 0
+            assert places.max() <= layer.picture.shape[1] - 1
+
+
+def test_embedded_pictures_are_disjoint():
+    train, held_out = embedded_pictures(), embedded_pictures(held_out=True)
+    assert len(train) >= 8
+    assert len(held_out) == 4
+    assert not set(train) & set(held_out)
+    data = scenes()
+    assert (data.train_set.pictures, data.val_set.pictures) == (train, held_out)
+
+
+def test_any_folder(folder):
+    names = ["colour.png", "grey.JPG", "tiny.tif", "deep.png", "rgba.png"]
+    assert [path.name for path in folder_pictures(folder)] == names
+    data = scenes(root=str(folder), val_root=str(folder), patch=12, val_patch=12)
+    for i in range(6):
+        for clips in (data.train_set, data.val_set):
+            clip = clips[i]
+            assert clip["rgb"].shape == (3, 48, 48)
+            assert clip["rgb"].isfinite().all()
+            assert clip["rgb"].amax() > 0
+
+
+def test_folder_without_validation_is_split(folder):
+    data = scenes(root=str(folder))
+    train, val = set(data.train_set.pictures), set(data.val_set.pictures)
+    assert train | val == set(folder_pictures(folder))
+    assert not train & val
+    assert scenes(root=str(folder)).val_set.pictures == data.val_set.pictures
+    many = [Path(f"{i}.png") for i in range(400)]
+    stay, out = split_pictures(many, 3)
+    assert (len(stay), len(out)) == (380, 20)
+    assert [len(part) for part in split_pictures(many[:10], 0)] == [6, 4]
+    assert [len(part) for part in split_pictures(many[:2], 0)] == [1, 1]
+    assert split_pictures(many[:1], 0) == (many[:1], many[:1])
+
+
+def test_validation_takes_every_picture_in_turn(folder, monkeypatch):
+    data = scenes(root=str(folder), val_root=str(folder), objects=0)
+    seen = []
+    monkeypatch.setattr(
+        "lightning_modules.data.stills.cached_picture", lambda path: seen.append(path) or torch.ones(3, 9, 9)
+    )
+    for i in range(5):
+        data.val_set[i]
+    assert seen == folder_pictures(folder)
+
+
+def test_errors_say_what_is_wrong(folder, tmp_path):
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(FileNotFoundError, match="nowhere: no such folder"):
+        scenes(root=str(tmp_path / "nowhere"))
+    with pytest.raises(FileNotFoundError, match="nowhere: no such folder"):
+        scenes(val_root=str(tmp_path / "nowhere"))
+    with pytest.raises(FileNotFoundError, match="no picture in this folder"):
+        scenes(val_root=str(empty))
+    with pytest.raises(NotADirectoryError, match="expected a folder of pictures, got a file"):
+        scenes(root=str(folder / "notes.txt"))
+    for name, value, message in (
+        ("pattern", "RGBG", "pattern: expected one of RGGB"),
+        ("scale", 0, "scale: expected"),
+        ("patch", 0, "patch: expected at least 1, got 0"),
+        ("motion", -1.0, "motion: expected 0 or more, got -1.0"),
+        ("rotation", -1.0, "rotation: expected"),
+        ("zoom", -0.1, "zoom: expected"),
+        ("bend", -1.0, "bend: expected"),
+        ("objects", -1, "objects: expected"),
+        ("brightness", (0.9, 0.5), "brightness: expected two numbers"),
+        ("photons", 0.0, "photons: expected"),
+        ("alpha", 0.0, "alpha: expected"),
+        ("flow_times", (5, 41), r"flow_times: expected clocks in \[0, 41\), got \(5, 41\)"),
+        ("seed", -1, "seed: expected"),
+        ("batch_size", 9, "train_clips: expected at least batch_size"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            scenes(**{name: value})
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_corrupt_picture_is_named(tmp_path, workers):
+    (tmp_path / "broken.png").write_bytes(b"\x89PNG\r\n\x1a\nnot really")
+    data = scenes(root=str(tmp_path), workers=workers)
+    with pytest.raises(ValueError, match=r"broken\.png: not a picture"):
+        next(iter(data.train_dataloader()))
+
+
+def test_outlines_and_textures_are_sound():
+    kinds = set()
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        mask = outline_mask(31, rng)
+        assert mask.shape == (31, 31)
+        assert 0.08 < mask.mean() < 0.9
+        assert ((mask > 0) & (mask < 1)).float().mean() < 0.2  # an edge, no feathers
+        assert mask[15, 15] == 1
+        picture = texture(40, 50, rng)
+        assert picture.shape == (3, 40, 50)
+        assert 0 <= picture.min() < picture.max() <= 1
+        assert torch.equal(texture(9, 9, np.random.default_rng(seed)), texture(9, 9, np.random.default_rng(seed)))
+        kinds.add(round(picture.std().item(), 1))
+    assert len(kinds) > 2
+    assert outline_mask(1, np.random.default_rng(0)).shape == (1, 1)
+
+
+@pytest.mark.parametrize("where", ["train", "val/kodak"])
+def test_shared_pictures(where):
+    root = SHARED / where
+    if not root.is_dir():
+        pytest.skip(f"{root} is not here")
+    data = scenes(root=str(root), patch=48)
+    clip = data.train_set[0]
+    assert clip["rgb"].shape == (3, 192, 192)
+    assert cached_picture(data.train_set.pictures[0]).std() > 0.01

@@ -1,0 +1,127 @@
+import pytest
+import torch
+
+from lightning_modules.inference.self_ensemble import self_ensemble
+from lightning_modules.networks import CSCSR, ClassicalDecoder
+from lightning_modules.tasks.super_resolution import SuperResolution
+from spikekit import bayer_mask
+
+TINY = {"width": 4, "representation_width": 4, "features": 2, "stages": 1, "blocks": 1, "end_blocks": 1}
+PATTERNS = "RGGB", "BGGR", "GRBG", "GBRG"
+SIZES = (24, 32), (23, 32), (24, 31), (21, 23)
+
+
+def clip(height=24, width=32):
+    generator = torch.Generator().manual_seed(0)
+    spikes = (torch.rand(1, 41, height, width, generator=generator) < 0.3).to(torch.uint8)
+    return spikes, 2 * torch.randn(1, 2, 2, height, width, generator=generator)
+
+
+def transposed(flow):
+    """Of the transposed picture: x and y change places, in it and in the vectors."""
+    return torch.stack([flow[:, :, 1].mT, flow[:, :, 0].mT], dim=2)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR"])
+def test_two_views_are_the_clip_and_its_transposed(pattern):
+    network = CSCSR(2, **TINY, pattern=pattern)
+    spikes, flow = clip()
+    one, both = SuperResolution(network), SuperResolution(network, self_ensemble=2)
+    with_flow = (network(spikes, flow) + network(spikes.mT, transposed(flow)).mT) / 2
+    torch.testing.assert_close(both(spikes, flow), with_flow.clamp(0, 1))
+    own = (network(spikes) + network(spikes.mT).mT) / 2
+    torch.testing.assert_close(both(spikes), own.clamp(0, 1))
+    assert (both(spikes) - one(spikes)).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("size", SIZES)
+def test_every_view_has_its_colours_where_the_network_has_them(pattern, size):
+    """What runs sees a mosaic of the picture's own colours, mirrored or not, and ends with the same colours."""
+    mask = bayer_mask(*size, pattern)
+    sites = (mask * torch.tensor([1.0, 2, 3])[:, None, None]).sum(dim=0)[None, None]
+    seen = []
+
+    def run(spikes, flow):
+        height, width = spikes.shape[-2:]
+        own = (bayer_mask(height, width, pattern) * torch.tensor([1.0, 2, 3])[:, None, None]).sum(dim=0)
+        assert spikes[0, 0].equal(own)
+        seen.append((height, width))
+        return spikes.expand(-1, 3, -1, -1)
+
+    assert self_ensemble(run, sites, None, pattern, 1, 8).equal(sites.expand(-1, 3, -1, -1))
+    assert len(seen) == 8
+    kept = [(height % 2, width % 2) for height, width in seen]
+    assert kept == [(size[0] % 2, size[1] % 2), (size[1] % 2, size[0] % 2)] * 4  # so they end as they ended
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("views", [2, 4, 8])
+def test_what_follows_the_flow_comes_back_the_same_from_every_view(pattern, size, views):
+    """A run that samples along the flow: were a vector mirrored wrongly, its view would sample elsewhere."""
+    generator = torch.Generator().manual_seed(0)
+    planes = torch.rand(1, 3, *size, generator=generator, dtype=torch.float64)
+    vectors = torch.tensor([2.0, -1.0], dtype=torch.float64)[:, None, None].expand(1, 2, 2, *size)
+    differing = set()
+
+    def run(spikes, flow):
+        u, v = (int(flow[0, 0, axis, 0, 0]) for axis in (0, 1))
+        differing.add((u, v))
+        return spikes.roll((-v, -u), (-2, -1)).repeat_interleave(2, -2).repeat_interleave(2, -1)
+
+    result = self_ensemble(run, planes, vectors, pattern, 2, views)
+    inside = (..., slice(8, -8), slice(8, -8))  # what is rolled over an edge is another pixel of each view
+    torch.testing.assert_close(result[inside], run(planes, vectors)[inside])
+    assert len(differing) == views
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(("tile", "tolerance"), [(0, 0.0), (16, 0.0), (32, 0.1)])
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR"])
+def test_what_is_transposed_gives_the_transposed_picture(pattern, tile, tolerance):
+    network = CSCSR(3, **TINY, pattern=pattern)
+    module = SuperResolution(network, tile=tile, psnr_tolerance=tolerance, self_ensemble=2)
+    spikes, _ = clip()
+    torch.testing.assert_close(module(spikes.mT), module(spikes).mT, rtol=0, atol=1e-5)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_of_odd_sides_every_turn_of_the_clip_gives_that_of_the_picture(pattern):
+    """Mirrors of an odd side leave nothing out: all eight views are those of the turned clip as well."""
+    module = SuperResolution(CSCSR(2, **TINY, pattern=pattern), self_ensemble=8)
+    spikes, _ = clip(23, 29)
+    for axes in [-1], [-2], [-1, -2]:
+        turned = module(spikes.flip(axes)).flip(axes)
+        torch.testing.assert_close(turned, module(spikes), rtol=0, atol=1e-5)
+
+
+def test_test_has_it_with_either_motion():
+    module = SuperResolution(CSCSR(2, **TINY), self_ensemble=8)
+    spikes, flow = clip()
+    with torch.no_grad():
+        pictures = module.test_step({"spikes": spikes, "flow": flow}, 0)
+        assert pictures["CSCSR"].equal(module(spikes))
+        assert pictures["CSCSR, true flow"].equal(module(spikes, flow))
+        assert not pictures["CSCSR"].equal(pictures["CSCSR, true flow"])
+
+
+@torch.no_grad()
+def test_a_decoder_has_it_as_well():
+    spikes, _ = clip()
+    decoder = ClassicalDecoder("tfp", 2)
+    expected = (decoder(spikes) + decoder(spikes.mT).mT) / 2
+    torch.testing.assert_close(SuperResolution(decoder, self_ensemble=2)(spikes), expected.clamp(0, 1))
+
+
+@pytest.mark.parametrize("views", [True, False, 0, 3, 16])
+def test_other_numbers_of_views_are_refused(views):
+    with pytest.raises(ValueError, match=rf"^self_ensemble: expected one of \(1, 2, 4, 8\), got {views}$"):
+        SuperResolution(CSCSR(2, **TINY), self_ensemble=views)
+
+
+def test_a_clip_that_has_no_views_is_refused():
+    with pytest.raises(ValueError, match=r"^self_ensemble: expected at least 5 x 5 sensor pixels, got 4 x 9$"):
+        SuperResolution(CSCSR(2, **TINY), self_ensemble=2)(torch.zeros(1, 41, 4, 9))

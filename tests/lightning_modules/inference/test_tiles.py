@@ -1,0 +1,317 @@
+import pytest
+import torch
+
+from lightning_modules.error_model import ErrorModel
+from lightning_modules.inference.tiles import AROUND, forward_in_tiles
+from lightning_modules.motion import MotionEstimator, ZeroFlow
+from lightning_modules.networks import CSCSR, ClassicalDecoder
+from lightning_modules.shipped import shipped_weights
+from lightning_modules.tasks.super_resolution import SuperResolution
+from spikekit.scenes.analytic import Layer, Motion, Scene
+from spikekit.sensor.simulate import simulate_spikes
+
+TINY = {"width": 4, "representation_width": 4, "features": 2, "stages": 1, "blocks": 1, "end_blocks": 1}
+
+
+class Counting(MotionEstimator):
+    """Half a pixel everywhere; remembers the sizes it was asked for."""
+
+    def __init__(self):
+        super().__init__()
+        self.sizes = []
+
+    def forward(self, spikes, times, pattern):
+        self.sizes.append(tuple(spikes.shape[-2:]))
+        flow = torch.full((len(spikes), 2, *spikes.shape[-2:]), 0.5)
+        return -flow, flow
+
+
+def counted(**settings):
+    """A network at the sensor's resolution that writes down the sizes it runs on, and whether it was told of motion."""
+    network = CSCSR(1, **TINY, skip=True, motion=Counting(), **settings)
+    network.error_model = ErrorModel(
+        flat=2.5, grainy=0.3, blurred=0.08, still=0.05, textured=1.5, moved=0.02, faint=1e-4
+    )
+    with torch.no_grad():
+        network.reconstruction.rgb.weight.normal_(std=0.02, generator=torch.Generator().manual_seed(0))
+    calls = []
+    network.register_forward_pre_hook(
+        lambda _, args, how: calls.append((tuple(args[0].shape[-2:]), not (how.get("static") or True in args[2:]))),
+        with_kwargs=True,
+    )
+    return network, calls
+
+
+def noise(height, width, seed=0):
+    return torch.rand(3, height, width, generator=torch.Generator().manual_seed(seed))
+
+
+def clip(layers, height, width, frames=41):
+    light = Scene(layers, 2 * height, 2 * width, frames=frames).light("RGGB", scale=2, alpha=0.4)
+    return simulate_spikes(light, generator=torch.Generator().manual_seed(0))[None]
+
+
+def coarse(height, width):
+    """Texture that the sensor sees."""
+    return noise(height, width).repeat_interleave(2, 1).repeat_interleave(2, 2)
+
+
+def mixed(frames=41):
+    """An object that moves over a still, rich ground, in the second of three tiles of 64 sensor pixels."""
+    thing = Layer(noise(48, 48, 1), Motion(velocity=(0.8, 0.0)), (176, 40), torch.ones(48, 48))
+    return clip([Layer(coarse(64, 192)), thing], 64, 192, frames)
+
+
+def test_without_a_tolerance_nothing_is_new():
+    network = CSCSR(1, **TINY, motion=Counting())
+    spikes = mixed()
+    flow, expected = network.estimate_flow(spikes), torch.empty(1, 3, 64, 192)
+    with torch.no_grad():
+        for left in (0, 64, 128):
+            x = max(left - CSCSR.halo - 2, 0)  # it moves by half a pixel, and the Bayer phase is kept
+            columns = slice(x, left + 64 + CSCSR.halo + 2)
+            part = network(spikes[..., columns], flow[..., columns])
+            expected[..., left : left + 64] = part[..., left - x :][..., :64]
+        whole = network(spikes)
+    assert forward_in_tiles(network, spikes, 64).equal(expected)
+    assert forward_in_tiles(network, spikes, 64, 0.0).equal(expected)
+    assert forward_in_tiles(network, spikes, 0).equal(whole)
+
+
+@pytest.mark.parametrize("name", [name for name in shipped_weights() if name.startswith("cscsr")])
+def test_shipped_networks_see_no_further_than_the_halo(name):
+    network = CSCSR.from_pretrained(name, motion=ZeroFlow()).double()  # float32's rounding is larger
+    spikes = mixed(network.frames)[..., :128]
+    with torch.no_grad():
+        in_tiles = forward_in_tiles(network, spikes, 64)
+        torch.testing.assert_close(in_tiles, network(spikes), rtol=0, atol=0.03 / 255)
+
+
+@pytest.mark.parametrize("settings", [{}, {"neighbors": 3}, {"resolution": "sensor"}, {"representation": "interval"}])
+@pytest.mark.parametrize("size", [(9, 12), (32, 20)])
+def test_static_is_a_flow_of_zeros(settings, size):
+    network = CSCSR(3, **TINY, **settings)
+    spikes = (torch.rand(2, 41, *size, generator=torch.Generator().manual_seed(0)) < 0.3).to(torch.uint8)
+    with torch.no_grad():
+        general, still = network(spikes, torch.zeros(2, 2, 2, *size)), network(spikes, static=True)
+    torch.testing.assert_close(still, general, rtol=1e-5, atol=1e-6)
+
+
+def test_static_searches_once(monkeypatch):
+    from lightning_modules.networks import cscsr
+
+    network, searched = CSCSR(2, **TINY), []
+    warp = cscsr.flow_warp_idw
+    monkeypatch.setattr(
+        cscsr, "flow_warp_idw", lambda *args, **how: searched.append(tuple(args[1].shape)) or warp(*args, **how)
+    )
+    spikes = torch.zeros(2, 41, 8, 8)
+    network(spikes, static=True).square().mean().backward()
+    assert searched == [(2, 2, 16, 16)] * 3
+    assert all(p.grad is not None for p in network.parameters())
+
+
+@pytest.mark.parametrize("flow", [0, 1, "still"])
+def test_a_number_is_no_flow(flow):
+    message = f"^flow: expected .*, got {flow!r}; static=True says that nothing moves$"
+    spikes = torch.zeros(1, 41, 8, 8)
+    for run in (CSCSR(2, **TINY), lambda spikes, flow: forward_in_tiles(CSCSR(2, **TINY), spikes, 4, flow=flow)):
+        with pytest.raises(ValueError, match=message):
+            run(spikes, flow)
+
+
+def test_a_flow_and_static_are_refused_together():
+    with pytest.raises(ValueError, match=r"^flow, static: expected a flow or static=True, got both$"):
+        CSCSR(2, **TINY)(torch.zeros(1, 41, 8, 8), torch.zeros(1, 2, 2, 8, 8), static=True)
+
+
+def test_a_still_clip_asks_nobody_for_motion():
+    network, calls = counted()
+    forward_in_tiles(network, clip([Layer(coarse(64, 96))], 64, 96), 64, 0.1)
+    assert network.motion.sizes == []
+    assert [moves for _, moves in calls] == [False, False]
+
+
+@pytest.mark.parametrize("tile", [0, 32, 128])
+def test_a_plain_clip_runs_no_network(tile):
+    network, calls = counted()
+    rgb = forward_in_tiles(network, clip([Layer(torch.full((3, 96, 128), 0.5))], 48, 64), tile, 0.5)
+    assert calls == network.motion.sizes == []
+    assert (rgb - 0.5).abs().max() < 0.03
+
+
+def test_motion_is_only_where_something_moves():
+    network, calls = counted()
+    spikes = mixed()
+    rgb = forward_in_tiles(network, spikes, 64, 0.01)
+    assert [moves for _, moves in calls] == [False, True, False]
+    height, width = calls[1][0]
+    assert network.motion.sizes == [(height, width + 2 * (AROUND - CSCSR.halo - 2))]  # asked once, about that part
+    with torch.no_grad():
+        still, moving = network(spikes, static=True), network(spikes, network.estimate_flow(spikes))
+    middle = slice(70, 122)  # without what is blended
+    torch.testing.assert_close(rgb[..., middle], moving[..., middle], rtol=0, atol=1e-5)
+    for others in (slice(0, 58), slice(134, None)):
+        torch.testing.assert_close(rgb[..., others], still[..., others], rtol=0, atol=1e-5)
+
+
+def test_several_parts_that_move_share_one_estimate():
+    network, calls = counted()
+    forward_in_tiles(network, clip([Layer(coarse(80, 112), Motion(velocity=(0.8, 0.4)))], 80, 112), 48, 0.05)
+    assert [moves for _, moves in calls] == [True] * 6
+    assert network.motion.sizes == [(80, 112)]
+
+
+def test_more_tolerance_is_never_more_work():
+    ground = torch.full((3, 256, 256), 0.5)
+    ground[:, :, 128:] = noise(256, 128).cumsum(2) / 128
+    thing = Layer(noise(48, 48, 1), Motion(velocity=(0.5, 0.3)), (150, 150), torch.ones(48, 48))
+    spikes, before = clip([Layer(ground), thing], 128, 128), (float("inf"), float("inf"))
+    for tolerance in (1e-6, 0.05, 0.1, 0.5, 1, 3, 10, 100):
+        network, calls = counted()
+        forward_in_tiles(network, spikes, 64, tolerance)
+        pixels = sum(height * width for (height, width), _ in calls)
+        moving = sum(height * width for (height, width), moves in calls if moves)
+        assert pixels <= before[0]
+        assert moving <= before[1]
+        before = pixels, moving
+    assert before == (0, 0)
+
+
+def jump(picture, at):
+    """How much a picture changes across a column, beyond the change on either side of it."""
+    steps = picture.diff(dim=-1).abs().mean(dim=(0, 1, 2))
+    return (steps[at - 1] - (steps[at - 2] + steps[at]) / 2).item()
+
+
+@torch.no_grad()
+def test_parts_without_the_network_do_not_show():
+    """The network adds 0.2 to everything: an abrupt border would be a step of 0.2."""
+    network, calls = counted()
+    network.reconstruction.rgb.weight.zero_()
+    network.reconstruction.rgb.bias.fill_(0.2)
+    picture = torch.full((3, 128, 384), 0.5)
+    picture[..., :120] = coarse(64, 60)
+    spikes = clip([Layer(picture)], 64, 192)
+    rgb = forward_in_tiles(network, spikes, 32, 0.1)
+    assert 0 < sum(height * width for (height, width), _ in calls) < 64 * 192
+    edge = 64  # where the cells with texture end; two tiles meet there, too
+    assert (rgb[..., : edge - 8] - network(spikes, static=True)[..., : edge - 8]).abs().max() < 1e-4
+    assert (rgb[..., edge + 8 :] - 0.5).abs().max() < 0.05
+    assert rgb[..., edge - 2 : edge + 6].mean(dim=(0, 1, 2)).diff().abs().max() < 0.06  # 0.2 in four steps
+
+
+@torch.no_grad()
+def test_tiles_of_one_kind_do_not_show():
+    network, calls = counted()
+    spikes = clip([Layer(coarse(96, 64), Motion(velocity=(0.8, 0.0)))], 96, 64)
+    rgb = forward_in_tiles(network, spikes, 32, 0.001)
+    assert len(calls) == 6
+    whole = network(spikes, network.estimate_flow(spikes))
+    for at in (32, 64):
+        assert jump(rgb.mT, at) == pytest.approx(jump(whole.mT, at), abs=1e-4)
+    assert jump(rgb, 32) == pytest.approx(jump(whole, 32), abs=1e-4)
+
+
+@pytest.mark.parametrize(("size", "tile"), [((3, 5), 128), ((17, 33), 16), ((50, 70), 50), ((40, 24), 0)])
+def test_any_size_and_several_clips(size, tile):
+    network, _ = counted(pattern="GBRG")
+    spikes = (torch.rand(2, 41, *size, generator=torch.Generator().manual_seed(0)) < 0.3).to(torch.uint8)
+    rgb = forward_in_tiles(network, spikes, tile, 0.01)
+    with torch.no_grad():
+        expected = network(spikes)
+    assert rgb.shape == expected.shape
+    torch.testing.assert_close(rgb, expected, rtol=0, atol=1e-5)  # noise: everything is needed
+
+
+def test_a_decoder_goes_through_as_well():
+    spikes = clip([Layer(coarse(32, 32), Motion(velocity=(0.8, 0.0)))], 32, 32)
+    decoder = ClassicalDecoder("tfp", scale=2)
+    torch.testing.assert_close(forward_in_tiles(decoder, spikes, 16, 0.01), decoder(spikes), rtol=0, atol=1e-5)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("scale", [2, 3])
+def test_a_decoder_sees_no_further_than_its_halo(scale):
+    spikes = (torch.rand(1, 41, 40, 56, generator=torch.Generator().manual_seed(0)) < 0.4).to(torch.uint8)
+    decoder = ClassicalDecoder("tfi", scale, "GBRG")
+    torch.testing.assert_close(forward_in_tiles(decoder, spikes, 16), decoder(spikes), rtol=0, atol=1e-5)
+    decoder.halo -= 2
+    assert (forward_in_tiles(decoder, spikes, 16) - decoder(spikes)).abs().max() > 0.01
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("tolerance", [0.0, 0.01])
+def test_a_network_that_sees_everything_is_not_run_in_tiles(tolerance):
+    network, calls = counted()
+    network.halo = None
+    spikes = mixed()
+    expected = network(spikes)
+    calls.clear()
+    assert forward_in_tiles(network, spikes, 64, tolerance).equal(expected)
+    assert [size for size, _ in calls] == [(64, 192)]
+
+
+@pytest.mark.parametrize("tolerance", [-0.1, float("nan"), float("inf")])
+def test_a_tolerance_that_is_none_is_refused(tolerance):
+    with pytest.raises(ValueError, match=f"^psnr_tolerance: expected 0 dB or more, got {tolerance}$"):
+        SuperResolution(CSCSR(2, **TINY), psnr_tolerance=tolerance)
+
+
+def test_predict_has_the_tolerance():
+    network, calls = counted()
+    spikes = clip([Layer(torch.full((3, 64, 64), 0.5))], 32, 32)
+    SuperResolution(network, psnr_tolerance=0.5).predict_step({"spikes": spikes}, 0)
+    assert calls == []
+    SuperResolution(network).predict_step({"spikes": spikes}, 0)
+    assert len(calls) == 1
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 0.01])
+@pytest.mark.parametrize("tile", [0, 64])
+def test_a_motion_that_is_given_takes_the_place_of_the_estimate(tile, tolerance):
+    network, _ = counted()
+    spikes = mixed()
+    flow = network.estimate_flow(spikes)
+    expected = forward_in_tiles(network, spikes, tile, tolerance)
+    network.motion.sizes.clear()
+    assert forward_in_tiles(network, spikes, tile, tolerance, flow).equal(expected)
+    assert not forward_in_tiles(network, spikes, tile, tolerance, -flow).equal(expected)
+    assert network.motion.sizes == []
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 0.01])
+def test_static_may_be_asked_for(tolerance):
+    network, _ = counted()
+    spikes = mixed()
+    still = forward_in_tiles(network, spikes, 64, tolerance, static=True)
+    zeros = forward_in_tiles(network, spikes, 64, tolerance, torch.zeros(1, 2, 2, 64, 192))
+    torch.testing.assert_close(still, zeros, rtol=0, atol=1e-5)
+    assert network.motion.sizes == []
+
+
+def test_clips_of_another_length_are_refused_before_motion_is_estimated():
+    network, _ = counted()
+    with pytest.raises(ValueError, match=r"^spikes: expected \(B, 41, H, W\) .*, got \(1, 15, 64, 192\)$"):
+        forward_in_tiles(network, mixed()[:, :15], 64)
+    assert network.motion.sizes == []
+
+
+def test_test_shows_what_predict_would():
+    network, calls = counted()
+    batch = {"spikes": mixed(), "flow": torch.full((1, 2, 2, 64, 192), 0.5)}
+    module = SuperResolution(network, tile=64, psnr_tolerance=0.01)
+    pictures = module.test_step(batch, 0)
+    assert [size for size, _ in calls[:3]] == [size for size, _ in calls[3:]]  # three tiles, with either motion
+    assert [moves for _, moves in calls] == [False, True, False] * 2
+    assert pictures["CSCSR"].equal(module.predict_step(batch, 0))
+    assert not pictures["CSCSR"].equal(pictures["CSCSR, true flow"])
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_a_gpu_gives_the_same_picture():
+    network, _ = counted()
+    spikes = mixed()
+    expected = forward_in_tiles(network, spikes, 64, 0.05)
+    rgb = forward_in_tiles(network.cuda(), spikes.cuda(), 64, 0.05).cpu()
+    torch.testing.assert_close(rgb, expected, rtol=0, atol=1e-3)

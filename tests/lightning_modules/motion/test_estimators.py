@@ -1,0 +1,251 @@
+import pytest
+import torch
+from scipy.ndimage import convolve1d
+
+from lightning_modules.motion import ClassicalFlow, MotionEstimator, ZeroFlow, classical
+from spikekit import mosaic, spike_integrate_fire, split_bayer, tfp_at
+from spikekit.flow import tvl1
+
+TIMES = (5, 20, 35)
+
+
+def moving(velocity, height=48, width=64, pattern="RGGB"):
+    """A smooth coloured texture that moves by ``velocity`` (x, y) sensor pixels a frame."""
+    generator = torch.Generator().manual_seed(1)
+    waves = torch.rand(3, 12, 4, generator=generator, dtype=torch.float64)
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    light = []
+    for clock in range(41):
+        u, v = x - velocity[0] * (clock - 20), y - velocity[1] * (clock - 20)
+        phase = sum((w - 0.5) * 1.2 * axis[..., None, None] for w, axis in ((waves[..., 0], u), (waves[..., 1], v)))
+        rgb = (torch.cos(phase + 6.3 * waves[..., 2]) * waves[..., 3]).mean(-1).movedim(-1, 0) * 0.6 + 0.5
+        light.append(0.4 * mosaic(rgb.clamp(0, 1), pattern))
+    charge = torch.rand(height, width, generator=generator)
+    return spike_integrate_fire(torch.stack(light).float(), charge=charge)[0][None]
+
+
+@pytest.mark.parametrize("velocity", [(0.2, 0.0), (0.0, -0.15), (-0.1, 0.1)])
+@pytest.mark.parametrize("pattern", ["RGGB", "GBRG"])
+def test_classical_flow_finds_a_translation(velocity, pattern):
+    to_first, to_last = ClassicalFlow()(moving(velocity, pattern=pattern), TIMES, pattern)
+    truth = 15 * torch.tensor(velocity).reshape(1, 2, 1, 1)
+    for flow, expected in ((to_first, -truth), (to_last, truth)):
+        error = (flow - expected).norm(dim=1)[..., 8:-8, 8:-8]
+        assert error.mean() < 0.2, error.mean()
+
+
+def test_time_reversed_swaps_the_flows():
+    spikes = moving((0.2, 0.1))
+    forward = ClassicalFlow()(spikes, TIMES, "RGGB")
+    backward = ClassicalFlow()(spikes.flip(1), TIMES, "RGGB")
+    for flow, other in zip(forward, reversed(backward), strict=True):
+        assert (flow - other).norm(dim=1)[..., 8:-8, 8:-8].mean() < 0.2
+
+
+def test_precision_of_a_network_is_not_that_of_motion():
+    spikes = moving((0.2, -0.1))
+    expected = ClassicalFlow()(spikes, TIMES, "RGGB")
+    with torch.autocast("cpu", torch.bfloat16):
+        got = ClassicalFlow()(spikes, TIMES, "RGGB")
+    assert all(torch.equal(flow, other) for flow, other in zip(got, expected, strict=True))
+    assert all(flow.isfinite().all() for flow in ClassicalFlow()(spikes.bfloat16(), TIMES, "RGGB"))
+
+
+@pytest.mark.parametrize("estimate", ["forward", "channel_flows"])
+def test_a_compiler_keeps_out(estimate):
+    spikes = moving((0.2, -0.1))
+    flow = ClassicalFlow()
+
+    def mean(spikes):
+        return sum(part.mean() for part in getattr(flow, estimate)(spikes, TIMES, "RGGB"))
+
+    assert torch.compile(mean, backend="eager")(spikes) == mean(spikes)
+
+
+@pytest.mark.parametrize("size", [(33, 35), (5, 4), (3, 3)])
+def test_any_size(size):
+    for estimator in (ClassicalFlow(), ZeroFlow()):
+        for flow in estimator((torch.rand(2, 41, *size) < 0.4).to(torch.uint8), TIMES, "RGGB"):
+            assert flow.shape == (2, 2, *size)
+            assert flow.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"attachment": 0.0}, {"attachment": float("nan")}, {"warps": 0}, {"warps": 1.5}, {"warps": True}]
+)
+def test_wrong_argument(wrong):
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))}: expected"):
+        ClassicalFlow(**wrong)
+
+
+def test_motion_keeps_its_edge():
+    torch.manual_seed(0)
+    texture = torch.rand(1, 1, 12, 16, generator=torch.Generator().manual_seed(0))
+    texture = torch.nn.functional.interpolate(texture, size=(5 * 48, 5 * 64), mode="bilinear")
+    light = torch.cat([texture.roll(clock - 20, dims=-1) for clock in range(41)])  # a fifth of a sensor pixel a frame
+    light[..., : 5 * 24, :] = texture[..., : 5 * 24, :]
+    light, charge = 0.4 * torch.nn.functional.avg_pool2d(light.squeeze(1), 5), torch.rand(48, 64)
+    spikes = spike_integrate_fire(light, charge=charge)[0]
+    to_first, to_last = ClassicalFlow()(spikes[None], TIMES, "RGGB")
+    right = to_last[0, 0, :, 8:-8]
+    assert right[:20].abs().mean() < 0.3
+    assert (right[28:] - 3).abs().mean() < 0.3
+    assert (to_first + to_last).abs().mean() < 0.03
+
+
+def test_flows_part_where_motion_bends():
+    torch.manual_seed(0)
+    texture = torch.rand(1, 1, 12, 16, generator=torch.Generator().manual_seed(0))
+    texture = torch.nn.functional.interpolate(texture, size=(5 * 48, 5 * 64), mode="bilinear")
+    light = torch.cat([texture.roll(max(clock - 20, 0), dims=-1) for clock in range(41)])  # still until the middle
+    light[..., : 5 * 24, :] = torch.cat([texture.roll(clock - 20, dims=-1) for clock in range(41)])[..., : 5 * 24, :]
+    light, charge = 0.4 * torch.nn.functional.avg_pool2d(light.squeeze(1), 5), torch.rand(48, 64)
+    spikes = spike_integrate_fire(light, charge=charge)[0]
+    to_first, to_last = ClassicalFlow()(spikes[None], TIMES, "RGGB")
+    parted = (to_first + to_last)[0, 0, :, 8:-8]
+    assert parted[:20].abs().mean() < 0.05
+    assert 1 < parted[28:].mean() < 4  # of 3: pictures of the moment see a little before and after it
+
+
+def test_scene_without_contrast_is_still():
+    for level in (0, 1):
+        assert all(not flow.any() for flow in ClassicalFlow()(torch.full((1, 41, 16, 16), level), TIMES, "RGGB"))
+
+
+def test_few_frames():
+    for frames, times in ((5, (0, 2, 4)), (3, (0, 1, 2))):
+        spikes = moving((0.2, 0.0))[:, 20 - frames // 2 : 21 + frames // 2]
+        assert all(flow.isfinite().all() for flow in ClassicalFlow()(spikes, times, "RGGB"))
+
+
+@pytest.mark.parametrize(("frames", "reach"), [(41, 18), (101, 24), (401, 24)])
+def test_pictures_of_longer_clips_see_no_more_than_49_frames(frames, reach):
+    middle = frames // 2
+    for away, seen in ((reach, True), (reach + 1, False)):
+        spikes = torch.zeros(1, frames, 2, 2)
+        spikes[:, [middle - away, middle + away]] = 1
+        assert bool(classical._decode(spikes, middle)[0][:, 1].any()) == seen
+
+
+def expected_flows(pictures, raw, clock, squared, border):
+    """Flows between decoded pictures (3, H, W), each half of the clip by itself where motion bends; here it does not.
+
+    ``squared`` are the weights of the raw pixels in a picture, along an axis, squared: noise adds up by them.
+    """
+    steps = torch.linspace(0, 1, 1025)[:-1]
+    noise = torch.from_numpy(classical._noise(13).numpy()[torch.searchsorted(steps, raw.mean(0), right=True) - 1])
+    for axis in range(2):
+        noise = torch.from_numpy(convolve1d(noise.numpy(), squared, axis, mode=border))
+    attachment = 120 / (1 + noise / 0.002**2)
+    times = torch.tensor([[clock[0] - clock[1], clock[2] - clock[1]]]) / (clock[2] - clock[0])
+    return tvl1.tvl1_flow(pictures[None, ::2], times, attachment[None])[0] / (clock[2] - clock[0]) * 15
+
+
+@pytest.mark.parametrize("size", [(32, 40), (33, 35)])
+def test_flows_of_the_sites_are_in_bayer_cells_and_in_the_order_of_split_bayer(size):
+    spikes = moving((0.2, -0.1), *size, "GRBG").repeat(2, 1, 1, 1)
+    flows = ClassicalFlow().channel_flows(spikes, TIMES, "GRBG")
+    sites = spike_sites(spikes, "GRBG")
+    for flow in flows:
+        assert flow.shape == (4, 2, 2, (size[0] + 1) // 2, (size[1] + 1) // 2)
+    weights = torch.eye(41)
+    for _ in range(3):
+        weights = torch.stack([weights[max(n - 6, 0) : n + 7].mean(dim=0) for n in range(41)])
+    clock, seen = (weights @ torch.arange(41.0)).tolist(), [10, 20, 30]
+    raw = torch.einsum("kn,sbnhw->sbkhw", weights[seen], sites.float())
+    blur = torch.exp(-(torch.arange(-2.0, 3) ** 2) / (2 * 0.5**2))
+    blur = (blur / blur.sum()).numpy()
+    pictures = torch.from_numpy(convolve1d(convolve1d(raw.numpy(), blur, -1, mode="nearest"), blur, -2, mode="nearest"))
+    for site in range(4):
+        expected = expected_flows(pictures[site, 1], raw[site, 1], [clock[n] for n in seen], blur**2, "nearest")
+        to_first, to_last = (flow[site, 1] for flow in flows)
+        straight = (to_first + to_last).abs() < 1e-5
+        assert straight.float().mean() > 0.9
+        torch.testing.assert_close(to_last[straight], expected[straight], rtol=1e-2, atol=2e-2)
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "GBRG"])
+def test_joint_flow_is_that_of_grey_pictures(pattern):
+    spikes, clock = moving((0.2, -0.1), pattern=pattern), torch.arange(41.0).reshape(41, 1, 1)
+    binomial, raw, when = [0.25, 0.5, 0.25], [], []
+    for n in (10, 20, 30):
+        raw.append(tfp_at(spikes[0].float(), n, 13, order=3))
+        when.append(tfp_at(clock, n, 13, order=3).item())
+    raw = torch.stack(raw)
+    grey = torch.from_numpy(convolve1d(convolve1d(raw.numpy(), binomial, 1, mode="mirror"), binomial, 2, mode="mirror"))
+    expected = expected_flows(grey, raw, when, [0.0625, 0.25, 0.0625], "mirror")
+    to_first, to_last = ClassicalFlow()(spikes, TIMES, pattern)
+    torch.testing.assert_close((to_last - to_first)[0] / 2, expected, rtol=1e-2, atol=2e-2)
+
+
+@pytest.mark.parametrize("step", [3, 20, 46, 63, 102, 320, 512, 788])
+def test_noise_of_a_mean_is_that_of_an_ideal_pixel(step):
+    charge = (torch.arange(100_000, dtype=torch.float64) + 0.5) / 100_000
+    light = torch.full((41, 1, len(charge)), (step + 0.5) / 1024, dtype=torch.float64)
+    means = tfp_at(spike_integrate_fire(light, charge=charge.reshape(1, -1))[0].double(), 20, 13, order=3)
+    assert classical._noise(13)[step].item() == pytest.approx(means.var().item(), rel=1e-3)
+
+
+def test_dark_flicker_is_no_motion():
+    """A pixel that fires once in a clip says little of where it moves, and is not followed."""
+    light = torch.full((41, 48, 48), 0.02)
+    spikes = spike_integrate_fire(light, charge=torch.rand(48, 48, generator=torch.Generator().manual_seed(0)))[0][None]
+    far = ClassicalFlow(attachment=1e6)(spikes, TIMES, "RGGB")[1].norm(dim=1).mean()
+    assert ClassicalFlow()(spikes, TIMES, "RGGB")[1].norm(dim=1).mean() < 0.2 * far
+
+
+def test_mosaic_without_motion_is_no_motion():
+    """The filter array stands still while the scene moves: what is left of it would hold the flow back."""
+    colour = torch.tensor([0.9, 0.3, 0.1])[:, None, None].expand(3, 24, 24)
+    light = 0.4 * mosaic(colour, "RGGB").expand(41, 24, 24)
+    grey = ClassicalFlow()(spike_integrate_fire(light, charge=torch.rand(24, 24))[0][None], TIMES, "RGGB")
+    assert all(flow.abs().max() < 0.3 for flow in grey)
+
+
+def spike_sites(spikes, pattern):
+    """Sub-streams of a clip of any size, an odd side continued by the pixel of the same site."""
+    spikes = torch.cat([spikes, spikes[..., -2:-1, :]], -2) if spikes.shape[-2] % 2 else spikes
+    spikes = torch.cat([spikes, spikes[..., -2:-1]], -1) if spikes.shape[-1] % 2 else spikes
+    return split_bayer(spikes, pattern)
+
+
+class Constant(MotionEstimator):
+    """Every site has a flow of its own."""
+
+    def channel_flows(self, spikes, times, pattern):
+        height, width = ((side + 1) // 2 for side in spikes.shape[-2:])
+        flow = torch.tensor([[1.0, 2], [3, 4], [5, 6], [7, 12]]).reshape(4, 1, 2, 1, 1)
+        flow = flow.expand(4, len(spikes), 2, height, width)
+        return -flow, flow
+
+
+@pytest.mark.parametrize("size", [(8, 10), (7, 9)])
+def test_joint_flow_is_the_mean_of_the_sites_in_sensor_pixels(size):
+    to_first, to_last = Constant()(torch.zeros(3, 41, *size), TIMES, "RGGB")
+    expected = torch.tensor([8.0, 12]).reshape(1, 2, 1, 1).expand(3, 2, *size)
+    assert to_last.equal(expected)
+    assert to_first.equal(-expected)
+
+
+def test_more_warps_are_more_exact():
+    def error(velocity, warps):
+        truth = 15 * torch.tensor(velocity).reshape(1, 2, 1, 1)
+        return (ClassicalFlow(warps=warps)(moving(velocity), TIMES, "RGGB")[1] - truth).norm(dim=1).mean().item()
+
+    once, twice, often = (error((0.25, -0.2), warps) for warps in (1, 2, 5))
+    assert once > 1.1 * twice > 1.1 * often, (once, twice, often)
+
+
+@pytest.mark.parametrize(
+    ("size", "times", "pattern", "message"),
+    [
+        ((1, 8, 8), (0, 0, 0), "RGGB", "with frames before and after the middle, 0"),
+        ((41, 8, 8), (0, 0, 10), "RGGB", "with frames before and after the middle, 0"),
+        ((41, 8, 8), (0, 40, 40), "RGGB", "with frames before and after the middle, 40"),
+        ((41, 1, 8), TIMES, "RGGB", "at least 2 x 2 pixels"),
+        ((41, 8, 8), TIMES, "XYZ", "pattern"),
+    ],
+)
+def test_classical_flow_refuses_what_has_no_motion(size, times, pattern, message):
+    with pytest.raises(ValueError, match=message):
+        ClassicalFlow()(torch.zeros(1, *size), times, pattern)

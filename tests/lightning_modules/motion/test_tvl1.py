@@ -1,0 +1,156 @@
+import numpy as np
+import pytest
+import torch
+from skimage.registration import optical_flow_tvl1
+
+from lightning_modules.motion.__main__ import main
+from spikekit.flow import tvl1
+from spikekit.flow.tvl1 import refine, tvl1_flow
+from spikekit.kernels import loops
+
+needs_numba = pytest.mark.skipif(not loops.NUMBA, reason="needs Numba")
+
+FORWARD = torch.tensor([[0.0, 1.0]])
+
+
+def moved(velocity, height=48, width=64, times=(0.0, 1.0), seed=1, count=1):
+    """Smooth textures, (count, 2, H, W) in double, that move by ``velocity`` (x, y) in a unit of time."""
+    waves = torch.rand(count, 3, 24, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+
+    def at(time):
+        u, v = x - velocity[0] * time, y - velocity[1] * time
+        phase = sum((w - 0.5)[..., None, None] * axis for w, axis in ((waves[:, 0], u), (waves[:, 1], v)))
+        return 0.3 + 0.5 * torch.cos(phase + 6.3 * waves[:, 2, :, None, None]).mean(dim=1)
+
+    return torch.stack([at(time) for time in times], dim=1)
+
+
+def steady(pictures, value=60.0):
+    return torch.full_like(pictures[:, 0], value)
+
+
+@pytest.mark.parametrize("times", [(0.0, 1.0), (-0.5, 0.5), (-0.4, 0.6), (1.0, 0.0)])
+@pytest.mark.parametrize("velocity", [(0.3, 0.0), (-1.5, 2.0), (3.0, -2.0)])
+def test_a_translation_is_found(times, velocity):
+    pictures = moved(velocity, times=times)
+    flow = tvl1_flow(pictures, torch.tensor([times]), steady(pictures))
+    error = (flow - torch.tensor(velocity).reshape(2, 1, 1)).norm(dim=1)[..., 10:-10, 10:-10]
+    assert error.mean() < 0.05, error.mean()
+
+
+@needs_numba
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [(48, 64), (33, 35), (17, 5), (2, 3), (2, 2)])
+def test_compiled_loops_do_what_the_tensors_do(dtype, size):
+    """In a batch of different motion, with weights and times of their own, and from a flow to begin with."""
+    still, far = moved((0.0, 0.0), *size), moved((1.5, -0.7), *size)
+    pictures = torch.cat([still, far, far.flip(-1)]).to(dtype)
+    generator = torch.Generator().manual_seed(0)
+    limit, flow = (torch.rand(3, *lead, *size, generator=generator, dtype=dtype) for lead in ((), (2,)))
+    times = torch.tensor([[-0.5, 0.5], [0.0, 1.0], [-0.4, 0.6]])
+    expected = refine(pictures, times, 40 * limit, flow, 3)
+    compiled = loops.import_loops("spikekit.flow.cpu_tvl1")
+    got = compiled.refine(pictures, times, 40 * limit, flow, 3)
+    assert got.dtype == dtype
+    difference = (got - expected).abs()
+    assert difference.mean() < (1e-12 if dtype == torch.float64 else 1e-4), difference.mean()
+    assert not flow.equal(got)
+
+
+@pytest.mark.parametrize("numba", [False, pytest.param(True, marks=needs_numba)])
+class TestBothPaths:
+    @pytest.fixture(autouse=True)
+    def path(self, monkeypatch, numba):
+        monkeypatch.setattr(loops, "NUMBA", numba)
+
+    def test_a_batch_is_its_members(self):
+        pictures = torch.cat([moved((0.1, 0.0)), moved((3.0, -2.0)), moved((0.0, 0.0))])
+        together = tvl1_flow(pictures, FORWARD.expand(3, 2), steady(pictures))
+        for one, flow in zip(pictures.split(1), together.split(1), strict=True):
+            torch.testing.assert_close(tvl1_flow(one, FORWARD, steady(one)), flow)
+
+    def test_pictures_and_times_change_places_together(self):
+        pictures, times = moved((1.0, -0.5)), torch.tensor([[-0.4, 0.6]])
+        flow = tvl1_flow(pictures, times, steady(pictures))
+        torch.testing.assert_close(tvl1_flow(pictures.flip(1), times.flip(1), steady(pictures)), flow)
+
+    def test_a_transposed_picture_moves_the_other_way_round(self):
+        pictures = moved((1.0, -0.5))
+        flow = tvl1_flow(pictures, FORWARD, steady(pictures))
+        transposed = tvl1_flow(pictures.mT, FORWARD, steady(pictures).mT).mT.flip(1)
+        torch.testing.assert_close(transposed, flow, rtol=1e-3, atol=1e-3)
+
+    def test_it_goes_on_from_a_start(self):
+        pictures = moved((6.0, 0.0))
+        truth = torch.zeros_like(pictures) + torch.tensor([6.0, 0.0]).reshape(2, 1, 1)
+        flow = tvl1_flow(pictures, FORWARD, steady(pictures), truth)
+        assert (flow - truth)[..., 10:-10, 10:-10].abs().mean() < 0.1
+        assert not tvl1_flow(pictures * 0, FORWARD, steady(pictures), truth * 0).any()
+
+    def test_no_weight_is_no_opinion(self):
+        """What moves on the left alone, seen on the right alone, is what a still picture is."""
+        pictures = moved((0.0, 0.0))
+        pictures[..., :24] = moved((1.0, 0.0))[..., :24]
+        weight = steady(pictures)
+        weight[..., :32] = 0
+        assert tvl1_flow(pictures, FORWARD, weight).abs().max() < 0.05
+
+    def test_nothing_to_see_is_no_motion(self):
+        for level in (0.0, 0.3):
+            pictures = torch.full((2, 2, 20, 20), level)
+            assert not tvl1_flow(pictures, FORWARD.expand(2, 2), steady(pictures)).any()
+
+    @pytest.mark.parametrize("wrong", [float("nan"), float("inf"), 1e30])
+    def test_a_broken_pixel_breaks_no_memory(self, wrong):
+        pictures = moved((1.0, 0.0)).float()
+        pictures[0, 0, 10, 10] = wrong
+        assert tvl1_flow(pictures, FORWARD, steady(pictures)).shape == (1, 2, 48, 64)
+
+
+def test_a_flow_grows_with_the_pictures(monkeypatch):
+    monkeypatch.setattr(loops, "NUMBA", False)
+    monkeypatch.setattr(tvl1, "refine", lambda pictures, times, limit, flow, warps: flow + (flow.shape[-1] == 35))
+    flow = tvl1_flow(torch.rand(1, 2, 33, 70), FORWARD, torch.ones(1, 33, 70))
+    torch.testing.assert_close(flow[0, :, 0, 0], torch.tensor([70 / 35, 33 / 17]))
+
+
+def energy(pictures, flow, attachment):
+    """Of the problem that is solved, in plain NumPy, not linearized."""
+    from scipy.ndimage import map_coordinates
+
+    first, second = pictures.numpy()
+    grid = np.mgrid[: first.shape[0], : first.shape[1]] + flow[::-1]
+    differs = map_coordinates(second, grid, order=1, mode="nearest") - first
+    variation = sum(
+        np.hypot(np.diff(part, axis=0, append=part[-1:]), np.diff(part, axis=1, append=part[:, -1:])).sum()
+        for part in flow
+    )
+    return attachment * np.abs(differs).sum() + variation
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_energy_is_as_low_as_that_of_scikit_image(noise):
+    pictures = moved((1.4, -0.8))
+    pictures[..., 20:30, 20:40] = moved((-1.0, 0.5), seed=2)[..., 20:30, 20:40]
+    pictures = pictures + noise * torch.randn(pictures.shape, generator=torch.Generator().manual_seed(0))
+    ours = tvl1_flow(pictures, FORWARD, steady(pictures, 30.0))[0].numpy()
+    first, second = pictures[0].numpy()
+    down, right = optical_flow_tvl1(first, second, attachment=30, num_warp=20, num_iter=50, tol=0)
+    got, theirs = (energy(pictures[0], flow, 30) for flow in (ours, np.stack([right, down])))
+    assert got < 1.1 * theirs, (got, theirs)
+    assert got < 0.75 * energy(pictures[0], 0 * ours, 30)
+
+
+def test_no_gradient_is_kept():
+    pictures = moved((1.0, 0.0)).requires_grad_()
+    assert not tvl1_flow(pictures, FORWARD, steady(pictures)).requires_grad
+
+
+def test_the_comparison_runs(capsys):
+    main(["--clips", "3", "--patch", "32", "--rounds", "1"])
+    table = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
+    errors = {name.strip(): float(error) for name, error, *_ in table[2:]}
+    assert set(errors) == {"ClassicalFlow", "without Numba", "3 warps", "1 warp", "scikit-image's TV-L1", "no motion"}
+    assert errors["ClassicalFlow"] == pytest.approx(errors["without Numba"], abs=2e-3)
+    assert errors["ClassicalFlow"] < 0.5 * errors["no motion"]

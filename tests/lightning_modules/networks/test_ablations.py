@@ -1,0 +1,448 @@
+"""The ten variants of Table 3: what every one leaves out or puts in another's place."""
+
+import sys
+from inspect import signature
+
+import pytest
+import torch
+import yaml
+
+import lightning_modules.networks.cscsr as cscsr
+from lightning_modules.__main__ import main
+from lightning_modules.inference.tiles import forward_in_tiles
+from lightning_modules.motion import MotionEstimator
+from lightning_modules.networks import CSCSR
+from lightning_modules.networks.reconstruction import ColorCorrelation, EarlyFusion, SeparateColors
+from lightning_modules.networks.refinement import FeatureRefinement, TimeFusion
+from lightning_modules.networks.representation import IntervalRepresentation, SpikeRepresentation, WindowMeans
+from lightning_modules.tasks.super_resolution import SuperResolution
+from spikekit import bayer_mask, bayer_sites, spike_interval
+
+TINY = {"width": 4, "representation_width": 4, "features": 2, "stages": 2, "blocks": 1, "end_blocks": 1}
+FULL = (SpikeRepresentation, FeatureRefinement, ColorCorrelation)
+# parameters at sizes M and L, and the modules
+VARIANTS = {
+    "a": (398_979, 2_292_227, (WindowMeans, *FULL[1:])),
+    "b": (607_791, 2_713_595, FULL),
+    "c": (398_979, 2_292_227, (IntervalRepresentation, *FULL[1:])),
+    "d": (726_447, 2_832_251, FULL),
+    "e": (726_447, 2_832_251, FULL),
+    "f": (632_847, 2_458_427, (SpikeRepresentation, TimeFusion, ColorCorrelation)),
+    "g": (632_847, 2_458_427, (SpikeRepresentation, TimeFusion, ColorCorrelation)),
+    "h": (624_975, 2_574_267, (*FULL[:2], SeparateColors)),
+    "i": (652_655, 2_537_211, (*FULL[:2], EarlyFusion)),
+    "j": (726_447, 2_832_251, FULL),
+}
+
+
+class Motions(MotionEstimator):
+    """Known flows of the four sub-streams, in Bayer cells: so far to the right, and half as far down."""
+
+    def __init__(self, constants=(1.0, 1.0, 1.0, 1.0)):
+        super().__init__()
+        self.constants = torch.tensor(constants)
+        self.direction = torch.nn.Parameter(torch.tensor([1.0, 0.5]))
+
+    def channel_flows(self, spikes, times, pattern):
+        height, width = spikes.shape[-2:]
+        size = 4, len(spikes), 2, (height + 1) // 2, (width + 1) // 2
+        constants = self.constants.reshape(4, 1, 1, 1, 1)
+        to_last = (constants * self.direction.reshape(2, 1, 1).float()).expand(size)
+        return -to_last, to_last
+
+
+class Slopes(MotionEstimator):
+    """What four perfect estimators see of a flow that is linear in space: its value at their pixels."""
+
+    def channel_flows(self, spikes, times, pattern):
+        height, width = spikes.shape[-2:]
+        flow = slope((height + 1) // 2 * 2, (width + 1) // 2 * 2).expand(len(spikes), -1, -1, -1)
+        sites = torch.stack([flow[..., row::2, column::2] / 2 for _, row, column in bayer_sites(pattern)])
+        return -sites, sites
+
+
+class Unwanted(MotionEstimator):
+    def channel_flows(self, spikes, times, pattern):
+        raise AssertionError("this variant needs no motion")
+
+    forward = channel_flows
+
+
+def slope(height, width):
+    y, x = torch.meshgrid(torch.arange(float(height)), torch.arange(float(width)), indexing="ij")
+    return torch.stack([0.5 + 0.25 * x - 0.1 * y, 0.3 * y - 1])
+
+
+def settings(configs, *overlays):
+    """Arguments of the network, overlay over overlay."""
+    merged = {}
+    for overlay in overlays:
+        config = yaml.safe_load((configs / f"{overlay}.yaml").read_text())
+        merged.update(config["model"]["network"]["init_args"])
+    return merged
+
+
+def variant(letter, configs, scale=2, seed=0, **arguments):
+    torch.manual_seed(seed)
+    return CSCSR(**{**TINY, "scale": scale, **settings(configs, f"ablation/{letter}"), **arguments})
+
+
+def clip(batch=1, height=12, width=16, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    spikes = (torch.rand(batch, 41, height, width, generator=generator) < 0.3).to(torch.uint8)
+    return spikes, torch.randn(batch, 2, 2, height, width, generator=generator)
+
+
+def parsed(configs, capsys, *overlays):
+    """What the command would run."""
+    files = [part for overlay in overlays for part in ("-c", str(configs / f"{overlay}.yaml"))]
+    with pytest.raises(SystemExit):
+        main(["fit", *files, "--print_config"])
+    return yaml.safe_load(capsys.readouterr().out)
+
+
+@pytest.fixture(autouse=True)
+def _argv(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["lightning"])
+
+
+@pytest.mark.parametrize("letter", VARIANTS)
+def test_the_command_builds_the_variant(letter, configs, capsys):
+    model = parsed(configs, capsys, "x4", "quick", f"ablation/{letter}")["model"]["init_args"]
+    assert model["flow"] == ("estimated" if letter in "de" else "scene")
+    asked = model["network"]["init_args"]
+    assert asked == {**CSCSR(**asked).settings, "motion": None, "steps": 16}  # the two that any weights serve with
+    overlay = settings(configs, f"ablation/{letter}")
+    assert overlay.items() <= asked.items()
+    defaults = {name: parameter.default for name, parameter in signature(CSCSR).parameters.items()}
+    assert all((asked[name] == defaults[name]) == (letter == "j") for name in overlay)
+
+
+@pytest.mark.parametrize("scale", [2, 3, 4])
+def test_j_is_the_configuration_of_the_scale_itself(scale, configs, capsys):
+    assert parsed(configs, capsys, f"x{scale}", "ablation/j") == parsed(configs, capsys, f"x{scale}")
+
+
+@pytest.mark.parametrize("letter", VARIANTS)
+def test_variants_differ_in_parameters_and_modules(letter, configs):
+    *parameters, modules = VARIANTS[letter]
+    for size, expected in zip(("paper_base", "paper_large"), parameters, strict=True):
+        for scale in (2, 3, 4):
+            network = CSCSR(**settings(configs, f"x{scale}", f"size/{size}", f"ablation/{letter}"))
+            assert network.scale == scale
+            assert sum(p.numel() for p in network.parameters()) == expected
+    found = *{type(part) for part in network.representation}, *{type(part) for part in network.refinement}
+    assert (*found, type(network.reconstruction)) == modules
+    learns = letter not in "ac"
+    assert any(name.startswith("representation") for name in network.state_dict()) == learns
+    assert any(".whole." in name for name in network.state_dict()) == (learns and letter != "b")
+
+
+def test_no_two_variants_are_alike(configs):
+    overlays = [yaml.safe_dump(settings(configs, f"ablation/{letter}")) for letter in VARIANTS]
+    assert len(set(overlays)) == 10
+    spikes, _ = clip()
+    pictures = {}
+    for letter in VARIANTS:
+        motion = Motions((1.0, -1.0, 0.5, 2.0))
+        pictures[letter] = variant(letter, configs, motion=motion)(spikes).detach()
+    for one in VARIANTS:
+        for other in VARIANTS:
+            assert one == other or not torch.allclose(pictures[one], pictures[other], atol=1e-3), (one, other)
+
+
+@pytest.mark.parametrize("scale", [2, 3, 4])
+@pytest.mark.parametrize("letter", VARIANTS)
+def test_any_size_and_every_parameter_learns(letter, scale, configs):
+    spikes, flow = clip(2, 9, 7)
+    network = variant(letter, configs, scale, motion=Motions())
+    rgb = network(spikes)
+    assert rgb.shape == (2, 3, 9 * scale, 7 * scale)
+    assert rgb.isfinite().all()
+    rgb.square().mean().backward()
+    for name, parameter in network.named_parameters():
+        if name != "motion.direction" or letter != "f":
+            assert parameter.grad is not None, name
+            assert parameter.grad.abs().sum() > 0, name
+    assert network(spikes[:, :, :3, :3], flow[..., :3, :3]).shape == (2, 3, 3 * scale, 3 * scale)
+
+
+@pytest.mark.parametrize("letter", VARIANTS)
+def test_precisions(letter, configs):
+    spikes, _ = clip(1, 12, 12)
+    network = variant(letter, configs, motion=Motions((0.93, 0.41, 0.57, 0.13)), skip=True)
+    torch.nn.init.normal_(network.reconstruction.rgb.weight, std=0.1)
+    with torch.no_grad():
+        exact = network(spikes)
+        with torch.autocast("cpu", torch.bfloat16):
+            half = network(spikes)
+        double = network.double()(spikes)
+    assert (half.dtype, double.dtype) == (torch.float32, torch.float64)
+    assert not half.bfloat16().float().equal(half)
+    assert (half - exact).abs().max() < 0.05 * exact.abs().max()
+    torch.testing.assert_close(double.float(), exact, rtol=0, atol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("letter", ["c", "d", "f"])
+def test_compiles_in_one_piece(letter, configs):
+    spikes, flow = clip()
+    flow = flow[:, None].expand(-1, 3, -1, -1, -1, -1) if letter == "d" else flow
+    network = variant(letter, configs)
+    compiled = torch.compile(network, fullgraph=True, backend="eager")
+    with torch.no_grad():
+        torch.testing.assert_close(compiled(spikes, flow), network(spikes, flow))
+
+
+# A, B, C: representation
+
+
+def test_a_shows_the_share_of_frames_that_fired(configs):
+    spikes, _ = clip()
+    seen = variant("a", configs).representation[0](spikes.float())
+    assert seen.shape == (1, 11, 1, 12, 16)
+    for n, time in enumerate(range(5, 36, 3)):
+        torch.testing.assert_close(seen[:, n, 0], spikes[:, time - 5 : time + 6].sum(1) / 11)
+
+
+def test_c_shows_the_inverse_interval_where_the_colour_is(configs):
+    spikes, _ = clip()
+    spikes[..., 2, 2] = 0
+    network = variant("c", configs)
+    mask = bayer_mask(12, 16)[0]
+    seen = network.representation[0](spikes * mask)
+    assert seen.shape == (1, 11, 1, 12, 16)
+    expected = mask / spike_interval(spikes)[:, 5:36:3]
+    expected[..., 2, 2] = 0
+    torch.testing.assert_close(seen[:, :, 0], expected)
+
+
+@pytest.mark.parametrize(("letter", "sees"), [("a", False), ("b", False), ("j", True)])
+def test_frames_between_the_windows_are_global_perception_alone(letter, sees, configs):
+    network = variant(letter, configs, window=5, stride=12)  # frames 0-4, 12-16, 24-28, 36-40
+    spikes, flow = clip()
+    spikes[:, 8] = 0
+    before = network(spikes, 0 * flow)
+    spikes[:, 8] = 1
+    assert before.equal(network(spikes, 0 * flow)) != sees
+    spikes[:, 14] = 1 - spikes[:, 14]
+    assert not before.equal(network(spikes, 0 * flow))
+
+
+# D, E: motion
+
+
+@pytest.mark.parametrize("letter", "de")
+def test_one_motion_of_all_colours_is_the_joint_one(letter, configs):
+    spikes, flow = clip(2, 13, 11)
+    one, other = variant(letter, configs, motion=Motions()), variant("j", configs, motion=Motions())
+    torch.testing.assert_close(one(spikes), other(spikes))
+    assert one(spikes, flow).equal(other(spikes, flow))  # a given flow is that of every colour
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
+@pytest.mark.parametrize("letter", "de")
+def test_flows_are_where_their_pixels_are(letter, pattern, configs):
+    spikes, _ = clip(2, 13, 10)
+    flow = variant(letter, configs, pattern=pattern, motion=Slopes()).estimate_flow(spikes)
+    flow = flow if letter == "d" else flow[:, None]
+    assert flow.shape == (2, 3 if letter == "d" else 1, 2, 2, 13, 10)
+    expected = slope(13, 10).expand_as(flow[:, :, 0])
+    inside = (..., slice(1, -1), slice(1, -1))
+    torch.testing.assert_close(flow[:, :, 0][inside], -expected[inside])
+    torch.testing.assert_close(flow[:, :, 1][inside], expected[inside])
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "GBRG"])
+def test_d_gives_every_colour_its_own_motion(pattern, configs):
+    spikes, _ = clip(1, 7, 8)
+    flow = variant("d", configs, pattern=pattern, motion=Motions((1.0, 2.0, 4.0, 8.0))).estimate_flow(spikes)
+    for color, expected in enumerate((2.0, 6.0, 16.0)):
+        for flow_to, sign in zip(flow[:, color].unbind(1), (-1, 1), strict=True):
+            assert (flow_to[:, 0] == sign * expected).all()
+            assert (flow_to[:, 1] == sign * expected / 2).all()
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "GBRG"])
+def test_e_gives_every_site_the_motion_of_its_sub_stream(pattern, configs):
+    spikes, _ = clip(1, 7, 8)
+    flow = variant("e", configs, pattern=pattern, motion=Motions((1.0, 2.0, 4.0, 8.0))).estimate_flow(spikes)
+    for (_, row, column), expected in zip(bayer_sites(pattern), (2.0, 4.0, 8.0, 16.0), strict=True):
+        assert (flow[:, 1, 0, row::2, column::2] == expected).all()
+        assert (flow[:, 0, 1, row::2, column::2] == -expected / 2).all()
+
+
+def test_d_searches_every_colour_along_its_motion(configs):
+    spikes, _ = clip(1, 24, 24)
+    still, moved = (
+        variant("d", configs, reconstruction="separate", motion=Motions((1.0, 1.0, 1.0, blue)))(spikes)
+        for blue in (1.0, 3.0)
+    )
+    assert still[:, :2].equal(moved[:, :2])
+    assert not torch.allclose(still[:, 2], moved[:, 2], atol=1e-3)
+
+
+@pytest.mark.parametrize("letter", "de")
+def test_tiles_take_the_flow_of_every_colour(letter, configs):
+    network = variant(letter, configs, motion=Motions((0.2, 0.4, 0.1, 0.3)))
+    spikes, _ = clip(1, 70, 58)
+    torch.testing.assert_close(forward_in_tiles(network, spikes, 32), network(spikes), rtol=0, atol=1e-5)
+
+
+def test_flows_of_another_size_are_refused(configs):
+    class Wrong(MotionEstimator):
+        def channel_flows(self, spikes, times, pattern):
+            return (spikes.new_zeros(4, len(spikes), 2, *spikes.shape[-2:]),) * 2
+
+    with pytest.raises(
+        ValueError, match=r"channel_flows: expected two flows \(4, 1, 2, 6, 8\), got \(4, 1, 2, 12, 16\)"
+    ):
+        variant("d", configs, motion=Wrong())(clip()[0])
+
+
+# F, G: search and refinement
+
+
+def test_f_neither_estimates_motion_nor_warps(configs, monkeypatch):
+    def refuse(*_, **__):
+        raise AssertionError("this variant does not search")
+
+    monkeypatch.setattr(cscsr, "flow_warp_idw", refuse)
+    monkeypatch.setattr(cscsr, "linear_motion", refuse)
+    spikes, flow = clip(1, 70, 58)
+    network = variant("f", configs, motion=Unwanted())
+    assert network(spikes).equal(network(spikes, flow))
+    torch.testing.assert_close(forward_in_tiles(network, spikes, 32), network(spikes), rtol=0, atol=1e-5)
+    with pytest.raises(ValueError, match="flow: expected"):
+        network(spikes, flow[..., :8])
+    assert type(variant("f", configs, refinement=True).refinement[0]) is FeatureRefinement
+
+
+def test_f_shows_every_feature_enlarged_bilinearly(configs):
+    spikes, _ = clip()
+    network = variant("f", configs, 3)
+    seen = []
+    network.refinement[1].register_forward_hook(lambda _, inputs, output: seen.append(inputs[0]))
+    network(spikes)
+    features = network.representation[1](spikes * bayer_mask(12, 16)[1])
+    expected = torch.nn.functional.interpolate(features[0], scale_factor=3, mode="bilinear", align_corners=False)
+    torch.testing.assert_close(seen[0][0], expected.flatten(0, 1))
+
+
+def test_g_merges_the_time_points_linearly(configs):
+    refine = variant("g", configs).refinement[0].double()
+    assert sum(p.numel() for p in refine.parameters()) == 11 * 2 * 4 * 9 + 4
+    one, other = torch.randn(2, 1, 11 * 2, 6, 6, dtype=torch.float64)
+    torch.testing.assert_close(refine(one) + refine(other), refine(one + other) + refine(0 * one))
+
+
+# H, I: reconstruction
+
+
+@pytest.mark.parametrize(("letter", "apart"), [("h", True), ("i", False), ("j", False)])
+def test_colours_help_each_other_except_in_h(letter, apart, configs):
+    spikes, flow = clip()
+    network = variant(letter, configs)
+    before = network(spikes, flow)
+    for color, mask in enumerate(bayer_mask(12, 16, dtype=torch.bool)):
+        after = network(torch.where(mask, 1 - spikes, spikes), flow)
+        changed = [not before[:, n].equal(after[:, n]) for n in range(3)]
+        assert changed == ([n == color for n in range(3)] if apart else [True] * 3)
+
+
+def test_h_is_three_reconstructions_side_by_side():
+    module = SeparateColors(4, stages=2, blocks=1, end_blocks=3).double()
+    colors = list(torch.randn(3, 1, 4, 6, 6, dtype=torch.float64))
+    for n, channel in enumerate(module(colors).split(1, dim=1)):
+        refined = module.refine[n](colors[n])
+        refined = refined + module.end[n](refined)
+        one = torch.nn.functional.conv2d(refined, module.rgb.weight[n : n + 1], module.rgb.bias[n : n + 1], padding=1)
+        torch.testing.assert_close(channel, one)
+
+
+@pytest.mark.parametrize("end_blocks", [1, 3, 4])
+def test_the_reconstructions_have_equally_many_residual_blocks(end_blocks, configs):
+    counts = {
+        letter: sum(
+            type(module).__name__ == "ResBlock"
+            for module in variant(letter, configs, end_blocks=end_blocks, stages=3, blocks=2).reconstruction.modules()
+        )
+        for letter in "hij"
+    }
+    assert counts["i"] == counts["j"] == 18 + end_blocks
+    assert counts["h"] == 18 + 3 * -(-end_blocks // 3)  # as many for each colour
+
+
+# arguments and checkpoints
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"representation": "tfp"}, "representation: expected one of bssr, spikes, interval, got 'tfp'"),
+        ({"motion_fusion": "mean"}, "motion_fusion: expected one of joint, independent, assembled, got 'mean'"),
+        ({"reconstruction": "a"}, "reconstruction: expected one of correlated, separate, early, got 'a'"),
+        ({"representation": "spikes", "global_perception": False}, "global_perception: part of representation bssr"),
+        ({"motion_fusion": "independent", "search": False}, "motion_fusion: expected joint without search"),
+        ({"end_width": 8, "reconstruction": "separate"}, "end_width: separate colours are never fused"),
+        ({"end_width": 0}, "end_width: expected a whole number >= 1, got 0"),
+    ],
+)
+def test_wrong_arguments(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        CSCSR(**{**TINY, **arguments})
+
+
+def test_variants_combine(configs):
+    spikes, _ = clip(1, 9, 7)
+    for representation in ("bssr", "spikes", "interval"):
+        for reconstruction in ("correlated", "separate", "early"):
+            for search in (True, False):
+                for refinement in (True, False):
+                    arguments = {
+                        "representation": representation,
+                        "reconstruction": reconstruction,
+                        "search": search,
+                        "refinement": refinement,
+                        "motion_fusion": "independent" if search else "joint",
+                    }
+                    assert CSCSR(1, **TINY, **arguments, motion=Motions())(spikes).isfinite().all()
+
+
+@pytest.mark.parametrize("letter", VARIANTS)
+def test_a_checkpoint_of_another_variant_is_refused(letter, configs):
+    checkpoint = {"state_dict": {}}
+    SuperResolution(variant("j", configs)).on_save_checkpoint(checkpoint)
+    module = SuperResolution(variant(letter, configs), flow="estimated")
+    overlay = settings(configs, f"ablation/{letter}")
+    younger = settings(configs, "ablation/j")
+    former = {name: value for name, value in checkpoint["network"].items() if name not in younger}
+    for stored in (checkpoint, {**checkpoint, "network": former}):  # the latter from before there were variants
+        if letter == "j":
+            module.on_load_checkpoint(stored)
+        else:
+            name, value = next(iter(overlay.items()))
+            with pytest.raises(ValueError, match=f"this run asks for {name}={value}"):
+                module.on_load_checkpoint(stored)
+
+
+def test_weights_are_named_as_before_there_were_variants():
+    names = set()
+    for color in range(3):
+        local = [f"{part}.{layer}" for part in ("local", "whole", "fuse") for layer in ("0.0", "1.body.0", "1.body.2")]
+        names |= {f"representation.{color}.{layer}" for layer in (*local, "fuse.2")}
+        names |= {f"refinement.{color}.{part}.{layer}" for part in ("base", "residual") for layer in ("0.0", "1")}
+        names |= {f"reconstruction.refine.{s}.{color}.0.body.{layer}" for s in range(2) for layer in (0, 2)}
+    names |= {f"reconstruction.{layer}" for layer in ("fuse.0.0", "fuse.1.0", "end.0.body.0", "end.0.body.2", "rgb")}
+    assert set(CSCSR(**TINY).state_dict()) == {f"{name}.{kind}" for name in names for kind in ("weight", "bias")}
+
+
+def test_weights_of_an_estimator_stay(configs):
+    class Trained(Motions):
+        def __init__(self):
+            super().__init__()
+            self.convolution = torch.nn.Conv2d(2, 2, 3)
+
+    motion = Trained()
+    before = motion.convolution.weight.clone()
+    assert CSCSR(**TINY, motion=motion).motion.convolution.weight.equal(before)

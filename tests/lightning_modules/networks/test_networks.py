@@ -1,0 +1,325 @@
+import pytest
+import torch
+import yaml
+from torch.utils.flop_counter import FlopCounterMode
+
+from lightning_modules.inference.tiles import forward_in_tiles
+from lightning_modules.motion import MotionEstimator, ZeroFlow
+from lightning_modules.networks import CSCSR, ClassicalDecoder
+from lightning_modules.networks.layers import fold
+from lightning_modules.networks.refinement import FeatureRefinement
+from lightning_modules.networks.representation import SpikeRepresentation, WindowMeans
+from spikekit import bayer_mask, demosaic, linear_motion, mosaic, psnr, spike_integrate_fire, split_colors, tfi, tfp
+
+TINY = {"width": 4, "representation_width": 4, "features": 2, "stages": 2, "blocks": 1, "end_blocks": 1}
+
+
+def clip(batch=1, height=12, width=16, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    spikes = (torch.rand(batch, 41, height, width, generator=generator) < 0.3).to(torch.uint8)
+    return spikes, torch.randn(batch, 2, 2, height, width, generator=generator)
+
+
+def test_a_trace_keeps_no_motion_of_its_example():
+    spikes, flow = clip()
+    network = CSCSR(2, **TINY)
+    for inputs in ((spikes,), (spikes, flow)):
+        with pytest.raises(RuntimeError, match=r"torch\.jit\.trace: expected static=True or ZeroFlow"):
+            torch.jit.trace(network, inputs)
+    at_rest, other = CSCSR(2, motion=ZeroFlow(), **TINY), clip(seed=1)[0]
+    torch.testing.assert_close(torch.jit.trace(at_rest, (spikes,))(other), at_rest(other))
+
+
+# The figures of README.md and configs/size.
+@pytest.mark.parametrize(
+    ("size", "parameters", "mmac"),
+    [
+        ("paper_small", 165_801, 1.86),
+        ("paper_base", 726_447, 9.06),
+        ("paper_large", 2_832_251, 42.7),
+        ("base", 1_320_742, 1.72),
+        ("small", 1_080_294, 1.48),
+        ("tiny", 300_963, 0.356),
+        ("large", 2_257_222, 2.66),
+        ("huge", 3_783_526, 4.18),
+        ("huge_long", 3_809_446, 4.21),
+    ],
+)
+def test_parameters_and_work_of_the_sizes(size, parameters, mmac, configs):
+    settings = yaml.safe_load((configs / f"size/{size}.yaml").read_text())["model"]["network"]["init_args"]
+    for scale in (2, 3, 4) if size.startswith("paper") else (4,):  # the others see scale x scale pixels as channels
+        network = CSCSR(scale, **settings)
+        assert sum(p.numel() for p in network.parameters()) == parameters
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        network(torch.zeros(1, network.frames, 8, 8), torch.zeros(1, 2, 2, 8, 8))
+    assert counter.get_total_flops() / 2 / 64 / 1e6 == pytest.approx(mmac, rel=0.005)
+
+
+@pytest.mark.parametrize("scale", [1, 2, 3, 4])
+@pytest.mark.parametrize("size", [(12, 16), (9, 7), (3, 4)])
+def test_any_size_and_scale(scale, size):
+    spikes, flow = clip(2, *size)
+    rgb = CSCSR(scale, **TINY)(spikes, flow)
+    assert rgb.shape == (2, 3, scale * size[0], scale * size[1])
+    assert rgb.isfinite().all()
+
+
+def test_time_points_are_those_of_the_paper():
+    network = CSCSR(**TINY)
+    assert network.times == (5, 8, 11, 14, 17, 20, 23, 26, 29, 32, 35)
+    assert network.flow_times == (5, 20, 35)
+
+
+def test_every_parameter_learns():
+    torch.manual_seed(0)
+    spikes, flow = clip()
+    network = CSCSR(2, **TINY)
+    network(spikes, flow).square().mean().backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in network.parameters())
+
+
+def test_search_undoes_motion_of_whole_bayer_periods():
+    """Features that move by one Bayer cell from time point to time point look the same at every time point."""
+    network = CSCSR(3, **TINY)
+    times = len(network.times)
+    still = torch.rand(1, 1, 2, 24, 60, generator=torch.Generator().manual_seed(0))
+    moving = torch.cat([still.roll(2 * (t - times // 2), dims=-1) for t in range(times)], dim=1)
+    flow = torch.zeros(1, 2, 24, 60)
+    flow[:, 0] = 2 * (times // 2)  # to the right, in sensor pixels, from the middle to the last time point
+    offsets = linear_motion(-flow, flow, network.times, scale=3)
+    for mask in bayer_mask(24, 60, scale=3):
+        pixels = network._search(moving, offsets, mask)[..., 36:-36]
+        torch.testing.assert_close(pixels, pixels[:, times // 2 :][:, :1].expand_as(pixels), rtol=0, atol=1e-5)
+        wrong = network._search(moving, -offsets, mask)[..., 36:-36]
+        assert (wrong - wrong[:, times // 2 :][:, :1]).abs().max() > 0.1
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_flows_reach_their_time_points(given):
+    class Estimator(MotionEstimator):
+        def forward(self, spikes, times, pattern):
+            assert (times, pattern) == ((5, 20, 35), "RGGB")
+            still = torch.zeros(len(spikes), 2, *spikes.shape[-2:])
+            return still - 1, still + 2
+
+    network = CSCSR(3, **TINY, motion=Estimator())
+    seen = []
+    search = network._search
+    network._search = lambda features, offsets, mask: seen.append(offsets) or search(features, offsets, mask)
+    spikes, flow = clip()
+    flow[:, 0], flow[:, 1] = -1, 2
+    network(spikes, flow) if given else network(spikes)
+    assert len(seen) == 3
+    for offsets in seen:
+        expected = torch.tensor([3 * (-1 * (20 - t) if t < 20 else 2 * (t - 20)) / 15 for t in network.times])
+        torch.testing.assert_close(offsets, expected.reshape(1, 11, 1, 1, 1).expand_as(offsets))
+
+
+def test_result_moves_with_the_scene_by_whole_bayer_periods():
+    network = CSCSR(2, **TINY).double()
+    spikes, _ = clip(1, 48, 48)
+    still = torch.zeros(1, 2, 2, 48, 48, dtype=torch.float64)
+    moved = network(spikes.roll((2, 4), dims=(-2, -1)), still).roll((-4, -8), dims=(-2, -1))
+    torch.testing.assert_close(moved[..., 32:-32, 32:-32], network(spikes, still)[..., 32:-32, 32:-32])
+
+
+@pytest.mark.parametrize("reconstruction", ["correlated", "separate", "early"])
+@pytest.mark.parametrize("scale", [1, 2, 3])
+def test_features_at_sensor_resolution(scale, reconstruction):
+    torch.manual_seed(0)  # so few channels may all be silent otherwise
+    network = CSCSR(scale, **TINY, resolution="sensor", reconstruction=reconstruction)
+    spikes, flow = clip(2, 9, 7)
+    rgb = network(spikes, flow)
+    assert rgb.shape == (2, 3, scale * 9, scale * 7)
+    rgb.square().mean().backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in network.parameters())
+
+
+@pytest.mark.parametrize("reconstruction", ["correlated", "early"])
+def test_width_after_the_last_fusion(reconstruction):
+    torch.manual_seed(0)
+    network = CSCSR(2, **TINY, end_width=6, reconstruction=reconstruction)
+    spikes, flow = clip()
+    network(spikes, flow).square().mean().backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in network.parameters())
+    assert network.reconstruction.rgb.in_channels == 6
+    widths = {module.out_channels for module in network.reconstruction.modules() if isinstance(module, torch.nn.Conv2d)}
+    assert widths == ({4, 6, 3} if reconstruction == "correlated" else {6, 3})
+
+
+def test_features_at_sensor_resolution_are_where_the_sensor_has_them():
+    """What a sensor pixel sees changes the picture around its own place."""
+    network = CSCSR(3, **TINY, resolution="sensor").double()
+    still = torch.zeros(1, 2, 2, 64, 64, dtype=torch.float64)
+    spikes, _ = clip(1, 64, 64)
+    other = spikes.clone()
+    other[..., 30, 40] ^= 1
+    change = (network(spikes, still) - network(other, still)).abs().sum(dim=1)[0].detach()
+    y, x = torch.meshgrid(torch.arange(192.0), torch.arange(192.0), indexing="ij")
+    centre = [(change * axis).sum() / change.sum() for axis in (y, x)]
+    assert centre[0] == pytest.approx(30 * 3 + 1, abs=1.5)
+    assert centre[1] == pytest.approx(40 * 3 + 1, abs=1.5)
+
+
+def test_features_at_sensor_resolution_cost_less():
+    def work(resolution):
+        network = CSCSR(4, width=32, representation_width=4, features=1, resolution=resolution)
+        with torch.no_grad(), FlopCounterMode(display=False) as counter:
+            network(torch.zeros(1, 41, 8, 8), torch.zeros(1, 2, 2, 8, 8))
+        return counter.get_total_flops()
+
+    assert work("sensor") < work("output") / 8
+
+
+@pytest.mark.parametrize("global_perception", [True, False])
+def test_representation_fuses_windows_with_the_whole_clip(global_perception):
+    """Fig. 4 as it is drawn: the features of the clip beside those of every window, then convolutions."""
+    torch.manual_seed(0)
+    part = SpikeRepresentation(9, 5, 2, 4, 3, global_perception).double()
+    spikes = (torch.rand(2, 9, 7, 6) < 0.4).double()
+    expected = []
+    for begin in (0, 2, 4):
+        seen = [part.local(spikes[:, begin : begin + 5])]
+        if global_perception:
+            seen.append(part.whole(spikes))
+        expected.append(part.fuse(torch.cat(seen, dim=1)))
+    got = part(spikes)
+    torch.testing.assert_close(got, torch.stack(expected, dim=1))
+    parameters = list(part.parameters())
+    weights = torch.randn(got.shape, dtype=torch.float64)
+    for one, other in zip(
+        torch.autograd.grad(got, parameters, weights),
+        torch.autograd.grad(torch.stack(expected, dim=1), parameters, weights),
+        strict=True,
+    ):
+        torch.testing.assert_close(one, other)
+
+
+@pytest.mark.parametrize("global_perception", [True, False])
+def test_representation_starts_at_the_mean_of_the_window(global_perception):
+    network = CSCSR(2, **TINY, global_perception=global_perception)
+    spikes = clip()[0].float()
+    for represent, plane in zip(network.representation, split_colors(spikes, "RGGB"), strict=True):
+        torch.testing.assert_close(represent(plane)[:, :, :1], WindowMeans(11, 3)(plane))
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_fold_is_pixel_unshuffle(size):
+    planes = torch.rand(1, 5, 2 * size, 4 * size)
+    folded = fold(planes, size)
+    assert torch.equal(folded, torch.nn.functional.pixel_unshuffle(planes, size))
+    assert folded.stride() == folded.contiguous(memory_format=torch.channels_last).stride()
+
+
+def test_refinement_looks_at_what_deviates_from_the_mean():
+    """Section 4.3: a base layer of everything, and a residual layer of what is left without the mean over time."""
+    refine, pixels = FeatureRefinement(5, 3, 4).double(), torch.rand(2, 5, 3, 6, 7, dtype=torch.float64)
+    residual = pixels - pixels.mean(dim=1, keepdim=True)
+    expected = refine.base(pixels.flatten(1, 2)) + refine.residual(residual.flatten(1, 2))
+    refined = refine(pixels.flatten(1, 2))
+    torch.testing.assert_close(refined, expected)
+    got, wanted = (torch.autograd.grad(out.square().sum(), refine.parameters()) for out in (refined, expected))
+    torch.testing.assert_close(got, wanted)
+
+
+@pytest.mark.parametrize(("resolution", "means"), [("output", 1), ("sensor", 4)])
+def test_fusion_of_times_starts_at_the_mean(resolution, means):
+    network = CSCSR(2, **TINY | {"features": 3, "width": 6}, refinement=False, resolution=resolution)
+    pixels = torch.rand(2, 11, 3 * means, 5, 6)
+    for fuse in network.refinement:
+        torch.testing.assert_close(fuse(pixels.flatten(1, 2))[:, :means], pixels[:, :, :means].mean(dim=1))
+        assert fuse.weight[means:].abs().min() > 0
+
+
+def test_skip_starts_at_a_smooth_classical_picture():
+    """Equal to the classical one where the scene is plain, and without its zipper at edges."""
+    spikes = torch.ones(1, 41, 12, 12)
+    torch.testing.assert_close(CSCSR(4, **TINY, skip=True)(spikes, clip(1, 12, 12)[1]), torch.full((1, 3, 48, 48), 2.5))
+    spikes[..., 6:] = 0
+    rgb = CSCSR(1, **TINY, skip=True)(spikes, clip(1, 12, 12)[1])
+    zipper = (rgb[..., 1:-1, :] - (rgb[..., :-2, :] + rgb[..., 2:, :]) / 2)[..., 2:-2, :]
+    raw = ClassicalDecoder("tfp", 1)(spikes)
+    assert zipper.abs().max() < 0.1 * (raw[..., 1:-1, :] - (raw[..., :-2, :] + raw[..., 2:, :]) / 2).abs().max()
+
+
+def test_bfloat16_keeps_the_picture_in_float32():
+    spikes, flow = clip(1, 16, 16)
+    network = CSCSR(2, **TINY)
+    with torch.no_grad():
+        exact = network(spikes, flow)
+        with torch.autocast("cpu", torch.bfloat16):
+            half = network(spikes, flow)
+    assert half.dtype == torch.float32
+    assert not half.bfloat16().float().equal(half)
+    assert (half - exact).abs().max() < 0.05 * exact.abs().max()
+
+
+@pytest.mark.parametrize("motion", [0, 1, 15, torch.nan])
+def test_tiles_change_nothing(motion):
+    """However far it moves: a tile sees what comes into it."""
+    network = CSCSR(2, **TINY, skip=True)
+    with torch.no_grad():
+        network.reconstruction.rgb.weight.normal_(std=0.1)
+    spikes, flow = clip(1, 70, 58)
+    flow = flow * motion
+    flow[..., 0, :32, :] += 9 * motion
+    network.estimate_flow = lambda _: flow
+    torch.testing.assert_close(forward_in_tiles(network, spikes, 32), network(spikes, flow), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("method", ["tfi", "tfp"])
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
+def test_classical_decoder_finds_the_colour_of_a_plain_scene(method, pattern):
+    rgb = torch.tensor([1.0, 0.5, 0.25]).reshape(1, 3, 1, 1)
+    light = 0.5 * mosaic(rgb.expand(1, 3, 12, 12), pattern).expand(41, 1, 12, 12).movedim(0, 1)
+    spikes, _ = spike_integrate_fire(light)
+    decoded = ClassicalDecoder(method, 2, pattern, alpha=0.5)(spikes)
+    assert psnr(decoded, rgb.expand_as(decoded)).item() > 30
+
+
+@pytest.mark.parametrize(
+    ("method", "settings"), [("tfi", {}), ("tfp", {"window": 13}), ("tfp", {"window": 13, "order": 3})]
+)
+def test_classical_decoder_shows_the_middle_of_the_clip(method, settings):
+    spikes, _ = clip(2)
+    raw = {"tfi": tfi, "tfp": tfp}[method](spikes, **settings)[:, 20]
+    torch.testing.assert_close(ClassicalDecoder(method, 1, **settings)(spikes), demosaic(raw / 0.4))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"frames": 40}, "odd frames"),
+        ({"stride": 7}, "divides frames - window"),
+        ({"scale": 0}, "scale"),
+        ({"pattern": "RGB"}, "pattern"),
+        ({"width": 0}, "width: expected a whole number >= 1, got 0"),
+        ({"width": 2.5}, "width: expected a whole number >= 1, got 2.5"),
+        ({"stride": 0}, "stride: expected a whole number >= 1, got 0"),
+        ({"alpha": float("nan")}, "alpha: expected a finite number above 0, got nan"),
+        ({"steps": 5}, "steps: expected an even number, or 0 for the exact search, got 5"),
+    ],
+)
+def test_wrong_arguments(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        CSCSR(**{**TINY, **arguments})
+
+
+def test_wrong_input():
+    spikes, flow = clip()
+    network = CSCSR(2, **TINY)
+    with pytest.raises(ValueError, match=r"expected \(B, 41, H, W\) of at least 3 x 3 pixels, got \(1, 21, 12, 16\)"):
+        network(spikes[:, :21], flow)
+    with pytest.raises(ValueError, match="flow: expected"):
+        network(spikes, flow[..., :8])
+
+
+def test_trains_after_a_look_in_inference_mode():
+    """What Lightning's validation keeps in the network must serve training, too."""
+    network = CSCSR(2, **TINY)
+    spikes, flow = clip()
+    with torch.inference_mode():
+        seen = network(spikes, flow)
+    learned = network(spikes, flow)
+    learned.square().mean().backward()
+    assert torch.equal(learned, seen)

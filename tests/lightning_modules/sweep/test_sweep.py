@@ -1,0 +1,539 @@
+"""``lightning sweep``, as its users type it; trials run in this process where processes are not what is tested."""
+
+import csv
+import fcntl
+import json
+import re
+import signal
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+import yaml
+
+from lightning_modules.__main__ import main
+from lightning_modules.charts import BLUE, ORANGE
+from lightning_modules.cli.errors import InputError
+from lightning_modules.sweep import cli, engines, worker
+from lightning_modules.sweep.budget import seconds
+from lightning_modules.sweep.paper import TABLE_3
+from lightning_modules.sweep.plot import plot
+from lightning_modules.sweep.table import Row
+from lightning_modules.sweep.trials import Trial, make_trials
+from lightning_modules.sweep.view import View
+from spikekit import read_picture
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+
+TINY = """
+model:
+  network:
+    init_args: {width: 4, representation_width: 4, features: 1, stages: 1, blocks: 1, end_blocks: 1}
+data:
+  init_args: {patch: 8, val_patch: 12, train_clips: 8, val_clips: 2, batch_size: 2, workers: 0}
+trainer:
+  check_val_every_n_epoch: 1
+  log_every_n_steps: 2
+"""
+COSINE = """
+model:
+  lr_scheduler:
+    class_path: torch.optim.lr_scheduler.CosineAnnealingLR
+    init_args: {T_max: 1000, eta_min: 1.0e-5}
+"""
+
+
+@pytest.fixture(autouse=True)
+def _argv(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["lightning"])
+
+
+@pytest.fixture(scope="module")
+def overlays(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("overlays")
+    for name, text in (
+        ("tiny", TINY),
+        ("cosine", COSINE),
+        ("diverges", "model: {optimizer: {init_args: {lr: 1.0e+30}}}"),
+        ("wide", "model: {network: {init_args: {width: 6}}}"),
+    ):
+        (folder / f"{name}.yaml").write_text(text)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def typed(overlays):
+    return ["sweep", str(CONFIGS / "x4.yaml"), "-c", str(overlays / "tiny.yaml")]
+
+
+def trials_here(folders, jobs, every):
+    """An engine that runs trials in this process."""
+    for folder in folders:
+        try:
+            worker.train_and_test(folder, every)
+            yield {folder: None}
+        except RuntimeError as error:
+            yield {folder: str(error)}
+
+
+@pytest.fixture(autouse=True)
+def _in_this_process(monkeypatch):
+    monkeypatch.setitem(cli._ENGINES, "local", trials_here)
+
+
+@pytest.fixture(scope="module")
+def swept(typed, tmp_path_factory):
+    """C and J, two seeds."""
+    output = tmp_path_factory.mktemp("sweep")
+    variants = [str(CONFIGS / "ablation" / f"{name}.yaml") for name in "cj"]
+    command = [*typed, "--over", *variants, "--seeds", "0", "1", "--steps", "4", "-o", str(output)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["lightning"])
+        patch.setitem(cli._ENGINES, "local", trials_here)
+        main(command)
+    return output, command
+
+
+def table(output):
+    return list(csv.DictReader((output / "sweep.csv").open()))
+
+
+def weights(folder):
+    return torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+
+
+def test_every_combination_has_a_name_and_a_configuration(overlays, tmp_path):
+    trials = make_trials(
+        [CONFIGS / "x4.yaml", overlays / "tiny.yaml"],
+        [[CONFIGS / "ablation/b.yaml", CONFIGS / "ablation/j.yaml"]],
+        ["model.network.features=1,2", "data.brightness=[0.5,0.8]"],
+        [3, 4],
+        {"steps": 5},
+        tmp_path,
+    )
+    names = [f"{v}-features={f}-seed{s}" for v in "bj" for f in (1, 2) for s in (3, 4)]
+    assert [trial.folder.name for trial in trials] == names
+    for trial in trials:
+        variant, features = trial.labels
+        network = trial.config["model"]["init_args"]["network"]["init_args"]
+        assert network["global_perception"] == (variant == "j")
+        assert f"features={network['features']}" == features
+        assert network["width"] == 4  # of the overlay below
+        assert trial.config["seed_everything"] == trial.seed
+        assert trial.config["trainer"]["max_steps"] == 5
+        assert trial.config["data"]["init_args"]["brightness"] == [0.5, 0.8]
+        assert trial.config["output"] == str(trial.folder)
+        assert trial.letter == variant.upper()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_size_e_is_not_the_variant_e(overlays, tmp_path):
+    """Both are called e."""
+    sizes, variants = ([CONFIGS / folder / "e.yaml"] for folder in ("size", "ablation"))
+    for over, letter in ([sizes], ""), ([variants], "E"), ([sizes, [CONFIGS / "ablation/a.yaml"]], "A"):
+        [trial] = make_trials([CONFIGS / "x4.yaml"], over, [], [], {"steps": 5}, tmp_path)
+        assert trial.letter == letter
+        row = Row([trial], {None: {"network": {"scale": 4}}})
+        assert row.paper == {"E": 26.66, "A": 28.57}.get(letter)
+
+
+@pytest.mark.slow
+def test_table_is_that_of_the_tests(swept):
+    output, _ = swept
+    rows = table(output)
+    assert [(row["variant"], row["seed"]) for row in rows] == [
+        (variant, seed) for variant in "cj" for seed in ("0", "1", "mean", "spread")
+    ]
+    psnr = {}
+    for row in rows:
+        if row["seed"] not in ("mean", "spread"):
+            tested = csv.DictReader((output / f"{row['variant']}-seed{row['seed']}" / "test.csv").open())
+            mean = next(line for line in tested if line["method"] == "CSCSR" and line["clip"] == "mean")
+            assert (row["psnr"], row["ssim"]) == (str(float(mean["psnr"])), str(float(mean["ssim"])))
+            assert row["steps"] == "4"
+            psnr[row["variant"], row["seed"]] = float(row["psnr"])
+    c, j = ([psnr[variant, seed] for seed in "01"] for variant in "cj")
+    assert c[0] != c[1]
+    for scores, mean, spread in ((c, rows[2], rows[3]), (j, rows[6], rows[7])):
+        assert float(mean["psnr"]) == pytest.approx(statistics.mean(scores), abs=1e-4)
+        assert float(spread["psnr"]) == pytest.approx(statistics.stdev(scores), abs=1e-4)
+    gaps = [ours - theirs for ours, theirs in zip(c, j, strict=True)]
+    text = (output / "sweep.md").read_text()
+    lines = (line.strip("| ").split(" | ") for line in text.splitlines()[:4])
+    header, _, c_row, j_row = ([cell.strip() for cell in line] for line in lines)
+    cells = dict(zip(header, c_row, strict=True))
+    assert cells["n"] == "2"
+    assert cells["PSNR (dB)"] == f"{statistics.mean(c):.2f} ± {statistics.stdev(c):.2f}"
+    assert cells["PSNR (dB) - j"] == f"{statistics.mean(gaps):+.2f} ± {statistics.stdev(gaps):.2f}"
+    assert (cells["paper, PSNR on REDS (dB)"], cells["paper - J"]) == ("28.06", "-0.71")
+    assert dict(zip(header, j_row, strict=True))["parameters"] == "14,310"
+    assert cells["`representation`"] == "interval"
+    assert not [name for name in header if name in ("`width`", "`scale`", "`lr`")]  # the same for all
+    assert read_picture(output / "sweep.png").shape[0] == 3
+
+
+@pytest.mark.slow
+def test_one_checkpoint_tested_by_hand_scores_what_the_table_says(swept, capsys):
+    output, _ = swept
+    before = (output / "c-seed1" / "test.csv").read_text()
+    (output / "c-seed1" / "test.csv").unlink()
+    main(["test", "-c", str(output / "c-seed1" / "trial.yaml"), "--ckpt_path", "last"])
+    assert (output / "c-seed1" / "test.csv").read_text() == before
+    printed = re.search(r"\n\| CSCSR +\| (\S+)", capsys.readouterr().out).group(1)
+    assert f"{float(table(output)[1]['psnr']):.2f}" == printed
+
+
+@pytest.mark.slow
+def test_hyper_parameters_are_those_of_the_checkpoint(swept, tmp_path):
+    output, _ = swept
+    folder = output / "c-seed0"
+    checkpoint, result = weights(folder), json.loads((folder / "result.json").read_text())
+    assert result["network"] == checkpoint["network"]
+    assert result["parameters"] == sum(value.numel() for value in checkpoint["state_dict"].values())
+    checkpoint["network"]["width"] = 99
+    checkpoint["optimizer_states"][0]["param_groups"][0]["initial_lr"] = 0.5
+    torch.save(checkpoint, tmp_path / "last.ckpt")
+    report = worker.Report(tmp_path)
+    report.parameters = 1
+    told = worker._result(tmp_path, tmp_path / "last.ckpt", report)
+    assert (told["network"]["width"], told["optimizer"]["lr"]) == (99, 0.5)
+
+
+@pytest.mark.slow
+def test_finished_trials_are_not_run_again(swept, capsys, monkeypatch):
+    output, command = swept
+    files = [path for path in output.rglob("*") if path.is_file() and path.parent != output]
+    before = {path: path.stat().st_mtime_ns for path in files}
+    monkeypatch.setitem(cli._ENGINES, "local", lambda *_: pytest.fail("something was run"))
+    main(command)
+    assert "4 trials, 4 of them finished before" in capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in files} == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (["--steps", "5"], r"c-seed0: holds a trial with budget.steps=4, and this sweep asks for 5"),
+        (["--set", "model.network.width=5"], r"c-seed0: holds .* model.network.width=4, and this sweep asks for 5"),
+    ],
+)
+def test_trials_of_other_settings_are_refused(swept, change, message):
+    _, command = swept
+    words = [*command[: command.index("--steps")], *command[command.index("--steps") + 2 :]]
+    words += change if change[0] == "--steps" else ["--steps", "4", *change]
+    with pytest.raises(SystemExit, match=message):
+        main(words)
+
+
+@pytest.mark.slow
+def test_a_killed_sweep_goes_on_and_ends_as_an_unbroken_one(typed, overlays, tmp_path):
+    settings = ["data.train_clips=24", "data.val_clips=1", "model.network.features=1,2"]  # epochs of 12 steps
+    sets = [word for setting in settings for word in ("--set", setting)]
+    command = [*typed, "-c", str(overlays / "cosine.yaml"), *sets, "--steps", "20", "-o", str(tmp_path / "broken")]
+    first, second = (tmp_path / "broken" / f"features={features}" for features in (1, 2))
+    words = [sys.executable, "-m", "lightning_modules", *command, "--every", "0.01"]
+    sweep = subprocess.Popen(words, stdout=subprocess.DEVNULL)
+    until = time.monotonic() + 200
+    while not (first / "checkpoints" / "last.ckpt").is_file():
+        assert sweep.poll() is None
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    sweep.send_signal(signal.SIGKILL)  # and nobody tells the trial
+    sweep.wait()
+    time.sleep(2)
+    reached = (first / "checkpoints" / "last.ckpt").stat().st_mtime_ns
+    assert 1 <= weights(first)["global_step"] < 20
+    time.sleep(1)
+    assert (first / "checkpoints" / "last.ckpt").stat().st_mtime_ns == reached  # the trial has ended with the sweep
+    assert not list(second.glob("checkpoints"))
+
+    main(command)
+    configs = [typed[1], typed[3], overlays / "cosine.yaml"]
+    unbroken, _ = make_trials(configs, [], settings, [], {"steps": 20}, tmp_path / "unbroken")
+    unbroken.write()
+    worker.train_and_test(unbroken.folder, 60)
+    ours, theirs = weights(first), weights(unbroken.folder)
+    assert ours["global_step"] == theirs["global_step"] == weights(second)["global_step"] == 20
+    assert all(ours["state_dict"][key].equal(value) for key, value in theirs["state_dict"].items())
+    assert (first / "test.csv").read_text() == (unbroken.folder / "test.csv").read_text()
+    # it went on: the step after a start is not timed
+    assert ours["callbacks"]["Report"]["steps"] == theirs["callbacks"]["Report"]["steps"] - 1
+    # the schedule ended with the budget
+    assert theirs["optimizer_states"][0]["param_groups"][0]["lr"] == pytest.approx(1e-5)
+
+
+@pytest.mark.slow
+def test_a_trial_that_fails_is_reported_and_the_others_go_on(typed, overlays, tmp_path, capsys):
+    over = [str(overlays / "diverges.yaml"), str(overlays / "wide.yaml")]
+    command = [*typed, "--over", *over, "--steps", "4", "-o", str(tmp_path)]
+    with pytest.raises(SystemExit, match="lightning: sweep: 1 of 2 trials failed"):
+        main(command)
+    assert "diverges  FAILED: the loss is nan at step" in capsys.readouterr().out
+    first, *_, last = table(tmp_path)
+    assert "the loss is nan" in first["failed"]
+    assert (last["variant"], last["seed"]) == ("wide", "spread")
+    assert re.search(r"\| diverges +\| 0, 1 failed +\|", (tmp_path / "sweep.md").read_text())
+    assert "diverges, failed: the loss is nan" in (tmp_path / "sweep.md").read_text()
+    assert (tmp_path / "wide" / "result.json").is_file()
+
+
+@pytest.mark.slow
+def test_flops_pay_for_steps(typed, overlays, tmp_path, convolutions):
+    words = [*typed[1:], "-c", str(overlays / "cosine.yaml")]
+    [trial] = make_trials([words[0], words[2], words[4]], [], [], [], {"flops": 1e9}, tmp_path)
+    trial.write()
+    planned = yaml.safe_load((text := worker.plan(trial.folder)).read_text())
+
+    from lightning_modules.cli.command import run
+    from lightning_modules.sweep.trials import _Resolver
+
+    built = run(["fit", "-c", str(trial.folder / "trial.yaml")], _Resolver)
+    batch = next(iter(built.datamodule.train_dataloader()))
+    convolutions.clear()
+    built.model.network(batch["spikes"], batch["flow"])
+    # forward, for the weights, and for what comes in where that was computed
+    count = sum(2 * products * (2 + computed) for products, computed in convolutions)
+    counted = float(re.search(r"(\S+) FLOPs", text.read_text()).group(1))
+    assert counted == pytest.approx(count, rel=1e-4)
+    steps = int(1e9 / count)
+    assert planned["trainer"]["max_steps"] == steps
+    assert planned["model"]["init_args"]["lr_scheduler"]["init_args"]["T_max"] == steps
+    before = text.stat().st_mtime_ns
+    assert worker.plan(trial.folder).stat().st_mtime_ns == before  # a resumed trial keeps its plan
+
+
+def test_a_checkpoint_in_a_configuration_is_refused(overlays, tmp_path):
+    (tmp_path / "goes_on.yaml").write_text("ckpt_path: last")
+    with pytest.raises(InputError, match=r"ckpt_path: expected none, .* got last"):
+        make_trials([CONFIGS / "x4.yaml", tmp_path / "goes_on.yaml"], [], [], [], {}, tmp_path)
+
+
+@pytest.mark.slow
+def test_a_step_is_all_batches_that_gradients_are_accumulated_over(overlays, tmp_path):
+    configs = [CONFIGS / "x4.yaml", overlays / "tiny.yaml"]
+    counted = []
+    for trial in make_trials(configs, [], ["trainer.accumulate_grad_batches=1,2"], [], {"flops": 1e9}, tmp_path):
+        trial.write()
+        counted.append(float(re.search(r"(\S+) FLOPs", worker.plan(trial.folder).read_text()).group(1)))
+    one, two = counted
+    assert two == pytest.approx(2 * one, rel=1e-4)
+
+
+@pytest.mark.parametrize("batches", [1, 3])
+def test_steps_are_timed_whole(batches, monkeypatch, tmp_path):
+    """A batch takes a second, and the warm-up ten times as long."""
+    clock = [0.0]
+    monkeypatch.setattr(worker.time, "monotonic", lambda: clock[0])
+    trainer = SimpleNamespace(global_step=0, accumulate_grad_batches=batches, max_steps=-1, callbacks=[])
+    trainer.callback_metrics = {}
+    cost, report = worker._Cost(), worker.Report(tmp_path / "progress.json")
+    report.on_train_start(trainer, None)
+    for index in range(worker._TIMED * batches):
+        cost.on_train_batch_start(trainer, None, None, index)
+        clock[0] += 10 if trainer.global_step < worker._WARM_UP else 1
+        trainer.global_step = (index + 1) // batches
+        cost.on_train_batch_end(trainer, None, None, None, index)
+        if trainer.global_step > worker._WARM_UP:
+            report.on_train_batch_end(trainer, None, {"loss": torch.tensor(1.0)}, None, index)
+    assert cost.flops == 0
+    assert cost.seconds == batches
+    assert report.seconds / report.steps == pytest.approx(batches)
+
+
+@pytest.mark.slow
+def test_time_ends_training(typed, overlays, tmp_path):
+    main([*typed, "--time", "00:00:02", "--set", "data.val_clips=1", "-o", str(tmp_path / "constant")])
+    assert not (tmp_path / "constant" / "tiny" / "plan.yaml").exists()
+    checkpoint = weights(tmp_path / "constant" / "tiny")
+    elapsed = checkpoint["callbacks"]["Timer"]["time_elapsed"]["train"]
+    assert checkpoint["global_step"] >= 1
+    assert elapsed >= 2
+
+    cosine = [typed[1], typed[3], overlays / "cosine.yaml"]
+    [trial] = make_trials(cosine, [], [], [], {"seconds": 3600}, tmp_path)
+    trial.write()
+    planned = yaml.safe_load(worker.plan(trial.folder).read_text())
+    steps = planned["trainer"]["max_steps"]
+    assert planned["model"]["init_args"]["lr_scheduler"]["init_args"]["T_max"] == steps > 1
+    assert planned["trainer"]["max_time"] == "00:01:00:00"
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        ([], "expected a configuration, such as configs/x4.yaml"),
+        (["X", "--steps", "3", "--time", "00:00:01"], "--time: not allowed with argument --steps"),
+        (["X", "--steps", "0"], "--steps: expected a whole number, 1 or more, got 0"),
+        (["X", "--time", "5"], "--time: expected HH:MM:SS or DD:HH:MM:SS, got 5"),
+        (["X", "--flops", "-1"], "--flops: expected a number above 0, got -1"),
+        (["X", "--set", "width"], "--set: expected KEY=VALUE"),
+        (["X", "--set", "model.width=8,16"], "did you mean model.network.width?"),
+        (["X", "--set", "model.network.widht=8,16"], "widht=8: model.network: Option 'widht' is not accepted"),
+        (
+            ["X", "--set", "model.network.width=8,x"],
+            "width=x: model.network.width: Expected a <class 'int'>. Got value: x",
+        ),
+        (["X", "--set", "data.motion=1,-1"], "motion=-1: motion: expected 0 or more, got -1.0"),
+        (["X", "--set", "trainer.devices=2"], "trainer.devices: expected 1, the one of a trial, got 2"),
+        (["X", "--over", "nowhere.yaml"], "nowhere: config: File does not exist"),
+        (["X", "--over", "X", "X"], "two trials are called x4"),
+        (["X", "--set", "output=there"], "--set: expected the folder of the sweep as -o DIR, got output=there"),
+        (["X", "--set", "ckpt_path=a.ckpt"], "ckpt_path: expected none, a trial goes on from its own; model.weights"),
+        (["X", "--set", "trainer.max_steps=5,6", "--steps", "4"], "same settings for max_steps=5 and max_steps=6"),
+        (
+            ["X", "--set", "model.weights=x4-e", "--over", "A", "J", "--seeds", "0", "1"],
+            "same settings for a-seed0 and j-seed0; model.weights=x4-e says what the network is, whatever overlays say",
+        ),
+    ],
+)
+def test_mistakes_are_one_line_before_anything_is_written(args, message, tmp_path):
+    files = {"X": "x4.yaml", "A": "ablation/a.yaml", "J": "ablation/j.yaml"}
+    words = [str(CONFIGS / files[word]) if word in files else word for word in args]
+    with pytest.raises(SystemExit) as exit:
+        main(["sweep", *words, "-o", str(tmp_path / "sweep")])
+    assert message in str(exit.value)
+    assert str(exit.value).startswith("lightning: ")
+    assert "\n" not in str(exit.value)
+    assert not (tmp_path / "sweep").exists()
+
+
+def test_two_sweeps_in_one_folder_are_refused(typed, tmp_path):
+    with open(tmp_path / "lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(SystemExit, match="another sweep is at work here"):
+            main([*typed, "-o", str(tmp_path)])
+    (tmp_path / "tiny").mkdir()
+    (tmp_path / "tiny" / "notes.txt").touch()
+    with pytest.raises(SystemExit, match="tiny: is not empty, and holds no trial"):
+        main([*typed, "-o", str(tmp_path)])
+
+
+def test_trials_end_as_their_processes_do(tmp_path, monkeypatch):
+    ends = {
+        "fine": ("pass", None),
+        "fails": ("import sys; print('before'); sys.exit('lightning: no such thing')", "no such thing"),
+        "killed": ("import os; os.kill(os.getpid(), 9)", "killed by SIGKILL, perhaps for want of memory"),
+        "threads": ("import os, sys; sys.exit(os.environ['OMP_NUM_THREADS'])", None),
+    }
+    start, started = subprocess.Popen, []
+
+    monkeypatch.setattr(engines.os, "sched_getaffinity", lambda _: set(range(6)), raising=False)
+
+    def start_one(command, **options):
+        started.append(Path(command[3]).name)
+        return start([sys.executable, "-c", ends[started[-1]][0]], **options)
+
+    monkeypatch.setattr(engines.subprocess, "Popen", start_one)
+    folders = [tmp_path / name for name in ends]
+    for folder in folders:
+        folder.mkdir()
+    found = {}
+    for ended in engines.run_locally(folders, 3, 60):
+        found |= {folder.name: reason for folder, reason in ended.items()}
+    assert started == list(ends)
+    assert found == {name: reason for name, (_, reason) in ends.items()} | {"threads": "2"}
+
+
+def test_a_sweep_that_stops_ends_its_trials(tmp_path, monkeypatch):
+    start, processes = subprocess.Popen, []
+
+    def start_one(command, **options):
+        processes.append(start([sys.executable, "-c", "import sys; sys.stdin.read()"], **options))
+        return processes[-1]
+
+    monkeypatch.setattr(engines.subprocess, "Popen", start_one)
+    running = engines.run_locally([tmp_path], None, 60)
+    next(running)
+    assert processes[0].poll() is None
+    running.close()
+    assert processes[0].poll() == 0
+
+
+def test_what_is_shown(tmp_path, overlays, capsys):
+    trials = make_trials([CONFIGS / "x4.yaml", overlays / "tiny.yaml"], [], [], [0, 1, 2], {}, tmp_path)
+    for trial in trials:
+        trial.write()
+    failed = {}
+    view = View(trials, failed)
+    told = {"phase": "training", "step": 30, "steps": 90, "share": 1 / 3, "rate": 2.0, "val": {"val/psnr": 21.5}}
+    (trials[0].folder / "progress.json").write_text(json.dumps(told))
+    view.draw()
+    view.draw()  # nothing new
+    failed[trials[1].folder] = "out of memory"
+    view.ended(trials[1])
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2
+    assert lines[0].startswith("tiny-seed0  step 30/90, 2 it/s, val/psnr 21.5, 0:30 left")
+    assert "0 of 3 trials done, 1 running" in lines[0]
+    assert lines[1] == f"tiny-seed1  FAILED: out of memory ({trials[1].folder / 'log.txt'})"
+
+    view.live = True
+    view.draw()
+    view.draw()
+    first, again = capsys.readouterr().out.split("\x1b[2A\x1b[J")
+    assert first == again
+    assert "0 of 3 trials done, 1 failed, 1 running" in again
+
+
+def test_the_paper_is_copied_right():
+    assert TABLE_3[2]["A"] == 33.04
+    assert TABLE_3[3]["E"] == 27.08
+    assert TABLE_3[4]["J"] == 28.77
+    assert [max(scores, key=scores.get) for scores in TABLE_3.values()] == ["J", "J", "J"]
+    assert [sorted(scores, key=scores.get)[:3] for scores in TABLE_3.values()] == [
+        list("HEC"),
+        list("EHC"),
+        list("HEC"),
+    ]
+
+
+@pytest.mark.parametrize("text", ["", "5", "00:00:00", "1:60:00", "a:b:c", "1:2:3:4:5"])
+def test_times_that_are_none(text):
+    with pytest.raises(ValueError, match="expected"):
+        seconds(text)
+
+
+def test_ray_that_is_missing_is_said(typed, tmp_path, monkeypatch):
+    monkeypatch.setattr(cli, "find_spec", lambda _: None)
+    with pytest.raises(SystemExit, match=r"pip install 'spikekit\[ray\]'"):
+        main([*typed, "--engine", "ray", "-o", str(tmp_path / "sweep")])
+    assert not (tmp_path / "sweep").exists()
+
+
+@pytest.mark.slow
+def test_ray_runs_trials(typed, overlays, tmp_path, monkeypatch):
+    pytest.importorskip("ray", reason="Ray is an extra")
+    over = [str(overlays / "diverges.yaml"), str(overlays / "wide.yaml")]
+    with pytest.raises(SystemExit, match="1 of 2 trials failed"):
+        main([*typed, "--over", *over, "--steps", "4", "--engine", "ray", "-o", str(tmp_path / "ray")])
+    main([*typed, "--over", over[1], "--steps", "4", "-o", str(tmp_path / "local")])
+    ours, theirs = (weights(tmp_path / engine / "wide")["state_dict"] for engine in ("ray", "local"))
+    assert all(ours[name].equal(value) for name, value in theirs.items())
+
+
+def test_the_plot_has_what_is_there(tmp_path):
+    def row(label, *psnr):
+        trials = [Trial((label,), seed, tmp_path, {}, {}, label.upper()) for seed in range(2)]
+        found = {"method": "CSCSR", "network": {"scale": 4}}
+        results = {seed: {**found, "metrics": {"CSCSR": {"psnr": value}}} for seed, value in enumerate(psnr)}
+        return Row(trials, results, {} if psnr else {0: "killed"})
+
+    def marks(*rows):
+        plot(rows, tmp_path / "plot.png")
+        pixels = (read_picture(tmp_path / "plot.png") * 255).round().int().permute(1, 2, 0)[:-70]  # without the legend
+        colours = [torch.tensor([int(colour[n : n + 2], 16) for n in (1, 3, 5)]) for colour in (BLUE, ORANGE)]
+        blue, orange = ((pixels == colour).all(-1).sum().item() for colour in colours)
+        return blue > 0, orange > 0
+
+    plot([row("c")], tmp_path / "plot.png")
+    assert not (tmp_path / "plot.png").exists()
+    assert marks(row("c", 20.0, 21.0), row("j", 22.0)) == (True, True)
+    assert marks(row("c", 20.0, 21.0), row("h", 22.0)) == (True, False)  # no J to compare with
+    assert marks(row("width=4", 20.0), row("width=8")) == (True, True)  # the word "failed"
+    assert marks(row("$x^{$", 20.0)) == (True, False)  # no formula

@@ -1,0 +1,251 @@
+"""``lightning fit -c configs/flow.yaml``: learning motion, and what CSCSR does with it."""
+
+import csv
+import sys
+
+import pytest
+import torch
+import yaml
+
+from lightning_modules.__main__ import main
+from lightning_modules.metrics.flow import end_point_error, outliers
+from lightning_modules.motion import MotionEstimator, Spike2Flow, ZeroFlow
+from lightning_modules.networks import CSCSR
+from lightning_modules.tasks.optical_flow import FlowTraining
+from lightning_modules.tasks.super_resolution import SuperResolution
+from spikekit import read_picture, split_bayer
+
+TINY = """
+model:
+  init_args:
+    network:
+      init_args: {widths: [4], features: 4, hidden: 4, correlation: [4, 4], motion: 4, head: 4, iterations: 2}
+data:
+  init_args: {patch: 8, val_patch: 12, train_clips: 8, val_clips: 3, batch_size: 2, workers: 0}
+trainer:
+  max_steps: 4
+  check_val_every_n_epoch: 1
+  log_every_n_steps: 2
+  enable_progress_bar: false
+"""
+CSCSR_TINY = {"width": 4, "representation_width": 4, "features": 1, "stages": 1, "blocks": 1, "end_blocks": 1}
+FLOW_TINY = yaml.safe_load(TINY)["model"]["init_args"]["network"]["init_args"]
+
+
+def clips(batch=2, size=12, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return {
+        "spikes": (torch.rand(batch, 41, size, size, generator=generator) < 0.3).to(torch.uint8),
+        "flow": 2 * torch.randn(batch, 2, 2, size, size, generator=generator),
+        "rgb": torch.rand(batch, 3, 2 * size, 2 * size, generator=generator),
+    }
+
+
+def test_errors_of_flow_against_brute_force():
+    flow, truth = torch.tensor([[3.0, 0], [100, 103.5], [0, 0.4]]), torch.tensor([[0.0, 4], [100, 100], [0, 0]])
+    flow, truth = (pairs.T.reshape(2, 1, 3) for pairs in (flow, truth))
+    error = end_point_error(flow, truth)
+    torch.testing.assert_close(error, torch.tensor([[5.0, 3.5, 0.4]]))
+    assert outliers(error, truth).tolist() == [[True, False, False]]
+    with pytest.raises(ValueError, match="expected one size"):
+        end_point_error(flow, truth[..., :1])
+
+
+def test_loss_is_the_discounted_error_of_every_iteration(monkeypatch):
+    batch = clips()
+    module = FlowTraining(Spike2Flow(**FLOW_TINY), pattern="GRBG")
+    monkeypatch.setattr(module, "log", lambda *_, **__: None)
+    cells = split_bayer(batch["flow"], "GRBG") / 2
+    exact = torch.stack([cells / 3, cells * 2 / 3, cells], dim=3)
+    monkeypatch.setattr(module.network, "refinements", lambda *_: [exact, exact + 3, exact - 1])
+    assert module.training_step(batch, 0).item() == pytest.approx(0.8 * 3 + 1, rel=1e-5)
+
+
+def test_training_lowers_the_loss(monkeypatch):
+    torch.manual_seed(0)
+    batch = clips()
+    batch["flow"] = torch.tensor([-2.0, 2]).reshape(1, 2, 1, 1, 1).expand(2, 2, 2, 12, 12)
+    module = FlowTraining(Spike2Flow(**FLOW_TINY))
+    monkeypatch.setattr(module, "log", lambda *_, **__: None)
+    optimizer = torch.optim.Adam(module.parameters(), lr=1e-2)
+    losses = []
+    for _ in range(15):
+        loss = module.training_step(batch, 0)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.6 * losses[0]
+
+
+def test_validation_measures_the_joint_flow_and_zero_flow(monkeypatch):
+    class Half(Spike2Flow):
+        def forward(self, *_):
+            return (batch["flow"] / 2).unbind(1)
+
+    batch, logged = clips(), {}
+    module = FlowTraining(Half(**FLOW_TINY))
+    monkeypatch.setattr(module, "log", lambda name, value, **_: logged.update({name: value.item()}))
+    module.validation_step(batch, 0)
+    length = batch["flow"].norm(dim=2)
+    for name, error in (("", length / 2), ("_zero", length)):
+        assert logged[f"val/epe{name}"] == pytest.approx(error.mean().item())
+        assert logged[f"val/over_1px{name}"] == pytest.approx((error > 1).float().mean().item())
+        assert logged[f"val/outliers{name}"] == pytest.approx((error > 3).float().mean().item())
+    assert 0 < logged["val/outliers"] < logged["val/outliers_zero"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"frames": 40}, "expected odd numbers"),
+        ({"window": 41}, "window below frames"),
+        ({"pattern": "RGB"}, "pattern"),
+        ({"network": Spike2Flow(**FLOW_TINY, frozen=True)}, "got a frozen one"),
+    ],
+)
+def test_wrong_arguments(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        FlowTraining(**{"network": Spike2Flow(**FLOW_TINY), **arguments})
+
+
+class Seen(MotionEstimator):
+    """Counts how often it is asked."""
+
+    asked = 0
+
+    def forward(self, spikes, times, pattern):
+        self.asked += 1
+        return ZeroFlow()(spikes, times, pattern)
+
+
+@pytest.mark.parametrize(("flow", "asked"), [("scene", 0), ("estimated", 1)])
+def test_super_resolution_trains_with_the_flow_that_is_asked_for(flow, asked, monkeypatch):
+    estimator = Seen()
+    module = SuperResolution(CSCSR(2, **CSCSR_TINY, motion=estimator), flow=flow)
+    monkeypatch.setattr(module, "log", lambda *_, **__: None)
+    module.training_step(clips(1), 0)
+    assert estimator.asked == asked
+    with pytest.raises(ValueError, match="flow: expected 'scene' or 'estimated', got 'true'"):
+        SuperResolution(module.network, flow="true")
+
+
+def test_estimators_of_a_checkpoint_are_exchanged():
+    def module(motion):
+        return SuperResolution(CSCSR(2, **CSCSR_TINY, motion=motion))
+
+    def saved(module):
+        checkpoint = {"state_dict": module.state_dict()}
+        module.on_save_checkpoint(checkpoint)
+        return checkpoint
+
+    def loaded(module, checkpoint):
+        module.on_load_checkpoint(checkpoint)
+        module.load_state_dict(checkpoint["state_dict"])
+        return module.state_dict()
+
+    learned, other, without = module(Spike2Flow(**FLOW_TINY)), module(Spike2Flow(**FLOW_TINY)), module(ZeroFlow())
+    name = "network.motion.network.heads.0.0.weight"
+    assert not learned.state_dict()[name].equal(other.state_dict()[name])
+    own = other.state_dict()[name].clone()
+    assert loaded(other, saved(without))[name].equal(own)
+    assert loaded(other, saved(learned))[name].equal(learned.state_dict()[name])
+    assert name not in loaded(without, saved(learned))
+    small = module(Spike2Flow(**{**FLOW_TINY, "hidden": 6}))
+    own = small.state_dict()[name].clone()
+    assert loaded(small, saved(learned))[name].equal(own)
+
+
+@pytest.fixture(autouse=True)
+def _argv(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["lightning"])
+
+
+@pytest.fixture(scope="module")
+def overlay(tmp_path_factory):
+    path = tmp_path_factory.mktemp("overlay") / "tiny.yaml"
+    path.write_text(TINY)
+    return path
+
+
+@pytest.fixture(scope="module")
+def trained(overlay, tmp_path_factory):
+    from pathlib import Path
+
+    output = tmp_path_factory.mktemp("run")
+    argv, sys.argv = sys.argv, ["lightning"]
+    main(["fit", "-c", str(Path(__file__).parents[3] / "configs/flow.yaml"), "-c", str(overlay), "-o", str(output)])
+    sys.argv = argv
+    return output
+
+
+@pytest.mark.slow
+def test_fit_logs_errors_and_pictures(trained):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(trained)).Reload()
+    measures = {f"val/{name}{of}" for name in ("epe", "over_1px", "outliers") for of in ("", "_zero")}
+    assert {"train/loss", *measures} <= set(events.Tags()["scalars"])
+    assert events.Tags()["images"] == ["val/flow, truth"]
+
+
+@pytest.mark.slow
+def test_test_compares_estimators_on_the_same_clips(trained, overlay, configs, capsys):
+    args = ["test", "-c", configs / "flow.yaml", "-c", overlay, "-o", trained, "--ckpt_path", "best"]
+    main([*map(str, args)])
+    printed = capsys.readouterr().out
+    estimators = ["Spike2Flow", "ClassicalFlow", "ZeroFlow"]
+    assert all(f"\n| {name} " in printed for name in estimators)
+    rows = list(csv.DictReader((trained / "test.csv").open()))
+    assert list(rows[0]) == ["method", "clip", "epe", "over_1px", "outliers", "milliseconds"]
+    assert [row["method"] for row in rows if row["clip"] == "mean"] == estimators
+    for name in estimators:
+        *each, mean = [float(row["epe"]) for row in rows if row["method"] == name]
+        assert mean == pytest.approx(sum(each) / 3, abs=1e-4)
+    assert read_picture(trained / "test.png").shape == (3, 3 * 12 + 2 * 4, 4 * 12 + 3 * 4)
+
+
+@pytest.mark.slow
+def test_its_checkpoint_goes_into_cscsr_by_an_overlay(trained, configs, tmp_path):
+    network = {**CSCSR_TINY, "motion": {"init_args": {**FLOW_TINY, "weights": str(trained / "checkpoints/best.ckpt")}}}
+    overlay = yaml.safe_load(TINY)
+    overlay["model"] = {"network": {"init_args": network}, "flow": "estimated"}
+    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(overlay))
+    args = ["fit", "-c", configs / "x4.yaml", "-c", configs / "motion/spike2flow.yaml", "-c", tmp_path / "tiny.yaml"]
+    main([*map(str, args), "-o", str(tmp_path / "run")])
+    motion, weights = (
+        torch.load(path, weights_only=True)["state_dict"]
+        for path in (trained / "checkpoints/best.ckpt", tmp_path / "run/checkpoints/last.ckpt")
+    )
+    name = "network.heads.0.0.weight"
+    assert weights[f"network.motion.{name}"].equal(motion[f"network.{name}"])  # frozen
+
+
+@pytest.mark.slow
+def test_errors_are_one_line(configs, tmp_path):
+    command = ["fit", "-c", configs / "x4.yaml", "-c", configs / "motion/spike2flow.yaml", "-o", tmp_path / "run"]
+    with pytest.raises(SystemExit) as exit:
+        main([*map(str, command), "--model.network.motion.weights", "nowhere.ckpt"])
+    assert str(exit.value).startswith("lightning: nowhere.ckpt: neither a file of weights nor the name of")
+    with pytest.raises(SystemExit, match="predict: expected a model that makes pictures, got FlowTraining"):
+        main(["predict", "-c", str(configs / "flow.yaml"), "-o", str(tmp_path / "run")])
+    for args, message in (
+        (["--data.pattern", "BGGR"], "data.pattern: expected RGGB, as the model has it, got BGGR"),
+        (["--data.frames", "51"], "data.frames: expected 41, as the model has it, got 51"),
+        (["--model.window", "21"], r"data.flow_times: expected (10, 30), as the model has it, got (5, 35)"),
+        (["--model.network.hidden", "0"], "expected 1 or more"),
+    ):
+        with pytest.raises(SystemExit) as exit:
+            main(["fit", "-c", str(configs / "flow.yaml"), *args, "-o", str(tmp_path / "run")])
+        assert message in str(exit.value)
+        assert "\n" not in str(exit.value)
+
+
+@pytest.mark.parametrize("name", ["spike2flow", "classical", "zero"])
+def test_overlays_name_their_estimators(name, configs, capsys):
+    args = ["fit", "-c", configs / "x4.yaml", "-c", configs / f"motion/{name}.yaml", "--print_config"]
+    with pytest.raises(SystemExit):
+        main([*map(str, args)])
+    config = yaml.safe_load(capsys.readouterr().out)
+    kind = config["model"]["init_args"]["network"]["init_args"]["motion"]["class_path"].split(".")[-1]
+    assert kind == {"spike2flow": "Spike2Flow", "classical": "ClassicalFlow", "zero": "ZeroFlow"}[name]

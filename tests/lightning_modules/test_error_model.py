@@ -1,0 +1,49 @@
+"""The constants of weights, in the file beside them."""
+
+import json
+import shutil
+
+import pytest
+
+from lightning_modules.error_model import FILE, ErrorModel, read_error_model, write_error_model
+from lightning_modules.networks import CSCSR
+from lightning_modules.shipped import FOLDER, list_pretrained
+
+
+def test_all_weights_of_the_package_have_their_own():
+    names = {weights.path.name for weights in list_pretrained() if weights.scale}
+    assert set(json.loads((FOLDER / FILE).read_text())) == names
+    models = [read_error_model(weights.path) for weights in list_pretrained() if weights.scale]
+    assert len(set(models)) == len(models)
+    careful = ErrorModel()  # the defaults spend no less than any of them
+    for model in models:
+        assert all(getattr(model, name) <= getattr(careful, name) for name in ("flat", "grainy", "blurred", "still"))
+        assert all(getattr(model, name) >= getattr(careful, name) for name in ("textured", "moved", "faint"))
+
+
+def test_a_network_has_the_constants_of_its_weights(tmp_path):
+    file = tmp_path / "mine.safetensors"
+    shutil.copy(next(weights.path for weights in list_pretrained(4)), file)
+    assert CSCSR.from_pretrained(file).error_model == ErrorModel()
+    model = ErrorModel(flat=1.0, faint=0.0)
+    assert write_error_model(file, model) == tmp_path / FILE
+    write_error_model(tmp_path / "other.safetensors", ErrorModel(still=9.0))
+    assert CSCSR.from_pretrained(file).error_model == model
+    assert read_error_model(tmp_path / "third.safetensors") == ErrorModel()
+    assert read_error_model(tmp_path / "mine.ckpt") == ErrorModel()
+
+
+def test_constants_of_a_checkpoint_are_not_written(tmp_path):
+    with pytest.raises(ValueError, match=r"best\.ckpt: expected a file of safetensors"):
+        write_error_model(tmp_path / "best.ckpt", ErrorModel())
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "[]", '{"a": 1}', '{"a": {"flat": -1}}', '{"a": {"flat": NaN}}', '{"a": {"flat": true}}', '{"a": {"x": 1}}'],
+)
+def test_a_damaged_file_of_constants_is_named_in_one_line(text, tmp_path):
+    (tmp_path / FILE).write_text(text)
+    with pytest.raises(ValueError, match=r"scene_activity\.json: expected the constants of weights") as raised:
+        read_error_model(tmp_path / "a.safetensors")
+    assert "\n" not in str(raised.value)

@@ -1,0 +1,320 @@
+"""Files from strangers: nothing in weights and checkpoints is run, imported or believed beyond what fits."""
+
+import json
+import os
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from lightning_modules import motion, networks
+from lightning_modules.__main__ import main
+from lightning_modules.checkpoint import Checkpoints, read_checkpoint
+from lightning_modules.motion import ESTIMATORS, Spike2Flow
+from lightning_modules.networks import CSCSR, NETWORKS
+from lightning_modules.pretrained import read_weights
+from lightning_modules.stored_settings import check_plain, own_class
+from lightning_modules.tasks.super_resolution import SuperResolution
+
+TINY = {"scale": 2, "width": 4, "representation_width": 4, "features": 1, "stages": 1, "end_blocks": 1}
+
+
+@pytest.fixture(autouse=True)
+def _argv(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["lightning"])
+
+
+@pytest.fixture(name="content", scope="module")
+def _content():
+    """What is in a checkpoint, as a function, since tests change it."""
+
+    def make():
+        torch.manual_seed(0)
+        module = SuperResolution(CSCSR(**TINY))
+        content = {"state_dict": module.state_dict(), "pytorch-lightning_version": "2.5.0", "global_step": 0}
+        module.on_save_checkpoint(content)
+        return content
+
+    return make
+
+
+@pytest.fixture(name="trap")
+def _trap(tmp_path, monkeypatch):
+    """A module that leaves a trace where it is imported, and where its function is called; returns the trace."""
+    trace = tmp_path / "trace"
+    (tmp_path / "evilmod.py").write_text(
+        f"import pathlib\npathlib.Path({str(trace)!r}).touch()\n\n\ndef X(*args, **kwargs):\n    return None\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "evilmod", raising=False)
+    return trace
+
+
+@pytest.mark.parametrize("verb", ["fit", "validate", "test", "predict"])
+def test_hyper_parameters_of_a_checkpoint_build_nothing(verb, content, trap, configs, tmp_path):
+    parts = {"optimizer": {"class_path": "os.mkdir", "init_args": {"path": str(trap)}}}
+    for name, hyper in {
+        "a": parts,
+        "b": {"network": {"class_path": "evilmod.X"}},
+        "c": {"_class_path": "evilmod.X"},
+        "d": {"_instantiator": "evilmod.X"},
+    }.items():
+        torch.save({**content(), "hyper_parameters": hyper}, tmp_path / f"{name}.ckpt")
+        # wrong at the end, so that nothing is computed: what a checkpoint says would have been built before
+        words = [
+            "-c",
+            str(configs / "x2.yaml"),
+            "--ckpt_path",
+            str(tmp_path / f"{name}.ckpt"),
+            "-o",
+            str(tmp_path / "o"),
+        ]
+        with pytest.raises(SystemExit):
+            main([verb, *words, "--data", "Recording", "--data.path", str(tmp_path / "nowhere.dat")])
+        assert not trap.exists()
+        assert "hyper_parameters" not in Checkpoints().load_checkpoint(tmp_path / f"{name}.ckpt")
+
+
+def test_hyper_parameters_reach_no_module(content, trap, tmp_path):
+    hyper = {"weights": "evilmod.X", "_instantiator": "evilmod.X", "network": {"class_path": "evilmod.X"}}
+    torch.save({**content(), "hyper_parameters": hyper}, tmp_path / "a.ckpt")
+    module = SuperResolution.load_from_checkpoint(tmp_path / "a.ckpt", network=CSCSR(**TINY))
+    expected = content()["state_dict"]
+    assert all(value.equal(expected[name]) for name, value in module.state_dict().items())
+    assert not trap.exists()
+
+
+def test_code_in_a_checkpoint_is_not_run_by_lightning(content, tmp_path, monkeypatch):
+    class Harmful:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "harmed"),)
+
+    torch.save({**content(), "callbacks": Harmful()}, tmp_path / "a.ckpt")
+    for forced in ("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "NOTHING"):
+        monkeypatch.setenv(forced, "1")
+        with pytest.raises(ValueError, match=r"a.ckpt: not a checkpoint of lightning fit \(UnpicklingError"):
+            Checkpoints().load_checkpoint(tmp_path / "a.ckpt", weights_only=False)
+        monkeypatch.delenv(forced)
+    assert not (tmp_path / "harmed").exists()
+
+
+def write(path, settings, motion, tensors):
+    """Weights with these settings, as safetensors or as a checkpoint."""
+    if path.suffix == ".safetensors":
+        save_file(tensors, path, {"network": json.dumps(settings), "motion": json.dumps(motion)})
+    else:
+        tensors = {f"network.{name}": value for name, value in tensors.items()}
+        torch.save({"network": settings, "motion": motion, "state_dict": tensors}, path)
+    return path
+
+
+SETTINGS = {"class": "CSCSR", **CSCSR(**TINY).settings}
+ESTIMATOR = {"class": "Spike2Flow", "window": 5}
+
+
+@pytest.mark.parametrize("suffix", [".safetensors", ".ckpt"])
+@pytest.mark.parametrize(
+    ("settings", "motion"),
+    [
+        ({**SETTINGS, "motion": {"class_path": "evilmod.X"}}, {}),
+        ({**SETTINGS, "motion": "evilmod.X"}, {}),
+        ({**SETTINGS, "class": "evilmod.X"}, {}),
+        ({**SETTINGS, "class": "X"}, {}),
+        ({**SETTINGS, "class": "Module"}, {}),
+        ({**SETTINGS, "class": None}, {}),
+        ({**SETTINGS, "class": ["CSCSR"]}, {}),
+        ({**SETTINGS, "weights": "x4-t"}, {}),
+        ({**SETTINGS, "representation": "evilmod.X"}, {}),
+        ({**SETTINGS, "pattern": 5}, {}),
+        ({**SETTINGS, "skip": 1}, {}),
+        ({**SETTINGS, "width": True}, {}),
+        ({**SETTINGS, "width": "4"}, {}),
+        ({**SETTINGS, "width": 4.5}, {}),
+        ({**SETTINGS, "alpha": float("nan")}, {}),
+        ({**SETTINGS, "pattern": "a\nb"}, {}),
+        ({**SETTINGS, "a\nb": 1}, {}),
+        (SETTINGS, {"class": "evilmod.X"}),
+        (SETTINGS, {"class": "X"}),
+        (SETTINGS, {"class": "CSCSR"}),
+        (SETTINGS, {**ESTIMATOR, "weights": "spike2flow"}),
+        (SETTINGS, {**ESTIMATOR, "widths": [4] * 1000}),
+        (SETTINGS, {**ESTIMATOR, "widths": "abc"}),
+        (SETTINGS, {**ESTIMATOR, "radius": 10**6}),
+        (SETTINGS, ["evilmod.X"]),
+    ],
+)
+def test_settings_reach_only_what_is_known(settings, motion, suffix, trap, configs, tmp_path):
+    path = write(tmp_path / f"odd{suffix}", settings, motion, CSCSR(**TINY).state_dict())
+    with pytest.raises(SystemExit) as stopped:
+        main(["predict", "--model.weights", str(path), "--data", "Recording", "--data.path", "nowhere.dat"])
+    said = str(stopped.value)
+    assert said.startswith(f"lightning: {path}: ")
+    assert "\n" not in said
+    assert len(said) < 700
+    with pytest.raises(ValueError, match=f"odd{suffix}: "):
+        CSCSR.from_pretrained(path)
+    assert not trap.exists()
+    assert "evilmod" not in sys.modules
+
+
+@pytest.mark.parametrize("suffix", [".safetensors", ".ckpt"])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"end_blocks": 10**9},
+        {"end_blocks": 10**30},
+        {"end_blocks": 60, "stages": 16, "blocks": 32},
+        {"width": 4000},
+        {"frames": 10**7 + 1},
+        {"scale": 10**4},
+        {"neighbors": 10**9},
+        {"representation": "spikes", "window": 1, "stride": 1, "frames": 4095, "width": 4096},
+    ],
+)
+def test_large_settings_are_refused_before_they_take_memory(changes, suffix, tmp_path, monkeypatch):
+    made = []
+    real = torch.nn.init.orthogonal_
+    monkeypatch.setattr(torch.nn.init, "orthogonal_", lambda *args, **kwargs: made.append(1) or real(*args, **kwargs))
+    path = write(tmp_path / f"large{suffix}", {**SETTINGS, **changes}, {}, {"a": torch.zeros(3)})
+    with pytest.raises(ValueError, match=f"large{suffix}: ") as refused:
+        CSCSR.from_pretrained(path)
+    assert "\n" not in str(refused.value)
+    assert len(str(refused.value)) < 400
+    assert not made  # initial weights are what takes the time
+
+
+def test_the_networks_of_the_table_are_those_of_the_package():
+    """And shapes are compared without making any of them: a checkpoint of each is read."""
+    kinds = {**NETWORKS, **ESTIMATORS}
+    assert set(networks.__all__) - {"NETWORKS", "CSCSRConfig", "Network"} == set(NETWORKS)
+    assert set(motion.__all__) - {"ESTIMATORS", "MotionEstimator"} == set(ESTIMATORS)
+    for name, kind in kinds.items():
+        if hasattr(built := kind(), "settings"):
+            assert own_class({"class": name, **built.settings}, "file", kinds)[1] == built.settings
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        CSCSR(**TINY, motion=Spike2Flow()),
+        CSCSR(**TINY, representation="interval", reconstruction="early", resolution="sensor", end_width=6),
+        CSCSR(**TINY, search=False, refinement=False, alpha=1),
+    ],
+)
+def test_what_the_package_writes_is_read(network, tmp_path):
+    module = SuperResolution(network)
+    content = {"state_dict": module.state_dict()}
+    module.on_save_checkpoint(content)
+    torch.save(content, tmp_path / "a.ckpt")
+    read = type(network).from_pretrained(tmp_path / "a.ckpt")
+    assert read.settings == network.settings
+    assert type(read.motion) is type(network.motion)
+    assert all(value.equal(read.state_dict()[name]) for name, value in network.state_dict().items())
+
+
+@pytest.mark.parametrize("suffix", [".safetensors", ".ckpt"])
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+def test_weights_that_are_not_finite_are_refused(bad, suffix, tmp_path):
+    tensors = CSCSR(**TINY).state_dict()
+    tensors["reconstruction.rgb.bias"][1] = bad
+    path = write(tmp_path / f"bad{suffix}", SETTINGS, {}, tensors)
+    with pytest.raises(ValueError, match=rf"bad{suffix}: .*reconstruction.rgb.bias: expected finite weights"):
+        read_weights(path)
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        torch.zeros(1).expand(10**12),
+        torch.zeros(3).to_sparse(),
+        torch.zeros(3, dtype=torch.complex64),
+        "text",
+        None,
+    ],
+)
+def test_tensors_are_no_more_than_the_file_holds(odd, tmp_path):
+    path = tmp_path / "odd.ckpt"
+    torch.save({"network": SETTINGS, "state_dict": {"network.reconstruction.rgb.bias": odd}}, path)
+    with pytest.raises(ValueError, match=r"odd.ckpt: not a checkpoint of lightning fit \(TypeError"):
+        read_checkpoint(path)
+
+
+def test_a_compressed_checkpoint_is_refused(content, tmp_path):
+    """A megabyte could become a gigabyte of memory."""
+    torch.save(content(), tmp_path / "plain.ckpt")
+    with zipfile.ZipFile(tmp_path / "plain.ckpt") as plain, zipfile.ZipFile(tmp_path / "a.ckpt", "w") as packed:
+        for member in plain.infolist():
+            packed.writestr(member.filename, plain.read(member), zipfile.ZIP_DEFLATED)
+    with pytest.raises(ValueError, match=r"a.ckpt: .*compressed"):
+        read_checkpoint(tmp_path / "a.ckpt")
+
+
+def test_plain_values():
+    check_plain("a", {"b": [1, 2.5, "c", None, True, (1, 2)], "d": {"e": {}}})
+    nested = []
+    for _ in range(100):
+        nested = [nested]
+    for odd in (nested, {1: 2}, {"a\nb": 1}, "a\nb", torch.ones(1), float("inf"), list(range(10**4)), {"a": {3}}, 1j):
+        with pytest.raises(ValueError, match=r"^a.*: expected ") as refused:
+            check_plain("a", odd)
+        assert "\n" not in str(refused.value)
+
+
+def test_a_checkpoint_removes_only_checkpoints_of_its_own_folder(content, tmp_path):
+    folder, other = tmp_path / "run" / "checkpoints", tmp_path / "other"
+    folder.mkdir(parents=True)
+    other.mkdir()
+    victims = [other / "a.ckpt", other / "notes.txt", tmp_path / "b.ckpt", folder / "notes.txt"]
+    for victim in victims:
+        victim.touch()
+    detour = str(folder / ".." / ".." / "other" / "a.ckpt")
+    own = str(folder / "old.ckpt")
+    state = {
+        "dirpath": str(folder),
+        "best_model_path": detour,
+        "kth_best_model_path": str(folder / "notes.txt"),
+        "last_model_path": 5,
+        "best_k_models": {detour: torch.ones(1), "s3://bucket/a.ckpt": torch.ones(1), own: torch.ones(1)},
+    }
+    torch.save({**content(), "callbacks": {"ModelCheckpoint{}": state, "Other": {"a": 1}}}, tmp_path / "a.ckpt")
+    found = Checkpoints().load_checkpoint(tmp_path / "a.ckpt")["callbacks"]
+    assert found["Other"] == {"a": 1}
+    found = found["ModelCheckpoint{}"]
+    assert [found[name] for name in ("best_model_path", "kth_best_model_path", "last_model_path")] == ["", "", ""]
+    assert list(found["best_k_models"]) == [own]
+    for path in (other / "notes.txt", folder / "notes.txt", other, folder / "nothing.ckpt"):
+        Checkpoints().remove_checkpoint(str(path))
+    assert all(victim.exists() for victim in victims)
+    Path(own).touch()
+    Checkpoints().remove_checkpoint(own)
+    assert not Path(own).exists()
+
+
+def test_random_damage_is_one_line_that_names_the_file(content, tmp_path):
+    """Bytes of a checkpoint and of safetensors changed, cut or added, seeded."""
+    torch.save(content(), tmp_path / "good.ckpt")
+    write(tmp_path / "good.safetensors", SETTINGS, {}, CSCSR(**TINY).state_dict())
+    generator = torch.Generator().manual_seed(24)
+    refused = 0
+    began = time.process_time()
+    for n in range(int(os.environ.get("SPIKEKIT_FUZZ", "60"))):
+        suffix = (".ckpt", ".safetensors")[n % 2]
+        data = bytearray((tmp_path / f"good{suffix}").read_bytes())
+        end = len(data) if n % 4 < 2 else 2000  # headers more often than weights
+        for place in torch.randint(min(end, len(data)), (1 + n % 7,), generator=generator).tolist():
+            data[place] = int(torch.randint(256, (1,), generator=generator))
+        if n % 5 == 0:
+            data = data[: int(torch.randint(len(data), (1,), generator=generator))]
+        path = tmp_path / f"bad{suffix}"
+        path.write_bytes(data)
+        try:
+            read_weights(path)
+        except ValueError as error:
+            assert str(error).startswith(f"{path}: ")  # noqa: PT017
+            assert "\n" not in str(error)  # noqa: PT017
+            refused += 1
+    assert refused > n // 3, time.process_time() - began

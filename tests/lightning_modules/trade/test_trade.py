@@ -1,0 +1,492 @@
+"""``lightning trade``, as its users type it, and the parts of it that have laws of their own."""
+
+import csv
+import random
+import re
+import shlex
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import pytorch_lightning
+import torch
+
+from lightning_modules.__main__ import main
+from lightning_modules.cli.arguments import arguments_preset
+from lightning_modules.cli.errors import InputError
+from lightning_modules.inference import presets
+from lightning_modules.inference.presets import Preset
+from lightning_modules.motion import Spike2Flow
+from lightning_modules.networks import CSCSR
+from lightning_modules.pretrained import settings_of
+from lightning_modules.trade import cli, energy, measure
+from lightning_modules.trade.energy import energy_meter, energy_per_call
+from lightning_modules.trade.measure import Row, Timed, running, time_in_turns
+from lightning_modules.trade.pareto import pareto_front
+from lightning_modules.trade.plot import plot
+from lightning_modules.trade.runner import Runner, make_runner
+from lightning_modules.trade.settings import Setting, read_setting, usual_settings
+from lightning_modules.trade.table import figures, front, markdown, write_csv
+from spikekit import read_picture
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+WIDTHS = dict.fromkeys(("width", "representation_width", "features", "stages", "blocks", "end_blocks"), 2)
+TINY = f"""
+model: {{network: {{init_args: {WIDTHS}}}}}
+data: {{init_args: {{patch: 8, val_patch: 12, train_clips: 8, val_clips: 3, batch_size: 2, workers: 0}}}}
+"""
+TFI = "--model.network ClassicalDecoder --model.network.method tfi"
+
+
+@pytest.fixture(autouse=True)
+def _argv(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["lightning"])
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory):
+    """Arguments of all settings."""
+    tiny = tmp_path_factory.mktemp("overlay") / "tiny.yaml"
+    tiny.write_text(TINY)
+    return ["-c", str(CONFIGS / "x4.yaml"), "-c", str(tiny)]
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    """As ``lightning fit`` leaves it, of a network that the seed of the configuration would not make."""
+    torch.manual_seed(5)
+    network = CSCSR(**WIDTHS)
+    path = tmp_path_factory.mktemp("checkpoint") / "best.ckpt"
+    weights = {f"network.{name}": value for name, value in network.state_dict().items()}
+    version = {"pytorch-lightning_version": pytorch_lightning.__version__}
+    torch.save({"network": settings_of(network), "state_dict": weights, **version}, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def base(shared):
+    return Runner(shared)
+
+
+def rows_of(output):
+    return {row["setting"]: row for row in csv.DictReader((output / "trade.csv").open())}
+
+
+@pytest.fixture(scope="module")
+def traded(shared, checkpoint, tmp_path_factory):
+    output = tmp_path_factory.mktemp("trade") / "out"
+    settings = [
+        "as it is:",
+        f"trained: --ckpt_path {checkpoint}",
+        "--model.network.motion ZeroFlow",
+        "small tiles: --model.tile 4",
+        f"TFI: {TFI}",
+        "missing: --model.weights nowhere.safetensors",
+    ]
+    words = [word for setting in settings for word in ("--setting", setting)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["lightning"])
+        main(["trade", *shared, *words, "--rounds", "2", "-o", str(output)])
+    return output
+
+
+@pytest.mark.slow
+def test_every_setting_has_a_row_in_all_three_files(traded):
+    rows = rows_of(traded)
+    names = ["as it is", "trained", "--model.network.motion ZeroFlow", "small tiles", "TFI", "missing"]
+    assert list(rows) == names
+    text = (traded / "trade.md").read_text()
+    for name, row in rows.items():
+        assert f" {name} " in text
+        assert row["command"] in text
+        if name == "missing":
+            assert (row["psnr"], row["ms"]) == ("", "")
+            assert "nowhere.safetensors: neither a file of weights nor" in row["failed"]
+            assert f"missing cannot run: {row['failed']}" in text
+            continue
+        assert row["failed"] == ""
+        assert re.search(rf"\| {float(row['psnr']):.2f} +\| {float(row['ssim']):.4f} +\|", text)
+        assert 0 < float(row["ms_q1"]) <= float(row["ms"]) <= float(row["ms_q3"])
+    threads = f"{torch.get_num_threads()} thread"
+    for said in ("mean of 3 clips", "2 clips of 12 x 12", "2 rounds", threads, torch.__version__):
+        assert said in text
+    assert read_picture(traded / "trade.png").shape[0] == 3
+    assert float(rows["as it is"]["ratio"]) == 1
+    tiles = rows["small tiles"]
+    assert (tiles["tile"], tiles["height"], tiles["width"]) == ("4", "12", "12")
+    assert {row["reference"] for row in rows.values()} == {"as it is"}
+    assert {name for name, row in rows.items() if any(row[key] for key in Preset.columns())} == set(names[2:])
+
+
+@pytest.mark.slow
+def test_scores_are_those_of_lightning_test(traded, shared, checkpoint, tmp_path):
+    rows = rows_of(traded)
+    for name, args in (
+        ("as it is", []),
+        ("trained", ["--ckpt_path", str(checkpoint)]),
+        ("--model.network.motion ZeroFlow", ["--model.network.motion", "ZeroFlow"]),
+    ):
+        main(["test", *shared, *args, "-o", str(tmp_path), "--trainer.enable_progress_bar=false"])
+        means = {row["method"]: row for row in csv.DictReader((tmp_path / "test.csv").open()) if row["clip"] == "mean"}
+        for ours, theirs in ((name, "CSCSR"), ("TFI", "TFI")):
+            assert float(rows[ours]["psnr"]) == pytest.approx(float(means[theirs]["psnr"]), abs=1e-4)
+            assert float(rows[ours]["ssim"]) == pytest.approx(float(means[theirs]["ssim"]), abs=1e-4)
+    assert len({rows[name]["psnr"] for name in ("as it is", "trained", "TFI")}) == 3
+
+
+@pytest.mark.slow
+def test_the_command_of_a_row_measures_it_again(traded):
+    for name in ("trained", "--model.network.motion ZeroFlow", "TFI"):
+        row = rows_of(traded)[name]
+        program, *words = shlex.split(row["command"])
+        assert program == "lightning"
+        main(words)
+        (again,) = rows_of(Path(words[words.index("-o") + 1])).values()
+        for column in ("setting", "psnr", "ssim", "parameters", "macs", "command"):
+            expected = row[column] if column != "command" else again["command"]
+            assert again[column] == expected, column
+
+
+@pytest.mark.slow
+def test_work_and_weights_are_counted(traded, convolutions):
+    rows = rows_of(traded)
+    network = CSCSR(**WIDTHS)
+    network(torch.zeros(1, 41, 12, 12), torch.zeros(1, 2, 2, 12, 12))
+    count = sum(products for products, _ in convolutions)
+    convolutions.clear()
+    network.estimate_flow(torch.zeros(1, 41, 12, 12))
+    motion = sum(products for products, _ in convolutions)
+    assert 0 < motion < 0.01 * count
+    assert float(rows["as it is"]["macs"]) == pytest.approx((count + motion) / 144)
+    assert int(rows["as it is"]["parameters"]) == sum(value.numel() for value in network.parameters())
+    assert rows["TFI"]["parameters"] == "0"
+    # nine tiles of 4 x 4 whose surroundings are the whole clip: what is counted is what predict does
+    assert float(rows["small tiles"]["macs"]) == pytest.approx((9 * count + motion) / 144)
+
+
+@pytest.mark.slow
+def test_usual_settings_all_run_on_weights_of_ones_own(shared, checkpoint, tmp_path, monkeypatch):
+    monkeypatch.setattr(energy, "POWERCAP", tmp_path)  # a second a row otherwise, where there are counters
+    own = ["--ckpt_path", str(checkpoint), "--data.val_clips", "1"]
+    main(["trade", *shared, *own, "--rounds", "1", "-o", str(tmp_path)])
+    rows = rows_of(tmp_path)
+    assert next(iter(rows)) == "own weights"
+    assert [name for name, row in rows.items() if row["failed"]] == []
+    psnr = {name: float(row["psnr"]) for name, row in rows.items()}
+    assert psnr["own weights"] == pytest.approx(psnr["own weights, tiles of 64"], abs=1e-4)  # a clip of 12 is in one
+    motions = "own weights", "own weights, no motion"
+    assert len({psnr[name] for name in (*motions, "TFI", "TFP 41", "TFP 13, order 3")}) == 5
+
+
+def test_usual_settings_are_those_of_the_weights_that_are_shipped(monkeypatch, tmp_path):
+    shipped = {
+        name: tmp_path / name
+        for name in (
+            "spike2flow",
+            "cscsr_small_x2",
+            "cscsr_huge_x4",
+            "cscsr_base_x4",
+            "cscsr_small_x4",
+            "cscsr_tiny_x4",
+        )
+    }
+    for place, path in enumerate(shipped.values()):
+        path.write_bytes(bytes(99 - place))
+    monkeypatch.setattr("lightning_modules.trade.settings.shipped_weights", lambda: shipped)
+    settings = {setting.name: setting for setting in usual_settings(4)}
+    assert list(settings)[:4] == [
+        "cscsr_base_x4",
+        "cscsr_tiny_x4",
+        "cscsr_small_x4",
+        "cscsr_huge_x4",
+    ]  # the reference, then by size
+    assert "Spike2Flow" in settings["cscsr_base_x4, Spike2Flow"].args
+    assert settings["cscsr_base_x4, no tiles"].preset == Preset("cscsr_base_x4", tile=0)
+    assert settings["cscsr_tiny_x4, self-ensemble of 2"].args == [
+        "--model.weights",
+        "cscsr_tiny_x4",
+        "--model.self_ensemble",
+        "2",
+    ]
+    assert settings["cscsr_tiny_x4, no motion"].preset == Preset("cscsr_tiny_x4", motion="ZeroFlow")
+    assert len([name for name in settings if name.startswith("cscsr_tiny_x4")]) == 3
+    assert settings["cscsr_huge_x4, self-ensemble of 8"].args == [
+        "--model.weights",
+        "cscsr_huge_x4",
+        "--model.self_ensemble",
+        "8",
+    ]
+    assert len([name for name in settings if name.startswith("cscsr_huge_x4")]) == 5
+    assert not [name for name in settings if name.endswith("_x2")]
+    assert settings["TFI"].args[-3:] == ["tfi", "--model.network.scale", "4"]
+    assert all(arguments_preset(setting.args) == setting.preset for setting in settings.values())
+    own = {setting.name: setting for setting in usual_settings(4, ["--ckpt_path"])}
+    assert own["own weights"].args == []
+    assert own["own weights, self-ensemble of 4"].args == ["--model.self_ensemble", "4"]
+    assert own["TFI"].args[-2:] == ["--ckpt_path", "null"]
+    assert own["TFI"].preset == settings["TFI"].preset
+    del shipped["spike2flow"]
+    assert not [setting for setting in usual_settings(4) if "Spike2Flow" in setting.args]
+
+
+@pytest.mark.parametrize("name", ["small tiles", "a, b|c", "it's"])
+@pytest.mark.parametrize("args", [[], ["-c", "my file.yaml"], ["--model.network.motion", "{class_path: ZeroFlow}"]])
+def test_settings_are_read_as_they_are_written(name, args):
+    assert read_setting(Setting(name, args).text)[:2] == (name, args)
+
+
+@pytest.mark.parametrize(
+    ("typed", "preset"),
+    [
+        ("--model.weights cscsr_small_x4 --model.tile=64", Preset("cscsr_small_x4", tile=64)),
+        ("nothing:", Preset()),
+        ("--model.network ClassicalDecoder --model.network.order 2", Preset(network="ClassicalDecoder", order=2)),
+        ("-c my.yaml --model.weights cscsr_small_x4", None),
+        ("--model.weights cscsr_small_x4 --model.weights cscsr_base_x4", None),
+        ("--model.weights cscsr_small_x4 --model.tile", None),
+        ("--model.weights cscsr_small_x4 --model.tile wide", None),
+        ("--model.weights cscsr_small_x4 --model.network CSCSR", None),
+    ],
+)
+def test_what_is_typed_is_a_preset_where_columns_can_say_it(typed, preset):
+    assert read_setting(typed).preset == preset
+
+
+def test_a_setting_without_a_name_is_called_by_its_arguments():
+    assert read_setting("--model.tile  8") == ("--model.tile 8", ["--model.tile", "8"], Preset(tile=8))
+    setting = read_setting("-c 'a: b.yaml'")
+    assert setting.args == ["-c", "a: b.yaml"]
+    assert read_setting(setting.text) == setting
+
+
+def test_a_table_is_read_as_it_is_written(tmp_path, monkeypatch):
+    """The reader of the package's tables takes that of a trade, and skips what is no preset."""
+    rows, _ = some_rows(4, [(9.0, 9.0), (2.0, 2.0), (1.0, 1.0), (1.0, 3.0)])
+    typed = [
+        "lost: --model.weights cscsr_base_x4",
+        "one: --model.weights cscsr_small_x4 --model.self_ensemble 2",
+        "-c my.yaml --model.weights cscsr_small_x4",
+        "tfi: --model.network ClassicalDecoder --model.network.method tfi",
+    ]
+    for n, text in enumerate(typed):
+        rows[n].setting, rows[n].memory = read_setting(text), 10.0
+    rows[0].reason = "no such file"
+    write_csv(rows, ["command"] * 4, Timed(1, (8, 8), 2, "wall time"), tmp_path / "x4.csv")
+    monkeypatch.setattr(presets, "_FOLDER", tmp_path)
+    decoder = Preset(network="ClassicalDecoder", method="tfi")
+    assert {(choice.name, choice.preset, choice.ms) for choice in presets.choices(4, (8, 8))} == {
+        ("one", Preset("cscsr_small_x4", self_ensemble=2), 2000.0),
+        ("tfi", decoder, 2000.0),
+    }
+
+
+MISTAKES = [
+    (["--setting", "cscsr_small_x4"], "expected arguments of lightning test, or a name, a colon and such arguments"),
+    (["--setting", "a: --model.tile '8"], "cannot be read (No closing quotation)"),
+    (["--setting", "a:", "--setting", "a: --model.tile 8"], "two settings are called 'a'"),
+    (["--setting", "a: --model.network.widht 3"], "did you mean model.network.width?"),
+    (["--setting", "a: --model.tile 3"], "a: tile: expected an even number"),
+    (["--setting", "a: --ckpt_path nowhere.ckpt"], "a: nowhere.ckpt: no such checkpoint"),
+    (["--setting", "a: --data.motion 9"], "a: data.motion: expected 3.0, the same scenes for all, got 9.0"),
+    (["--setting", "a: --model.network.scale 2"], "a: data.scale: expected 4, the same scenes for all, got 2"),
+    (["--setting", "a: --model.network.frames 47"], "a: frames: expected at most the 41 of the clips, got 47"),
+    (["--widht", "3"], "unrecognized arguments"),
+    (["--data.val_root", "nowhere"], "nowhere"),
+    (["--ckpt_path", "nowhere.ckpt"], "nowhere.ckpt: no such checkpoint"),
+    (["--rounds", "0"], "expected a whole number, 1 or more, got 0"),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("words", "said"), MISTAKES)
+def test_mistakes_are_one_line_before_anything_runs(words, said, shared, tmp_path, monkeypatch):
+    monkeypatch.setattr(cli, "measure", lambda *_: pytest.fail("something was run"))
+    with pytest.raises(SystemExit) as stopped:
+        main(["trade", *shared, "--setting", "good:", "-o", str(tmp_path / "out"), *words])
+    assert said in stopped.value.code
+    assert "\n" not in stopped.value.code
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["-c", str(CONFIGS / "flow.yaml")], "expected a model that makes pictures, got FlowTraining"),
+        (["-c", str(CONFIGS / "x4.yaml"), "--data", "Recording"], "truth is known, got Recording"),
+    ],
+)
+def test_what_cannot_be_traded_is_refused(args, said, tmp_path):
+    from spikekit import write_spikes
+
+    write_spikes(tmp_path / "clip.dat", torch.zeros(41, 8, 8))
+    if "Recording" in args:
+        path = ["--data.path", str(tmp_path / "clip.dat"), "--data.height", "8", "--data.width", "8"]
+        tiny = ["--model.network.init_args", str(WIDTHS)]
+        args = [*args, *path, *tiny]
+    with pytest.raises(InputError, match=said):
+        Runner(args)
+
+
+@pytest.mark.slow
+def test_what_fails_while_it_runs_does_not_take_the_others_along(shared, tmp_path, monkeypatch):
+    def fail(*_):
+        raise NotImplementedError("not for this\ndtype")
+
+    monkeypatch.setattr(Spike2Flow, "channel_flows", fail)
+    settings = ["--setting", "learned: --model.network.motion Spike2Flow", "--setting", "moving:"]
+    main(["trade", *shared, *settings, "--rounds", "1", "-o", str(tmp_path)])
+    rows = rows_of(tmp_path)
+    assert rows["learned"]["failed"] == "NotImplementedError: not for this dtype"
+    assert (rows["learned"]["psnr"], rows["learned"]["front"]) == ("", "")
+    assert (rows["moving"]["ratio"], rows["moving"]["front"]) == ("1", "1")  # the first that ran
+    with pytest.raises(SystemExit, match="nothing can run; learned: NotImplementedError: not for this dtype"):
+        main(["trade", *shared, *settings[:2], "-o", str(tmp_path)])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is here")
+def test_what_the_machine_lacks_is_a_row(shared, base):
+    from lightning_modules.trade.runner import CannotRunError
+
+    for args in (["--trainer.accelerator", "gpu"], ["--trainer.precision", "16-mixed"]):
+        with pytest.raises(CannotRunError, match=r"gpu|16-mixed: not on this device"):
+            make_runner(shared, args, base)
+
+
+def test_a_network_of_fewer_frames_sees_the_middle_of_the_clip(shared, base):
+    fewer = ["--model.network.frames", "21", "--model.network.stride", "5"]
+    runner = make_runner(shared, fewer, base)
+    spikes = (torch.rand(1, 41, 12, 12, generator=torch.Generator().manual_seed(0)) < 0.3).to(torch.uint8)
+    with torch.no_grad():
+        expected = runner.network(spikes[:, 10:31]).clamp(0, 1)
+    assert torch.equal(runner(spikes), expected)
+
+
+def test_precision_is_that_of_the_trainer(shared, base):
+    spikes = torch.zeros(1, 41, 12, 12, dtype=torch.uint8)
+    assert base(spikes).dtype == torch.float32
+    half = make_runner(shared, ["--trainer.precision", "bf16-true"], base)
+    assert half(spikes).dtype == torch.bfloat16
+    assert torch.get_default_dtype() == torch.float32
+
+
+def some_rows(count, seconds=()):
+    """Rows whose runners only remember what they were run on."""
+    calls = []
+
+    class Remember:
+        device = torch.device("cpu")
+        network = torch.nn.Linear(2, 3)
+
+        def __init__(self, name):
+            self.name = name
+
+        def __call__(self, spikes):
+            calls.append((self.name, int(spikes.sum())))
+
+    names = [chr(ord("a") + n) for n in range(count)]
+    rows = [Row(Setting(name, []), Remember(name), psnr=[20.0], ssim=[0.5], macs=100.0) for name in names]
+    for row, times in zip(rows, seconds, strict=False):
+        row.seconds = list(times)
+    return rows, calls
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_order_rotates_and_everyone_is_timed_equally_often_on_the_same_clip(threads, monkeypatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    rows, calls = some_rows(3)
+    clips = [torch.full((1, 1, 1, 1), n) for n in range(2)]
+    time_in_turns(rows, clips, 6)
+    rounds = [calls[n : n + 3] for n in range(0, 18, 3)]
+    assert ["".join(name for name, _ in turn) for turn in rounds] == ["abc", "bca", "cab"] * 2
+    assert [{clip for _, clip in turn} for turn in rounds] == [{0}, {1}] * 3
+    assert [len(row.seconds) for row in rows] == [6, 6, 6]
+    assert all(seconds >= 0 for row in rows for seconds in row.seconds)
+
+
+def test_ratios_are_of_the_same_round():
+    rows, _ = some_rows(2, [(1.0, 10.0, 2.0), (2.0, 20.0, 4.0)])
+    lost = Row(Setting("lost", []), reason="no such thing")
+    first, second, third = figures([rows[0], rows[1], lost])
+    assert (first["ratio"], second["ratio"], second["ratio_q3"]) == (1, 2, 2)
+    rows[1].seconds = [2.0, 30.0, 1.0]
+    assert figures(rows)[1]["ratio"] == 2  # the median of 2, 3 and 0.5; the ratio of the medians is 1
+    assert second["ms"] == 4000
+    assert third == {}
+
+
+def test_pareto_front_is_that_of_brute_force():
+    chance = random.Random(0)
+    for _ in range(300):
+        points = [(chance.randint(0, 6), chance.randint(0, 6)) for _ in range(chance.randint(1, 9))]
+        costs, values = zip(*points, strict=True)
+        found = pareto_front(costs, values)
+        beaten = [
+            any(c <= cost and v >= value and (c, v) != (cost, value) for c, v in points) for cost, value in points
+        ]
+        assert sorted(found) == [n for n in range(len(points)) if not beaten[n]]
+        assert [costs[n] for n in found] == sorted(costs[n] for n in found)
+
+
+def test_the_front_leaves_out_what_cannot_run(tmp_path):
+    rows, _ = some_rows(4, [(2.0,), (3.0,), (1.0,), (4.0,)])
+    rows[0] = replace(rows[0], reason="no")
+    rows[1].psnr = [22.0]
+    rows[3].psnr = [21.0]
+    assert front(rows) == [2, 1]
+    rows[3].psnr = [22.001]  # better than the eye and the table see, and slower
+    assert front(rows) == [2, 1]
+    text = markdown(rows, ["command"] * 4, Timed(1, (8, 8), 1, "wall time"))
+    marked = [line.rstrip("| ").endswith("x") for line in text.splitlines() if line.startswith("|")][2:]
+    assert marked == [False, True, True, False]
+    for shown, beaten in ((rows, True), (rows[:3], False)):
+        plot(shown, tmp_path / "trade.png")
+        pixels = (read_picture(tmp_path / "trade.png") * 255).round().permute(1, 2, 0)
+        blue, grey = ((pixels == torch.tensor(colour)).all(-1).sum() for colour in ((38, 92, 160), (150, 150, 150)))
+        assert blue > 500  # two dots and the line, at least
+        assert (grey > 100) == beaten  # a dot; rounded letters have some grey, too
+
+
+def test_energy_is_counted_where_the_machine_counts_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(energy, "POWERCAP", tmp_path)
+    assert energy_meter(torch.device("cpu")) is None
+    for name, value in (("intel-rapl:0", 999_990), ("intel-rapl:1", 0), ("intel-rapl:0:0", 0), ("dtpm", 0)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "energy_uj").write_text(f"{value}\n")
+        (tmp_path / name / "max_energy_range_uj").write_text("999999\n")
+    meter = energy_meter(torch.device("cpu"))
+
+    def run():
+        for name in ("intel-rapl:0", "intel-rapl:1", "intel-rapl:0:0"):
+            path = tmp_path / name / "energy_uj"
+            path.write_text(f"{(int(path.read_text()) + 300) % 1_000_000}\n")
+
+    assert energy_per_call(run, meter, seconds=0) == pytest.approx(600e-6)  # two packages, one begins anew
+    assert energy_per_call(run, meter, seconds=1e-3) == pytest.approx(600e-6)
+    (tmp_path / "intel-rapl:1" / "energy_uj").unlink()
+    assert energy_meter(torch.device("cpu")) is None
+
+
+def test_energy_has_a_column_only_where_there_is_some(monkeypatch):
+    rows, calls = some_rows(2, [(1.0,), (1.0,)])
+    timed = Timed(1, (8, 8), 1, "wall time")
+    assert "| J a frame " not in markdown(rows, ["", ""], timed)
+    monkeypatch.setattr(measure, "energy_meter", lambda _: lambda: float(len(calls)) ** 2)
+    monkeypatch.setattr(measure, "energy_per_call", lambda run, meter: meter() + 0.25)
+    measure._weigh(rows[1], torch.zeros(1, 1, 2, 2))
+    assert "| J a frame " in markdown(rows, ["", ""], timed)
+    assert rows[1].joules == len(calls) ** 2 + 0.25
+
+
+def test_running_leaves_out_what_has_a_reason():
+    rows, _ = some_rows(2)
+    assert running([rows[0], replace(rows[1], reason="no")]) == [rows[0]]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_on_a_gpu(shared, tmp_path):
+    main(["trade", *shared, "--setting", "gpu:", "--rounds", "2", "-o", str(tmp_path)])
+    (row,) = rows_of(tmp_path).values()
+    assert float(row["mib"]) > 0
+    assert torch.cuda.get_device_name() in (tmp_path / "trade.md").read_text()

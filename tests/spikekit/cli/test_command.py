@@ -1,0 +1,577 @@
+"""The ``spikekit`` command as a user types it."""
+
+import contextlib
+import errno
+import io
+import os
+import re
+import subprocess
+import sys
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from spikekit import (
+    __version__,
+    bin_to_sensor,
+    iter_spikes,
+    psnr,
+    read_picture,
+    read_spikes,
+    spike_integrate_fire,
+    tfi,
+    tfp,
+    write_spikes,
+)
+from spikekit.cli import command as cli
+from spikekit.cli.command import main
+
+SPIKES = Path(__file__).parents[3].parent / "shared" / "data" / "spikes"
+REDS = SPIKES / "reds_sim_mono_203_250x400.dat"
+UHSR = SPIKES / "uhsr_real_mono_helicopter_250x250.npz"
+needs_data = pytest.mark.skipif(not SPIKES.is_dir(), reason="the shared recordings are not beside the repository")
+
+COMMAND = [sys.executable, "-c", "from spikekit.cli.command import main; raise SystemExit(main())"]
+
+
+def expose(light, frames):
+    """A still scene of a simulated camera, recorded."""
+    spikes, _ = spike_integrate_fire(light.expand(frames, *light.shape), charge=torch.rand(light.shape))
+    return spikes
+
+
+def run(*words, **kwargs):
+    return subprocess.run([*COMMAND, *map(str, words)], capture_output=True, text=True, timeout=120, **kwargs)
+
+
+@pytest.fixture
+def clip(tmp_path):
+    """A recording of 60 frames of 12 x 20, brighter from left to right and dark at the top left."""
+    light = torch.linspace(0.1, 0.5, 20).repeat(12, 1)
+    light[0, 0] = 0
+    write_spikes(tmp_path / "clip.dat", expose(light, 60))
+    return tmp_path / "clip.dat"
+
+
+@pytest.fixture
+def fails(capsys):
+    """Run a command line that fails: one line on stderr, nothing on stdout."""
+
+    def check(status, *words):
+        assert main([str(word) for word in words]) == status
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert err.startswith("spikekit: ")
+        assert err.endswith("\n")
+        assert err.count("\n") == 1
+        return err
+
+    return check
+
+
+def sized(path, height=12, width=20):
+    return path, "--height", height, "--width", width
+
+
+# --- info -------------------------------------------------------------------------------------------------------------
+
+
+def test_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"spikekit {__version__}\n"
+
+
+def test_info(clip, capsys):
+    assert main(["info", *map(str, sized(clip))]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    lines = dict(
+        line.split(maxsplit=1) for line in out.replace(" fire ", "_fire ").replace("bits s", "bits_s").splitlines()
+    )
+    assert lines["file"] == str(clip)
+    assert lines["size"] == "12 x 20 (H x W), 1800 bytes"
+    assert lines["frames"] == "60, 3 ms at 20 kHz"
+    assert lines["darkest"] == "0.0000 spikes a frame, at row 0, column 0"
+    assert lines["brightest"].startswith("0.5000 spikes a frame, at row ")
+    assert lines["brightest"].endswith("column 19")
+    assert lines["never_fire"] == "1 of 240 pixels, 0.42%"
+    assert lines["always_fire"] == "0 of 240 pixels, 0.00%"
+    assert lines["bits_set"].startswith(f"{read_spikes(clip, 12, 20).sum()} of 14400, ")
+
+
+@pytest.mark.parametrize("frames", [255, 256, 700])
+def test_info_of_many_frames(tmp_path, capsys, monkeypatch, frames):
+    """Sums of bytes do not run over, whatever is counted at a time."""
+    spikes = torch.ones(frames, 2, 4)
+    spikes[1, 0, 0] = 0
+    write_spikes(tmp_path / "a.npz", spikes)
+    for block in (1, 800, 1 << 24):
+        monkeypatch.setattr(cli, "_BLOCK", block)
+        assert main(["info", str(tmp_path / "a.npz")]) == 0
+        out = capsys.readouterr().out
+        assert f"bits set     {8 * frames - 1} of {8 * frames}," in out
+        assert "always fire  7 of 8 pixels" in out
+
+
+def test_info_of_an_array(tmp_path, capsys):
+    write_spikes(tmp_path / "a.npz", torch.ones(7, 3, 5))
+    assert main(["info", str(tmp_path / "a.npz")]) == 0
+    out = capsys.readouterr().out
+    assert "3 x 5 (H x W)" in out
+    assert "always fire  15 of 15 pixels, 100.00%" in out
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [
+        (12_500 * 301, "250 x 400 (grey Vidar camera: 301 frames) divides its 3762500 bytes exactly"),
+        (7_813 * 2, "250 x 250 (UHSR: 2 frames) divides its 15626 bytes exactly"),
+        (
+            250_000,
+            "250 x 400 (grey Vidar camera: 20 frames) and 1000 x 1000 (colour spike camera: 2 frames) divide its",
+        ),
+        (30, "none of 250 x 400, 250 x 416, 250 x 250, 1000 x 1000, 1000 x 1024 divides its 30 bytes exactly"),
+    ],
+)
+@pytest.mark.parametrize("given", [(), ("--height", 250), ("--width", 400)])
+def test_headerless_without_its_size(tmp_path, fails, size, expected, given):
+    path = tmp_path / "a.dat"
+    path.touch()
+    os.truncate(path, size)
+    for words in (["info", path], ["decode", path, "--method", "tfi", "-o", tmp_path / "a.png"]):
+        err = fails(2, *words, *given)
+        assert f"{path}: a .dat has no header, give --height and --width" in err
+        assert expected in err
+
+
+# --- decode -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("method", "least"), [("tfi", 20), ("tfp", 30)])
+def test_decode(clip, tmp_path, capsys, method, least):
+    """The scene comes back, at its own brightness with the gain, and with white at its brightest without."""
+    out = tmp_path / "made" / "a.png"
+    words = ["decode", *map(str, sized(clip)), "--method", method, "-o", str(out)]
+    light = torch.linspace(0.1, 0.5, 20).repeat(3, 12, 1)
+    assert main([*words, "--alpha", "0.5"]) == 0
+    assert capsys.readouterr().out.endswith("divided by alpha 0.5\n")
+    assert psnr(read_picture(out)[:, 1:], light[:, 1:] / 0.5) > least
+    assert main(words) == 0
+    report = capsys.readouterr().out
+    assert report.startswith(f"{out}: frame 30 of 60 by {method} from frames {0 if method == 'tfi' else 10} .. ")
+    assert report.endswith("so that the 99.9th percentile of the spike rate around frame 30 is white\n")
+    assert 1.9 < float(report.split("multiplied by ")[1].split(",")[0]) <= 2
+    assert psnr(read_picture(out)[:, 1:], light[:, 1:] / 0.5) > least
+
+
+@pytest.mark.parametrize(
+    ("method", "words"),
+    [("tfi", []), ("tfp", []), ("tfp", ["--window", "5"]), ("tfp", ["--window", "13", "--order", "3"])],
+)
+@pytest.mark.parametrize("frame", [0, 3, 250, 498, 499])
+def test_decode_reads_what_it_needs(tmp_path, method, words, frame):
+    """The picture of a frame is that of the whole recording, for pixels that fire within the span."""
+    spikes = expose(torch.rand(40, 9) * 0.5 + 0.05, 500)
+    write_spikes(tmp_path / "a.npz", spikes)
+    out = tmp_path / "a.png"
+    assert (
+        main(
+            [
+                "decode",
+                str(tmp_path / "a.npz"),
+                "--method",
+                method,
+                "-o",
+                str(out),
+                "--alpha",
+                "1",
+                *words,
+                "--frame",
+                str(frame),
+            ]
+        )
+        == 0
+    )
+    window, order = map(int, (*words[1::2], 1)[:2]) if words else (41, 1)
+    whole = tfi(spikes) if method == "tfi" else tfp(spikes, window, order=order)
+    assert torch.equal((read_picture(out)[0] * 255).round(), (whole[frame] * 255).round())
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--method", "tfp"], [(499_980, 41)]),
+        (["--method", "tfp", "--window", "1", "--frame", "7"], [(7, 1)]),
+        (["--method", "tfp", "--window", "5", "--order", "3", "--frame", "100"], [(94, 13)]),
+        (["--method", "tfi", "--frame", "999999"], [(999_799, 201)]),
+        (["--method", "tfp", "--frame", "100:140:10"], [(80, 71)]),
+        (["--method", "tfp", "--window", "5", "--frame", "100:140:20"], [(98, 5), (118, 5)]),
+        (["--method", "tfp", "--window", "5", "--frame", "100:140:5"], [(98, 40)]),
+    ],
+)
+def test_decode_reads_only_what_it_needs(tmp_path, monkeypatch, words, expected):
+    """Each frame once, and none between two pictures."""
+    read = []
+
+    def count(*_, start, **__):
+        read.append([start, 0])
+        for frame in iter_spikes(*_, start=start, **__):
+            read[-1][1] += 1
+            yield frame
+
+    monkeypatch.setattr(cli, "iter_spikes", count)
+    with open(tmp_path / "a.dat", "wb") as file:
+        file.truncate(2 * 1_000_000)
+    line = ["decode", str(tmp_path / "a.dat"), "--height", "4", "--width", "4", "-o", str(tmp_path / "{frame}.png")]
+    assert main([*line, *words, "--alpha", "1"]) == 0
+    assert [tuple(part) for part in read] == expected
+
+
+def test_decode_reads_an_array_once(tmp_path, monkeypatch):
+    """Every way into an .npz begins at its start."""
+    calls = []
+    monkeypatch.setattr(cli, "iter_spikes", lambda *_, **__: calls.append(__) or iter_spikes(*_, **__))
+    write_spikes(tmp_path / "a.npz", torch.ones(90, 2, 4))
+    words = ["--method", "tfp", "--window", "3", "--frame", "10:90:20", "--alpha", "1"]
+    assert main(["decode", str(tmp_path / "a.npz"), *words, "-o", str(tmp_path / "{frame}.png")]) == 0
+    assert [call["start"] for call in calls] == [9]
+
+
+@pytest.mark.parametrize("name", ["a.dat", "a.npz"])
+@pytest.mark.parametrize("method", ["tfi", "tfp"])
+@pytest.mark.parametrize("frames", ["0:500:83", "240:260:7", ":3", "498:", "17:18"])
+def test_decode_many(tmp_path, capsys, name, method, frames):
+    """Pictures of many frames are the pictures of each, under their numbers."""
+    spikes = expose(torch.rand(12, 9) * 0.5 + 0.05, 500)
+    write_spikes(tmp_path / name, spikes)
+    line = ["decode", *map(str, sized(tmp_path / name, 12, 9)), "--method", method]
+    assert main([*line, "--frame", frames, "-o", str(tmp_path / "out" / "a{frame}.png"), "--alpha", "0.6"]) == 0
+    chosen = range(500)[slice(*[int(part) if part else None for part in frames.split(":")])]
+    report, err = capsys.readouterr()
+    assert err == ""
+    if len(chosen) > 1:
+        assert f"{len(chosen)} pictures of frames {chosen[0]} .. {chosen[-1]} of 500" in report
+    else:
+        assert report.startswith(f"{tmp_path / 'out' / f'a{chosen[0]:03}.png'}: frame {chosen[0]} of 500")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [f"a{n:03}.png" for n in chosen]
+    whole = tfi(spikes) if method == "tfi" else tfp(spikes, 41)
+    for n in chosen:
+        expected = (whole[n] / 0.6).clamp(0, 1)
+        assert torch.equal((read_picture(tmp_path / "out" / f"a{n:03}.png")[0] * 255).round(), (expected * 255).round())
+
+
+def test_decode_many_at_one_scale(tmp_path, capsys):
+    """A light that goes on stays darker than white before: pictures can be compared."""
+    spikes = torch.cat([expose(torch.full((6, 8), level), 100) for level in (0.1, 0.4)])
+    write_spikes(tmp_path / "a.npz", spikes)
+    line = ["decode", str(tmp_path / "a.npz"), "--method", "tfp", "--window", "21", "-o", str(tmp_path / "{frame}.png")]
+    assert main([*line, "--frame", "50:200:50"]) == 0
+    report = capsys.readouterr().out
+    assert "3 pictures of frames 50 .. 150 of 200, 50 apart, by tfp from up to 10 frames on each side" in report
+    assert "99.9th percentile of the spike rate around frame 100 is white" in report
+    dark, _, bright = (read_picture(tmp_path / f"{n:03}.png").mean() for n in (50, 100, 150))
+    assert dark < bright / 2
+
+
+def test_decode_many_until_the_disk_is_full(clip, tmp_path, monkeypatch, fails):
+    """The pictures already made stay, and the one that failed leaves nothing."""
+    write, out = cli.write_picture, tmp_path / "out"
+
+    def full(path, picture):
+        if path.name == "12.png":
+            raise OSError(28, "No space left on device")
+        write(path, picture)
+
+    monkeypatch.setattr(cli, "write_picture", full)
+    words = ("--method", "tfp", "--frame", "10:20", "-o", out / "{frame}.png")
+    assert f"{out / '12.png'}: cannot be written (No space left on device)" in fails(1, "decode", *sized(clip), *words)
+    assert sorted(path.name for path in out.iterdir()) == ["10.png", "11.png"]
+    assert read_picture(out / "11.png").shape == (3, 12, 20)
+
+
+def test_progress_on_a_terminal(clip, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    line = ["decode", *map(str, sized(clip)), "--method", "tfp", "-o", str(tmp_path / "{frame}.png"), "--frame"]
+    assert main([*line, "5:8"]) == 0
+    shown = capsys.readouterr().err.split("\r")
+    assert re.match(r"pictures: .* 0/3 ", shown[1])
+    assert not shown[-2].strip()  # the bar is taken away
+    assert main([*line, "5"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+BOUNDED = """
+import resource, sys
+from spikekit.cli.command import main
+
+def run(frames):
+    line = ["decode", sys.argv[1], "--height", "50", "--width", "80", "--method", "tfi", "-o", sys.argv[2]]
+    assert main([*line, "--frame", frames]) == 0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+before = run("0:1000:250")
+print(run("0::250") - before)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="kilobytes of ru_maxrss are Linux's")
+def test_decode_many_in_bounded_memory(tmp_path):
+    """20,000 frames, 80 MB as bytes, take no more than 8 MB beyond what 1000 take."""
+    chunk = (torch.rand(200, 50, 80) < 0.2).byte()
+    write_spikes(tmp_path / "a.dat", (chunk for _ in range(100)))
+    words = [tmp_path / "a.dat", tmp_path / "{frame}.png"]
+    done = subprocess.run(
+        [sys.executable, "-c", BOUNDED, *words],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"MALLOC_MMAP_THRESHOLD_": "131072"},  # what is freed is given back, and no longer counts
+    )
+    assert int(done.stdout.splitlines()[-1]) < 8000
+    assert len(list(tmp_path.glob("*.png"))) == 80
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG", "bggr"])
+def test_decode_colour(tmp_path, pattern):
+    """A coloured wall, stored upside down, comes back in its colour: the phase counts after the flip."""
+    rgb = torch.tensor([0.9, 0.5, 0.2])[:, None, None].expand(3, 10, 14)
+    raw = bin_to_sensor(rgb, pattern.upper(), scale=1)
+    write_spikes(tmp_path / "a.dat", expose(0.4 * raw, 200), flip=True)
+    out = tmp_path / "a.png"
+    words = ["decode", *map(str, sized(tmp_path / "a.dat", 10, 14)), "--flip", "--method", "tfp", "--window", "199"]
+    assert main([*words, "--alpha", "0.4", "--pattern", pattern, "-o", str(out)]) == 0
+    assert (read_picture(out) - rgb).abs().max() < 0.06
+
+
+def test_decode_flip(tmp_path):
+    spikes = torch.zeros(5, 6, 4)
+    spikes[:, 0] = 1
+    write_spikes(tmp_path / "a.npz", spikes, flip=True)
+    for flip, row in (([], 5), (["--flip"], 0)):
+        assert main(["decode", str(tmp_path / "a.npz"), "--method", "tfp", "-o", str(tmp_path / "a.png"), *flip]) == 0
+        assert (read_picture(tmp_path / "a.png")[0].sum(-1) > 0).nonzero().tolist() == [[row]]
+
+
+def test_decode_darkness(tmp_path, capsys):
+    write_spikes(tmp_path / "a.npz", torch.zeros(5, 6, 4))
+    assert main(["decode", str(tmp_path / "a.npz"), "--method", "tfp", "-o", str(tmp_path / "a.png")]) == 0
+    assert "multiplied by 1," in capsys.readouterr().out
+    assert read_picture(tmp_path / "a.png").max() == 0
+
+
+# --- command lines and files that cannot be used ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "required: VERB (see spikekit --help)"),
+        (["look"], "invalid choice: 'look'"),
+        (["info"], "required: FILE (see spikekit info --help)"),
+        (["info", "a.dat", "--height", "0"], "--height: expected a whole number, 1 or more, got 0"),
+        (["info", "a.dat", "--width", "wide"], "--width: expected a whole number, 1 or more, got wide"),
+        (["decode", "a.dat"], "required: --method, -o/--output (see spikekit decode --help)"),
+        (["decode", "a.dat", "-o", "a.png", "--method", "mean"], "--method: invalid choice: 'mean'"),
+        (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--pattern", "RGB"], "--pattern: invalid choice: 'RGB'"),
+        (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--alpha", "0"], "--alpha: expected a number above 0"),
+        (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--alpha", "nan"], "--alpha: expected a number above 0"),
+        (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--frame", "-1"], "--frame: expected a whole number, 0"),
+        (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--frame", "1:2:0"], "or A:B or A:B:STEP, got 1:2:0"),
+        (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--frame", "1:-2"], "or A:B or A:B:STEP, got 1:-2"),
+        (
+            ["decode", "a.dat", "-o", "a.png", "--method", "tfp", "--window", "4"],
+            "odd number, with --method tfp, got 4",
+        ),
+        (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--window", "5"], "with --method tfp, got 5 with tfi"),
+        (
+            ["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--order", "3"],
+            "expected --method tfp, got 3 with tfi",
+        ),
+        (
+            ["decode", "a.dat", "-o", "a.dat", "--method", "tfi"],
+            "ends in .png, .jpg, .jpeg, .bmp, .tif, .tiff, got a.dat",
+        ),
+    ],
+)
+def test_wrong_command_lines(fails, words, message):
+    assert message in fails(2, *words)
+
+
+@pytest.mark.parametrize("frames", ["60", "60:", "5:5", "9:3", "0:61", "70:80:2"])
+def test_frames_that_are_not_there(clip, tmp_path, fails, frames):
+    words = ("--method", "tfi", "-o", tmp_path / "{frame}.png", "--frame", frames)
+    message = f"--frame: expected 0 .. 59, as {clip} has 60 frames, got {frames}\n"
+    assert message in fails(2, "decode", *sized(clip), *words)
+
+
+def test_many_pictures_under_one_name(clip, tmp_path, fails):
+    words = ("--method", "tfi", "-o", tmp_path / "a.png", "--frame", "0:3")
+    message = f"--output: expected {{frame}} in the name of 3 pictures, got {tmp_path / 'a.png'}"
+    assert message in fails(2, "decode", *sized(clip), *words)
+
+
+@pytest.mark.parametrize("order", [61, 10**20])
+def test_an_order_beyond_the_recording(clip, tmp_path, fails, order):
+    words = ("--method", "tfp", "-o", tmp_path / "a.png", "--order", order)
+    message = f"--order: expected 1 .. 60, as {clip} has 60 frames, got {order}\n"
+    assert message in fails(2, "decode", *sized(clip), *words)
+
+
+@pytest.mark.parametrize("window", [2 * 60 - 1, 10**20 + 1])
+def test_a_window_beyond_the_recording(clip, tmp_path, window):
+    """The mean of all frames."""
+    words = ["--method", "tfp", "--alpha", "1", "-o", str(tmp_path / "a.png"), "--window", str(window)]
+    assert main(["decode", *map(str, sized(clip)), *words]) == 0
+    expected = read_spikes(clip, 12, 20).float().mean(0)
+    assert (read_picture(tmp_path / "a.png")[0] - expected).abs().max() < 1 / 255
+
+
+def test_wrong_files(clip, tmp_path, fails):
+    (tmp_path / "clip.raw").write_bytes(b"raw")
+    np.savez(tmp_path / "a.npz", spk=np.zeros((3, 12, 20)))
+    for path, message in [
+        (sized(tmp_path / "none.dat"), "none.dat: no such file"),
+        ((tmp_path / "none.dat",), "none.dat: no such file"),
+        ((tmp_path,), "got a folder"),
+        ((tmp_path / "clip.raw",), "clip.raw: expected a recording that ends in .dat or .npz, got .raw"),
+        (sized(clip, 7, 7), "1800 bytes at 7 bytes a frame make 257 whole frames and 1 bytes left over"),
+        (sized(tmp_path / "a.npz", 20, 12), "holds frames of 12 x 20, got height 20 and width 12"),
+    ]:
+        assert message in fails(1, "info", *path)
+        assert message in fails(1, "decode", *path, "--method", "tfi", "-o", tmp_path / "a.png")
+    assert not (tmp_path / "a.png").exists()
+
+
+def test_too_small_for_colour(tmp_path, fails):
+    write_spikes(tmp_path / "a.npz", torch.ones(3, 2, 2))
+    words = ("--method", "tfp", "-o", tmp_path / "a.png", "--pattern", "RGGB")
+    assert "at least 3 x 3, got (2, 2)" in fails(1, "decode", tmp_path / "a.npz", *words)
+
+
+def test_where_nothing_can_be_written(clip, tmp_path, fails):
+    (tmp_path / "folder.png").mkdir()
+    for out, message in [(tmp_path / "folder.png", "got a folder"), (clip / "a.png", "cannot be written")]:
+        assert f"{out}: " in (err := fails(1, "decode", *sized(clip), "--method", "tfp", "-o", out))
+        assert message in err
+
+
+@pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt(), 130), (MemoryError("no room"), 1)])
+def test_stopped(clip, monkeypatch, capsys, error, status):
+    def stop(*_, **__):
+        raise error
+
+    monkeypatch.setattr(cli, "iter_spikes", stop)
+    assert main(["info", *map(str, sized(clip))]) == status
+    assert capsys.readouterr() == ("", "spikekit: no room\n" if status == 1 else "")
+
+
+# --- as a process -----------------------------------------------------------------------------------------------------
+
+
+def test_installed_command():
+    (script,) = entry_points(group="console_scripts", name="spikekit")
+    assert script.load() is main
+
+
+@pytest.mark.parametrize("words", [["--help"], ["info", "--help"], ["decode", "--help"]])
+def test_help(words, capsys):
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("usage: spikekit")
+    assert ("example:\n  spikekit " in out) == (len(words) == 2)
+
+
+def test_process(clip, tmp_path):
+    done = run("decode", *sized(clip), "--method", "tfi", "-o", "made/here/a.png", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert read_picture(tmp_path / "made" / "here" / "a.png").shape == (3, 12, 20)
+    done = run("info", "none.npz", cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", "spikekit: none.npz: no such file\n")
+
+
+@pytest.mark.parametrize("help_", [True, False])
+def test_closed_pipe(clip, help_):
+    reader, writer = os.pipe()
+    os.close(reader)
+    words = ["--help"] if help_ else ["info", *map(str, sized(clip))]
+    done = subprocess.run([*COMMAND, *words], stdout=writer, stderr=subprocess.PIPE, timeout=120)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (0 if help_ else 141, b"")  # argparse itself lets the help go
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
+def test_full_disk(clip):
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [*COMMAND, "info", *map(str, sized(clip))], stdout=full, stderr=subprocess.PIPE, text=True
+        )
+    assert (done.returncode, done.stderr) == (1, "spikekit: standard output: No space left on device\n")
+
+
+def test_a_file_that_cannot_be_opened_is_named(tmp_path, fails):
+    long, inside = tmp_path / ("a" * 300), tmp_path / "file" / "a.md"
+    inside.parent.write_text("no folder")
+    for out, why in ((inside, "Not a directory"), (long, "File name too long")):
+        assert fails(1, "extremes", "--operator", "tfp", "-o", out) == f"spikekit: {out}: {why}\n"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
+def test_a_table_without_room_is_named(fails):
+    words = "extremes", "--operator", "spike_interval", "--device", "cpu", "-o", "/dev/full"
+    assert fails(1, *words) == "spikekit: /dev/full: No space left on device\n"
+
+
+class Full(io.StringIO):
+    """Standard output in memory that finds no room."""
+
+    def __init__(self, error):
+        super().__init__()
+        self.error = error
+
+    def write(self, text):
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "said"),
+    [
+        (OSError(errno.ENOSPC, "No room"), 1, "spikekit: standard output: No room\n"),
+        (BrokenPipeError(errno.EPIPE, "Broken pipe"), 141, ""),
+    ],
+)
+def test_called_where_standard_output_is_no_file(clip, capsys, error, status, said):
+    with contextlib.redirect_stdout(Full(error)):
+        assert main(["info", *map(str, sized(clip))]) == status
+    assert capsys.readouterr() == ("", said)
+
+
+# --- the field's own --------------------------------------------------------------------------------------------------
+
+
+@needs_data
+def test_info_of_the_fields_own(capsys):
+    assert main(["info", str(REDS), "--height", "250", "--width", "400"]) == 0
+    out = capsys.readouterr().out
+    assert "frames       301, 15.05 ms at 20 kHz" in out
+    assert "bits set     6497164 of 30100000, 21.59%" in out
+    assert main(["info", str(UHSR)]) == 0
+    out = capsys.readouterr().out
+    assert "250 x 250 (H x W)" in out
+    assert "never fire   2 of 62500 pixels, 0.00%" in out
+
+
+@needs_data
+@pytest.mark.parametrize("method", ["tfi", "tfp"])
+def test_decode_of_the_fields_own(tmp_path, method):
+    out = tmp_path / "a.png"
+    assert main(["decode", *map(str, sized(REDS, 250, 400)), "--flip", "--method", method, "-o", str(out)]) == 0
+    picture = read_picture(out)
+    assert picture.shape == (3, 250, 400)
+    assert picture[:, :40, :200].mean() > 0.6 > 0.2 > picture[:, 60:90, :180].mean()  # awning over roof: upright
+    assert main(["decode", str(UHSR), "--method", method, "-o", str(out)]) == 0
+    picture = read_picture(out)
+    assert picture.shape == (3, 250, 250)
+    assert picture[:, 40:60, 60:200].mean() > 0.4 > picture[:, 200:, :].mean()  # a screen in a dark room

@@ -1,0 +1,533 @@
+"""``spikekit simulate`` as a user types it: whole sets of files or none, the same every time, and made again."""
+
+import hashlib
+import json
+import os
+import re
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from skimage import io
+
+from spikekit import read_picture, read_spikes, tfp, write_picture
+from spikekit.cli.command import main
+from spikekit.cli.simulation import Settings, build
+from spikekit.io.sidecar import find_sidecar, published, read_sidecar
+from spikekit.scenes.adaptive_sampling import Plan
+from spikekit.scenes.frame_sequence import Film
+
+COMMAND = [sys.executable, "-c", "from spikekit.cli.command import main; raise SystemExit(main())"]
+IGNORING = "import signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN); "
+LIMITED = [*COMMAND[:2], IGNORING + COMMAND[2]]
+QUICK = ["--scale", "2", "--interpolation", "Blend"]
+
+
+def frames(count, seed=0):
+    """A smooth picture that moves to the left, two pixels a frame, in whole 255ths."""
+    noise = torch.rand(1, 3, 5, 8, generator=torch.Generator().manual_seed(seed))
+    picture = torch.nn.functional.interpolate(noise, size=(35, 60), mode="bicubic")[0].clamp(0, 1)
+    return [(picture.roll(-2 * n, -1)[:, :, :37] * 255).round() / 255 for n in range(count)]
+
+
+@pytest.fixture
+def film(tmp_path, monkeypatch):
+    """A folder of five pictures of 35 x 37, of which a sensor at scale 2 sees 32 x 36."""
+    monkeypatch.chdir(tmp_path)
+    for n, rgb in enumerate(frames(5)):
+        write_picture(f"film/f{n}.png", rgb)
+    return Path("film")
+
+
+def simulate(*words):
+    assert main(["simulate", *map(str, words)]) == 0
+
+
+@pytest.fixture
+def fails(capsys):
+    """Run a command line that fails: one line on stderr, nothing on stdout, nothing left."""
+
+    def check(status, *words):
+        before = everything()
+        assert main(["simulate", *map(str, words)]) == status
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert err.startswith("spikekit: ")
+        assert err.count("\n") == 1
+        assert everything() == before
+        return err
+
+    return check
+
+
+def everything():
+    """All files below the working folder and what is in them."""
+    return {str(path): path.read_bytes() for path in Path().rglob("*") if path.is_file()}
+
+
+def believed(stream):
+    """Whether a set of files is complete: by its side-car, and then each of them."""
+    sidecar = find_sidecar(stream)
+    if sidecar is None:
+        return False
+    assert hashlib.sha256(stream.read_bytes()).hexdigest() == sidecar.stream["sha256"]
+    assert all(read_picture(stream.parent / picture).shape[0] == 3 for picture in sidecar.truth)
+    return True
+
+
+# --- a clip -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_clip(film, capsys):
+    simulate(film, "-o", "made/a.dat", "--scale", 2, "--seed", 3, "--pattern", "gbrg", "--frame", 2)
+    report, err = capsys.readouterr()
+    assert err == ""
+    assert "film, f1.png .. f3.png (3 frames): 35 x 37 (H x W), the first 32 x 36 of them" in report
+    assert "latent frames: " in report
+    assert believed(Path("made/a.dat"))
+    known = read_sidecar(Path("made/a.json"))
+    assert [known.stream[name] for name in ("frames", "height", "width")] == [41, 16, 18]
+    assert known.truth == {"a.png": 20}
+    assert known.source["path"] == "../film"
+    assert list(known.source["frames"]) == ["f1.png", "f2.png", "f3.png"]
+    assert known.settings["frame"] == 2
+    assert [interval["latent"] for interval in known.plan["intervals"]] == [
+        Film(frames(5), scale=2, pattern="GBRG").plan(n).latent for n in (1, 2)
+    ]
+
+    assert (io.imread("made/a.png") == io.imread("film/f2.png")[:32, :36]).all()
+    whole = Film(frames(5), scale=2, pattern="GBRG")
+    spikes = read_spikes("made/a.dat", 16, 18)
+    assert spikes.equal(torch.cat(list(whole.spikes(20, 41, seed=3))))
+    light = whole.light(20, 41).mean(0)
+    assert (tfp(spikes, 41)[20] - light).abs().max() < 0.03
+
+
+def test_the_whole_film(film, capsys):
+    """The same spikes as at once, every frame as truth, in memory that does not grow."""
+    simulate(film, "-o", "a.npz", "--all", *QUICK, "--photons", 50)
+    assert "all that was asked for" in capsys.readouterr().out
+    known = read_sidecar(Path("a.json"))
+    assert known.truth == {f"a/f{n}.png": 20 * n for n in range(5)}
+    for n in range(5):
+        assert (io.imread(f"a/f{n}.png") == io.imread(f"film/f{n}.png")[:32, :36]).all()
+    simulate(film, "-o", "b.dat", "--all", *QUICK, "--photons", 50)
+    spikes = read_spikes("b.dat", 16, 18)
+    assert spikes.shape[0] == 81
+    assert spikes.equal(read_spikes("a.npz"))
+    assert read_sidecar(Path("b.json")).stream["sha256"] == known.stream["sha256"]
+    assert known.plan["intervals"] == [{"latent": 0, "region": None}] * 4
+
+
+def test_the_end_of_a_read_out(film):
+    """Clocks that fill no read-out are left out, and so is a truth that no frame of the stream has seen."""
+    simulate(film, "-o", "a.dat", "--all", *QUICK, "--readout", 4)
+    assert read_sidecar(Path("a.json")).truth == {f"a/f{n}.png": 5 * n for n in range(4)}
+    assert read_spikes("a.dat", 16, 18).shape[0] == 20
+
+
+@pytest.mark.parametrize("source", ["film/f1.png", "one"])
+def test_one_picture_stands_still(film, source):
+    Path("one").mkdir()
+    Path("one/f1.png").write_bytes(Path("film/f1.png").read_bytes())
+    simulate(source, "-o", "a.dat", "--scale", 2)
+    assert believed(Path("a.dat"))
+    spikes = read_spikes("a.dat", 16, 18)
+    assert (spikes.sum(0) - 41 * Film(frames(2)[1:], scale=2).light()[0]).abs().max() < 1
+
+
+def test_noise_that_changes_nothing_is_left_out(film, capsys):
+    words = film, "--scale", 2, "--photons", 20, "--dark-current", 1e-9
+    simulate(*words, "-o", "a.dat")
+    assert "noise: photons (left out: dark_current)" in capsys.readouterr().out
+    simulate(*words, "-o", "b.dat", "--plan", "everything")
+    assert "noise: all that was asked for" in capsys.readouterr().out
+    noise = [read_sidecar(Path(f"{name}.json")).plan["noise"] for name in "ab"]
+    assert [one["dark_current"] for one in noise] == [0, 1e-9]
+    assert [one["photons"] for one in noise] == [20, 20]
+
+
+@pytest.mark.parametrize(("plan", "latent"), [("everything", 19), (3, 3)])
+def test_the_plan_can_be_given(film, plan, latent):
+    simulate(film, "-o", "a.dat", "--scale", 2, "--plan", plan)
+    assert {one["latent"] for one in read_sidecar(Path("a.json")).plan["intervals"]} == {latent}
+
+
+class Hold:
+    """An interpolation of one's own: the first frame, up to a moment."""
+
+    def __init__(self, until=0.5):
+        self.until = until
+
+    def __call__(self, first, second):
+        hold = self
+        Hold.threads = torch.get_num_threads()
+
+        class Between:
+            forward = backward = None
+
+            def at(self, tau):
+                return first if tau < hold.until else second
+
+        return Between()
+
+
+def test_an_interpolation_of_ones_own(film, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    for until, name in ((0.25, "a"), (0.75, "b")):
+        own = f"test_simulate.Hold(until={until})"
+        simulate(film, "-o", f"{name}.dat", "--scale", 2, "--plan", "everything", "--interpolation", own)
+    early, late = (read_spikes(f"{name}.dat", 16, 18) for name in "ab")
+    assert early[:5].equal(late[:5])
+    assert not early[5:15].equal(late[5:15])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "os.mkdir(path='harmed')",
+        "test_simulate.Hold",
+        "spikekit.cli.simulation.build(text='os.getcwd()')",
+        "FlowInterpolation(shrink=1000000000)",
+        "FlowInterpolation(shrink=True)",
+        "Blend(first='os.mkdir')",
+        "Between",
+        "torch",
+        "",
+    ],
+)
+def test_a_sidecar_runs_nothing(film, fails, capsys, monkeypatch, text):
+    simulate(film, "-o", "a.dat", *QUICK)
+    capsys.readouterr()
+    known = json.loads(Path("a.json").read_text())
+    Path("b.json").write_text(json.dumps(known | {"settings": known["settings"] | {"interpolation": text}}))
+    monkeypatch.setattr("importlib.import_module", lambda name: pytest.fail(f"{name} was imported"))
+    said = fails(2, "b.json", "-o", "c.dat")
+    assert said.startswith("spikekit: b.json: its interpolation is not spikekit's and would run code: ")
+    assert "--interpolation: expected" in fails(2, "b.json", "-o", "c.dat", "--interpolation", "Blend")
+
+
+def test_an_interpolation_of_ones_own_is_replayed_where_it_is_typed(film, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    own = "test_simulate.Hold(until=0.25)"
+    simulate(film, "-o", "a.dat", "--scale", 2, "--plan", "everything", "--interpolation", own)
+    simulate("a.json", "-o", "b.dat", "--interpolation", own)
+    assert Path("a.dat").read_bytes() == Path("b.dat").read_bytes()
+
+
+def test_what_is_no_interpolation_is_refused(film, fails):
+    """Also where it is falsy, which is not the same as not given."""
+    assert "expected what looks at two frames" in fails(
+        2, film, "-o", "a.dat", "--scale", 2, "--interpolation", "builtins.dict"
+    )
+    with pytest.raises(TypeError):
+        next(iter(Film(frames(2), scale=2, interpolation=0, plan=Plan(3)).spikes(0, 20)))
+
+
+def test_the_defaults_are_those_of_the_film():
+    film = Film(frames(1), scale=2)
+    settings = Settings(scale=2)
+    for name in ("pattern", "alpha", "clocks", "step"):
+        assert getattr(settings, name) == getattr(film, name)
+    assert settings.tolerance == film.spike_tolerance
+    assert isinstance(build(settings.interpolation), type(film.interpolation))
+
+
+# --- the same again ---------------------------------------------------------------------------------------------------
+
+
+def test_made_again_from_its_sidecar(film):
+    simulate(film, "-o", "a.dat", "--scale", 2, "--photons", 30, "--gain-spread", 0.1, "--frames", 21, "--seed", 5)
+    simulate("a.json", "-o", "else/where/b.dat")
+    assert Path("else/where/b.dat").read_bytes() == Path("a.dat").read_bytes()
+    assert Path("else/where/b.png").read_bytes() == Path("a.png").read_bytes()
+    assert read_sidecar(Path("else/where/b.json")).source["path"] == "../../film"
+    simulate("else/where/b.json", "-o", "c.npz")
+    assert read_spikes("c.npz").equal(read_spikes("a.dat", 16, 18))
+    Path("film").rename("moved")
+    simulate("a.json", "-o", "d.dat", "--source", "moved")
+    assert Path("d.dat").read_bytes() == Path("a.dat").read_bytes()
+
+
+def test_not_made_again_from_another_source(film, fails, capsys):
+    simulate(film, "-o", "a.dat", *QUICK)
+    capsys.readouterr()
+    write_picture("film/f3.png", frames(5, seed=1)[3])
+    assert f"film{os.sep}f3.png: changed since the side-car was written" in fails(1, "a.json", "-o", "b.dat")
+    Path("film/f0.png").unlink()
+    assert "not the frames of the side-car: expected f1.png .. f3.png" in fails(1, "a.json", "-o", "b.dat")
+    Path("film").rename("moved")
+    assert "film: no such file or folder" in fails(1, "a.json", "-o", "b.dat")
+
+
+def test_not_made_again_with_other_settings(film, fails, capsys):
+    simulate(film, "-o", "a.dat", *QUICK)
+    capsys.readouterr()
+    assert "got --seed as well" in fails(2, "a.json", "-o", "b.dat", "--seed", 1)
+    known = json.loads(Path("a.json").read_text())
+    Path("b.json").write_text(json.dumps(known | {"settings": known["settings"] | {"seed": 1}}))
+    assert "c.dat: not the stream of its side-car, though the source is the same (by the same versions)" in fails(
+        1, "b.json", "-o", "c.dat"
+    )
+    Path("b.json").write_text(json.dumps(known | {"settings": {}}))
+    assert "b.json: not settings of a simulation" in fails(1, "b.json", "-o", "c.dat")
+    Path("b.json").write_text("{}")
+    assert "b.json: not a side-car that can be read" in fails(1, "b.json", "-o", "c.dat")
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "said"),
+    [
+        ("settings", [], "settings: expected names and values, got []"),
+        ("source", None, "source: expected names and values, got None"),
+        ("versions", "1", "versions: expected names and values, got '1'"),
+        ("source.path", 5, "path: expected a text, got 5"),
+        ("source.frames", 5, "frames of the source: expected names and values, got 5"),
+        ("stream.sha256", 5, "sha256: expected a text, got 5"),
+        ("stream.frames", True, "expected frames, height and width above 0, got [True, "),
+        ("stream.height", -1, "expected frames, height and width above 0, got [41, -1, 18]"),
+        ("settings.alpha", "x", "alpha: expected a finite number above 0, got 'x'"),
+        ("settings.alpha", -1, "alpha: expected a finite number above 0, got -1"),
+        ("settings.alpha", float("nan"), "alpha: expected a finite number above 0, got nan"),
+        ("settings.alpha", 10**400, "alpha: expected a finite number above 0, got 1000"),
+        ("settings.pattern", "RGB", "pattern: expected one of RGGB, BGGR, GRBG, GBRG, got 'RGB'"),
+        ("settings.pattern", ["RGGB"], "pattern: expected one of RGGB, BGGR, GRBG, GBRG, got ['RGGB']"),
+        ("settings.frames", "4", "frames: expected a whole number, 1 or more, or null, got '4'"),
+        ("settings.frame", -1, "frame: expected a whole number, 0 or more, or null, got -1"),
+        ("settings.scale", 2.5, "scale: expected a whole number, 1 or more, got 2.5"),
+        ("settings.clocks", "20", "clocks: expected a whole number, 1 or more, got '20'"),
+        ("settings.readout", 0, "readout: expected a whole number, 1 or more, got 0"),
+        ("settings.seed", 1.0, "seed: expected a whole number, 0 or more, got 1.0"),
+        ("settings.tolerance", True, "tolerance: expected a finite number above 0, got True"),
+        ("settings.plan", 1.0, "plan: expected a text or a number of latent frames, got 1.0"),
+        ("settings.interpolation", 5, "interpolation: expected a text, got 5"),
+        ("settings.noise", {"photons": "many"}, "noise: expected names and finite numbers, got {'photons': 'many'}"),
+    ],
+)
+def test_a_sidecar_edited_by_hand(film, fails, capsys, part, value, said):
+    """One line that names it, from every verb that reads it."""
+    simulate(film, "-o", "a.dat", *QUICK)
+    known = json.loads(Path("a.json").read_text())
+    section, _, name = part.partition(".")
+    known = known | {section: known[section] | {name: value} if name else value}
+    Path("a.json").write_text(json.dumps(known))
+    capsys.readouterr()
+    assert fails(1, "a.json", "-o", "b.dat").startswith(f"spikekit: a.json: not a side-car that can be read ({said}")
+    for words in (["info"], ["decode", "--method", "tfp", "-o", "a.png"], ["view", "-o", "a.png"]):
+        assert main([words[0], "a.dat", *words[1:]]) == 1
+        err = capsys.readouterr().err
+        assert err.startswith(f"spikekit: a.json: not a side-car that can be read ({said}")
+        assert err.count("\n") == 1
+    assert main(["info", "a.dat", "--height", "16", "--width", "18"]) == 0  # without it
+
+
+def test_a_json_that_speaks_of_no_stream_is_no_sidecar(film, fails, capsys):
+    simulate(film, "-o", "a.dat", *QUICK)
+    known = json.loads(Path("a.json").read_text())
+    capsys.readouterr()
+    for other in ("{}", "[" * 100_000, json.dumps(known | {"kind": "something else", "settings": []})):
+        Path("a.json").write_text(other)
+        assert find_sidecar(Path("a.dat")) is None
+        assert "a.json: not a side-car that can be read" in fails(1, "a.json", "-o", "b.dat")
+    Path("a.json").write_text(json.dumps(known | {"stream": known["stream"] | {"file": "b.dat"}, "settings": []}))
+    assert find_sidecar(Path("a.dat")) is None
+
+
+def test_a_long_seed_is_read_again(film):
+    simulate(film, "-o", "a.dat", *QUICK, "--seed", 10**30)
+    simulate("a.json", "-o", "b.dat")
+    assert Path("b.dat").read_bytes() == Path("a.dat").read_bytes()
+
+
+@pytest.mark.slow
+def test_four_at_once(film):
+    """Processes that write one name, and one process with as many threads as there are, give the same files."""
+    words = ["simulate", str(film), "--scale", "2", "--photons", "30"]
+    running = [subprocess.Popen([*COMMAND, *words, "-o", "a.dat"], stdout=subprocess.DEVNULL) for _ in range(4)]
+    assert [process.wait(120) for process in running] == [0] * 4
+    assert believed(Path("a.dat"))
+    at_once = {name: Path(name).read_bytes() for name in ("a.dat", "a.png", "a.json")}
+    assert not list(Path().glob(".*"))
+    for name in at_once:
+        Path(name).unlink()
+    assert main([*words, "-o", "a.dat"]) == 0
+    assert {name: Path(name).read_bytes() for name in at_once} == at_once
+
+
+def test_one_thread(film, monkeypatch):
+    """However many threads there are, sums are taken in one order."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        own = "test_simulate.Hold"
+        simulate(film, "-o", "a.dat", "--scale", 2, "--plan", "everything", "--interpolation", own)
+        assert sys.modules["test_simulate"].Hold.threads == 1
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+
+
+# --- whole or not at all ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("step", range(8))
+def test_killed_while_it_publishes(film, monkeypatch, step):
+    """Between any two of the moves, what lies there is the old set, the new set, or not believed."""
+    simulate(film, "-o", "a.dat", "--all", *QUICK)
+    old = Path("a.dat").read_bytes()
+    moves = iter(range(100))
+    replace = os.replace
+
+    def dies(*paths):
+        if str(paths[0]).count(".part") == 1 and next(moves) == step:
+            raise KeyboardInterrupt
+        replace(*paths)
+
+    monkeypatch.setattr("spikekit.io.sidecar.os.replace", dies)
+    status = main(["simulate", str(film), "-o", "a.dat", "--all", *QUICK, "--seed", "1"])
+    assert status == (130 if step < 7 else 0)
+    assert believed(Path("a.dat")) == (step == 7)
+    assert (Path("a.dat").read_bytes() == old) == (step == 0)
+
+
+@pytest.mark.slow
+def test_killed_at_random_moments(film):
+    words = [*COMMAND, "simulate", str(film), "-o", "a.dat", "--scale", "2", "--all"]
+    begin = time.monotonic()
+    subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
+    whole = time.monotonic() - begin
+    for name in ("a.dat", "a.json"):
+        Path(name).unlink()
+    for share in (0.5, 0.7, 0.8, 0.9, 0.95, 1.0):
+        process = subprocess.Popen(words, stdout=subprocess.DEVNULL)
+        time.sleep(share * whole)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        if Path("a.json").exists():
+            assert believed(Path("a.dat"))
+    simulate(film, "-o", "a.dat", *QUICK)
+    assert not list(Path().glob(".*"))
+
+
+def test_what_was_killed_is_removed_and_what_runs_is_not(film):
+    Path(".a.dat.12345678.part").mkdir()
+    with published(Path("a.dat")) as running:
+        assert not Path(".a.dat.12345678.part").exists()
+        simulate(film, "-o", "a.dat", *QUICK)
+        assert running.is_dir()
+        (running / "a.json").write_bytes(Path("a.json").read_bytes())
+    assert not list(Path().glob(".*"))
+    assert believed(Path("a.dat"))
+
+
+@pytest.mark.parametrize(("room", "words", "name"), [(8000, ["--all", "--clocks", "200"], "a.dat"), (500, [], "a.png")])
+def test_a_full_disk(film, room, words, name):
+    """One line that names the file for which there is no room; what was there is untouched."""
+    simulate(film, "-o", "a.dat", *QUICK)
+    before = everything()
+    done = subprocess.run(
+        [*LIMITED, "simulate", str(film), "-o", "a.dat", *QUICK, *words],
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (room, room)),
+    )
+    assert done.returncode == 1
+    assert done.stderr == f"spikekit: {name}: cannot be written (File too large)\n"
+    assert everything() == before
+    assert not list(Path().glob(".*"))
+
+
+def test_no_permission(film, fails, monkeypatch):
+    def refuse(*_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("spikekit.io.sidecar.tempfile.mkdtemp", refuse)
+    assert fails(1, film, "-o", "a.dat", *QUICK) == "spikekit: a.dat: cannot be written (Permission denied)\n"
+
+
+def test_nothing_of_others_is_replaced(film, fails, capsys):
+    assert "its ground truth, film/f0.png, would replace the source" in fails(
+        1, film, "-o", "film.dat", "--all", *QUICK
+    )
+    assert "would replace the source" in fails(1, "film/f1.png", "-o", "film/f1.dat", *QUICK)
+    Path("b.json").write_text("{}")
+    assert "b.json: not a side-car that can be read" in fails(1, film, "-o", "b.dat", *QUICK)
+    simulate(film, "-o", "a.dat", *QUICK)
+    capsys.readouterr()
+    assert "a.npz: its side-car, a.json, would replace that of a.dat" in fails(1, film, "-o", "a.npz", *QUICK)
+    Path("c.dat").mkdir()
+    assert "c.dat: expected a stream to write, got a folder" in fails(1, film, "-o", "c.dat", *QUICK)
+
+
+# --- awkward input ----------------------------------------------------------------------------------------------------
+
+
+def test_a_damaged_frame(film, fails):
+    path = Path("film/f4.png")
+    path.write_bytes(path.read_bytes()[:150])
+    assert f"film{os.sep}f4.png: not a picture that can be read" in fails(1, film, "-o", "a.dat", "--all", *QUICK)
+    simulate(film, "-o", "a.dat", *QUICK)  # which needs three others
+
+
+def test_frames_of_several_sizes(film, fails):
+    write_picture("film/f2.png", torch.rand(3, 8, 8))
+    assert f"film{os.sep}f2.png: expected 35 x 37" in fails(1, film, "-o", "a.dat", *QUICK)
+
+
+def test_grey_deep_and_transparent(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("film").mkdir()
+    numbers = np.random.default_rng(0)
+    deep = numbers.integers(0, 1 << 16, (32, 32), dtype=np.uint16)
+    io.imsave("film/0.png", deep, check_contrast=False)
+    io.imsave("film/1.png", numbers.integers(0, 256, (32, 32), dtype=np.uint8), check_contrast=False)
+    io.imsave("film/2.png", numbers.integers(0, 256, (32, 32, 4), dtype=np.uint8), check_contrast=False)
+    simulate("film", "-o", "a.dat", "--all", *QUICK)
+    assert (io.imread("a/1.png") == io.imread("film/1.png")[..., None]).all()
+    assert (io.imread("a/0.png")[..., 0] == np.round(deep / 65535 * 255)).all()
+    assert (io.imread("a/2.png") == (read_picture("film/2.png") * 255).round().byte().permute(1, 2, 0).numpy()).all()
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "said"),
+    [
+        (["film", "--scale", "2", "--frame", "0"], 2, "expected --frame 1 to 3, got frame 0"),
+        (["film", "--scale", "2", "--frames", "401"], 2, "of 5 frames, expected more frames, or fewer with --frames"),
+        (["film", "--scale", "2", "--all", "--frame", "1"], 2, "--frame: not with --all, got 1"),
+        (["film", "--scale", "20"], 1, "film: frames: expected 40 x 40 pixels or more, got 35 x 37"),
+        (["film"], 2, "--scale: needed"),
+        (["film", "--scale", "2", "--source", "film"], 2, "--source: expected a side-car"),
+        (["film", "--scale", "2", "--plan", "20"], 2, "0 to 19 latent frames in 20 clocks, got 20"),
+        (["film", "--scale", "2", "--plan", "most"], 2, "expected scene, everything or a number"),
+        (["film", "--scale", "2", "--interpolation", "Flaw"], 2, "--interpolation: Flaw cannot be made"),
+        (["film", "--scale", "2", "--interpolation", "Blend(3)"], 2, "cannot be made (arguments need names)"),
+        (["film", "--scale", "2", "--dark-current", "-1"], 2, "--dark-current: expected a finite number"),
+        (["film", "--scale", "2", "--hot", "much"], 2, "argument --hot: expected a number, got much"),
+        (["film/f0.png", "--scale", "2", "--all"], 2, "one picture, which has no end"),
+        (["nothing", "--scale", "2"], 1, "nothing: no such file or folder"),
+        (["nothing.json"], 1, "nothing.json: cannot be read (No such file or directory)"),
+    ],
+)
+def test_mistakes(film, fails, words, status, said):
+    assert said in fails(status, *words, "-o", "a.dat")
+
+
+def test_another_ending(film, fails):
+    assert "expected a stream that ends in .dat or .npz, got a.png" in fails(2, film, "-o", "a.png", "--scale", 2)
+
+
+def test_progress_on_a_terminal(film, monkeypatch, capsys):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    simulate(film, "-o", "a.dat", "--all", *QUICK)
+    err = capsys.readouterr().err
+    assert re.search(r"frames read: .* 0/5 ", err)
+    assert re.search(r"frames of a.dat: .* 0/81 ", err)
+    assert err.endswith("\r")
+    assert not err.split("\r")[-2].strip()  # the bar is taken away

@@ -1,0 +1,340 @@
+"""``spikekit view`` as a user types it, and what the verbs know of a recording by its side-car or its camera."""
+
+import base64
+import io
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from skimage import io as skio
+
+from spikekit import (
+    Layer,
+    Motion,
+    Scene,
+    read_picture,
+    simulate_spikes,
+    tfi,
+    tfp,
+    write_picture,
+    write_spikes,
+)
+from spikekit.cli.command import main
+from spikekit.cli.drawing import fit, histogram, raster, sheet
+from spikekit.cli.view import Moment
+from spikekit.decoders.dense import spike_interval
+from spikekit.io import recording
+from spikekit.io.image_bytes import gif_bytes
+
+PATTERN = "RGGB"
+
+
+def view(*words):
+    assert main(["view", *map(str, words)]) == 0
+
+
+@pytest.fixture
+def moving(tmp_path, monkeypatch):
+    """A colour recording of 101 frames of 40 x 48: a smooth picture moving to the right, 0.1 pixels a frame."""
+    monkeypatch.chdir(tmp_path)
+    noise = torch.rand(1, 3, 9, 15, generator=torch.Generator().manual_seed(1))
+    picture = torch.nn.functional.interpolate(noise, size=(60, 100), mode="bicubic")[0].clamp(0, 1)
+    scene = Scene([Layer(picture, Motion((0.1, 0.0)), (-10, -20))], 40, 48, 101)
+    write_spikes("a.dat", simulate_spikes(scene.light(PATTERN, scale=1, alpha=0.5)))
+    return scene
+
+
+@pytest.fixture
+def still(tmp_path, monkeypatch):
+    """A simulated stream with its side-car: left half red, right half blue."""
+    monkeypatch.chdir(tmp_path)
+    picture = torch.zeros(3, 32, 48)
+    picture[0, :, :24] = picture[2, :, 24:] = 1
+    write_picture("photo.png", picture)
+    assert main(["simulate", "photo.png", "-o", "a.dat", "--scale", "1", "--pattern", "GBRG", "--alpha", "0.5"]) == 0
+    return picture
+
+
+def moment(path, **known):
+    frames, size = (known.pop("frames"), known.pop("size"))
+    shown = recording.Recording(Path(path), frames, size, **known)
+    return Moment(shown, 0, frames, 41, 0.5, None)
+
+
+# --- what is shown ----------------------------------------------------------------------------------------------------
+
+
+def test_the_pictures_are_those_of_the_decoders(moving):
+    """TFP and TFI of the middle, its motion, and the spikes of a row."""
+    here = moment("a.dat", frames=101, size=(40, 48))
+    spikes = recording.Recording(Path("a.dat"), 101, (40, 48)).read(0, 101)
+    assert here.tfp()[::10, ::10].equal((tfp(spikes, 41)[50] / 0.5).clamp(0, 1))
+    assert here.tfi()[::10, ::10].equal((1 / spike_interval(spikes)[50].float() / 0.5).clamp(0, 1))
+    assert here.tfi()[::10, ::10].equal((tfi(spikes)[50] / 0.5).clamp(0, 1))
+    drawn = here.raster()
+    assert drawn.shape == (480, 404)
+    assert ((drawn[::10, ::4] < 0.5) == (spikes[:, 20].T == 1)).all()
+    colours, longest, length = here.motion()
+    assert length == 20
+    assert longest == pytest.approx(2, abs=0.8)  # a tenth of a pixel a frame
+    red, green, blue = colours[:, 150:250, 150:330].flatten(1).median(dim=1).values
+    assert red > 0.99  # to the right
+    assert max(green, blue) < 0.6
+
+
+def test_a_sheet_by_its_sidecar(still, capsys):
+    """Size, Bayer phase and brightness are known; colours are those of the scene."""
+    capsys.readouterr()
+    view("a.dat", "-o", "made/a.png")
+    assert capsys.readouterr().out == "made/a.png: frames 0 .. 40 of 41, alpha 0.5 is white\n"
+    shown = read_picture("made/a.png")
+    assert shown[:, 200, 60].tolist() == pytest.approx([1, 0, 0], abs=0.1)
+    assert shown[:, 200, 400].tolist() == pytest.approx([0, 0, 1], abs=0.1)
+
+
+@pytest.mark.parametrize(("seconds", "shown"), [(1e9, 655_350), (1e-9, 20), (0.5, 500)])
+def test_pictures_of_a_gif_are_shown_as_long_as_it_can_tell(seconds, shown):
+    data = gif_bytes([torch.zeros(4, 6), torch.ones(4, 6)], seconds)
+    with Image.open(io.BytesIO(data)) as film:
+        assert film.n_frames == 2
+        assert film.info["duration"] == shown
+
+
+def test_an_animation_slides(moving):
+    view("a.dat", "--height", 40, "--width", 48, "-o", "a.gif", "--alpha", 0.5, "--seconds", 2)
+    with Image.open("a.gif") as film:
+        assert film.n_frames == 60
+        assert film.size == (480, 400)
+        assert film.info["duration"] == pytest.approx(2000 / 60, abs=10)
+        shades = []
+        for n in (0, 59):
+            film.seek(n)
+            shades.append(np.asarray(film.convert("L"))[::10, ::10].astype(float))
+    spikes = recording.Recording(Path("a.dat"), 101, (40, 48)).read(0, 101).float()
+    for shade, first in zip(shades, (0, 60), strict=True):
+        assert np.abs(shade - (spikes[first : first + 41].mean(0) * 2 * 255).clamp(0, 255).numpy()).mean() < 3
+
+
+def test_a_page_of_its_own(still):
+    """Every picture is inside, one for each place of the slider; nothing is loaded."""
+    view("a.dat", "-o", "a.html")
+    page = Path("a.html").read_text()
+    assert "http" not in page
+    pictures = re.findall(r'<img (hidden )?src="data:image/png;base64,([^"]+)"', page)
+    sizes = {Image.open(io.BytesIO(base64.b64decode(data))).size for _, data in pictures}
+    assert (480, 320) in sizes
+    sliding = sum(bool(hidden) for hidden, _ in pictures)
+    starts = json.loads(re.search(r"const starts = (\[[^]]*\])", page)[1])
+    assert len(starts) == sliding == 22
+    assert starts[-1] == 21
+    assert 'max="21"' in page
+    assert "img:not([hidden]){display:block}" in page  # or all would be seen at once
+    assert "length = 20" in page
+    assert "41 frames of 32 x 48, alpha 0.5 is white" in page
+
+
+def test_a_name_cannot_break_the_page(still):
+    Path("a.dat").rename("a<b>.dat")
+    view("a<b>.dat", "--height", 32, "--width", 48, "-o", "a.html")
+    assert "a<b>" not in Path("a.html").read_text()
+
+
+def test_a_part_of_a_long_recording(tmp_path, monkeypatch):
+    """Only what is shown is read."""
+    monkeypatch.chdir(tmp_path)
+    spikes = torch.zeros(2000, 4, 8, dtype=torch.uint8)
+    spikes[1500] = 1
+    write_spikes("a.dat", spikes)
+    read = []
+
+    def counted(original):
+        def count(*words, **known):
+            read.append(known["frames"])
+            return original(*words, **known)
+
+        return count
+
+    for name in ("read_spikes", "iter_spikes"):
+        monkeypatch.setattr(recording, name, counted(getattr(recording, name)))
+    size = "--height", 4, "--width", 8
+    view("a.dat", *size, "-o", "a.png", "--frames", "1490:1511", "--row", 3)
+    assert read == [21]
+    assert (skio.imread("a.png")[:200].min(axis=(0, 1)) < 80).any()
+    read.clear()
+    view("a.dat", *size, "-o", "a.png")
+    assert read == [401]
+    read.clear()
+    view("a.dat", *size, "-o", "a.gif")
+    assert sorted(read) == [41] * 60 + [401]
+
+
+@pytest.mark.parametrize("shape", [(1, 4, 4), (1, 1, 1), (2, 3, 5), (30, 40, 40)])
+@pytest.mark.parametrize("value", [0, 1])
+def test_little_to_see(tmp_path, monkeypatch, shape, value):
+    """A few pixels, one frame, no spike, nothing but spikes: there is always a picture."""
+    monkeypatch.chdir(tmp_path)
+    write_spikes("a.npz", torch.full(shape, value))
+    for ending in ("png", "gif", "html"):
+        view("a.npz", "-o", f"a.{ending}", "--pattern", "RGGB")
+        assert Path(f"a.{ending}").stat().st_size > 0
+
+
+# --- drawings ---------------------------------------------------------------------------------------------------------
+
+
+def test_fit():
+    assert fit(torch.rand(3, 5, 7), 30, 30).shape == (3, 20, 28)
+    big = torch.rand(40, 60)
+    assert (fit(big, 30, 30) - big.reshape(20, 2, 30, 2).mean((1, 3))).abs().max() < 1e-6
+
+
+def test_raster_of_more_than_fits():
+    spikes = torch.zeros(100, 8)
+    spikes[50:] = 1
+    drawn = raster(spikes, 50, 8)
+    assert drawn.shape == (8, 50)
+    assert (drawn[:, :25] == 1).all()
+    assert (drawn[:, 25:] < 0.2).all()
+
+
+def test_histogram():
+    """Bars as high as there are pixels, at the right place of the axis."""
+    counts = torch.tensor([0] * 50 + [10] * 100)
+    drawn = histogram(counts, 20, 200, 118)
+    ink = (drawn[0, :100] < 0.5).float()
+    left, right = ink[:, 8], ink[:, 190]
+    assert right.sum() == pytest.approx(96, abs=1)
+    assert left.sum() == pytest.approx(48, abs=1)
+    assert ink[:, 40:160].sum() == 0
+
+
+def test_sheet():
+    page = sheet([[("one", torch.zeros(20, 100)), ("two", torch.zeros(3, 20, 100))]])
+    assert page.shape == (3, 20 + 18 + 24, 100 + 12 + 100 + 24)
+    assert (page[:, 30:50, 12:112] == 0).all()
+    assert page[:, 12:30, 12:40].min() < 0.5  # the title
+
+
+# --- what is known of a recording -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def own_camera(tmp_path, monkeypatch):
+    """A camera of 6 x 8 pixels with two columns of header, upside down, BGGR, cropped by one on every side."""
+    monkeypatch.chdir(tmp_path)
+    known = {
+        "title": "a small one", "height": 6, "width": 8, "drop": [[3, 5]], "rate": 20000, "flip": True,
+        "pattern": "BGGR", "crop": [1, 1, 1, 1], "gain": 1.5, "gamma": 2.0, "source": "made up",
+    }  # fmt: skip
+    Path("own.json").write_text(json.dumps(known))
+    return torch.rand(6, 8) * 0.4 + 0.1
+
+
+@pytest.mark.parametrize("header", [True, False])
+def test_a_camera_is_known(own_camera, capsys, header):
+    """Columns of the header go, frames are turned, the border goes, in every verb."""
+    light = own_camera
+    spikes = simulate_spikes(light.expand(400, 6, 8)).flip(-2)
+    if header:
+        spikes = torch.cat([spikes[..., :3], torch.ones(400, 6, 2, dtype=torch.uint8), spikes[..., 3:]], -1)
+    write_spikes("a.dat", spikes)
+    assert main(["info", "a.dat", "--camera", "own.json"]) == 0
+    out = capsys.readouterr().out
+    assert "size         4 x 6 (H x W)" in out
+    assert "always fire  0 of 24 pixels" in out
+    inner = light[1:-1, 1:-1]
+    place = divmod(int(inner.argmax()), 6)
+    assert f"at row {place[0]}, column {place[1]}" in out.split("brightest")[1]
+
+    words = ["a.dat", "--camera", "own.json", "--alpha", "1"]
+    assert main(["decode", *words, "--method", "tfp", "--window", "399", "-o", "d.png"]) == 0
+    shown = read_picture("d.png")
+    known = torch.zeros(4, 6)
+    known[::2, ::2], known[1::2, 1::2] = shown[0, ::2, ::2], shown[2, 1::2, 1::2]  # RGGB after the crop
+    known[::2, 1::2], known[1::2, ::2] = shown[1, ::2, 1::2], shown[1, 1::2, ::2]
+    assert (known - (1.5 * inner).sqrt()).abs().max() < 0.01
+    view(*words, "-o", "v.png")
+    assert read_picture("v.png").shape[0] == 3
+    known = recording.camera("own.json")
+    shown = recording.Recording(Path("a.dat"), 400, (6, 10 if header else 8), known.flip, camera=known)
+    for n, plane in enumerate(shown.packed(7, 3), 7):
+        assert (shown.unpack(plane) == known.prepare(spikes[n]).numpy()).all()
+        assert shown.read(n, 1)[0].equal(known.prepare(spikes[n]))
+
+
+def test_decode_by_its_sidecar(still, capsys):
+    capsys.readouterr()
+    assert main(["decode", "a.dat", "--method", "tfp", "-o", "d.png"]) == 0
+    assert capsys.readouterr().out.endswith("divided by alpha 0.5\n")
+    assert read_picture("d.png")[:, 16, 8].tolist() == pytest.approx([1, 0, 0], abs=0.1)
+    assert main(["info", "a.dat"]) == 0
+    assert "size         32 x 48 (H x W)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "said"),
+    [
+        (["a.dat", "--camera", "vidar", "--width", "400"], 2, "--camera: it knows --height, --width and --flip"),
+        (["a.dat", "--camera", "nobody"], 1, "camera: expected m1k40"),
+        (["a.dat", "--camera", "vidar"], 1, "a.dat: truncated, or not 250 x 4"),
+        (["a.dat", "--row", "32"], 2, "--row: expected 0 .. 31, got 32"),
+        (["a.dat", "--frames", "40:42"], 2, "--frames: expected A:B within 0:41, as a.dat has 41 frames, got 40:42"),
+        (["a.dat", "--frames", "3"], 2, "argument --frames: expected A:B, got 3"),
+        (["b.dat"], 2, "b.dat: a .dat has no header, give --height and --width"),
+        (["nothing.dat", "--height", "2", "--width", "2"], 1, "nothing.dat: no such file"),
+    ],
+)
+def test_mistakes(still, capsys, words, status, said):
+    Path("b.dat").write_bytes(b"abc")
+    capsys.readouterr()
+    assert main(["view", *words, "-o", "out.png"]) == status
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert said in err
+    assert err.count("\n") == 1
+    assert not Path("out.png").exists()
+
+
+@pytest.mark.parametrize(
+    "words", [["view", "a.dat"], ["decode", "a.dat", "--method", "tfi"], ["view", "b.dat"], ["view", "sub/../a.dat"]]
+)
+def test_what_a_sidecar_names_is_not_written_over(still, capsys, words):
+    shutil.copy("a.dat", "b.dat")
+    Path("sub").mkdir()
+    truth = Path("a.png").read_bytes()
+    size = ["--height", "32", "--width", "48"]
+    for typed in ([*words, *size], words) if words[1] != "b.dat" else ([*words, *size],):
+        assert main([*typed, "-o", "a.png"]) == 1
+        assert capsys.readouterr().err == (
+            "spikekit: a.png: the ground truth of a.json would be lost; choose another name\n"
+        )
+    assert Path("a.png").read_bytes() == truth
+
+
+def test_a_stream_that_lost_its_end(still, capsys):
+    Path("a.dat").write_bytes(Path("a.dat").read_bytes()[:-192])
+    assert main(["view", "a.dat", "-o", "out.png"]) == 1
+    assert "a.dat: expected 41 frames as its side-car says, got 40" in capsys.readouterr().err
+
+
+def test_another_ending(still, capsys):
+    assert main(["view", "a.dat", "-o", "a.dat"]) == 2
+    assert "expected a file that ends in .png, .gif or .html, got a.dat" in capsys.readouterr().err
+
+
+def test_no_room(still, capsys, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    Path("a.html").write_text("before")
+    capsys.readouterr()
+    monkeypatch.setattr("os.fsync", full)
+    assert main(["view", "a.dat", "-o", "a.html"]) == 1
+    assert capsys.readouterr().err == "spikekit: a.html: cannot be written (No space left on device)\n"
+    assert Path("a.html").read_text() == "before"
+    assert not list(Path().glob(".*"))

@@ -1,0 +1,206 @@
+"""The colour filter array against loops over the letters of the pattern."""
+
+import numpy as np
+import pytest
+import torch
+from kornia.color import CFA, rgb_to_raw
+from torch.autograd import gradcheck
+
+import spikekit as sk
+
+PATTERNS = ["RGGB", "BGGR", "GRBG", "GBRG"]
+
+
+def color_at(pattern, y, x):
+    return "RGB".index(pattern[2 * (y % 2) + x % 2])
+
+
+def test_patterns():
+    assert sorted(sk.PATTERNS) == sorted(PATTERNS)
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("scale", [1, 2, 3, 4])
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 5), (4, 2), (1, 6)])
+def test_bayer_mask(pattern, scale, height, width):
+    expected = np.zeros((3, scale * height, scale * width))
+    for y in range(scale * height):
+        for x in range(scale * width):
+            expected[color_at(pattern, y // scale, x // scale), y, x] = 1
+    mask = sk.bayer_mask(height, width, pattern, scale=scale)
+    assert mask.dtype == torch.get_default_dtype()
+    assert np.array_equal(mask.numpy(), expected)
+    assert (mask.sum(0) == 1).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.bool, torch.uint8, torch.bfloat16, torch.float64])
+def test_bayer_mask_dtype(dtype):
+    mask = sk.bayer_mask(3, 4, dtype=dtype)
+    assert mask.dtype == dtype
+    assert torch.equal(mask.double(), sk.bayer_mask(3, 4, dtype=torch.float64))
+    assert torch.equal(sk.BayerMask(scale=2)(mask), sk.bayer_mask(3, 4, scale=2, dtype=dtype))
+
+
+@pytest.mark.parametrize("cfa", list(CFA))
+def test_kornia_cfa(cfa):
+    rgb = torch.rand(2, 3, 4, 6)
+    pattern = sk.bayer_pattern(cfa)
+    assert torch.equal(sk.mosaic(rgb, cfa), rgb_to_raw(rgb, cfa)[:, 0])
+    assert torch.equal(sk.mosaic(rgb, pattern), rgb_to_raw(rgb, cfa)[:, 0])
+    assert torch.equal(sk.bayer_mask(4, 6, cfa), sk.bayer_mask(4, 6, pattern))
+
+
+def test_a_phase_in_small_letters():
+    assert sk.bayer_mask(4, 4, "grbg").equal(sk.bayer_mask(4, 4, "GRBG"))
+    assert sk.BinToSensor("bggr", scale=2).pattern == "BGGR"
+
+
+def test_kornia_bg_is_rggb():
+    assert sk.bayer_pattern(CFA.BG) == "RGGB"
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_bayer_sites(pattern):
+    sites = sk.bayer_sites(pattern)
+    assert [color for color, _, _ in sites] == [0, 1, 1, 2]
+    assert all(color_at(pattern, row, column) == color for color, row, column in sites)
+    assert sites[1][1] < sites[2][1]  # G1 is the upper one
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("scale", [1, 2, 3, 4])
+@pytest.mark.parametrize("lead", [(), (2,), (2, 3)])
+def test_bin_to_sensor(pattern, scale, lead):
+    rows, columns = 3, 5
+    # multiples of scale^2: every mean is a whole number
+    rgb = torch.randint(0, 256, (*lead, 3, scale * rows, scale * columns)).double() * scale**2
+    expected = np.zeros((*lead, rows, columns))
+    for y in range(rows):
+        for x in range(columns):
+            for a in range(scale):
+                for b in range(scale):
+                    site = rgb[..., color_at(pattern, y, x), scale * y + b, scale * x + a]
+                    expected[..., y, x] += site.numpy() / scale**2
+    for dtype in (torch.float64, torch.float32):
+        raw = sk.bin_to_sensor(rgb.to(dtype), pattern, scale=scale)
+        assert raw.dtype == dtype
+        assert np.array_equal(raw.double().numpy(), expected)
+
+
+def test_bin_to_sensor_sums_wide():
+    rgb = torch.full((3, 4, 4), 60000.0, dtype=torch.float16)
+    assert sk.bin_to_sensor(rgb, scale=4).item() == rgb[0, 0, 0].item()
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.bool, torch.float16])
+def test_mosaic_any_dtype(dtype):
+    rgb = torch.randint(0, 2, (3, 3, 5)).to(dtype)
+    raw = sk.mosaic(rgb, "GRBG")
+    assert raw.dtype == dtype
+    assert all(raw[y, x] == rgb[color_at("GRBG", y, x), y, x] for y in range(3) for x in range(5))
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("lead", [(), (3,), (2, 3)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.uint8, torch.bool])
+def test_split_and_merge(pattern, lead, dtype):
+    raw = (torch.rand(*lead, 4, 6) * 8).to(dtype)
+    planes = sk.split_bayer(raw, pattern)
+    assert planes.dtype == dtype
+    assert planes.shape == (4, *lead, 2, 3)
+    for plane, letter in zip(planes, "RGGB", strict=True):
+        y, x = divmod(pattern.index(letter), 2)
+        if letter != "G":
+            assert torch.equal(plane, raw[..., y::2, x::2])
+    g1, g2 = (i for i, letter in enumerate(pattern) if letter == "G")
+    assert torch.equal(planes[1], raw[..., g1 // 2 :: 2, g1 % 2 :: 2])
+    assert torch.equal(planes[2], raw[..., g2 // 2 :: 2, g2 % 2 :: 2])
+    assert torch.equal(sk.merge_bayer(planes, pattern), raw)
+    assert torch.equal(sk.split_bayer(sk.merge_bayer(planes, pattern), pattern), planes)
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("lead", [(), (2, 3)])
+def test_split_colors(pattern, lead):
+    raw = torch.rand(*lead, 3, 5) + 1
+    colors = sk.split_colors(raw, pattern)
+    assert colors.shape == (3, *lead, 3, 5)
+    assert torch.equal(colors.sum(0), raw)
+    assert torch.equal((colors != 0).reshape(3, -1, 3, 5)[:, 0], sk.bayer_mask(3, 5, pattern, dtype=torch.bool))
+    assert sk.split_colors(raw > 1.5).dtype == torch.bool
+
+
+@pytest.mark.parametrize(
+    "op",
+    [
+        lambda x: sk.bin_to_sensor(x, "GBRG", scale=2),
+        lambda x: sk.mosaic(x, "BGGR"),
+        lambda x: sk.split_colors(x, "GRBG"),
+        lambda x: sk.split_bayer(x, "GRBG"),
+        lambda x: sk.merge_bayer(x.repeat(2, 1, 1)[:4]),
+    ],
+)
+def test_gradients(op):
+    assert gradcheck(op, torch.rand(3, 4, 6, dtype=torch.float64, requires_grad=True))
+
+
+@pytest.mark.parametrize(
+    ("error", "call"),
+    [
+        (ValueError, lambda: sk.bayer_mask(0, 2)),
+        (ValueError, lambda: sk.bayer_mask(2, 2, scale=0)),
+        (ValueError, lambda: sk.bayer_mask(2, 2, scale=1.5)),
+        (ValueError, lambda: sk.bayer_mask(2, 2, "RGB")),
+        (ValueError, lambda: sk.bayer_mask(2, 2, None)),
+        (ValueError, lambda: sk.BinToSensor("rgbg", scale=2)),
+        (ValueError, lambda: sk.BinToSensor(scale=0)),
+        (ValueError, lambda: sk.bin_to_sensor(torch.rand(3, 4, 5), scale=2)),
+        (ValueError, lambda: sk.bin_to_sensor(torch.rand(1, 4, 4), scale=2)),
+        (ValueError, lambda: sk.bin_to_sensor(torch.rand(4, 4), scale=2)),
+        (TypeError, lambda: sk.bin_to_sensor(torch.ones(3, 4, 4, dtype=torch.uint8), scale=2)),
+        (TypeError, lambda: sk.bin_to_sensor([[[1.0]]] * 3, scale=1)),
+        (TypeError, lambda: sk.split_colors(torch.ones(2, 2, dtype=torch.complex64))),
+        (ValueError, lambda: sk.split_colors(torch.ones(2))),
+        (ValueError, lambda: sk.split_bayer(torch.ones(4, 5))),
+        (ValueError, lambda: sk.split_bayer(torch.ones(3, 4))),
+        (ValueError, lambda: sk.merge_bayer(torch.ones(3, 2, 2))),
+    ],
+)
+def test_errors(error, call):
+    with pytest.raises(error):
+        call()
+
+
+def test_split_colors_keeps_a_bad_pixel_to_its_colour():
+    raw = torch.ones(2, 2)
+    raw[0, 0] = float("nan")
+    red, green, blue = sk.split_colors(raw)
+    assert red.isnan().tolist() == [[True, False], [False, False]]
+    assert green.tolist() == [[0, 1], [1, 0]]
+    assert blue.tolist() == [[0, 0], [0, 1]]
+
+
+@pytest.mark.parametrize("size", [(1.5, 2), (2, 0), (True, 2), ("2", 2)])
+def test_wrong_size_of_a_mask(size):
+    with pytest.raises(ValueError, match="expected a whole number"):
+        sk.bayer_mask(*size)
+
+
+def test_merge_of_an_empty_batch():
+    assert sk.merge_bayer(torch.zeros(4, 0, 3, 5)).shape == (0, 6, 10)
+
+
+def test_scale_of_numpy():
+    """A byte as the scale: sizes are no bytes, or they would run over."""
+    expected = sk.bayer_mask(100, 90, scale=3)
+    assert torch.equal(sk.bayer_mask(100, np.uint8(90), scale=np.uint8(3)), expected)
+    assert torch.equal(sk.BayerMask(scale=np.uint8(3))(torch.zeros(100, 90)), expected)
+    rgb = torch.rand(3, 300, 270)
+    assert torch.equal(sk.bin_to_sensor(rgb, scale=np.uint8(3)), sk.bin_to_sensor(rgb, scale=3))
+    assert torch.equal(sk.BinToSensor(scale=np.uint8(3))(rgb), sk.bin_to_sensor(rgb, scale=3))
+
+
+@pytest.mark.parametrize("dtype", ["float32", np.float32, float])
+def test_wrong_dtype_of_a_mask(dtype):
+    with pytest.raises(TypeError, match="dtype: expected a type of torch, got "):
+        sk.bayer_mask(2, 2, dtype=dtype)

@@ -1,0 +1,238 @@
+"""A stream decoded in chunks equals the whole, however it is cut, and takes bounded memory."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from spikekit import iter_spikes, spike_integrate_fire, spike_interval, tfi, tfp, write_spikes
+from spikekit.decoders.chunked import decode_in_chunks
+from spikekit.decoders.packing import pack_spikes, unpack_spikes
+
+SEEDS = st.integers(0, 2**31)
+CUTS = st.lists(st.integers(1, 30), min_size=1, max_size=12)
+
+
+def stream(frames, rate, seed):
+    """Pixels of random rates up to ``rate``, some of them silent or always on."""
+    generator = torch.Generator().manual_seed(seed)
+    rates = rate * torch.rand(2, 5, generator=generator)
+    rates[0, 0], rates[1, 4] = 0, 1
+    return (torch.rand(frames, 2, 5, generator=generator) < rates).to(torch.uint8)
+
+
+def in_chunks(decode, spikes, cuts, overlap):
+    pieces = list(decode_in_chunks(decode, spikes.split(cuts, dim=-3), overlap))
+    assert all(piece.shape[-3] >= max(overlap, 1) for piece in pieces[:-1])
+    return torch.cat(pieces, dim=-3)
+
+
+@given(CUTS, st.sampled_from([1, 3, 11, 41]), st.floats(0, 1), SEEDS)
+def test_tfp_in_chunks(cuts, window, rate, seed):
+    spikes = stream(sum(cuts), rate, seed)
+    got = in_chunks(lambda part: tfp(part, window), spikes, cuts, window // 2)
+    assert got.equal(tfp(spikes, window))
+
+
+def decided(spikes, overlap):
+    """Where the frames n - overlap .. n + overlap hold all that the interval at n is made from, pixel by pixel."""
+    frames = len(spikes)
+    result = torch.zeros(spikes.shape, dtype=torch.bool)
+    for y, x in [(y, x) for y in range(spikes.shape[1]) for x in range(spikes.shape[2])]:
+        fired = spikes[:, y, x].nonzero().flatten().tolist()
+        for n in range(frames):
+            low, high = n - overlap, n + overlap
+            before, after = [k for k in fired if k < n][::-1], [k for k in fired if k >= n]
+            if before and after:
+                result[n, y, x] = before[0] >= low and after[0] <= high
+            else:
+                ends = (before or low <= 0) and (after or high >= frames - 1)
+                result[n, y, x] = bool(ends) and all(low <= k <= high for k in (before or after)[:2])
+    return result
+
+
+@given(CUTS, st.integers(0, 30), st.floats(0, 1), SEEDS)
+def test_tfi_in_chunks(cuts, overlap, rate, seed):
+    """Exact wherever the docstring says so."""
+    spikes = stream(sum(cuts), rate, seed)
+    exact = decided(spikes, overlap)
+    got, whole = in_chunks(spike_interval, spikes, cuts, overlap), spike_interval(spikes)
+    assert got[exact].equal(whole[exact])
+    got, whole = in_chunks(tfi, spikes, cuts, overlap), tfi(spikes)
+    assert got[exact].equal(whole[exact])
+
+
+@given(CUTS, st.integers(2, 30), SEEDS)
+def test_tfi_of_pixels_that_are_never_silent_for_long(cuts, overlap, seed):
+    """Exact everywhere where no pixel is silent for half the overlap, ends of the recording included."""
+    generator = torch.Generator().manual_seed(seed)
+    gaps = torch.randint(1, overlap // 2 + 1, (sum(cuts) + 1, 2, 3), generator=generator)
+    spikes = torch.zeros(sum(cuts) + overlap, 2, 3, dtype=torch.uint8)
+    times = gaps.cumsum(0) - 1
+    spikes.scatter_(0, times.clamp(max=len(spikes) - 1), 1)
+    spikes = spikes[: sum(cuts)]
+    assert decided(spikes, overlap).all()
+    assert in_chunks(tfi, spikes, cuts, overlap).equal(tfi(spikes))
+
+
+@pytest.mark.parametrize(
+    ("frame", "fires", "got"), [(20, (10, 25), 15), (20, (8, 25), 16), (19, (15, 29), 14), (19, (15, 31), 15)]
+)
+def test_spikes_on_the_edge_of_the_overlap(frame, fires, got):
+    """Of pieces 0 .. 19 and 20 .. 39 with an overlap of 10, frame 20 sees as far as 10 and frame 19 as far as 29."""
+    spikes = torch.zeros(70, 1, 1, dtype=torch.uint8)
+    spikes[list(fires)] = 1
+    pieces = list(decode_in_chunks(spike_interval, spikes.split([30, 20, 20]), 10))
+    assert [len(piece) for piece in pieces] == [20, 20, 20, 10]
+    assert torch.cat(pieces)[frame] == got
+    assert decided(spikes, 10)[frame].item() == (fires[1] - fires[0] == got)
+
+
+def test_real_ends_are_ends_and_cuts_are_not():
+    spikes = torch.zeros(50, 1, 2, dtype=torch.uint8)
+    spikes[4::5, :, 0] = 1
+    spikes[[10, 13], :, 1] = 1
+    got = in_chunks(spike_interval, spikes, [7] * 7 + [1], 40)
+    assert got.equal(spike_interval(spikes))
+    assert got[:, 0, 0].unique().tolist() == [5]
+
+
+@pytest.mark.parametrize("cuts", [[30], [1] * 30, [29, 1], [4, 4, 4, 18]])
+def test_leading_dimensions_and_dtypes(cuts):
+    spikes = torch.rand(2, 3, 30, 4, 5) < 0.5
+    for dtype in (torch.bool, torch.float16, torch.float64):
+        got = in_chunks(lambda part: tfp(part, 5), spikes.to(dtype), cuts, 2)
+        assert got.equal(tfp(spikes.to(dtype), 5))
+
+
+def test_packed_chunks_from_a_file(tmp_path):
+    spikes = stream(100, 0.5, 1)
+    write_spikes(tmp_path / "a.dat", spikes)
+    chunks = iter_spikes(tmp_path / "a.dat", 2, 5, chunk=17, packed=True)
+    pieces = decode_in_chunks(lambda part: tfp(unpack_spikes(part, 5), 11), chunks, 5)
+    assert torch.cat(list(pieces)).equal(tfp(spikes, 11))
+    assert pack_spikes(spikes).shape == (100, 2, 1)
+
+
+def test_pieces_come_as_soon_as_they_can():
+    """Nothing is read ahead, and nothing is yielded before its context is there."""
+    read = []
+
+    def chunks():
+        for n in range(6):
+            read.append(n)
+            yield torch.ones(10, 1, 1)
+
+    pieces = decode_in_chunks(lambda part: part, chunks(), 5)
+    assert read == []
+    lengths = []
+    for piece in pieces:
+        lengths.append((read[-1], len(piece)))
+    assert lengths == [(0, 5), (1, 10), (2, 10), (3, 10), (4, 10), (5, 10), (5, 5)]
+
+
+def test_work_is_at_most_tripled():
+    worked = 0
+
+    def decode(part):
+        nonlocal worked
+        worked += len(part)
+        return part
+
+    for length in (1, 7, 20, 100):
+        worked = 0
+        list(decode_in_chunks(decode, torch.ones(1000, 1, 1).split(length), 20))
+        assert 1000 <= worked <= 3 * 1000
+
+
+def test_no_chunks_no_pieces():
+    assert list(decode_in_chunks(tfi, [], 3)) == []
+
+
+def test_sensor_in_chunks(tmp_path):
+    """The loop of the example of write_spikes: light in chunks, one recording."""
+    light, charge = torch.rand(100, 3, 5), torch.rand(3, 5)
+
+    def expose(lights, charge):
+        for part in lights:
+            spikes, charge = spike_integrate_fire(part, charge=charge)
+            yield spikes
+
+    write_spikes(tmp_path / "a.npz", expose(light.split(17), charge))
+    whole, _ = spike_integrate_fire(light, charge=charge)
+    assert torch.cat(list(iter_spikes(tmp_path / "a.npz", chunk=30))).equal(whole.byte())
+
+
+@pytest.mark.parametrize(
+    ("chunks", "overlap", "error", "message"),
+    [
+        ([], -1, ValueError, "overlap: expected 0 or more frames, got -1"),
+        ([], 2.0, TypeError, r"overlap: expected a whole number, got 2\.0"),
+    ],
+)
+def test_bad_overlap_at_the_call(chunks, overlap, error, message):
+    with pytest.raises(error, match=message):
+        decode_in_chunks(tfi, chunks, overlap)
+
+
+@pytest.mark.parametrize(
+    ("chunks", "error", "message"),
+    [
+        ([torch.ones(3, 4)], ValueError, r"chunks: expected a non-empty tensor of shape \(\*, T, H, W\), got \(3, 4\)"),
+        ([torch.ones(0, 3, 4)], ValueError, "non-empty"),
+        ([[1, 0]], TypeError, "chunks: expected a tensor"),
+        ([torch.ones(3, 4, 5), torch.ones(3, 5, 4)], ValueError, r"one size.*\(3, 4, 5\).*before \(3, 5, 4\)"),
+        ([torch.ones(3, 4, 5), torch.ones(1, 3, 4, 5)], ValueError, "one size"),
+        ([torch.ones(3, 4, 5), torch.ones(3, 4, 5).bool()], ValueError, "type.*torch.float32.*torch.bool"),
+    ],
+)
+def test_bad_chunks(chunks, error, message):
+    with pytest.raises(error, match=message):
+        list(decode_in_chunks(tfi, chunks, 2))
+
+
+def test_decode_that_changes_the_number_of_frames():
+    with pytest.raises(ValueError, match=r"decode: expected 7 frames as given, got a result of \(1, 4, 5\)"):
+        list(decode_in_chunks(lambda part: part[:1], [torch.ones(7, 4, 5)], 2))
+
+
+@pytest.mark.parametrize("result", [None, (torch.ones(7, 4, 5),), 3])
+def test_decode_that_returns_no_tensor(result):
+    with pytest.raises(TypeError, match=r"decode: expected a function that returns a tensor, got "):
+        list(decode_in_chunks(lambda _: result, [torch.ones(7, 4, 5)], 2))
+
+
+BOUNDED = """
+import resource, sys
+import torch
+from spikekit import iter_spikes, tfi
+from spikekit.decoders.chunked import decode_in_chunks
+
+def run(frames):
+    chunks = iter_spikes(sys.argv[1], 50, 80, frames=frames, chunk=200)
+    return sum(len(piece) for piece in decode_in_chunks(lambda part: tfi(part, 255.0, dtype=torch.uint8), chunks, 200))
+
+run(2000)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+assert run(None) == 20_000
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="kilobytes of ru_maxrss are Linux's")
+def test_bounded_memory(tmp_path):
+    """20,000 frames, 80 MB as bytes and as many decoded, take no more than 8 MB beyond what 2000 take."""
+    chunk = (torch.rand(200, 50, 80) < 0.2).byte()
+    write_spikes(tmp_path / "long.dat", (chunk for _ in range(100)))
+    done = subprocess.run(
+        [sys.executable, "-c", BOUNDED, tmp_path / "long.dat"],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"MALLOC_MMAP_THRESHOLD_": "131072"},  # what is freed is given back, and no longer counts
+    )
+    assert int(done.stdout) < 8000

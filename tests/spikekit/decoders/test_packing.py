@@ -1,0 +1,149 @@
+"""Packed spikes: bits by hand, round trips of every type and width, the torch path, and what cannot be packed."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from spikekit.decoders.packing import _pack_bits, _unpack_bits, pack_spikes, unpack_spikes
+
+DTYPES = [
+    torch.bool,
+    torch.uint8,
+    torch.int8,
+    torch.int64,
+    torch.float16,
+    torch.bfloat16,
+    torch.float32,
+    torch.float64,
+]
+
+
+def random_spikes(*shape):
+    return (torch.rand(shape) < 0.4).to(torch.uint8)
+
+
+def packed_by_hand(spikes):
+    """One pixel at a time."""
+    rows = spikes.reshape(-1, spikes.shape[-1]).tolist()
+    packed = [[sum(bit << i for i, bit in enumerate(row[j : j + 8])) for j in range(0, len(row), 8)] for row in rows]
+    return torch.tensor(packed, dtype=torch.uint8).reshape(*spikes.shape[:-1], -1)
+
+
+def test_bits_by_hand():
+    spikes = torch.tensor([[1, 0, 0, 0, 0, 0, 0, 0, 0, 1], [0, 1, 0, 0, 0, 0, 0, 1, 1, 1]])
+    assert pack_spikes(spikes).tolist() == [[1, 2], [0b10000010, 3]]
+    assert unpack_spikes(torch.tensor([[1, 2], [0b10000010, 3]], dtype=torch.uint8), 10).equal(spikes.byte())
+
+
+@given(
+    st.sampled_from([(1, 1), (3, 4), (2, 3, 5), (2, 1, 3, 2)]),
+    st.integers(1, 25),
+    st.sampled_from(DTYPES),
+    st.booleans(),
+)
+def test_against_one_pixel_at_a_time(lead, width, dtype, strided):
+    spikes = random_spikes(*lead, width).to(dtype)
+    if strided:
+        spikes = spikes.mT.contiguous().mT
+    packed = pack_spikes(spikes)
+    assert packed.dtype is torch.uint8
+    assert packed.equal(packed_by_hand(spikes.byte()))
+    unpacked = unpack_spikes(packed, width, dtype=dtype)
+    assert unpacked.dtype is dtype
+    assert unpacked.equal(spikes)
+
+
+@pytest.mark.parametrize("width", [1, 7, 8, 9, 24])
+def test_torch_path(width):
+    """What runs on other devices than the CPU."""
+    spikes = random_spikes(2, 3, 4, width)
+    packed = packed_by_hand(spikes)
+    assert _pack_bits._init_fn(spikes.float()).equal(packed)
+    assert _unpack_bits._init_fn(packed, width).equal(spikes)
+    with pytest.raises(ValueError, match="zeros and ones"):
+        _pack_bits._init_fn(2 * spikes)
+
+
+def test_as_in_a_file(tmp_path):
+    """Where 8 divides the width, packed frames are the bytes of a .dat."""
+    spikes = random_spikes(5, 6, 16)
+    pack_spikes(spikes).numpy().tofile(tmp_path / "a.dat")
+    from spikekit import read_spikes
+
+    assert read_spikes(tmp_path / "a.dat", 6, 16).equal(spikes)
+    assert np.array_equal(np.packbits(spikes.numpy(), axis=-1, bitorder="little"), pack_spikes(spikes).numpy())
+
+
+def test_bits_beyond_the_width_say_nothing():
+    assert unpack_spikes(torch.full((2, 1), 255, dtype=torch.uint8), 3).tolist() == [[1, 1, 1]] * 2
+
+
+def test_empty_batch():
+    packed = pack_spikes(torch.zeros(0, 4, 9))
+    assert packed.shape == (0, 4, 2)
+    assert unpack_spikes(packed, 9).shape == (0, 4, 9)
+
+
+@pytest.mark.parametrize("value", [2, -1, 0.5, float("nan"), float("inf")])
+def test_other_values(value):
+    for dtype in (torch.float32, torch.bfloat16, torch.float64):
+        with pytest.raises(ValueError, match="expected zeros and ones"):
+            pack_spikes(torch.tensor([[0, 1, value]], dtype=dtype))
+    if value == 2:
+        with pytest.raises(ValueError, match="expected zeros and ones"):
+            pack_spikes(torch.tensor([[0, 1, 2]], dtype=torch.uint8))
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: pack_spikes(np.zeros((3, 4))), TypeError, r"spikes: expected a tensor of shape \(\*, H, W\)"),
+        (lambda: pack_spikes(torch.zeros(4)), ValueError, r"spikes: expected a non-empty tensor.*got \(4,\)"),
+        (lambda: pack_spikes(torch.zeros(3, 0)), ValueError, "non-empty"),
+        (lambda: pack_spikes(torch.zeros(3, 4, dtype=torch.complex64)), TypeError, "a real tensor"),
+        (lambda: unpack_spikes(torch.zeros(3, 2), 16), TypeError, "packed: expected bytes, torch.uint8, got torch.fl"),
+        (lambda: unpack_spikes(torch.zeros(3, 2).byte(), 17), ValueError, r"width: expected 9 \.\. 16 .* got 17"),
+        (lambda: unpack_spikes(torch.zeros(3, 2).byte(), 8), ValueError, r"width: expected 9 \.\. 16 .* got 8"),
+        (lambda: unpack_spikes(torch.zeros(3, 2).byte(), 0), ValueError, "width: expected a whole number >= 1, got 0"),
+        (lambda: unpack_spikes(torch.zeros(3, 2).byte(), 9.5), ValueError, "width: expected a whole number"),
+        (lambda: unpack_spikes(torch.zeros(3, 2).byte(), 9, dtype="int8"), TypeError, r"to\(\)"),
+    ],
+)
+def test_bad_arguments(call, error, message):
+    with pytest.raises(error, match=message):
+        call()
+
+
+@pytest.mark.parametrize("axis", [0, 1, 3])
+def test_vmap(capfd, axis):
+    spikes = random_spikes(3, 5, 4, 13)
+    packed = pack_spikes(spikes)
+    assert torch.func.vmap(pack_spikes, axis)(spikes.movedim(0, axis)).equal(packed)
+    unpack = torch.func.vmap(lambda one: unpack_spikes(one, 13), axis)
+    assert unpack(packed.movedim(0, axis)).equal(spikes)
+    assert capfd.readouterr().err == ""  # without a rule of its own vmap loops, and says so
+
+
+def test_compile():
+    spikes = random_spikes(2, 5, 4, 13)
+    packed = pack_spikes(spikes)
+    torch.compiler.reset()
+    pack = torch.compile(pack_spikes, fullgraph=True, backend="aot_eager")
+    unpack = torch.compile(unpack_spikes, fullgraph=True, backend="aot_eager")
+    assert pack(spikes).equal(packed)
+    assert unpack(packed, 13).equal(spikes)
+
+
+@pytest.mark.parametrize(
+    ("op", "arguments"),
+    [
+        (torch.ops.spikekit.pack_bits, (random_spikes(2, 4, 13),)),
+        (torch.ops.spikekit.unpack_bits, (random_spikes(2, 4, 2), 13)),
+    ],
+)
+def test_custom_operators_are_registered_correctly(op, arguments):
+    torch.library.opcheck(
+        op.default, arguments, test_utils=("test_schema", "test_autograd_registration", "test_faketensor")
+    )

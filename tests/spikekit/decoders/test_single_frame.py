@@ -1,0 +1,213 @@
+"""One key frame equals that frame of the whole, and is found without looking at frames that do not matter."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from spikekit import spike_interval, spike_interval_at, tfi, tfi_at, tfp, tfp_at
+from spikekit.decoders.single_frame import _spike_interval_at, search, tfp_weights
+
+
+def interval_by_hand(fired, n):
+    """The interval of one pixel at frame n, from a list of the frames at which it fires."""
+    frames, spikes = len(fired), [k for k, one in enumerate(fired) if one]
+    before, after = [k for k in spikes if k < n], [k for k in spikes if k >= n]
+    observed = (after[0] if after else frames) - (before[-1] if before else -1)
+    if not before and len(after) > 1:
+        return max(observed, after[1] - after[0])
+    if not after and len(before) > 1:
+        return max(observed, before[-1] - before[-2])
+    return observed
+
+
+@given(st.integers(1, 40), st.floats(0, 1), st.integers(0, 2**31), st.data())
+def test_against_one_pixel_at_a_time(frames, rate, seed, data):
+    spikes = torch.rand(frames, 3, 4, generator=torch.Generator().manual_seed(seed)) < rate
+    frame = data.draw(st.integers(0, frames - 1))
+    expected = [[interval_by_hand(spikes[:, y, x].tolist(), frame) for x in range(4)] for y in range(3)]
+    assert spike_interval_at(spikes, frame).tolist() == expected
+    assert _spike_interval_at._init_fn(spikes, frame).tolist() == expected  # what runs on other devices
+    assert spike_interval(spikes)[frame].tolist() == expected
+
+
+@pytest.mark.parametrize(
+    "dtype",
+    [torch.bool, torch.uint8, torch.int8, torch.int32, torch.float16, torch.bfloat16, torch.float32, torch.float64],
+)
+def test_equals_that_frame_of_the_whole(dtype):
+    spikes = (torch.rand(2, 3, 30, 4, 5) < torch.rand(4, 5) * 0.3).to(dtype)
+    for frame in (0, 1, 14, 28, 29):
+        for got, whole in [
+            (spike_interval_at(spikes, frame), spike_interval(spikes)),
+            (tfi_at(spikes, frame), tfi(spikes)),
+            (tfi_at(spikes, frame, 255.0, dtype=torch.uint8), tfi(spikes, 255.0, dtype=torch.uint8)),
+            (tfi_at(spikes, frame, 0.3, dtype=torch.float16), tfi(spikes, 0.3, dtype=torch.float16)),
+        ]:
+            assert got.dtype is whole.dtype
+            assert got.equal(whole[..., frame, :, :])
+
+
+def test_any_value_but_0_is_a_spike():
+    spikes = torch.tensor([0, 255, 0, 0, 0, 7, 0], dtype=torch.uint8).reshape(7, 1, 1)
+    for frame in range(7):
+        assert spike_interval_at(spikes, frame).equal(spike_interval(spikes)[frame])
+        assert spike_interval_at(-spikes.float(), frame).equal(spike_interval(-spikes.float())[frame])
+
+
+@pytest.mark.parametrize("frames", [255, 256, 600, 40_000])
+def test_long_silence(frames):
+    """Counters of one byte do not run over."""
+    spikes = torch.zeros(frames, 1, 3, dtype=torch.uint8)
+    spikes[3, 0, 0] = spikes[-1, 0, 0] = 1
+    spikes[[0, frames // 2], 0, 1] = 1
+    for frame in (0, 3, 4, frames // 2 + 1, frames - 1):
+        assert spike_interval_at(spikes, frame).equal(spike_interval(spikes)[frame])
+
+
+def test_looks_no_further_than_needed():
+    """Frames outwards, until every pixel has fired on both sides."""
+    spikes = np.zeros((100, 2, 2), np.uint8)
+    spikes[[40, 44, 50, 53], :, :] = 1
+    seen = []
+    assert (search(lambda n: seen.append(n) or spikes[n], 48, range(100)) == 6).all()
+    assert set(seen) == set(range(44, 51))
+    seen.clear()
+    spikes[:48] = 0
+    assert (search(lambda n: seen.append(n) or spikes[n], 48, range(30, 100)) == 21).all()
+    assert set(seen) == set(range(30, 54))
+
+
+def test_strides_batches_and_gradients():
+    spikes = (torch.rand(5, 4, 30) < 0.2).float().requires_grad_().permute(2, 0, 1)
+    rate = tfi_at(spikes, 7)
+    assert rate.equal(tfi(spikes)[7])
+    assert not rate.requires_grad
+    assert tfi_at(spikes.detach()[:, None].expand(30, 2, 5, 4).movedim(0, 1), 7).equal(rate.expand(2, 5, 4))
+    assert tfi_at(torch.zeros(0, 3, 4, 5), 1).shape == (0, 4, 5)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 3])
+def test_vmap(capfd, axis):
+    spikes = torch.rand(3, 9, 4, 6) < 0.3
+    for op in (spike_interval_at, tfi_at):
+        for frame in (0, 4):
+            mapped = torch.func.vmap(lambda one, op=op, frame=frame: op(one, frame), axis)(spikes.movedim(0, axis))
+            assert mapped.equal(op(spikes, frame))
+    assert capfd.readouterr().err == ""  # without a rule of its own vmap loops, and says so
+
+
+def test_compile():
+    spikes = torch.rand(2, 9, 4, 6) < 0.3
+    torch.compiler.reset()
+    compiled = torch.compile(tfi_at, fullgraph=True, backend="aot_eager")
+    assert compiled(spikes, 4).equal(tfi_at(spikes, 4))
+    torch.library.opcheck(
+        torch.ops.spikekit.spike_interval_at.default,
+        (spikes, 4),
+        test_utils=("test_schema", "test_autograd_registration", "test_faketensor"),
+    )
+
+
+@pytest.mark.parametrize("op", [spike_interval_at, tfi_at])
+@pytest.mark.parametrize(
+    ("spikes", "frame", "error", "message"),
+    [
+        (torch.ones(5, 4, 4), 5, ValueError, r"frame: expected 0 \.\. 4, got 5"),
+        (torch.ones(5, 4, 4), -1, ValueError, r"frame: expected 0 \.\. 4, got -1"),
+        (torch.ones(5, 4, 4), 2.0, TypeError, r"frame: expected a whole number, got 2\.0"),
+        (torch.ones(4, 4), 0, ValueError, "non-empty tensor of shape"),
+        (torch.ones(0, 4, 4), 0, ValueError, "non-empty tensor of shape"),
+        ([1, 0], 0, TypeError, "expected a tensor"),
+    ],
+)
+def test_bad_arguments(op, spikes, frame, error, message):
+    with pytest.raises(error, match=message):
+        op(spikes, frame)
+
+
+def test_bad_range_and_dtype():
+    with pytest.raises(ValueError, match="max_range"):
+        tfi_at(torch.ones(5, 4, 4), 0, 0.0)
+    with pytest.raises(TypeError, match="dtype"):
+        tfi_at(torch.ones(5, 4, 4), 0, dtype=torch.int32)
+    assert tfi_at(torch.ones(5, 4, 4), np.int64(2)).unique().tolist() == [1]
+
+
+def mean_by_hand(values, n, window, order):
+    """The mean of means of one pixel at frame n, as it is said: the mean of what the order before it gives."""
+    around = range(max(n - window // 2, 0), min(n + window // 2 + 1, len(values)))
+    return sum(mean_by_hand(values, k, window, order - 1) if order > 1 else values[k] for k in around) / len(around)
+
+
+@given(st.integers(1, 20), st.integers(0, 6), st.integers(1, 3), st.data())
+def test_mean_against_one_pixel_at_a_time(frames, half, order, data):
+    frame = data.draw(st.integers(0, frames - 1))
+    values = torch.rand(frames, 1, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(frames))
+    got = tfp_at(values, frame, 2 * half + 1, order=order).flatten()
+    for pixel in range(2):
+        assert got[pixel].item() == pytest.approx(
+            mean_by_hand(values[:, 0, pixel].tolist(), frame, 2 * half + 1, order)
+        )
+
+
+@pytest.mark.parametrize("window", [1, 5, 11, 61])
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_mean_equals_that_frame_of_the_whole(window, order):
+    spikes = torch.rand(2, 3, 30, 4, 5, generator=torch.Generator().manual_seed(0)) < 0.3
+    for dtype in (torch.bool, torch.uint8, torch.int32, torch.float16, torch.bfloat16, torch.float32, torch.float64):
+        for frame in (0, 1, 14, 29):
+            got = tfp_at(spikes.to(dtype), frame, window, 0.3, order=order)
+            whole = tfp(spikes.to(dtype), window, 0.3, order=order)[..., frame, :, :]
+            torch.testing.assert_close(got, whole, rtol=max(1e-6, torch.finfo(whole.dtype).eps), atol=1e-7)
+    picture = tfp_at(spikes, 14, window, 255.0, order=order, dtype=torch.uint8).int()
+    assert (picture - tfp(spikes, window, 255.0, order=order, dtype=torch.uint8)[..., 14, :, :].int()).abs().max() <= 1
+
+
+def test_mean_is_linear_with_its_weights_as_gradient():
+    light = torch.rand(9, 2, 2, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda values: tfp_at(values, 2, 5, 1.5, order=2), light)
+    (gradient,) = torch.autograd.grad(tfp_at(light, 2, 5, order=2).sum(), light)
+    first, weights = tfp_weights(9, 2, 5, 2)
+    assert first == 0
+    assert gradient[:7, 0, 0].tolist() == pytest.approx(weights)
+    assert not gradient[7:].any()
+    assert sum(weights) == pytest.approx(1)
+
+
+def test_mean_of_a_pixel_that_always_fires_is_exact_at_the_extremes():
+    """A whole recording in one mean, half precision, a range near the end of the type."""
+    spikes = torch.ones(70_001, 1, 2, dtype=torch.uint8)
+    assert tfp_at(spikes, 35_000, 2001, order=2).sub(1).abs().max() <= 2e-6
+    assert tfp_at(spikes[:2001].half(), 1000, 2001).tolist() == [[1, 1]]
+    assert tfp_at(spikes[:41], 20, 41, 6e4, dtype=torch.float16).tolist() == [[60000, 60000]]
+    assert not tfp_at(torch.zeros(41, 1, 2), 20, 13, order=3).any()
+
+
+def test_mean_compiles_maps_and_takes_no_spikes_that_it_does_not_see():
+    spikes = torch.rand(2, 41, 4, 6)
+    expected = tfp_at(spikes, 20, 13, order=3)
+    torch.compiler.reset()
+    compiled = torch.compile(lambda values: tfp_at(values, 20, 13, order=3), fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(compiled(spikes), expected)
+    torch.testing.assert_close(torch.func.vmap(lambda values: tfp_at(values, 20, 13, order=3))(spikes), expected)
+    spikes[:, [0, 1, 39, 40]] = torch.nan  # 37 are seen
+    assert tfp_at(spikes, 20, 13, order=3).equal(expected)
+
+
+@pytest.mark.parametrize(
+    ("args", "error", "message"),
+    [
+        ((torch.ones(3, 3), 0, 3), ValueError, "spikes"),
+        ((torch.ones(5, 2, 2), 5, 3), ValueError, r"frame: expected 0 \.\. 4, got 5"),
+        ((torch.ones(5, 2, 2), 1.5, 3), TypeError, "frame"),
+        ((torch.ones(5, 2, 2), 1, 4), ValueError, "window: expected an odd number"),
+        ((torch.ones(5, 2, 2), 1, 3, 0.0), ValueError, "max_range"),
+    ],
+)
+def test_mean_says_what_is_wrong(args, error, message):
+    with pytest.raises(error, match=message):
+        tfp_at(*args)
+    with pytest.raises(ValueError, match="order"):
+        tfp_at(torch.ones(5, 2, 2), 1, 3, order=0)

@@ -1,0 +1,323 @@
+"""Latent frames: against scenes whose motion is known, at the ends, where something is hidden, and across cuts."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+
+from spikekit import psnr, write_picture
+from spikekit.bench import interpolation
+from spikekit.flow.interpolate import Between, Blend, FlowInterpolation, Still, _Carried
+from spikekit.io.video import read_video
+from spikekit.scenes.analytic import Layer, Motion, Scene
+
+VIDEO = Path(__file__).parents[3].parent / "shared" / "data" / "video" / "vid4"
+
+needs_video = pytest.mark.skipif(not VIDEO.is_dir(), reason="the shared films are not beside the repository")
+
+
+def texture(height, width, seed=0, dtype=torch.float32):
+    """Blurred noise from 0 to 1: coarse shapes, as pictures have them, with finer and finer detail."""
+    white = np.random.default_rng(seed).normal(size=(3, 3, height, width))
+    layers = [gaussian_filter(noise, (0, sigma, sigma)) for noise, sigma in zip(white, (1.5, 5, 15), strict=True)]
+    noise = sum(layer / layer.std() for layer in layers)
+    low, high = noise.min(), noise.max()
+    return torch.from_numpy((noise - low) / (high - low)).to(dtype)
+
+
+def panning(x, y, size=(96, 112), dtype=torch.float32):
+    """A scene of 21 clocks that moves by (x, y) pixels from the first to the last."""
+    picture = texture(size[0] + 80, size[1] + 80, dtype=dtype)
+    return Scene([Layer(picture, Motion(velocity=(x / 20, y / 20)), (-40, -40))], *size, frames=21)
+
+
+def passing(background=(-1.6, 1.2), front=(4.0, 0.0), size=(120, 120)):
+    """A square in front of a background; both move by so many pixels from the first to the last of 21 clocks."""
+    back = Layer(texture(200, 200), Motion((background[0] / 20, background[1] / 20)), (-40, -40))
+    square = Layer(texture(48, 48, seed=1), Motion((front[0] / 20, front[1] / 20)), (36, 36), torch.ones(48, 48))
+    return Scene([back, square], *size, frames=21)
+
+
+def ends(scene):
+    return scene.rgb(0), scene.rgb(20)
+
+
+ALL = [Still(), Blend(), FlowInterpolation()]
+
+
+# --- the ends, kinds of numbers, bad input ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ALL, ids=lambda method: type(method).__name__)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16])
+def test_the_ends_are_the_frames(method, dtype):
+    first, second = (frame.to(dtype) for frame in ends(panning(3.0, 1.0)))
+    between = method(first, second)
+    assert isinstance(between, Between)
+    assert between.at(0).equal(first)
+    assert between.at(1.0).equal(second)
+    assert between.at(0.3).dtype == dtype
+    assert between.at(0.3).shape == first.shape
+    for tau in (-0.01, 1.01, float("nan")):
+        with pytest.raises(ValueError, match="tau"):
+            between.at(tau)
+
+
+@pytest.mark.parametrize("method", ALL, ids=lambda method: type(method).__name__)
+def test_equal_frames_stay(method):
+    frame = texture(40, 50)
+    between = method(frame, frame.clone())
+    for tau in (0, 0.25, 0.5, 0.9, 1):
+        assert torch.allclose(between.at(tau), frame, atol=1e-7, rtol=0)
+    assert not between.cut
+    if isinstance(method, FlowInterpolation):
+        assert between.at(0.7).equal(frame)
+        assert not between.forward.any()
+
+
+@pytest.mark.parametrize("method", ALL, ids=lambda method: type(method).__name__)
+def test_what_are_no_frames(method):
+    frame = torch.rand(3, 20, 20)
+    with pytest.raises(ValueError, match="first"):
+        method(frame[:1], frame[:1])
+    with pytest.raises(ValueError, match="first"):
+        method(frame[None], frame[None])
+    with pytest.raises(ValueError, match="second"):
+        method(frame, frame[:, 1:])
+    with pytest.raises(ValueError, match="second"):
+        method(frame, frame.double())
+    with pytest.raises(TypeError, match="first"):
+        method((frame * 255).byte(), frame)
+
+
+def test_flow_refuses_what_is_not_finite():
+    frame = torch.rand(3, 20, 20)
+    hole = frame.clone()
+    hole[0, 3, 3] = float("nan")
+    with pytest.raises(ValueError, match="NaN"):
+        FlowInterpolation()(frame, hole)
+    for shrink in (0, 1.5, True):
+        with pytest.raises(ValueError, match="shrink"):
+            FlowInterpolation(shrink)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (5, 3), (17, 16), (31, 45)])
+@pytest.mark.parametrize("shrink", [1, 2, 3])
+def test_any_size(size, shrink):
+    first, second = torch.rand(2, 3, *size).sort(dim=0).values
+    picture = FlowInterpolation(shrink)(first, second).at(0.4)
+    assert picture.shape == first.shape
+    assert picture.isfinite().all()
+    assert picture.min() >= first.min()
+    assert picture.max() <= second.max()
+
+
+def test_the_simple_ones():
+    first, second = torch.rand(2, 3, 4, 5, dtype=torch.float64)
+    assert torch.allclose(Blend()(first, second).at(0.3), 0.7 * first + 0.3 * second, atol=1e-15)
+    still = Still()(first, second)
+    assert still.at(0.49).equal(first)
+    assert still.at(0.5).equal(second)
+    assert Blend()(first, second).forward is None
+
+
+# --- motion -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("x", "y"), [(1.0, 0.5), (-2.0, 1.0), (4.5, -3.5), (10.0, 8.0)])
+@pytest.mark.parametrize("tau", [0.25, 0.5, 0.8])
+def test_known_translation(x, y, tau):
+    scene = panning(x, y)
+    between = FlowInterpolation(shrink=1)(*ends(scene))
+    truth = scene.rgb(20 * tau)
+    blend = psnr(Blend()(*ends(scene)).at(tau), truth)
+    made = psnr(between.at(tau), truth)
+    assert made > (45 if abs(x) < 8 else 29)
+    assert made > blend + 4
+    inner = (slice(None), slice(24, -24), slice(24, -24))
+    for flow, sign in ((between.forward, 1), (between.backward, -1)):
+        assert flow.shape == (2, 96, 112)
+        error = flow[inner] - sign * torch.tensor([x, y]).reshape(2, 1, 1)
+        assert error.abs().mean() < 0.1
+
+
+def test_a_feature_goes_straight_on():
+    y, x = torch.meshgrid(torch.arange(150.0), torch.arange(150.0), indexing="ij")
+    spot = 0.9 * torch.exp(-((x - 75) ** 2 + (y - 75) ** 2) / (2 * 4.0**2))
+    scene = Scene([Layer(spot.expand(3, -1, -1), Motion((0.3, -0.2)), (-35, -35))], 80, 80, frames=21)
+    between = FlowInterpolation()(*ends(scene))
+
+    def place(picture):
+        mass = picture[0].clamp(min=0.05) - 0.05
+        return torch.stack([(mass * x[:80, :80]).sum(), (mass * y[:80, :80]).sum()]) / mass.sum()
+
+    start = place(scene.rgb(0))
+    path = torch.stack([place(between.at(tau)) - start for tau in (0.1, 0.25, 0.5, 0.75, 0.9)])
+    expected = torch.tensor([0.1, 0.25, 0.5, 0.75, 0.9])[:, None] * torch.tensor([6.0, -4.0])
+    assert (path - expected).abs().max() < 0.15
+
+
+def test_double_is_more_than_single():
+    single, double = panning(3.0, 1.0), panning(3.0, 1.0, dtype=torch.float64)
+    made = FlowInterpolation()(*ends(double)).at(0.5)
+    assert made.dtype == torch.float64
+    assert not made.equal(made.float().double())
+    assert torch.allclose(made.float(), FlowInterpolation()(*ends(single)).at(0.5), atol=1e-3)
+
+
+@pytest.mark.parametrize("tau", [0.25, 0.5, 0.75])
+def test_what_an_object_hides(tau):
+    scene = passing()
+    truth = scene.rgb(20 * tau)
+    made, blend = (method(*ends(scene)).at(tau) for method in (FlowInterpolation(), Blend()))
+    left, top = 36 + 4 * (tau - 0.5), 36
+    y, x = torch.meshgrid(torch.arange(120.0), torch.arange(120.0), indexing="ij")
+    outside = torch.maximum((x - left - 23.5).abs(), (y - top - 23.5).abs()) - 24
+    edge = outside.abs() < 4
+    error, plain = ((picture - truth).abs().mean(dim=0)[edge].mean() for picture in (made, blend))
+    assert error < 0.02 < plain
+
+
+def ball(radius, pixels):
+    """A white ball that moves to the right, in front of a dark background that stands still."""
+    axis = torch.arange(2.0 * radius + 1) - radius
+    disc = (axis[:, None] ** 2 + axis**2 < radius**2).float()
+    ball = Layer(torch.full((3, *disc.shape), 0.95), Motion((pixels / 20, 0.0)), (50, 50), disc)
+    return Scene([Layer(texture(200, 200) * 0.6, position=(-40, -40)), ball], 120, 120, frames=21)
+
+
+@pytest.mark.parametrize(("radius", "pixels", "tau", "least"), [(4, 10, 0.5, 40), (5, 12, 0.5, 36), (6, 16, 0.5, 34)])
+def test_a_ball_that_moves_farther_than_it_is_wide(radius, pixels, tau, least):
+    # half way, both frames show only background where the ball is: its motion must be carried there
+    scene = ball(radius, pixels)
+    assert psnr(FlowInterpolation()(*ends(scene)).at(tau), scene.rgb(20 * tau)) > least
+
+
+def test_what_is_in_front_covers_what_is_behind():
+    scene = passing((0.0, 0.0), (6.0, 0.0))
+    frames = torch.stack(ends(scene))
+    flows = torch.zeros(2, 2, 120, 120)
+    flows[0, 0, 36:84, 33:81] = 6
+    flows[1, 0, 36:84, 39:87] = -6
+    between = _Carried(*frames, frames, torch.ones(2, 1, 1, 1), flows)
+    motion = between._candidates(torch.tensor([-0.5, 0.5]).reshape(2, 1, 1, 1))[1]
+    # there the square meets background that the second frame no longer shows; a plain mean of the two would be 3
+    meeting = motion[0, 36:84, 81:84]
+    assert meeting.mean() > 5
+    assert (motion[1] == 0).all()
+
+
+@pytest.mark.parametrize("method", [Blend(), FlowInterpolation()], ids=lambda method: type(method).__name__)
+def test_the_nearer_frame_counts_more(method):
+    scene = panning(3.0, 2.0)
+    grain = torch.randn(2, 3, scene.height, scene.width) * 0.05
+    first, second = ((frame + noise).clamp(0, 1) for frame, noise in zip(ends(scene), grain, strict=True))
+    between = method(first, second)
+    for tau, frame in ((0.05, first), (0.95, second)):
+        assert psnr(between.at(tau), frame) > 33
+
+
+def test_what_comes_in_from_outside():
+    scene = panning(12.0, 0.0)
+    first, second = ends(scene)
+    between = FlowInterpolation()(first, second)
+    truth = scene.rgb(10)
+    # half way, the leftmost pixels are in the second frame alone, the rightmost in the first alone
+    for columns in (slice(0, 5), slice(-5, None)):
+        error = (between.at(0.5) - truth)[..., columns].abs().mean()
+        assert error < 0.8 * (Blend()(first, second).at(0.5) - truth)[..., columns].abs().mean()
+
+
+@pytest.mark.parametrize("gain", [0.5, 0.9, 1.3])
+def test_light_that_changes_is_not_motion(gain):
+    scene = panning(2.0, 1.0)
+    first, second = ends(scene)
+    between = FlowInterpolation()(first * 0.7, second * 0.7 * gain)
+    assert not between.cut
+    assert psnr(between.at(0.5), scene.rgb(10) * 0.7 * (1 + gain) / 2) > 50
+
+
+def test_shrink_finds_the_motion_too():
+    scene = panning(4.0, 3.0)
+    truth = scene.rgb(10)
+    fine, coarse = (FlowInterpolation(shrink)(*ends(scene)) for shrink in (1, 2))
+    assert not fine.forward.equal(coarse.forward)
+    for between in (fine, coarse):
+        assert psnr(between.at(0.5), truth) > psnr(Blend()(*ends(scene)).at(0.5), truth) + 6
+        error = between.forward[:, 20:-20, 20:-20] - torch.tensor([4.0, 3.0]).reshape(2, 1, 1)
+        assert error.abs().mean() < 0.1
+
+
+# --- cuts, chance -----------------------------------------------------------------------------------------------------
+
+
+def test_a_cut_shows_the_nearer_frame():
+    first, second = texture(80, 100, seed=0), texture(80, 100, seed=7)
+    between = FlowInterpolation()(first, second)
+    assert between.cut
+    assert between.forward is None
+    assert between.backward is None
+    assert between.at(0.4).equal(first)
+    assert between.at(0.6).equal(second)
+
+
+@pytest.mark.parametrize("scene", [panning(0.2, 0.1), panning(10.0, -8.0), passing(), passing((3.0, 0.0), (-5.0, 0.0))])
+def test_motion_and_noise_are_no_cut(scene):
+    noise = torch.randn(2, 3, scene.height, scene.width) * 0.03
+    first, second = ends(scene)
+    assert not FlowInterpolation()(first, second).cut
+    assert not FlowInterpolation()((first + noise[0]).clamp(0, 1), (second + noise[1]).clamp(0, 1)).cut
+
+
+def test_the_same_whatever_the_threads(tmp_path):
+    program = """
+import sys, torch
+from spikekit.flow.interpolate import FlowInterpolation
+torch.set_num_threads(int(sys.argv[1]))
+first, second = torch.load(sys.argv[2])
+between = FlowInterpolation()(first, second)
+torch.save([between.forward, between.at(0.3), between.at(0.7)], sys.argv[3])
+"""
+    torch.save(list(ends(panning(2.3, 1.1, size=(203, 179)))), tmp_path / "frames.pt")
+    made = []
+    for threads in ("1", "2"):
+        out = tmp_path / f"{threads}.pt"
+        subprocess.run([sys.executable, "-c", program, threads, tmp_path / "frames.pt", out], check=True)
+        made.append(torch.load(out))
+    assert all(one.equal(two) for one, two in zip(*made, strict=True))
+
+
+# --- films ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_benchmark(tmp_path):
+    for n in range(7):
+        write_picture(tmp_path / f"{n}.png", torch.full((3, 20, 20), n / 255))
+    triples = list(interpolation.film(tmp_path, 2))
+    assert [[round(frame.mean().item() * 255) for frame in three] for three in triples] == [
+        [0, 1, 2],
+        [2, 3, 4],
+        [4, 5, 6],
+    ]
+    count, scores, seconds = interpolation.measure(iter([interpolation.scene(2, hidden=True)]))
+    assert count == 1
+    assert scores.keys() == seconds.keys() == interpolation.METHODS.keys()
+    assert scores["flow"] > scores["blend"] + 2 > scores["nearest"] + 2
+    first, truth, second = interpolation.scene(0, hidden=False)
+    assert first.equal(truth)
+    assert first.equal(second)
+
+
+@needs_video
+@pytest.mark.parametrize("clip", ["walk", "foliage"])
+def test_a_frame_that_was_left_out(clip):
+    first, truth, second = (frame[:, 100:292, 200:456] for frame in read_video(VIDEO / clip, start=20, count=3))
+    made, blend, still = (
+        psnr(method(first, second).at(0.5), truth) for method in (FlowInterpolation(), Blend(), Still())
+    )
+    assert made > blend + 2
+    assert blend > still

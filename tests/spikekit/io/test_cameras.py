@@ -1,0 +1,181 @@
+"""Cameras: presets say what the field knows, and are applied in the right order."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from spikekit.color.cfa import PATTERNS, bayer_mask, mosaic
+from spikekit.decoders.dense import tfp
+from spikekit.io.cameras import CAMERAS, Camera, camera
+from spikekit.io.files import read_spikes, spikes_shape, write_spikes
+
+SHARED = Path(__file__).parents[4] / "shared" / "data" / "spikes"
+
+PLAIN = {
+    "title": "a camera",
+    "height": 6,
+    "width": 8,
+    "drop": [],
+    "rate": 1000,
+    "flip": False,
+    "pattern": None,
+    "crop": [0, 0, 0, 0],
+    "gain": 1.0,
+    "gamma": 1.0,
+    "source": "invented",
+}
+
+
+def stored(tmp_path, **changes):
+    path = tmp_path / "own.json"
+    path.write_text(json.dumps(PLAIN | changes))
+    return path
+
+
+def test_presets_say_what_is_known():
+    known = {name: camera(name) for name in CAMERAS}
+    assert {name: (c.height, c.width, c.stored_width) for name, c in known.items()} == {
+        "m1k40": (1000, 1000, 1024),
+        "m1k40-bayer": (1000, 1000, 1024),
+        "uhsr": (250, 250, 250),
+        "vidar": (250, 400, 416),
+    }
+    assert {name for name, c in known.items() if c.flip} == {"m1k40", "m1k40-bayer", "vidar"}
+    assert {c.rate for c in known.values()} == {20_000}
+    assert all(c.source and c.title and c.name == name for name, c in known.items())
+    colour = known.pop("m1k40-bayer")
+    assert (colour.pattern, colour.prepared_pattern, colour.prepared_size) == ("BGGR", "RGGB", (992, 992))
+    for grey in known.values():
+        assert (grey.pattern, grey.prepared_pattern) == (None, None)
+        assert grey.prepared_size == (grey.height, grey.width)
+        picture = torch.rand(4, 5)
+        assert torch.equal(grey.display(picture), picture)
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_stored_frames_become_what_the_camera_saw(name):
+    """Number the pixels, store them as the camera does, and find them again."""
+    known = camera(name)
+    seen = torch.arange(known.height * known.width).reshape(1, known.height, known.width)
+    top, bottom, left, right = known.crop
+    expected = seen[:, top : known.height - bottom, left : known.width - right]
+    frames = seen.flip(-2) if known.flip else seen
+    assert torch.equal(known.prepare(frames), expected)
+    assert torch.equal(known.prepare(seen, flip=False), expected)
+    assert torch.equal(known.prepare(seen.flip(-2), flip=True), expected)
+    raw = torch.full((1, known.height, known.stored_width), -1)
+    pixels = torch.ones(known.stored_width, dtype=torch.bool)
+    for start, stop in {"vidar": [(400, 416)], "uhsr": []}.get(name, [(500, 512), (1000, 1012)]):
+        pixels[start:stop] = False
+    raw[..., pixels] = frames
+    assert torch.equal(known.prepare(raw), expected)
+    assert expected.shape[-2:] == known.prepared_size
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("crop", [(0, 0, 0, 0), (1, 0, 0, 2), (0, 1, 3, 0), (1, 1, 1, 1)])
+def test_the_crop_shifts_the_bayer_phase(tmp_path, pattern, crop):
+    own = camera(stored(tmp_path, pattern=pattern, crop=crop))
+    colours = torch.tensor([1.0, 2.0, 3.0])[:, None, None]
+    height, width = own.prepared_size
+    expected = (bayer_mask(height, width, own.prepared_pattern) * colours).sum(0)
+    assert torch.equal(own.prepare(mosaic(colours.expand(3, 6, 8), pattern)), expected)
+
+
+def test_pictures_are_shown_with_gain_and_gamma():
+    picture = torch.tensor([[-0.1, 0.0, 0.24, 0.5, 0.9]])
+    shown = camera("m1k40-bayer").display(picture)
+    torch.testing.assert_close(shown, torch.tensor([[0.0, 0.0, 0.6, 0.75**0.5, 1.0]]))
+    assert camera("m1k40-bayer").display(picture.double()).dtype == torch.float64
+
+
+def test_a_recording_is_read_as_the_camera_saw_it(tmp_path):
+    """Whoever reads turns the frames, and prepares them without turning them again."""
+    known = camera("vidar")
+    raw = (torch.rand(3, 250, 416) < 0.3).to(torch.uint8)
+    write_spikes(tmp_path / "raw.dat", raw)
+    read = read_spikes(tmp_path / "raw.dat", known.height, known.stored_width, flip=known.flip)
+    assert torch.equal(known.prepare(read, flip=False), known.prepare(raw))
+    assert torch.equal(known.prepare(raw), raw.flip(-2)[..., :400])
+
+
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [("reds_sim_mono_203_250x400.dat", "vidar"), ("uhsr_real_mono_helicopter_250x250.npz", "uhsr")],
+)
+def test_recordings_of_these_cameras(file, name):
+    if not (SHARED / file).is_file():
+        pytest.skip(f"no recording {file} beside the checkout")
+    known = camera(name)
+    assert spikes_shape(SHARED / file, known.height, known.width)[1:] == (known.height, known.width)
+    spikes = known.prepare(read_spikes(SHARED / file, known.height, known.width, frames=100))
+    assert spikes.shape == (100, *known.prepared_size)
+    shown = known.display(tfp(spikes, 99)[49])
+    top, bottom = shown[: known.height // 2].mean(), shown[known.height // 2 :].mean()
+    assert 0 < shown.mean() < 1
+    if name == "uhsr":
+        assert top > bottom  # the sky is above the helicopter
+
+
+def test_a_camera_of_ones_own(tmp_path):
+    own = camera(stored(tmp_path, drop=[[0, 2], [5, 6]], crop=[1, 2, 0, 3]))
+    assert own == Camera(**{**PLAIN, "name": "own", "drop": ((0, 2), (5, 6)), "crop": (1, 2, 0, 3)})
+    raw = torch.arange(11).expand(6, 11)
+    assert own.prepare(raw)[0].tolist() == [2, 3, 4, 6, 7]
+    assert own.prepare(raw).shape == (3, 5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"height": 0}, "height: expected a whole number >= 1, got 0"),
+        ({"width": "8"}, "width: expected a whole number >= 1, got '8'"),
+        ({"rate": -1}, "rate: expected a finite number above 0, got -1"),
+        ({"gamma": "two"}, "gamma: expected a number, got 'two'"),
+        ({"flip": 1}, "flip: expected bool, got 1"),
+        ({"pattern": "RGBG"}, "RGBG"),
+        ({"crop": [3, 3, 0, 0]}, "crop: expected \\[top, bottom, left, right\\] that leaves pixels"),
+        ({"crop": [0, 0, 0]}, "crop: expected"),
+        ({"crop": [0, 0, 0, -1]}, "crop: expected"),
+        ({"crop": 1}, "crop: expected"),
+        ({"drop": [[4, 2]]}, "drop: expected"),
+        ({"drop": [[7, 9], [2, 3]]}, "drop: expected"),
+        ({"drop": [[9, 10]]}, "drop: expected"),
+        ({"drop": [3]}, "drop: expected pairs"),
+        ({"drop": [["a", "b"]]}, "drop: expected pairs"),
+        ({"drop": None}, "drop: expected pairs"),
+        ({"colour": "red"}, "got also colour"),
+    ],
+)
+def test_a_file_that_describes_no_camera_says_why(tmp_path, changes, message):
+    path = stored(tmp_path, **changes)
+    with pytest.raises(ValueError, match=message) as raised:
+        camera(path)
+    assert str(raised.value).startswith(str(path))
+    assert "\n" not in str(raised.value)
+
+
+def test_errors_say_what_was_expected(tmp_path):
+    with pytest.raises(
+        ValueError, match=r"camera: expected m1k40, m1k40-bayer, uhsr, vidar, or a .json file, got leica"
+    ):
+        camera("leica")
+    with pytest.raises(ValueError, match=r"none.json: .*No such file"):
+        camera(tmp_path / "none.json")
+    (tmp_path / "list.json").write_text("[1]")
+    with pytest.raises(ValueError, match=r"list.json: expected an object with title, height, .*, got list"):
+        camera(tmp_path / "list.json")
+    (tmp_path / "torn.json").write_text('{"title": "a')
+    with pytest.raises(ValueError, match=r"torn.json: .*line 1"):
+        camera(tmp_path / "torn.json")
+    (tmp_path / "less.json").write_text(json.dumps({k: v for k, v in PLAIN.items() if k != "gain"}))
+    with pytest.raises(ValueError, match=r"less.json: .*got none of gain"):
+        camera(tmp_path / "less.json")
+    with pytest.raises(ValueError, match="spikes: expected 250 x 400 or 416 of the camera vidar, got 250 x 250"):
+        camera("vidar").prepare(torch.zeros(3, 250, 250))
+    with pytest.raises(ValueError, match="spikes: expected 250 x 250 of the camera uhsr, got 250 x 400"):
+        camera("uhsr").prepare(torch.zeros(3, 250, 400))
+    with pytest.raises(TypeError, match="picture: expected a floating-point tensor"):
+        camera("vidar").display(torch.zeros(3, 3, dtype=torch.uint8))

@@ -1,0 +1,274 @@
+"""What a scene requires: profiles of pairs whose motion is known, and the decisions made of them."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from spikekit import PATTERNS, bin_to_sensor
+from spikekit.scenes.adaptive_sampling import Plan, SceneProfile, profile_interval
+from spikekit.sensor.noise import SensorNoise
+
+
+class Steady:
+    """Flow that is the same everywhere, in pixels of what it is called with; counts the calls."""
+
+    def __init__(self, x=0.0, y=0.0):
+        self.velocity, self.calls, self.sizes = torch.tensor([x, y]), 0, []
+
+    def __call__(self, first, second):
+        self.calls += 1
+        self.sizes.append(tuple(first.shape))
+        flow = self.velocity[:, None, None].expand(2, *first.shape[1:]).to(first)
+        return SimpleNamespace(forward=flow, backward=-flow)
+
+
+def profile_of(first, second, motion=None, **settings):
+    return profile_interval(first, second, **({"scale": 2, "motion": motion or Steady()} | settings))
+
+
+MOVING = SceneProfile((64, 64), 20, (0.0, 0.2, 0.4), 0.0, (0, 0, 64, 64), 0.1, 0.12, 0.02)
+
+
+def test_where_nothing_changes_motion_is_not_looked_for():
+    picture, motion = torch.rand(3, 16, 24), Steady(1.0)
+    profile = profile_of(picture, picture, motion)
+    assert motion.calls == 0
+    assert profile.static == 1
+    assert profile.region is None
+    assert profile.displacement == 0
+    assert profile.blending == 0
+    assert profile.plan().latent == 0
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_brightness_is_that_of_the_light(pattern):
+    first, second = torch.rand(2, 3, 16, 24).unbind()
+    light = 0.7 * torch.stack([bin_to_sensor(frame, pattern, scale=2) for frame in (first, second)])
+    expected = light.min().item(), light.mean().item(), light.max().item()
+    assert profile_of(first, second, alpha=0.7, pattern=pattern).brightness == pytest.approx(expected)
+
+
+def test_displacement_is_in_sensor_pixels_per_clock():
+    first, second = torch.rand(2, 3, 64, 64).unbind()
+    profile = profile_of(first, second, Steady(0.75, 1.0), clocks=10)  # cells are two sensor pixels wide
+    assert profile.displacement == pytest.approx(2 * 1.25 / 10)
+    assert profile.displacement_max == pytest.approx(2 * 1.25 / 10)
+
+
+@pytest.mark.parametrize("scale", [1, 2, 3])
+def test_motion_is_looked_for_in_cells_of_the_sensor(scale):
+    motion = Steady()
+    first, second = torch.rand(2, 3, 12 * scale, 20 * scale).unbind()
+    profile_of(first, second, motion, scale=scale)
+    assert motion.sizes == [(3, 6, 10)]
+
+
+def test_only_what_changes_is_looked_at():
+    first = torch.rand(3, 160, 160)
+    second = first.clone()
+    second[:, 81:97, 60:62] = 1 - second[:, 81:97, 60:62]
+    motion = Steady()
+    profile = profile_of(first, second, motion)
+    # sensor rows 40 to 48, columns 30 to 30
+    assert profile.region == (40, 30, 9, 1)
+    assert 1 - 9 / 6400 <= profile.static < 1
+    assert motion.sizes[0][1] < 40
+    assert motion.sizes[0][2] < 40
+
+
+@pytest.mark.parametrize(("change", "static"), [(0.9, 1.0), (1.1, 0.0)])
+def test_a_change_below_the_tolerance_is_none(change, static):
+    first = torch.full((3, 16, 16), 0.5)
+    step = change * 0.05 * 0.2 / 20 / 0.4  # of the charge of 20 clocks, per spike
+    assert profile_of(first, first + step).static == static
+
+
+def test_a_gain_is_flicker_and_no_motion():
+    first = 0.2 + 0.3 * torch.rand(3, 32, 32)
+    seen = []
+
+    def motion(one, other):
+        seen.extend([one, other])
+        return Steady()(one, other)
+
+    profile = profile_of(first, 1.25 * first, motion)
+    torch.testing.assert_close(seen[0], seen[1], atol=1e-3, rtol=0)
+    assert profile.flicker == pytest.approx(0.4 * 0.25 * first.mean().item(), rel=1e-3)
+    assert profile.plan().latent == 0
+
+
+def test_motion_that_explains_the_change_is_no_flicker():
+    picture = torch.linspace(0, 1, 72).expand(3, 64, 72)
+    first, second = picture[..., 8:], picture[..., :-8]  # what is seen moves by 8 pixels, 4 of the sensor, 2 cells
+    change = 0.4 * 8 / 71
+    assert profile_of(first, second).flicker == pytest.approx(-change, rel=0.01)
+    assert abs(profile_of(first, second, Steady(2.0)).flicker) < 0.1 * change
+
+
+@pytest.mark.parametrize(("fast_rows", "cells"), [(1, 1.0), (12, 2.0)])  # of 300
+def test_one_per_cent_may_be_faster(fast_rows, cells):
+    first, second = torch.rand(2, 3, 1200, 32).unbind()
+
+    def motion(one, other):
+        flow = Steady(1.0)(one, other).forward.clone()
+        flow[0, 100 : 100 + fast_rows] = 2.0
+        return SimpleNamespace(forward=flow, backward=-flow)
+
+    assert profile_of(first, second, motion).displacement == pytest.approx(2 * cells / 20)
+
+
+def test_motion_where_nothing_is_seen_does_not_count():
+    first, second = torch.rand(2, 3, 64, 64).unbind()
+    first[..., 24:] = 0.5  # flat, and brighter at the next frame
+    second[..., 24:] = 0.7
+
+    def motion(one, other):
+        flow = Steady(1.0)(one, other).forward.clone()
+        flow[0, :, 10:] = 2.0
+        return SimpleNamespace(forward=flow, backward=-flow)
+
+    profile = profile_of(first, second, motion)
+    assert profile.displacement == pytest.approx(2 * 1.0 / 20, rel=0.3)
+    assert profile.displacement_max == pytest.approx(2 * 2.0 / 20)
+
+
+def test_blending_stands_for_pixels_without_flow_too():
+    """Half of the pixels have flow that is not consistent: the estimate is that of the other half, twice."""
+    first, second = torch.rand(2, 3, 64, 64).unbind()
+
+    def motion(one, other):
+        between = Steady(0.5)(one, other)
+        backward = between.backward.clone()
+        backward[:, 8:] = 9.0
+        return SimpleNamespace(forward=between.forward, backward=backward)
+
+    everywhere = profile_of(first, second, Steady(0.5)).blending
+    assert profile_of(first, second, motion).blending == pytest.approx(everywhere, rel=0.3)
+
+
+def test_blending_along_a_diagonal():
+    """A wave bends along the way across it, and not at all along its crests."""
+    y, x = torch.meshgrid(torch.arange(64.0), torch.arange(64.0), indexing="ij")
+    first, second = ((0.5 + 0.4 * torch.sin((x + y) / 4 + phase)).expand(3, 64, 64) for phase in (0.0, 0.5))
+    across, along = (profile_of(first, second, Steady(0.5, y)).blending for y in (0.5, -0.5))
+    assert along < 0.2 * across
+
+
+def test_flicker_is_the_mean_of_all_pixels():
+    first = torch.full((3, 160, 160), 0.5)
+    second = first.clone()
+    second[:, 40:60, 40:60] += 0.1
+    assert profile_of(first, second).flicker == pytest.approx(0.4 * 0.1 * 400 / 160**2, rel=1e-3)
+
+
+def test_inconsistent_flow_does_not_count():
+    first, second = torch.rand(2, 3, 64, 64).unbind()
+
+    def motion(one, other):
+        between = Steady(1.0)(one, other)
+        forward = between.forward.clone()
+        forward[0, :, :4] = 30.0
+        return SimpleNamespace(forward=forward, backward=between.backward)
+
+    assert profile_of(first, second, motion).displacement_max == pytest.approx(2 * 1.0 / 20, rel=0.05)
+
+
+@pytest.mark.parametrize("backward", [torch.ones(2, 16, 16), None])
+def test_where_motion_is_not_found_everything_is_modelled(backward):
+    first, second = torch.rand(2, 3, 64, 64).unbind()
+    forward = None if backward is None else torch.ones(2, 16, 16)  # there and back do not meet, or there is no flow
+    profile = profile_of(first, second, lambda one, other: SimpleNamespace(forward=forward, backward=backward))
+    assert profile.displacement == float("inf")
+    assert profile.plan() == Plan.everything(20)
+    assert "latent frames: 19 an interval, as motion is not found, for all pixels" in str(profile.plan())
+
+
+def test_pairs_of_two_sizes():
+    with pytest.raises(ValueError, match=r"first, second: expected one size, got \(3, 8, 8\) and \(3, 8, 12\)"):
+        profile_of(torch.rand(3, 8, 8), torch.rand(3, 8, 12))
+
+
+@pytest.mark.parametrize(
+    ("displacement", "step", "latent"), [(0.0, 0.5, 0), (0.024, 0.5, 0), (0.026, 0.5, 1), (0.1, 0.5, 3), (0.1, 0.25, 7)]
+)
+def test_steps_stay_below_a_fraction_of_a_pixel(displacement, step, latent):
+    plan = replace(MOVING, displacement=displacement).plan(step=step)
+    assert plan.latent == latent
+    assert displacement * 20 / (plan.latent + 1) <= step
+
+
+def test_detail_asks_for_more_frames():
+    assert replace(MOVING, blending=0.05 * 36).plan().latent == 5
+    assert replace(MOVING, blending=0.05 * 36.1).plan().latent == 6
+    assert replace(MOVING, blending=0.05 * 36).plan(spike_tolerance=0.2).latent == 3
+
+
+def test_never_more_than_a_frame_a_clock():
+    assert replace(MOVING, displacement=9.0).plan() == Plan.everything(20)
+
+
+def test_the_region_has_a_margin_and_whole_cells():
+    small = replace(MOVING, size=(200, 300), region=(100, 150, 7, 5), displacement=0.1)
+    top, left, height, width = small.plan().region
+    assert top <= 90
+    assert left <= 140
+    assert top + height >= 117
+    assert left + width >= 165
+    assert not any(side % 2 for side in (top, left, height, width))
+    top, left, height, width = replace(small, region=(0, 290, 3, 10)).plan().region
+    assert top == 0
+    assert left + width == 300
+    assert replace(small, region=(10, 10, 180, 280)).plan().region is None
+    assert replace(small, displacement=0.0).plan().region is None  # nothing is synthesised
+
+
+def test_noise_that_changes_nothing_is_left_out():
+    noise = SensorNoise(photons=1e12, hot=0.1)
+    plan = MOVING.plan(noise=noise)
+    assert plan.noise == SensorNoise(hot=0.1)
+    assert "noise: hot (left out: photons)" in str(plan)
+    assert MOVING.plan(noise=noise, spike_tolerance=1e-9).noise == noise
+    dark = replace(MOVING, brightness=(0.0, 0.001, 0.01))
+    assert dark.plan(noise=SensorNoise(dark_current=1e-4)).noise == SensorNoise(dark_current=1e-4)
+    assert replace(MOVING, brightness=(0.3, 0.9, 0.9)).plan(noise=SensorNoise(dark_current=1e-4)).noise == SensorNoise()
+    assert MOVING.plan().noise is None
+
+
+def test_profiles_join():
+    other = SceneProfile((64, 64), 20, (0.1, 0.4, 0.5), 1.0, (10, 70, 4, 6), 0.3, 0.4, 0.01, -0.2)
+    joined = SceneProfile.join([replace(MOVING, region=(20, 30, 10, 10)), other, replace(MOVING, region=None)])
+    assert joined.brightness == pytest.approx((0.0, 0.8 / 3, 0.5))
+    assert joined.static == pytest.approx(1 / 3)
+    assert joined.region == (10, 30, 20, 46)
+    assert (joined.displacement, joined.displacement_max, joined.blending) == (0.3, 0.4, 0.02)
+    assert joined.flicker == -0.2
+    with pytest.raises(ValueError, match="profiles: expected at least one"):
+        SceneProfile.join([])
+
+
+def test_plans_are_printed():
+    text = str(MOVING.plan())
+    assert "latent frames: 3 an interval, 0.5 sensor pixels apart, for all pixels" in text
+    assert "0.1 sensor pixels per clock (at most 0.12)" in text
+    small = replace(MOVING, size=(200, 300), region=(100, 150, 6, 6)).plan()
+    assert f"for {small.region[2]} x {small.region[3]} of 200 x 300 pixels" in str(small)
+    assert "none, nothing moves" in str(SceneProfile((4, 4), 20, (0, 0, 0)).plan())
+    assert str(Plan(latent=2)) == "latent frames: 2 an interval"
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Plan(-1), "latent: expected 0 frames or more, got -1"),
+        (lambda: Plan(1, (1, 0, 4, 4)), "region: expected an even row and column"),
+        (lambda: Plan(1, (0, 0, 0, 4)), "region: expected an even row and column"),
+        (lambda: Plan.everything(0), "clocks: expected a whole number >= 1"),
+        (lambda: MOVING.plan(spike_tolerance=0), "spike_tolerance: expected a finite number above 0"),
+        (lambda: MOVING.plan(step=0), "step: expected a finite number above 0"),
+    ],
+)
+def test_errors(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

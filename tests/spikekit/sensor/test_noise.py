@@ -1,0 +1,394 @@
+"""Noise: each source is what its formula says, at any cut in time, and leaves the others alone."""
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from spikekit.sensor.integrate_fire import spike_integrate_fire
+from spikekit.sensor.noise import NoisyPixels, SensorNoise
+from spikekit.sensor.simulate import SpikeSensor, simulate_spikes
+
+EVERYTHING = SensorNoise(photons=30.0, dark_current=0.02, dark_spread=0.5, gain_spread=0.2, hot=0.05, dead=0.05)
+ALONE = {
+    "photons": SensorNoise(photons=30.0),
+    "dark_current": SensorNoise(dark_current=0.02),
+    "dark_spread": SensorNoise(dark_current=0.02, dark_spread=0.5),
+    "dark_photons": SensorNoise(dark_current=0.02, photons=30.0),
+    "gain_spread": SensorNoise(gain_spread=0.2),
+    "hot": SensorNoise(hot=0.05),
+    "dead": SensorNoise(dead=0.05),
+}
+NOISES = [*ALONE.values(), EVERYTHING]
+
+
+def chance(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def arriving(noise, light, *, threshold=1.0, seed=0, clock=0):
+    size = tuple(light.shape[:-3] + light.shape[-2:])
+    return NoisyPixels(noise, size, seed).charge(light, threshold, clock)
+
+
+def close(values, expected, deviation):
+    """Whether a mean is within five standard errors."""
+    return abs(values.double().mean().item() - expected) < 5 * deviation / math.sqrt(values.numel())
+
+
+# What happens without noise
+
+
+def test_without_noise_nothing_is_done():
+    light = torch.rand(30, 9, 7)
+    start = torch.rand(9, 7, generator=chance(3))
+    expected, _ = spike_integrate_fire(light, charge=start)
+    for noise in (None, SensorNoise()):
+        spikes = simulate_spikes(light, noise=noise, generator=chance(3))
+        assert spikes.dtype == torch.uint8
+        assert torch.equal(spikes, expected.to(torch.uint8))
+    assert arriving(SensorNoise(), light) is light
+    assert 0 <= start.min() <= start.max() < 1
+
+
+def test_pixels_begin_with_a_charge_that_noise_does_not_move():
+    dark = torch.zeros(1, 80, 80)
+    for noise in (SensorNoise(), *NOISES):
+        sensor = SpikeSensor(noise, threshold=2.0, seed=5)
+        sensor.expose(dark)
+        if noise == SensorNoise():
+            begins = sensor.charge
+            assert close(begins, 1.0, math.sqrt(1 / 3))
+            assert close((begins - 1) ** 2, 1 / 3, math.sqrt(4 / 45))
+            assert 0 <= begins.min() <= begins.max() < 2
+        leaked = begins + arriving(noise, dark, threshold=2.0, seed=5)[0]
+        torch.testing.assert_close(sensor.charge, leaked % 2)
+
+
+def test_the_charge_at_the_start_can_be_given():
+    light = torch.full((4, 1, 2), 0.25)
+    spikes = simulate_spikes(light, charge=torch.tensor([[0.0, 0.75]]))
+    assert spikes[:, 0].T.tolist() == [[0, 0, 0, 1], [1, 0, 0, 0]]
+
+
+# Each source
+
+
+@pytest.mark.parametrize("threshold", [1.0, 2.5])
+def test_photons_have_the_mean_and_variance_of_poisson(threshold):
+    light = torch.full((60, 50, 50), 0.3 * threshold)
+    found = arriving(SensorNoise(photons=20.0), light, threshold=threshold).double() * 20 / threshold
+    counts = found.round()
+    torch.testing.assert_close(found, counts, atol=1e-4, rtol=0)  # whole photons
+    mean = 20 * 0.3
+    assert close(counts, mean, math.sqrt(mean))
+    assert close((counts - mean) ** 2, mean, math.sqrt(mean + 2 * mean**2))
+    assert close((counts[1:] - mean) * (counts[:-1] - mean), 0, mean)  # nothing comes back at the next clock
+    assert close((counts == 2).double(), mean**2 / 2 * math.exp(-mean), 0.5)
+
+
+@pytest.mark.parametrize("threshold", [1.0, 2.5])
+def test_dark_current_adds_its_charge(threshold):
+    noise = SensorNoise(dark_current=0.0125)
+    spikes = simulate_spikes(torch.zeros(400, 20, 20), noise=noise, threshold=threshold)
+    assert set(spikes.int().sum(0).unique().tolist()) <= {4, 5, 6}  # 400 * 0.0125, to a rounding of the charge
+    assert abs(spikes.sum() / 400 - 5) < 0.1
+    light = torch.rand(3, 4, 5)
+    torch.testing.assert_close(arriving(noise, light, threshold=threshold), light + 0.0125 * threshold)
+
+
+def test_dark_current_has_shot_noise_where_photons_are_counted():
+    dark = arriving(SensorNoise(dark_current=0.05, photons=40.0), torch.zeros(60, 50, 50)).double() * 40
+    assert close(dark, 2, math.sqrt(2))
+    assert close((dark - 2) ** 2, 2, math.sqrt(2 + 2 * 4))
+
+
+@pytest.mark.parametrize("spread", [0.05, 0.4, 2.0])
+def test_pixels_spread_around_their_mean_and_stay_as_they_are(spread):
+    light = torch.full((3, 300, 300), 0.3)
+    gain = arriving(SensorNoise(gain_spread=spread), light) / light
+    dark = arriving(SensorNoise(dark_current=0.1, dark_spread=spread), light * 0) / 0.1
+    for pixels in (gain, dark):
+        assert torch.equal(pixels, pixels[:1].expand(3, -1, -1))
+        values = pixels[0].double()
+        assert values.min() > 0
+        assert close(values, 1, spread)
+        kurtosis = (1 + spread**2) ** 4 + 2 * (1 + spread**2) ** 3 + 3 * (1 + spread**2) ** 2 - 3  # of log-normal ones
+        assert close((values - 1) ** 2, spread**2, spread**2 * math.sqrt(kurtosis - 1))
+        logs = values.log()
+        assert close(logs, -0.5 * math.log1p(spread**2), math.sqrt(math.log1p(spread**2)))
+    correlation = torch.corrcoef(torch.stack([gain[0].flatten().log(), dark[0].flatten().log()]))[0, 1]
+    assert abs(correlation) < 5 / 300  # one pixel's gain says nothing about its dark current
+
+
+def test_hot_pixels_always_fire_and_dead_ones_never():
+    light = torch.full((50, 200, 200), 0.3)
+    clean = simulate_spikes(light, generator=chance()).bool()
+    bits = simulate_spikes(light, noise=SensorNoise(hot=0.02, dead=0.05), generator=chance()).bool()
+    always, never = bits.all(0), ~bits.any(0)
+    assert close(always.double(), 0.02, math.sqrt(0.02))
+    assert close(never.double(), 0.05, math.sqrt(0.05))
+    good = ~always & ~never
+    assert torch.equal(bits[:, good], clean[:, good])
+    more = simulate_spikes(light, noise=SensorNoise(hot=0.5, dead=0.5), generator=chance()).bool()
+    assert (more.all(0) | ~more.any(0)).all()
+    assert more.all(0)[always].all()
+    assert not more[:, never].any()
+    assert simulate_spikes(light, noise=SensorNoise(dead=1.0)).sum() == 0
+    assert simulate_spikes(light, noise=SensorNoise(hot=1.0)).all()
+
+
+def test_batches_have_a_sensor_each():
+    bits = simulate_spikes(torch.full((2, 20, 60, 60), 0.3), noise=SensorNoise(hot=0.1))
+    assert bits.shape == (2, 20, 60, 60)
+    assert not torch.equal(bits[0].all(0), bits[1].all(0))
+
+
+# Together
+
+
+def test_a_source_switched_on_leaves_the_others_alone():
+    light, without = torch.rand(6, 40, 40), dict.fromkeys(("dark_current", "dark_spread", "gain_spread"), 0.0)
+    photons = arriving(dataclasses.replace(EVERYTHING, **without), light)
+    electrons = arriving(dataclasses.replace(EVERYTHING, gain_spread=0.0), light * 0)
+    gain = arriving(ALONE["gain_spread"], light * 0 + 1)
+    torch.testing.assert_close(arriving(EVERYTHING, light), photons * gain + electrons)
+    torch.testing.assert_close(photons, arriving(ALONE["photons"], light), rtol=0, atol=0)
+    dark = arriving(ALONE["dark_spread"], light * 0)
+    torch.testing.assert_close(arriving(dataclasses.replace(EVERYTHING, photons=None), light), light * gain + dark)
+    many = arriving(dataclasses.replace(EVERYTHING, photons=1e9), light * 0)  # so many that the mean shows
+    torch.testing.assert_close(many, dark, rtol=0.01, atol=0)
+    good = dataclasses.replace(EVERYTHING, hot=0.0, dead=0.0)
+    hot = simulate_spikes(light * 0, noise=ALONE["hot"], generator=chance())[0].bool()
+    dead = ~simulate_spikes(light * 0 + 1, noise=ALONE["dead"], generator=chance())[0].bool()
+    expected = (simulate_spikes(light, noise=good, generator=chance()).bool() | hot) & ~dead
+    assert torch.equal(simulate_spikes(light, noise=EVERYTHING, generator=chance()).bool(), expected)
+
+
+@given(
+    noise=st.sampled_from(NOISES),
+    cuts=st.sets(st.integers(1, 23), max_size=5),
+    readout=st.sampled_from([1, 2, 3]),
+    threshold=st.sampled_from([1.0, 0.7]),
+    dtype=st.sampled_from([torch.float32, torch.float64, torch.float16]),
+)
+def test_chunks_make_the_whole(noise, cuts, readout, threshold, dtype):
+    light = torch.rand(24 * readout, 5, 6, generator=chance(2)).to(dtype) * threshold / readout
+    settings = {"threshold": threshold, "readout": readout, "seed": 7}
+    whole = SpikeSensor(noise, **settings)
+    expected = whole.expose(light)
+    edges = [0, *sorted(cuts), 24]
+    sensor = SpikeSensor(noise, **settings)
+    parts = []
+    for start, stop in itertools.pairwise(edges):
+        # half of the time another sensor goes on, as after a break
+        if start % 2:
+            sensor = SpikeSensor(noise, **settings, charge=sensor.charge, clock=sensor.clock)
+        parts.append(sensor.expose(light[start * readout : stop * readout]))
+    assert torch.equal(torch.cat(parts), expected)
+    assert torch.equal(sensor.charge, whole.charge)
+    assert sensor.clock == 24
+    assert expected.shape == (24, 5, 6)
+
+
+def test_seeds_repeat_and_differ():
+    light, empty = torch.rand(20, 30, 30), torch.zeros(1, 1)
+    for noise in NOISES:
+        by_seed = [SpikeSensor(noise, seed=seed, charge=empty).expose(light) for seed in (1, 1, 2)]
+        by_generator = [simulate_spikes(light, noise=noise, charge=empty, generator=chance(s)) for s in (1, 1, 2)]
+        for first, same, other in (by_seed, by_generator):
+            assert torch.equal(first, same)
+            assert torch.equal(first, other) == (noise == ALONE["dark_current"])  # the one without chance
+
+
+def test_a_threshold_is_a_unit():
+    light = torch.rand(20, 30, 30)
+    for noise in (None, *NOISES):
+        bits = [simulate_spikes(light * t, threshold=t, noise=noise, generator=chance()) for t in (1.0, 4.0)]
+        assert torch.equal(*bits)
+
+
+def test_random_numbers_stay_what_they_are():
+    """Streams of a seed that somebody has noted down: other numbers here are another version of the simulator."""
+    noisy = arriving(SensorNoise(photons=10.0, dark_current=0.1), torch.full((2, 1, 4), 0.5), seed=2, clock=3)
+    assert (noisy.flatten() * 10).round().int().tolist() == [3, 4, 6, 8, 8, 8, 10, 10]
+    assert torch.equal(
+        noisy[1:], arriving(SensorNoise(photons=10.0, dark_current=0.1), torch.full((1, 1, 4), 0.5), seed=2, clock=4)
+    )
+
+
+# The read-out
+
+
+@given(period=st.integers(1, 5), seed=st.integers(0, 9), bright=st.floats(0.1, 3.0))
+def test_the_readout_takes_flags(period, seed, bright):
+    """Against a pixel that is reset at once, keeps a flag, and is asked every period."""
+    light = torch.rand(4 * period, 3, 4, generator=chance(seed), dtype=torch.float64) * bright
+    charge = torch.rand(3, 4, generator=chance(seed + 1), dtype=torch.float64)
+    bits = simulate_spikes(light, readout=period, charge=charge)
+    for n in range(4):
+        flag = torch.zeros(3, 4, dtype=torch.bool)
+        for now in light[n * period : (n + 1) * period]:
+            charge = charge + now
+            flag |= charge >= 1
+            charge = charge - charge.floor()
+        assert torch.equal(bits[n].bool(), flag)
+
+
+def test_noise_is_that_of_a_readout():
+    light = torch.full((120, 50, 50), 0.05)
+    sensor = SpikeSensor(SensorNoise(dark_current=0.1), readout=4)
+    bits = sensor.expose(light)
+    assert bits.shape == (30, 50, 50)
+    assert abs(bits.double().mean() - 0.3) < 0.002  # 4 * 0.05 of light, 0.1 of dark current
+
+
+# What it changes
+
+
+@pytest.mark.parametrize("light", [0.03, 0.2, 0.5, 0.9])
+@pytest.mark.parametrize(
+    ("source", "noise", "reached"),
+    [
+        ("photons", SensorNoise(photons=3000.0), 0.9),
+        ("photons", SensorNoise(photons=100.0), 0.2),
+        ("photons", SensorNoise(photons=2.0), 0.2),
+        ("dark_current", SensorNoise(dark_current=0.0004), 0.9),
+        ("dark_current", SensorNoise(dark_current=0.0004, dark_spread=0.4, photons=50.0), 0.6),
+        ("dark_current", SensorNoise(dark_current=0.01), 0.3),
+        ("gain_spread", SensorNoise(gain_spread=0.001), 0.9),
+        ("gain_spread", SensorNoise(gain_spread=0.1), 0.15),
+        ("hot", SensorNoise(hot=0.2), 0.9),
+        ("dead", SensorNoise(dead=0.2), 0.9),
+    ],
+)
+def test_bits_change_as_foretold(source, noise, reached, light):
+    rest = SensorNoise(photons=noise.photons if source != "photons" else None)
+    for frames, pixels in ((2, 400), (41, 200)):
+        lights = torch.full((frames, pixels, pixels), light)
+        sensors = [SpikeSensor(n, seed=3) for n in (noise, rest)]
+        noisy, clean = (sensor.expose(lights) for sensor in sensors)
+        differ = (noisy != clean).double().mean()
+        change = noise.spike_changes(light, frames)[source]
+        slack = 5 * math.sqrt(change.share) / pixels  # bits of one pixel hang together
+        assert reached * change.share - slack < differ < change.share + slack
+        if source in ("hot", "dead") or light == 0.9 or noise.photons == 2:
+            continue  # thresholds are lost in the read-out
+        counts, left = noisy.sum(0, dtype=torch.double) - clean.sum(0), sensors[0].charge - sensors[1].charge
+        assert (counts + left).abs().mean() == pytest.approx(change.charge, rel=0.04, abs=1e-5)
+
+
+def test_photons_that_are_few_are_not_normal():
+    for mean in (0.0, 0.001, 0.5, 0.999, 1.0, 3.7, 40.0, 600.5, 9999.0):
+        counts = np.arange(1, 60 + 3 * int(mean))
+        logs = counts * math.log(mean or 1) - mean - np.array([math.lgamma(n + 1) for n in counts])
+        expected = math.exp(-mean) * mean + (np.exp(logs) * abs(counts - mean)).sum() if mean else 0.0
+        assert SensorNoise(photons=1.0).spike_changes(mean, 1)["photons"].charge == pytest.approx(expected)
+    assert SensorNoise(photons=1.0).spike_changes(1e16, 1)["photons"].charge == pytest.approx(
+        math.sqrt(2 / math.pi) * 1e8
+    )
+
+
+def test_the_bound_holds_in_any_light():
+    light = torch.rand(41, 100, 100, generator=chance()) ** 3 * torch.rand(100, 100, generator=chance(1))
+    for name, noise in ALONE.items():
+        noisy, clean = (SpikeSensor(n, seed=3).expose(light) for n in (noise, None))
+        changes = noise.spike_changes(light.mean().item(), 41)
+        bound = sum(change.share for change in changes.values())
+        assert 0 < (noisy != clean).double().mean() < bound * 1.02, name
+
+
+def test_only_what_is_required_stays():
+    for light in (0.0, 0.02, 0.4):
+        changes = EVERYTHING.spike_changes(light, 41)
+        assert list(changes) == ["photons", "dark_current", "gain_spread", "hot", "dead"]
+        for tolerance in (0.0, *(change.share for change in changes.values())):
+            left = EVERYTHING.required(light, 41, tolerance)
+            expected = {source for source, change in changes.items() if change.share > tolerance}
+            assert set(left.spike_changes(light, 41)) == expected
+            assert (left.dark_spread == EVERYTHING.dark_spread) == bool(left.dark_current)
+    assert set(EVERYTHING.required(0.0, 41, 0.0).spike_changes(0.0, 41)) == {
+        "dark_current",
+        "hot",
+    }  # none is seen in the dark
+    assert SensorNoise().spike_changes(0.3, 41) == {}
+
+
+# Awkward input
+
+
+def test_light_that_is_no_number_of_photons_stays():
+    light = torch.tensor([-0.25, math.nan, math.inf, -math.inf, 1e30, 0.5]).reshape(1, 1, 6)
+    noisy = arriving(SensorNoise(photons=10.0), light)
+    torch.testing.assert_close(noisy[..., :5], light[..., :5], rtol=0, atol=0, equal_nan=True)
+    assert noisy[..., 5].item() * 10 == pytest.approx(round(noisy[..., 5].item() * 10))
+    assert torch.equal(light[..., 5], torch.full((1, 1), 0.5))  # nothing written into what came
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+def test_dtypes_and_gradients(dtype):
+    light = torch.rand(8, 4, 5).to(dtype).requires_grad_()
+    for noise in (None, *NOISES):
+        spikes = simulate_spikes(light, noise=noise)
+        assert spikes.dtype == torch.uint8
+        assert not spikes.requires_grad
+    sensor = SpikeSensor(EVERYTHING)
+    sensor.expose(light)
+    assert sensor.charge.dtype == torch.promote_types(dtype, torch.float32)
+
+
+@pytest.mark.parametrize(
+    "device", [pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA"))]
+)
+def test_another_device_sees_the_same(device):
+    light = torch.rand(20, 30, 40)
+    for noise in NOISES:
+        here, there = (SpikeSensor(noise, seed=4).expose(light.to(d)) for d in ("cpu", device))
+        assert there.device.type == device
+        assert torch.equal(here, there.cpu())
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"photons": 0.0}, "photons: expected a finite number above 0, got 0.0"),
+        ({"photons": math.nan}, "photons: expected a finite number above 0, got nan"),
+        ({"dark_current": -0.1}, "dark_current: expected a finite number, 0 or more, got -0.1"),
+        ({"gain_spread": math.inf}, "gain_spread: expected a finite number, 0 or more, got inf"),
+        ({"dark_spread": 0.1}, "dark_spread: expected a dark_current above 0 with it"),
+        ({"dead": math.nan}, "dead: expected a finite number"),
+        ({"hot": 0.6, "dead": 0.5}, "hot, dead: expected shares that add up to 1 at most, got 0.6, 0.5"),
+    ],
+)
+def test_a_noise_that_cannot_be_says_so(settings, message):
+    with pytest.raises(ValueError, match=message):
+        SensorNoise(**settings)
+
+
+def test_errors_say_what_was_expected():
+    light = torch.rand(6, 4, 5)
+    for make, message in (
+        (lambda: SpikeSensor(threshold=0.0), "threshold: expected a finite number above 0"),
+        (lambda: SpikeSensor(readout=0), "readout: expected a whole number >= 1, got 0"),
+        (lambda: SpikeSensor(seed=-1), "seed: expected 0 or more, got -1"),
+        (lambda: SpikeSensor(clock=-1), "clock: expected 0 or more, got -1"),
+        (lambda: SpikeSensor(readout=4).expose(light), "light: expected a multiple of 4 frames, one read-out, got 6"),
+        (lambda: simulate_spikes(light, charge=torch.zeros(3, 5)), r"charge: expected \(4, 5\), got \(3, 5\)"),
+        (lambda: simulate_spikes(light, threshold=-1.0), "threshold: expected"),
+        (lambda: simulate_spikes(light[0]), r"light: expected a non-empty tensor of shape \(\*, T, H, W\)"),
+        (lambda: SensorNoise().spike_changes(-0.1, 41), "light: expected a finite number, 0 or more, got -0.1"),
+        (lambda: SensorNoise().spike_changes(0.1, 0), "frames: expected a whole number >= 1, got 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make()
+    sensor = SpikeSensor(EVERYTHING)
+    sensor.expose(light)
+    with pytest.raises(ValueError, match=r"light: expected the size \(4, 5\) that came before, got \(4, 6\)"):
+        sensor.expose(torch.rand(6, 4, 6))
+    with pytest.raises(TypeError, match="light: expected a floating-point tensor"):
+        simulate_spikes(torch.ones(3, 4, 5, dtype=torch.uint8))

@@ -1,0 +1,148 @@
+"""The three bilinear operators of the warp against loops in float64, by every path, layout and dtype."""
+
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+import torch
+from torch.autograd import gradcheck, gradgradcheck
+
+from spikekit.kernels import cpu_warp
+from spikekit.kernels.layout import is_channels_last
+from spikekit.warp.gather import Dot, Gather, Scatter, weighted_dot, weighted_gather, weighted_scatter
+
+OPERATORS = [weighted_gather, weighted_scatter, weighted_dot]
+PIXELS, POINTS = 11, 7
+FLOATS = [torch.float64, torch.float32, torch.bfloat16, torch.float16]
+
+
+@pytest.fixture(params=["torch path", "one piece", "pieces"], autouse=True)
+def path(request, monkeypatch):
+    with ExitStack() as stack:
+        if request.param == "torch path":
+            for op in OPERATORS:
+                stack.enter_context(op.set_kernel_enabled("cpu", enabled=False))
+        if request.param == "pieces":
+            monkeypatch.setattr(
+                cpu_warp, "_pieces", lambda length, width: (slice(i, i + 3) for i in range(0, length, 3))
+            )
+        yield
+
+
+def draw(batch, channels, bags, dtype=torch.float64, last=False):
+    """Values, their gradient's like, indices and weights; the index leaves pixels out and names others often."""
+
+    def planes(size):
+        if last:
+            return torch.randn(batch, size, channels, dtype=torch.float64).to(dtype).transpose(1, 2)
+        return torch.randn(batch, channels, size, dtype=torch.float64).to(dtype)
+
+    wide = torch.promote_types(dtype, torch.float32)
+    index = torch.randint(2, PIXELS - 1, (batch, bags, POINTS))
+    return planes(PIXELS), planes(POINTS), index, torch.rand(batch, bags, POINTS, dtype=wide)
+
+
+def loops(values, grad, index, weight):
+    """Gather, scatter and dot by their definition, in float64."""
+    values, grad, index, weight = (np.asarray(a.double()) for a in (values, grad, index, weight))
+    gathered, scattered, dots = np.zeros(grad.shape), np.zeros(values.shape), np.zeros(weight.shape)
+    for b, k, q in np.ndindex(weight.shape):
+        p = int(index[b, k, q])
+        gathered[b, :, q] += weight[b, k, q] * values[b, :, p]
+        scattered[b, :, p] += weight[b, k, q] * grad[b, :, q]
+        dots[b, k, q] = values[b, :, p] @ grad[b, :, q]
+    return [torch.from_numpy(a) for a in (gathered, scattered, dots)]
+
+
+def results(values, grad, index, weight):
+    return (
+        weighted_gather(values, index, weight),
+        weighted_scatter(grad, index, weight, PIXELS),
+        weighted_dot(values, grad, index),
+    )
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+@pytest.mark.parametrize("last", [False, True])
+@pytest.mark.parametrize(
+    ("batch", "channels", "bags"), [(1, 1, 1), (3, 2, 4), (2, 20, 4), (1, 9, 5), (0, 9, 4), (0, 2, 4)]
+)
+def test_against_loops(batch, channels, bags, last, dtype):
+    values, grad, index, weight = draw(batch, channels, bags, dtype, last)
+    got = results(values, grad, index, weight)
+    wide = torch.promote_types(dtype, torch.float32)
+    assert [a.dtype for a in got] == [dtype, dtype, wide]
+    for one, expected in zip(got, loops(values, grad, index, weight), strict=True):
+        eps = max(torch.finfo(one.dtype).eps, 1e-14)
+        torch.testing.assert_close(one.double(), expected, rtol=2 * eps, atol=50 * torch.finfo(wide).eps)
+
+
+def test_of_two_dtypes():
+    values, grad, index, weight = draw(2, 9, 4)
+    for one, other, third in [
+        (torch.float16, torch.float64, torch.float32),
+        (torch.float32, torch.float32, torch.float64),
+    ]:
+        args = values.to(one), grad.to(other), index, weight.to(third)
+        for got, expected in zip(results(*args), loops(*args), strict=True):
+            torch.testing.assert_close(got.double(), expected, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 9])
+@pytest.mark.parametrize("last", [False, True])
+def test_layout_is_that_of_the_values(channels, last):
+    """As promised to the compiler, whatever the path: a result in another layout would be read wrongly."""
+    values, grad, index, weight = draw(2, channels, 4, last=last)
+    gathered, scattered, _ = results(values, grad, index, weight)
+    for got in (gathered, scattered):
+        assert is_channels_last(got) == (last and channels > 1)
+    for op, args in [
+        (weighted_gather, (values, index, weight)),
+        (weighted_scatter, (grad, index, weight, PIXELS)),
+        (weighted_dot, (values, grad, index)),
+    ]:
+        torch.library.opcheck(op, args, test_utils=("test_schema", "test_faketensor", "test_aot_dispatch_dynamic"))
+
+
+@pytest.mark.parametrize("channels", [2, 9])
+def test_each_is_the_derivative_of_the_others(channels):
+    values, grad, index, weight = draw(1, channels, 3)
+    for tensor in (values, grad, weight):
+        tensor.requires_grad_()
+    for function, args in [
+        (Gather.apply, (values, index, weight)),
+        (lambda *a: Scatter.apply(*a, PIXELS), (grad, index, weight)),
+        (Dot.apply, (values, grad, index)),
+    ]:
+        assert gradcheck(function, args)
+        assert gradgradcheck(function, args)
+
+
+def test_gradient_of_what_is_asked_for_only():
+    values, grad, index, weight = draw(1, 9, 3)
+    weight.requires_grad_()
+    (got,) = torch.autograd.grad(Gather.apply(values, index, weight), weight, grad)
+    torch.testing.assert_close(got, loops(values, grad, index, weight.detach())[2])
+
+
+@pytest.mark.filterwarnings("error")  # without a rule of its own vmap loops, with a warning
+def test_vmap():
+    values, grad, index, weight = (a.unflatten(0, (2, 3)) for a in draw(6, 9, 4))
+    for dims in [(0, 0, 0), (1, 1, 1)]:
+        mapped = torch.func.vmap(Gather.apply, dims)(values, index, weight)
+        expected = Gather.apply(*(a.movedim(dims[0], 0).flatten(0, 1) for a in (values, index, weight)))
+        torch.testing.assert_close(mapped.flatten(0, 1), expected)
+    mapped = torch.func.vmap(Dot.apply, (0, None, 0))(values, grad[1], index)
+    torch.testing.assert_close(mapped[0], weighted_dot(values[0], grad[1], index[0]))
+
+
+def test_deterministic_mode():
+    values, grad, index, weight = draw(2, 9, 4)
+    expected = results(values, grad, index, weight)
+    torch.use_deterministic_algorithms(True)
+    try:
+        got = results(values, grad, index, weight)
+    finally:
+        torch.use_deterministic_algorithms(False)
+    for one, other in zip(got, expected, strict=True):
+        assert torch.equal(one, other)

@@ -1,0 +1,261 @@
+"""The search of known pixels: closed form and general path against brute force in whole numbers, tables, caches."""
+
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+import torch
+
+from spikekit import bayer_mask, flow_warp_idw
+from spikekit.kernels import cpu_warp
+from spikekit.warp.neighbors import _key, _products, _table, idw_neighbors, nearest_known
+
+UNIT = 64  # flows below are multiples of 1 / UNIT, squared distances are whole numbers in units of 1 / UNIT^2
+
+
+def brute(flow, mask, neighbors):
+    """Sorted indices (N, K, H W), the first of them, and their weights, from all squared distances."""
+    height, width = mask.shape
+    rows, columns = np.nonzero(np.asarray(mask))
+    y, x = np.mgrid[:height, :width].reshape(2, -1, 1)
+    moved = np.rint(np.asarray(flow.double().flatten(2)) * UNIT).astype(np.int64)[..., None]
+    square = (columns * UNIT - x * UNIT - moved[:, 0]) ** 2 + (rows * UNIT - y * UNIT - moved[:, 1]) ** 2
+    nearest = np.argsort(square, axis=-1, kind="stable")[..., :neighbors]
+    distance = np.sqrt(np.take_along_axis(square, nearest, -1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weight = np.where(distance[..., :1] == 0, distance == 0, distance[..., :1] / distance)
+    weight /= weight.sum(-1, keepdims=True)
+    return (rows * width + columns)[nearest], weight
+
+
+def check(flow, mask, neighbors=4):
+    expected, share = brute(flow, mask, neighbors)
+    index, weight = (a.movedim(1, -1).numpy() for a in nearest_known(flow, mask, neighbors, 0))
+    assert index.shape[-1] == neighbors
+    known = expected.shape[-1]
+    assert (weight[..., known:] == 0).all()
+    assert (index[..., known:] == index[..., :1]).all()
+    assert (index[..., 0] == expected[..., 0]).all()
+    order, expected_order = index[..., :known].argsort(-1), expected.argsort(-1)
+    np.testing.assert_array_equal(
+        np.take_along_axis(index, order, -1), np.take_along_axis(expected, expected_order, -1)
+    )
+    np.testing.assert_allclose(
+        np.take_along_axis(weight, order, -1), np.take_along_axis(share, expected_order, -1), rtol=1e-6, atol=1e-7
+    )
+
+
+@pytest.fixture(params=["closed form", "general"])
+def path(request):
+    with ExitStack() as stack:
+        if request.param == "general":
+            stack.enter_context(nearest_known.set_kernel_enabled("cpu", enabled=False))
+        yield request.param
+
+
+def masks():
+    """Products of at least four rows and four columns, and unions of two."""
+    for pattern, scale in [("RGGB", 1), ("GRBG", 1), ("BGGR", 2), ("GBRG", 3), ("RGGB", 4)]:
+        for colour, mask in zip(
+            "RGB", bayer_mask(8 // min(scale, 2), 10 // min(scale, 2), pattern, scale=scale), strict=True
+        ):
+            yield pytest.param(mask, id=f"{pattern}{scale}{colour}")
+    random = torch.Generator().manual_seed(5)
+    for density in (0.2, 0.6):
+        columns = torch.rand(2, 13, generator=random) < density
+        columns[0, 3:7] = columns[1, ::4] = True
+        product = torch.cat([torch.arange(8) % 2, torch.randint(0, 3, (7,), generator=random)])
+        rows = product == torch.arange(2)[:, None]
+        both = [of_rows[:, None] & of_columns for of_rows, of_columns in zip(rows, columns, strict=True)]
+        yield pytest.param(both[0], id=f"product {density}")
+        yield pytest.param(both[0] | both[1], id=f"two products {density}")
+    yield pytest.param(torch.ones(7, 9), id="all")
+
+
+@pytest.mark.parametrize("mask", list(masks()))
+def test_at_every_eighth_of_a_pixel(mask, path, monkeypatch):
+    """The whole picture, its borders and what lies beyond them; ties are everywhere."""
+    monkeypatch.setattr(cpu_warp, "_TILE", 333)
+    called = []
+    four = cpu_warp.nearest_four
+    monkeypatch.setattr(cpu_warp, "nearest_four", lambda *args: called.append(args) or four(*args))
+    eighths = torch.cartesian_prod(torch.arange(8), torch.arange(8))[:, :, None, None] / 8
+    for reach in (0, 2, 20):
+        check(eighths + torch.randint(-reach - 1, reach + 1, (64, 2, *mask.shape)), mask)
+    assert bool(called) == (path == "closed form")
+
+
+@pytest.mark.parametrize("mask", list(masks()))
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_at_any_position(mask, dtype, path):
+    flow = (torch.randint(-8 * UNIT, 8 * UNIT, (40, 2, *mask.shape)) / UNIT).to(dtype)
+    check(flow, mask)
+    check((flow[:10] * 1000).round(), mask)
+
+
+@pytest.mark.parametrize("neighbors", [1, 2, 3, 5, 8, 30])
+def test_of_any_number(neighbors):
+    for mask in (*bayer_mask(3, 4, scale=2), torch.rand(6, 8) < 0.3):
+        check(torch.randint(-4 * UNIT, 4 * UNIT, (5, 2, *mask.shape)) / UNIT, mask, neighbors)
+
+
+@pytest.mark.parametrize("width", [1, 3, 4])
+def test_of_masks_too_small_for_the_closed_form(width):
+    for height in (1, 3, 5):
+        mask = torch.ones(height, width)
+        check(torch.randint(-4 * UNIT, 4 * UNIT, (5, 2, height, width)) / UNIT, mask)
+
+
+def test_float32_is_compared_in_double(path):
+    """Two pixels whose distances differ by less than float32 can tell next to their size."""
+    mask = torch.zeros(9, 9, dtype=torch.bool)
+    mask[::4, ::4] = True
+    tiny = 2.0**-26
+    flow = torch.zeros(2, 2, 9, 9)
+    flow[0, 0], flow[1, 0] = tiny, -tiny
+    index, _ = nearest_known(flow, mask, 4, 0)
+    up, left, centre, right, down = 4, 36, 40, 44, 76
+    for nearest, expected in zip(
+        index[:, :, centre], ({centre, right, up, down}, {centre, left, up, down}), strict=True
+    ):
+        assert set(nearest.tolist()) == expected
+
+
+def test_registration():
+    flow = torch.randn(2, 2, 4, 6, dtype=torch.float64)
+    for steps in (0, 4):
+        torch.library.opcheck(
+            nearest_known,
+            (flow, bayer_mask(4, 6)[1], 4, steps),
+            test_utils=("test_schema", "test_faketensor", "test_aot_dispatch_dynamic"),
+        )
+
+
+def test_vmap_is_over_the_flow():
+    flow, mask = torch.randn(3, 2, 2, 4, 6), bayer_mask(4, 6)[0]
+    index, weight = torch.func.vmap(idw_neighbors, (1, None), 1)(flow.movedim(0, 1), mask)
+    expected = idw_neighbors(flow.flatten(0, 1), mask)
+    assert torch.equal(index.movedim(1, 0).flatten(0, 1), expected[0])
+    assert torch.equal(weight.movedim(1, 0).flatten(0, 1), expected[1])
+    with pytest.raises(ValueError, match="first 1 argument"):
+        torch.func.vmap(idw_neighbors, (0, 0))(flow, mask.expand(3, 4, 6))
+
+
+def test_tables_are_made_once():
+    flow, mask = torch.randn(1, 2, 6, 8), torch.rand(6, 8) < 0.3
+    nearest_known(flow, mask, 4, 0)
+    made = _products.cache_info().misses
+    nearest_known(flow, mask, 4, 0)
+    nearest_known(flow, mask.clone(), 4, 0)
+    nearest_known(flow, mask.double(), 4, 0)
+    assert _products.cache_info().misses == made
+    nearest_known(flow, mask, 3, 0)
+    nearest_known(flow, ~mask, 4, 0)
+    nearest_known(flow.mT, mask.reshape(8, 6), 4, 0)
+    assert _products.cache_info().misses == made + 3
+
+
+class Elsewhere(torch.Tensor):
+    """On the CPU, but says that it is not."""
+
+    device = torch.device("cuda")
+
+
+def test_the_same_mask_is_not_read_again(monkeypatch):
+    """On a GPU reading it would wait for all that runs there; on the CPU its memory may be another's."""
+    here = torch.rand(6, 8) < 0.3
+    mask = here.clone().as_subclass(Elsewhere)
+    seen = _key(mask)
+    _key(here)
+    mask[0] = ~mask[0]
+    changed = _key(mask)
+    assert changed != seen
+    monkeypatch.setattr(torch.Tensor, "cpu", lambda self: pytest.fail("read again"))
+    assert _key(mask) == changed
+    with pytest.raises(pytest.fail.Exception, match="read again"):
+        _key(here)
+
+
+def on_the_grid(mask, steps):
+    """Flows of whole steps that stay within half a pixel of the picture, as (64, 2, H, W)."""
+    height, width = mask.shape
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    to_x = torch.randint(-steps // 2, (width - 1) * steps + steps // 2 + 1, (64, height, width))
+    to_y = torch.randint(-steps // 2, (height - 1) * steps + steps // 2 + 1, (64, height, width))
+    return torch.stack([to_x - x * steps, to_y - y * steps], dim=1) / steps
+
+
+@pytest.mark.parametrize(
+    ("scale", "neighbors", "size"), [(1, 4, (14, 18)), (1, 6, (24, 3)), (2, 4, (9, 6)), (3, 2, (5, 4))]
+)
+def test_table_is_exact_at_its_positions(scale, neighbors, size, path):
+    """All colours, near the borders and inside: every class of positions has its own neighbours."""
+    for mask in bayer_mask(*size, "GRBG", scale=scale):
+        flow = on_the_grid(mask, 8)
+        exact, table = nearest_known(flow, mask, neighbors, 0), nearest_known(flow, mask, neighbors, 8)
+        assert torch.equal(exact[0].sort(1).values, table[0].sort(1).values)
+        order = [index.argsort(1) for index, _ in (exact, table)]
+        shares = [weight.gather(1, by) for (_, weight), by in zip((exact, table), order, strict=True)]
+        torch.testing.assert_close(*shares)
+
+
+@pytest.mark.parametrize("steps", [2, 4, 16])
+def test_table_between_its_positions(steps, path):
+    """Weights are those of the rounded position, and no neighbour is farther than the rounding lets it."""
+    mask = bayer_mask(12, 14, scale=2)[1]
+    height, width = mask.shape
+    flow = torch.rand(20, 2, height, width, dtype=torch.float64) * 4 - 2
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    position = (flow + torch.stack([x, y])).flatten(2)[:, :, None]
+
+    def distance(index):
+        return (torch.stack([index % width, index // width], dim=1) - position).norm(dim=1)
+
+    index, weight = nearest_known(flow, mask, 4, steps)
+    rounded = nearest_known((flow * steps).round() / steps, mask, 4, 0)[1]
+    inside = ((position > -0.5) & (position < torch.tensor([width, height])[:, None, None] - 0.5)).all(1)[:, 0]
+    farthest = distance(nearest_known(flow, mask, 4, 0)[0]).amax(1)
+    assert (distance(index).amax(1) - farthest)[inside].max() <= 2**0.5 / steps  # twice half a diagonal of a step
+    shares = [part.sort(1).values.movedim(1, -1)[inside] for part in (weight, rounded)]
+    torch.testing.assert_close(*shares)
+
+
+def test_table_far_outside_is_that_of_the_border(path):
+    mask = bayer_mask(12, 14, scale=2)[0]
+    far, border = torch.full((1, 2, *mask.shape), 2.0**30), torch.zeros(1, 2, *mask.shape)
+    border[0, 0], border[0, 1] = 27.5 - torch.arange(28), 23.5 - torch.arange(24)[:, None]
+    assert torch.equal(nearest_known(far, mask, 4, 4)[0], nearest_known(border, mask, 4, 4)[0])
+
+
+def test_table_keeps_known_pixels():
+    features, mask = torch.randn(1, 9, 24, 28), bayer_mask(12, 14, scale=2, dtype=torch.bool)[2]
+    for steps in (2, 6, 16):
+        warped = flow_warp_idw(features, torch.zeros(1, 2, 24, 28), mask, steps=steps)
+        assert torch.equal(warped[..., mask], features[..., mask])
+
+
+def test_table_grows_with_the_period_only():
+    sizes = set()
+    for size in (24, 48, 50):
+        mask = bayer_mask(size, size, scale=2, dtype=torch.bool)[0]
+        sizes.add(_table((mask.numpy().tobytes(), *mask.shape, "cpu"), 4, 4, torch.float32).shift.shape)
+    assert len(sizes) == 1
+
+
+@pytest.mark.parametrize("known", ["random", "one pixel", "diagonal"])
+def test_table_needs_a_period(known):
+    mask = {"random": torch.rand(400, 300) < 0.3, "one pixel": torch.zeros(400, 300), "diagonal": torch.eye(400, 300)}
+    mask["one pixel"][3, 5] = 1
+    with pytest.raises(ValueError, match="repeats"):
+        flow_warp_idw(torch.zeros(1, 1, 400, 300), torch.zeros(1, 2, 400, 300), mask[known], steps=16)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 4)])
+def test_table_of_a_small_mask_needs_none(size, path):
+    mask = torch.rand(size) < 0.5
+    mask[0, 0] = True
+    flow = on_the_grid(mask, 4)
+    for neighbors in (1, 4):
+        exact, table = nearest_known(flow, mask, neighbors, 0), nearest_known(flow, mask, neighbors, 4)
+        assert torch.equal(exact[0].sort(1).values, table[0].sort(1).values)
+        torch.testing.assert_close(exact[1].sum(1), table[1].sum(1))

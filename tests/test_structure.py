@@ -1,0 +1,109 @@
+"""The house as its imports draw it: no circle of modules or rooms, small rooms, and the order in which light goes."""
+
+import ast
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = "spikekit", "lightning_modules"
+MODULES = {
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+    for package in PACKAGES
+    for path in sorted((ROOT / package).rglob("*.py"))
+}
+
+#: the way of the light: none of these imports one that comes later; estimators of flow warp, so warp is before them
+WAY = "color", "sensor", "decoders", "warp", "flow", "scenes"
+
+
+def imported(name, source, modules):
+    """Modules that a module imports, at its top or inside its functions."""
+    package = name if modules[name].name == "__init__.py" else name.rpartition(".")[0]
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            above = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            origin = ".".join([*above, *([node.module] if node.module else [])])
+            for alias in node.names:
+                inner = f"{origin}.{alias.name}"
+                yield inner if inner in modules else origin
+
+
+def graph(sources, modules=MODULES):
+    return {
+        name: {other for other in imported(name, source, modules) if other in modules and other != name}
+        for name, source in sources.items()
+    }
+
+
+def room(name):
+    """The folder of a module; a module that is in none of the rooms is one by itself, and so is a package."""
+    parts = name.split(".")
+    return ".".join(parts[:2])
+
+
+def rooms(modules):
+    between = {room(name): set() for name in modules}
+    for name, others in modules.items():
+        # what a package says of itself, such as its version, is below everything
+        between[room(name)] |= {room(other) for other in others if other not in PACKAGES} - {room(name)}
+    return {name: others for name, others in between.items() if name not in PACKAGES}
+
+
+def circle(edges):
+    try:
+        TopologicalSorter(edges).prepare()
+    except CycleError as error:
+        return error.args[1]
+    return None
+
+
+@pytest.fixture(name="house", scope="module")
+def _house():
+    return graph({name: path.read_text(encoding="utf-8") for name, path in MODULES.items()})
+
+
+def test_no_circle_of_modules(house):
+    assert circle(house) is None
+
+
+def test_no_circle_of_rooms(house):
+    assert circle(rooms(house)) is None
+
+
+@pytest.mark.parametrize("folder", sorted({path.parent for path in MODULES.values()}), ids=str)
+def test_a_folder_has_no_more_modules_than_one_takes_in(folder):
+    assert len([path for path in folder.glob("*.py") if path.name != "__init__.py"]) <= 13
+
+
+def test_nothing_imports_against_the_way_of_the_light(house):
+    order = {f"spikekit.{name}": place for place, name in enumerate(WAY)}
+    edges = rooms(house)
+    assert set(order) <= set(edges)
+    against = [(a, b) for a in order for b in edges[a] if b in order and order[b] > order[a]]
+    assert not against
+
+
+def test_the_camera_does_not_know_the_networks(house):
+    known = {name for name, others in house.items() if any(room(other).startswith(PACKAGES[1]) for other in others)}
+    assert not [name for name in known if name.startswith("spikekit")]
+
+
+def test_circles_are_found_where_there_are_some():
+    modules = {f"p.{name}": Path(f"{name}.py") for name in ("a.x", "a.y", "b.z")}
+    sources = {
+        "p.a.x": "def f():\n    from p.b import z",
+        "p.a.y": "from . import x",
+        "p.b.z": "import p.a.y",
+    }
+    found = graph(sources, modules)
+    assert found == {"p.a.x": {"p.b.z"}, "p.a.y": {"p.a.x"}, "p.b.z": {"p.a.y"}}
+    assert circle(found) is not None
+    assert set(circle(rooms(found))) == {"p.a", "p.b"}
+    found["p.a.x"] = set()  # the modules are in order now, the rooms are not
+    found["p.b.z"], found["p.a.x"], found["p.a.y"] = {"p.a.x"}, set(), {"p.b.z"}
+    assert circle(found) is None
+    assert circle(rooms(found)) is not None
