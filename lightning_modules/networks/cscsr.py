@@ -111,7 +111,8 @@ class CSCSR(Network):
         if not shapes_only:
             self._initialize()
         self._masks: dict[Any, Tensor] = {}
-        foldable = config.search and sensor and config.scale > 1 and not shapes_only
+        learned = config.representation == "bssr"
+        foldable = config.search and learned and sensor and config.scale > 1 and not shapes_only
         self._response = rest_response(config.scale, config.pattern, config.neighbors) if foldable else None
         self._responses: dict[Any, Tensor] = {}
 
@@ -209,15 +210,23 @@ class CSCSR(Network):
         """
         how = {"neighbors": self.config.neighbors, "steps": self.steps or None}
         if offsets.shape[1] == 1:
-            pixels = enlarge(features, self.scale)
+            pixels = self._enlarge(features, mask)
             return flow_warp_idw(pixels.flatten(1, 2), offsets[:, 0], mask, **how).reshape(pixels.shape)
         # a few time points after the others: what the search needs on the way is many times its result
         few = max(1, _SEARCHED // (offsets.shape[-2] * offsets.shape[-1]))
         pixels = [
-            flow_warp_idw(enlarge(part, self.scale), offset, mask, **how)
+            flow_warp_idw(self._enlarge(part, mask), offset, mask, **how)
             for part, offset in zip(features.flatten(0, 1).split(few), offsets.flatten(0, 1).split(few), strict=True)
         ]
         return torch.cat(pixels).unflatten(0, features.shape[:2])
+
+    def _enlarge(self, features: Tensor, mask: Tensor) -> Tensor:
+        """Enlarge features; those without weights are zero at other colours' pixels, which must not darken them."""
+        pixels = enlarge(features, self.scale)
+        if self.config.representation == "bssr" or self.scale == 1:
+            return pixels
+        known = enlarge(mask[None, :: self.scale, :: self.scale].to(pixels.dtype), self.scale)
+        return pixels / known.where(mask, 1)
 
     def _base(self, spikes: Tensor) -> Tensor:
         """TFP of the whole clip, demosaiced, smoothed, enlarged."""

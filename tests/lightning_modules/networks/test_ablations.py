@@ -217,6 +217,19 @@ def test_c_shows_the_inverse_interval_where_the_colour_is(configs):
     torch.testing.assert_close(seen[:, :, 0], expected)
 
 
+@pytest.mark.parametrize("letter", "ac")
+@pytest.mark.parametrize("scale", [2, 3, 4])
+def test_features_without_weights_of_a_flat_scene_are_flat_whatever_moves(letter, scale, configs):
+    network = variant(letter, configs, scale=scale)
+    spikes = torch.ones(1, 41, 12, 16)
+    flow = torch.rand(1, 2, 2, 12, 16, generator=torch.Generator().manual_seed(0)) * 6 - 3
+    for color, mask in enumerate(network._mask(12, 16, spikes.device)):
+        features = network.representation[color](spikes * bayer_mask(12, 16)[color])
+        for offsets in (network._offsets(flow, spikes)[color], network._offsets(None, spikes)[color]):
+            pixels = network._search(features, offsets, mask)
+            torch.testing.assert_close(pixels, torch.ones_like(pixels))
+
+
 @pytest.mark.parametrize(("letter", "sees"), [("a", False), ("b", False), ("j", True)])
 def test_frames_between_the_windows_are_global_perception_alone(letter, sees, configs):
     network = variant(letter, configs, window=5, stride=12)  # frames 0-4, 12-16, 24-28, 36-40
