@@ -60,6 +60,10 @@ def why_no_lpips() -> str | None:
 def lpips(rgb: Tensor, truth: Tensor) -> Tensor:
     """Learned perceptual image patch similarity with AlexNet's features, by torchmetrics; lower is better.
 
+    In the convention of the authors of CSCSR, whose programs give the metric pictures of 0 .. 1 as they are. Values where
+    pictures are brought to -1 .. 1 first, as LPIPS was trained, are others. No library ships AlexNet's weights:
+    :func:`why_no_lpips` says how to fetch them.
+
     Args:
         rgb: :math:`(B, 3, H, W)`, cut to 0 .. 1.
         truth: likewise.
@@ -81,4 +85,4 @@ def lpips(rgb: Tensor, truth: Tensor) -> Tensor:
 def _metric(device: torch.device) -> Callable[[Tensor, Tensor], Tensor]:
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
-    return LearnedPerceptualImagePatchSimilarity("alex", normalize=True).to(device)
+    return LearnedPerceptualImagePatchSimilarity("alex").to(device)

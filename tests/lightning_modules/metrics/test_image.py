@@ -29,6 +29,7 @@ def alexnet(weights):
 
 @pytest.fixture
 def torchvision(monkeypatch, tmp_path):
+    pytest.importorskip("torchmetrics.image.lpip")  # before it can see a torchvision that is none
     models = SimpleNamespace(alexnet=alexnet, AlexNet_Weights=SimpleNamespace(DEFAULT="all"))
     module = ModuleType("torchvision")
     module.models, module.__spec__ = models, ModuleSpec("torchvision", None)
@@ -57,6 +58,9 @@ def test_lpips_of_every_picture(torchvision):
     assert of(2 * truth, truth.clamp(max=1)).tolist() == of((2 * truth).clamp(max=1), truth).tolist()
     assert of(rgb[:1].double(), truth[:1].double()).item() == 0
     assert of(rgb[..., :62, :], truth[..., :62, :]).isnan().all()
+    # as the authors give it pictures: 0 .. 1, not brought to -1 .. 1
+    as_learned = quality._metric(rgb.device)(2 * rgb[2:] - 1, 2 * truth[2:] - 1)
+    assert abs(as_learned.item() - flat) > 0.01 * flat
 
 
 def test_what_lpips_lacks(torchvision, monkeypatch):
