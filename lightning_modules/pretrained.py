@@ -21,6 +21,7 @@ from lightning_modules.stored_settings import check_plain, check_shapes
 from spikekit.io.whole_file import whole_file
 
 _MOTION = "motion."
+_EXCHANGED = "motion_fusion"
 
 
 class CheckpointMismatchError(ValueError):
@@ -157,6 +158,8 @@ def motion_of(network: nn.Module) -> dict[str, Any]:
 def check_settings(network: nn.Module, settings: dict[str, Any], source: str | Path) -> None:
     """Refuse weights of another network: scale, say, is in no parameter, and would go unnoticed.
 
+    How the colours' motion is joined may differ, as the estimator of motion may: weights serve with any.
+
     Args:
         network: what the weights are meant for.
         settings: class and arguments of the network that they are of; empty where they are not known.
@@ -169,7 +172,7 @@ def check_settings(network: nn.Module, settings: dict[str, Any], source: str | P
     # an argument that is younger than the weights had the effect of its default
     defaults = {name: parameter.default for name, parameter in signature(type(network)).parameters.items()}
     there = {**defaults, **(settings or here)}
-    differing = [key for key in here if here[key] != there.get(key)]
+    differing = [key for key in here if here[key] != there.get(key) and key != _EXCHANGED]
     if differing:
         trained = ", ".join(f"{key}={there.get(key)}" for key in differing)
         asked = ", ".join(f"{key}={here[key]}" for key in differing)

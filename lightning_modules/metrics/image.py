@@ -60,8 +60,8 @@ def why_no_lpips() -> str | None:
 def lpips(rgb: Tensor, truth: Tensor) -> Tensor:
     """Learned perceptual image patch similarity with AlexNet's features, by torchmetrics; lower is better.
 
-    In the convention of the authors of CSCSR, whose programs give the metric pictures of 0 .. 1 as they are. Values where
-    pictures are brought to -1 .. 1 first, as LPIPS was trained, are others. No library ships AlexNet's weights:
+    In the convention of the authors of CSCSR, whose programs give the metric pictures of 0 .. 1 as they are. LPIPS was
+    trained on pictures brought to -1 .. 1, which have other values. No library ships AlexNet's weights;
     :func:`why_no_lpips` says how to fetch them.
 
     Args:

@@ -18,7 +18,7 @@ from lightning_modules.cli.command import run
 from lightning_modules.cli.rehearsal import Rehearsal
 from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
 from lightning_modules.networks import CSCSR, ClassicalDecoder
-from lightning_modules.pretrained import read_weights, write_weights
+from lightning_modules.pretrained import load_weights, read_weights, write_weights
 from lightning_modules.shipped import FOLDER, shipped_weights
 from lightning_modules.tasks.super_resolution import SuperResolution
 from spikekit import read_picture, write_picture, write_spikes
@@ -86,6 +86,14 @@ def test_learned_motion_is_part_of_the_weights(tmp_path, suffix):
     before = {name: value.clone() for name, value in mine.state_dict().items()}
     assert CSCSR.from_pretrained(path.with_suffix(suffix), motion=mine).motion is mine
     assert all(torch.equal(value, before[name]) for name, value in mine.state_dict().items())
+
+
+@pytest.mark.parametrize("fusion", ["independent", "assembled"])
+def test_weights_serve_with_any_way_of_joining_motion(fusion, file):
+    other = network(motion_fusion=fusion, motion=ZeroFlow())
+    load_weights(other, read_weights(file))
+    assert other.config.motion_fusion == fusion
+    torch.testing.assert_close(other(SPIKES), network(motion=ZeroFlow())(SPIKES))
 
 
 def test_weights_of_something_else(file, tmp_path):
