@@ -16,7 +16,7 @@ from lightning_modules.networks.reconstruction import ColorCorrelation, EarlyFus
 from lightning_modules.networks.refinement import FeatureRefinement, TimeFusion
 from lightning_modules.networks.representation import IntervalRepresentation, SpikeRepresentation, WindowMeans
 from lightning_modules.tasks.super_resolution import SuperResolution
-from spikekit import bayer_mask, bayer_sites, spike_interval
+from spikekit import bayer_mask, bayer_sites, spike_integrate_fire, spike_interval
 
 TINY = {"width": 4, "representation_width": 4, "features": 2, "stages": 2, "blocks": 1, "end_blocks": 1}
 FULL = (SpikeRepresentation, FeatureRefinement, ColorCorrelation)
@@ -228,6 +228,17 @@ def test_features_without_weights_of_a_flat_scene_are_flat_whatever_moves(letter
         for offsets in (network._offsets(flow, spikes)[color], network._offsets(None, spikes)[color]):
             pixels = network._search(features, offsets, mask)
             torch.testing.assert_close(pixels, torch.ones_like(pixels))
+
+
+@pytest.mark.parametrize("velocity", [(0.0, 0.0), (1.37, -0.81), (2.5, 1.9)])
+def test_learned_features_show_no_pattern_of_motion_on_a_flat_scene(velocity):
+    """0.15 to 0.25 of a step of 8 bits, at rest as in motion."""
+    network = CSCSR.from_pretrained("cscsr_small_x4")
+    spikes, _ = spike_integrate_fire(torch.full((1, 41, 32, 32), 0.2), charge=torch.full((1, 32, 32), 0.05))
+    flow = torch.tensor(velocity).reshape(1, 2, 1, 1).expand(1, 2, 32, 32)
+    with torch.no_grad():
+        middle = network(spikes, torch.stack([-flow, flow], dim=1))[..., 48:-48, 48:-48]
+    assert 255 * middle.std(dim=(-2, -1)).max() < 0.4
 
 
 @pytest.mark.parametrize(("letter", "sees"), [("a", False), ("b", False), ("j", True)])
