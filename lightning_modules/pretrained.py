@@ -21,7 +21,6 @@ from lightning_modules.stored_settings import check_plain, check_shapes
 from spikekit.io.whole_file import whole_file
 
 _MOTION = "motion."
-_EXCHANGED = "motion_fusion"
 
 
 class CheckpointMismatchError(ValueError):
@@ -158,8 +157,6 @@ def motion_of(network: nn.Module) -> dict[str, Any]:
 def check_settings(network: nn.Module, settings: dict[str, Any], source: str | Path) -> None:
     """Refuse weights of another network: scale, say, is in no parameter, and would go unnoticed.
 
-    How the colours' motion is joined may differ, as the estimator of motion may: weights serve with any.
-
     Args:
         network: what the weights are meant for.
         settings: class and arguments of the network that they are of; empty where they are not known.
@@ -172,7 +169,7 @@ def check_settings(network: nn.Module, settings: dict[str, Any], source: str | P
     # an argument that is younger than the weights had the effect of its default
     defaults = {name: parameter.default for name, parameter in signature(type(network)).parameters.items()}
     there = {**defaults, **(settings or here)}
-    differing = [key for key in here if here[key] != there.get(key) and key != _EXCHANGED]
+    differing = [key for key in here if here[key] != there.get(key)]
     if differing:
         trained = ", ".join(f"{key}={there.get(key)}" for key in differing)
         asked = ", ".join(f"{key}={here[key]}" for key in differing)
@@ -205,7 +202,8 @@ def load_weights(network: nn.Module, weights: Weights, keep_motion: bool = False
     """Give a network weights that are of its kind.
 
     Weights are of the gain alpha that they were trained with. Where the network was built for another, its picture is
-    multiplied by what one gain is of the other.
+    multiplied by what one gain is of the other. How the motion of the colours is joined may differ as well: it has no
+    weights.
 
     Args:
         network: what the weights are meant for.
@@ -216,9 +214,9 @@ def load_weights(network: nn.Module, weights: Weights, keep_motion: bool = False
         CheckpointMismatchError: they are of another network.
         ValueError: the file says that they fit, and they do not.
     """
-    settings, alpha = weights.settings, network.settings.get("alpha")
-    ratio = 1 if alpha is None else settings.get("alpha", alpha) / alpha
-    check_settings(network, settings if ratio == 1 else {**settings, "alpha": alpha}, weights.source)
+    exchanged = {name: network.settings[name] for name in ("alpha", "motion_fusion") if name in network.settings}
+    ratio = weights.settings.get("alpha", exchanged["alpha"]) / exchanged["alpha"] if "alpha" in exchanged else 1
+    check_settings(network, weights.settings and {**weights.settings, **exchanged}, weights.source)
     motion = getattr(network, "motion", None)
     tensors = weights.tensors if motion is None else with_own_motion(weights.tensors, motion, keep=keep_motion)
     try:
