@@ -6,11 +6,13 @@ import re
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
+from inspect import signature
 from typing import NamedTuple
 
 from lightning_modules.cli.arguments import arguments_preset, preset_arguments
 from lightning_modules.cli.errors import InputError
 from lightning_modules.inference.presets import Preset
+from lightning_modules.networks import Network
 from lightning_modules.shipped import shipped_weights
 from spikekit.decoders.methods import DECODERS
 
@@ -89,7 +91,7 @@ _SPIKE2FLOW = {"motion": "Spike2Flow", "motion_weights": "spike2flow"}
 _LEARNED = [("Spike2Flow", _SPIKE2FLOW), ("Spike2Flow, once", {**_SPIKE2FLOW, "motion_iterations": 1})]
 
 
-def usual_settings(scale: int, own: Sequence[str] = ()) -> list[Setting]:
+def usual_settings(scale: int, own: Sequence[str] = (), network: Network | None = None) -> list[Setting]:
     """Return what is measured where nothing else is asked for.
 
     The networks whose weights come with the package, as they are, the reference first and then by size; then the same
@@ -100,6 +102,7 @@ def usual_settings(scale: int, own: Sequence[str] = ()) -> list[Setting]:
         scale: super-resolution factor.
         own: arguments that give weights to the network of all settings, such as ``--ckpt_path``: that network then
             stands in the place of those in the package.
+        network: that network, of which only what it has arguments for is changed.
     """
     shipped = shipped_weights()
     # those for longer clips would need other scenes than the rest
@@ -110,15 +113,21 @@ def usual_settings(scale: int, own: Sequence[str] = ()) -> list[Setting]:
     if own:
         networks, largest = {"own weights": Preset()}, "own weights"
     learned = _LEARNED if "spike2flow" in shipped else []
+    lacking: set[str] = set()
+    if network is not None:
+        lacking = {"motion", "steps"} - signature(type(network)).parameters.keys()
+        if network.halo is None:  # it is never cut into tiles
+            lacking |= {"tile", "psnr_tolerance"}
     presets = dict(networks)
-    for place, (network, preset) in enumerate(networks.items()):
+    for place, (weights, preset) in enumerate(networks.items()):
         for name, changes in [
             *(learned if place == 0 else []),
             *_EFFORT,
-            *(_MOST if network == largest else []),
+            *(_MOST if weights == largest else []),
             *(_VARIANTS if place == 0 else []),
         ]:
-            presets[f"{network}, {name}"] = replace(preset, **changes)
+            if not lacking & changes.keys():
+                presets[f"{weights}, {name}"] = replace(preset, **changes)
     decoders = {
         name: Preset(network="ClassicalDecoder", scale=scale, method=method, **options)
         for method, decoder in DECODERS.items()

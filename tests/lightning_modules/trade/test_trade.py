@@ -18,7 +18,7 @@ from lightning_modules.cli.errors import InputError
 from lightning_modules.inference import presets
 from lightning_modules.inference.presets import Preset
 from lightning_modules.motion import Spike2Flow
-from lightning_modules.networks import CSCSR
+from lightning_modules.networks import CSCSR, TSCNN
 from lightning_modules.pretrained import settings_of
 from lightning_modules.trade import cli, energy, measure
 from lightning_modules.trade.energy import energy_meter, energy_per_call
@@ -226,6 +226,10 @@ def test_usual_settings_are_those_of_the_weights_that_are_shipped(monkeypatch, t
     assert own["own weights, self-ensemble of 4"].args == ["--model.self_ensemble", "4"]
     assert own["TFI"].args[-2:] == ["--ckpt_path", "null"]
     assert own["TFI"].preset == settings["TFI"].preset
+    tscnn = [setting.name for setting in usual_settings(4, ["--ckpt_path"], TSCNN(width=8, blocks=1))]
+    ensembles = [f"own weights, self-ensemble of {views}" for views in (2, 4, 8)]
+    assert tscnn[:6] == ["own weights", *ensembles, "own weights, bf16-true", "own weights, bf16-mixed"]
+    assert set(tscnn[6:]) == {"TFI", *(name for name in settings if name.startswith("TFP"))}
     del shipped["spike2flow"]
     assert not [setting for setting in usual_settings(4) if "Spike2Flow" in setting.args]
 
