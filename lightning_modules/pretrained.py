@@ -21,6 +21,7 @@ from lightning_modules.stored_settings import check_plain, check_shapes
 from spikekit.io.whole_file import whole_file
 
 _MOTION = "motion."
+_ADAPTED = "alpha", "motion_fusion"  # settings that weights serve any value of
 
 
 class CheckpointMismatchError(ValueError):
@@ -173,7 +174,8 @@ def check_settings(network: nn.Module, settings: dict[str, Any], source: str | P
     if differing:
         trained = ", ".join(f"{key}={there.get(key)}" for key in differing)
         asked = ", ".join(f"{key}={here[key]}" for key in differing)
-        raise CheckpointMismatchError(f"{source} was trained with {trained}; this run asks for {asked}")
+        way = "; --model.weights adapts them" if set(differing) <= set(_ADAPTED) else ""
+        raise CheckpointMismatchError(f"{source} was trained with {trained}; this run asks for {asked}{way}")
 
 
 def with_own_motion(
@@ -214,7 +216,7 @@ def load_weights(network: nn.Module, weights: Weights, keep_motion: bool = False
         CheckpointMismatchError: they are of another network.
         ValueError: the file says that they fit, and they do not.
     """
-    exchanged = {name: network.settings[name] for name in ("alpha", "motion_fusion") if name in network.settings}
+    exchanged = {name: network.settings[name] for name in _ADAPTED if name in network.settings}
     ratio = weights.settings.get("alpha", exchanged["alpha"]) / exchanged["alpha"] if "alpha" in exchanged else 1
     check_settings(network, weights.settings and {**weights.settings, **exchanged}, weights.source)
     motion = getattr(network, "motion", None)
