@@ -23,7 +23,7 @@ _PATHS = ("best_model_path", "kth_best_model_path", "last_model_path")
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """Read a checkpoint; nothing in it is run, and nothing is built of what it names.
+    """Read a checkpoint; nothing in it is run, and no class that it names is built.
 
     Args:
         path: the file.

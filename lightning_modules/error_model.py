@@ -36,7 +36,7 @@ class ErrorModel:
     flat: float = 12.0
     grainy: float = 1.7
     blurred: float = 0.25
-    still: float = 0.15
+    still: float = 0.18
     textured: float = 0.085
     moved: float = 0.0019
     faint: float = 1.3e-5

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ class CheckpointMismatchError(ValueError):
 
 @dataclass(frozen=True)
 class Weights:
-    """What a file holds.
+    """The contents of a file of weights.
 
     Args:
         source: the file.
@@ -39,12 +39,14 @@ class Weights:
         motion: likewise of the learned estimator of motion inside the network, empty where it has none, or where the
             file does not say.
         tensors: weights by name.
+        halo: how far the network sees with them, where that was measured.
     """
 
     source: Path
     settings: dict[str, Any]
     motion: dict[str, Any]
     tensors: dict[str, Tensor]
+    halo: int | None = None
 
 
 def read_weights(source: str | Path) -> Weights:
@@ -64,7 +66,8 @@ def read_weights(source: str | Path) -> Weights:
     if not path.is_file():
         names = ", ".join(weights.name for weights in list_pretrained())
         raise FileNotFoundError(f"{source}: neither a file of weights nor the name of those in the package ({names})")
-    return _read_safetensors(path) if path.suffix == ".safetensors" else _read_checkpoint(path)
+    found = _read_safetensors(path) if path.suffix == ".safetensors" else _read_checkpoint(path)
+    return replace(found, halo=shipped.halo) if shipped else found
 
 
 def check_weights(weights: Weights, kinds: Mapping[str, type[nn.Module]]) -> None:
@@ -230,6 +233,8 @@ def load_weights(network: nn.Module, weights: Weights, keep_motion: bool = False
         network.scale_picture(ratio)
     if hasattr(network, "error_model"):
         network.error_model = read_error_model(weights.source)
+    if weights.halo is not None:
+        network.halo = weights.halo
 
 
 def _first_line(error: Exception) -> str:

@@ -23,6 +23,7 @@ class Pretrained:
         former: an older name, which goes on working; None where there is none.
         scale: super-resolution factor; None for an estimator of motion.
         size: of the network, as in ``configs/size``; None for an estimator of motion.
+        halo: of the network with these weights, measured; None for an estimator of motion.
     """
 
     name: str
@@ -30,6 +31,7 @@ class Pretrained:
     former: str | None = None
     scale: int | None = None
     size: str | None = None
+    halo: int | None = None
 
     @property
     def parameters(self) -> int:
@@ -48,6 +50,7 @@ def _index() -> tuple[Pretrained, ...]:
                 row["former"] or None,
                 int(row["scale"]) if row["scale"] else None,
                 row["size"] or None,
+                int(row["halo"]) if row["halo"] else None,
             )
             for row in csv.DictReader(file)
         )

@@ -1,4 +1,4 @@
-"""Old names that go on working: of modules, each the very one that took its place, of what they held, of arguments."""
+"""Old names that go on working: of modules, of their members, and of arguments."""
 
 from __future__ import annotations
 
@@ -60,6 +60,9 @@ RENAMED = {
     "lightning_modules.speed": "lightning_modules.inference.presets",
     "lightning_modules.networks.rest": "lightning_modules.networks.static_scene",
     "lightning_modules.savings": "lightning_modules.trade.adaptive",
+    "lightning_modules.trade.energy": "lightning_modules.cost.energy",
+    "lightning_modules.trade.measure": "lightning_modules.cost.measure",
+    "lightning_modules.trade.runner": "lightning_modules.cost.runner",
     "lightning_modules.quality": "lightning_modules.metrics.image",
     "lightning_modules.flow_metrics": "lightning_modules.metrics.flow",
 }
@@ -94,7 +97,7 @@ def moved(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
 
     Args:
         package: its name.
-        homes: modules by the names of what they took over.
+        homes: where each name is now, by name.
     """
 
     def __getattr__(name: str) -> Any:  # noqa: N807

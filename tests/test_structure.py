@@ -92,6 +92,11 @@ def test_the_camera_does_not_know_the_networks(house):
     assert not [name for name in known if name.startswith("spikekit")]
 
 
+def test_sweep_and_trade_do_not_import_each_other(house):
+    edges, pair = rooms(house), {"lightning_modules.sweep", "lightning_modules.trade"}
+    assert not [(name, other) for name in pair for other in edges[name] & pair]
+
+
 def test_circles_are_found_where_there_are_some():
     modules = {f"p.{name}": Path(f"{name}.py") for name in ("a.x", "a.y", "b.z")}
     sources = {

@@ -1,4 +1,4 @@
-"""What a sensor of four times coarser pixels sees: every pixel averages its block, in its own colour."""
+"""A picture seen by a sensor of four times coarser pixels: every pixel averages its block, in its own colour."""
 
 import matplotlib.pyplot as plt
 import torch

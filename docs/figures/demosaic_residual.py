@@ -1,4 +1,4 @@
-"""What residual interpolation makes of a mosaic, beside linear filters."""
+"""Residual interpolation of a mosaic, beside linear filters."""
 
 import matplotlib.pyplot as plt
 import torch

@@ -1,4 +1,4 @@
-"""What the frames of a clip count for in tfp_at: its gradient."""
+"""The weight of every frame of a clip in tfp_at: its gradient."""
 
 import matplotlib.pyplot as plt
 import torch

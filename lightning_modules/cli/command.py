@@ -317,7 +317,7 @@ def _check_continuation(path: str, model: Learner) -> None:
 
 
 def _check_agreement(model: Learner, data: LightningDataModule) -> None:
-    """What is not linked, because more than one kind of model has it; a recording has a Bayer phase of its own."""
+    """Refuse a model and data that disagree; a recording has a Bayer phase of its own."""
     if not isinstance(data, (StillScenes, FilmScenes)):
         return
     if data.workers < 0:

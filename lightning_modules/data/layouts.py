@@ -51,7 +51,7 @@ class FilmFiles:
 
 @dataclass(frozen=True)
 class Collection:
-    """What was found in a folder.
+    """The contents of a folder.
 
     Args:
         name: the data set.

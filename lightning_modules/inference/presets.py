@@ -15,6 +15,7 @@ from lightning_modules import motion as estimators
 from lightning_modules.inference.predict import predict
 from lightning_modules.inference.tiles import FAR, TILE
 from lightning_modules.networks import CSCSR, ClassicalDecoder, Network
+from lightning_modules.shipped import find_shipped
 from spikekit.timing import timer_of
 
 _FOLDER = Path(__file__).parents[1] / "weights"
@@ -207,7 +208,9 @@ def choices(scale: int, size: tuple[int, int]) -> list[Choice]:
             continue
         measured = int(row["height"]) * int(row["width"])
         pixels = size[0] * size[1] / measured
-        in_tile = min(pixels, ((preset.tile or TILE) + 2 * (CSCSR.halo + FAR)) ** 2 / measured)
+        shipped = find_shipped(preset.weights or "")
+        halo = shipped.halo if shipped else CSCSR.halo
+        in_tile = min(pixels, ((preset.tile or TILE) + 2 * (halo + FAR)) ** 2 / measured)
         psnr, ratio, mib = (float(row[name]) for name in ("psnr", "ratio", "mib"))
         moves = preset.motion != "ZeroFlow" and preset.network is None
         everywhere = frame + moves * _MOTION * measured
@@ -266,8 +269,8 @@ def choose(
         scale: super-resolution factor.
         speed: ``"best"``, ``"balanced"`` or ``"fast"``, the fastest that is at most so many dB below the most exact as
             :data:`SPEEDS` says, or ``"fastest"``; of those that take hardly longer the most exact.
-        budget: instead, what a frame may take: a time, such as ``"40ms"``, or memory, such as ``"200MB"``. Of what fits
-            it is the best.
+        budget: instead, what a frame may take: a time, such as ``"40ms"``, or memory, such as ``"200MB"``. The best
+            preset that fits is chosen.
         size: of a frame, (H, W) in sensor pixels, which a budget depends on.
 
     Raises:

@@ -43,7 +43,7 @@ class Activity(NamedTuple):
 
 
 class Look(NamedTuple):
-    """What was seen of clips, cell by cell.
+    """Statistics of clips, cell by cell.
 
     Args:
         picture: smooth ``rgb`` :math:`(B, 3, s H, s W)`, all that flat parts need.

@@ -1,4 +1,4 @@
-"""Self-ensemble: the mean of what a network makes of a clip mirrored, turned and transposed."""
+"""Self-ensemble: the mean of a network's pictures of a clip mirrored, turned and transposed."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ def _around(cells: Tensor) -> Box:
 
 
 def _boxes(network: Tensor, motion: Tensor, tile: int) -> dict[Box, bool]:
-    """What the network has to see of every tile of so many cells, in cells, and whether it moves."""
+    """The part of every tile of so many cells that needs the network, in cells, and whether it moves."""
     boxes = {}
     for top in range(0, network.shape[0], tile):
         for left in range(0, network.shape[1], tile):

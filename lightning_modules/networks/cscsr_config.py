@@ -10,7 +10,7 @@ from lightning_modules.networks.configuration import check_fields
 
 @dataclass(frozen=True)
 class CSCSRConfig:
-    """What a :class:`lightning_modules.networks.CSCSR` is made of: a YAML file fills it, and weights carry it.
+    """Configuration of a :class:`lightning_modules.networks.CSCSR`: a YAML file fills it, and weights carry it.
 
     Widths and depths are not in the paper; the defaults are size paper_base of this project, see ``configs/size``. The
     fields from ``representation`` to ``reconstruction`` are the ablations of the paper's Table 3, see

@@ -12,6 +12,7 @@ from lightning_modules.error_model import ErrorModel
 from lightning_modules.motion import ESTIMATORS, ClassicalFlow, MotionEstimator
 from lightning_modules.pretrained import check_weights, load_weights, read_weights
 from lightning_modules.stored_settings import own_class
+from spikekit.check import check_planes
 
 
 class Network(nn.Module):
@@ -27,7 +28,7 @@ class Network(nn.Module):
     Attributes:
         halo: how many sensor pixels around a place the network sees, beside those that motion reaches over; even, as
             the Bayer phase is kept. None where it sees the whole picture, or where nobody knows: such a network is
-            not run in tiles.
+            not run in tiles. Shipped weights bring their own.
         takes_flow: whether a flow changes anything.
         error_model: what less work costs it, for a tolerance; that of the weights, once they are loaded.
         flow_groups: leading dimensions of the flows that the network takes, behind the batch.
@@ -98,6 +99,18 @@ class Network(nn.Module):
         A camera of twice the gain sees a scene as the other sees one twice as bright: the same spikes, half the
         picture. A network whose input is divided by alpha knows that already; others override this.
         """
+
+    def check_spikes(self, spikes: Tensor) -> None:
+        """Raise unless a clip is one that the network takes.
+
+        Raises:
+            TypeError: not a tensor of real numbers.
+            ValueError: another number of frames, or less than 3 x 3 pixels.
+        """
+        check_planes("spikes", spikes, 4, "(B, N, H, W)")
+        if spikes.ndim != 4 or spikes.shape[1] != self.frames or min(spikes.shape[-2:]) < 3:
+            expected = f"(B, {self.frames}, H, W) of at least 3 x 3 pixels"
+            raise ValueError(f"spikes: expected {expected}, got {tuple(spikes.shape)}")
 
     def estimate_flow(self, spikes: Tensor) -> Tensor:
         """Flows from the middle to the first and to the last time point, (B, 2, 2, H, W), in sensor pixels."""

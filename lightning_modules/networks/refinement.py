@@ -37,7 +37,7 @@ class FeatureRefinement(nn.Module):
         return torch.cat([base.weight, weight]), torch.cat([base.bias, residual.bias])
 
     def finish(self, seen: Tensor) -> Tensor:
-        """What comes behind the first convolution."""
+        """The layers behind the first convolution."""
         base, residual = self.base[1], self.residual[1]
         weight = torch.cat([base.weight, residual.weight], dim=1)
         return F.conv2d(seen.relu_(), weight, base.bias + residual.bias, padding=1)

@@ -20,7 +20,7 @@ _WINDOW = 2 + 2 * _AROUND
 
 @lru_cache(maxsize=8)
 def rest_response(scale: int, pattern: str, neighbors: int) -> Tensor | None:
-    """What the temporal pixels of a Bayer cell, and of the sites next to it, are made of where nothing moves.
+    """Weights that the temporal pixels of a Bayer cell, and of the sites next to it, have where nothing moves.
 
     Args:
         scale: super-resolution factor s.

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from lightning_modules.cli.errors import InputError
+from lightning_modules.cost.measure import Row as Measured
+from lightning_modules.cost.measure import measure_costs, quartiles, running
+from lightning_modules.cost.runner import CannotRunError, Runner
+from lightning_modules.cost.setting import Setting
 from lightning_modules.sweep.state import read_json, write_json
 from lightning_modules.sweep.table import Row
-from lightning_modules.trade.measure import Row as Measured
-from lightning_modules.trade.measure import measure_costs, quartiles, running
-from lightning_modules.trade.runner import CannotRunError, Runner
-from lightning_modules.trade.settings import Setting
 from spikekit.bench import cpu_name
 
 _ROUNDS = 5
@@ -30,7 +30,7 @@ def measure_variants(rows: Sequence[Row], path: Path) -> dict[str, Any]:
 
     Returns:
         ``variants``: by name ``ms``, ``mib`` and ``macs``, the multiplications of a sensor pixel; ``where``: how they
-        were measured, a sentence; ``trials``: of what.
+        were measured, a sentence; ``trials``: their folders.
     """
     trials = {
         row.variant: next(trial.folder for trial in row.trials if trial.seed in row.results)

@@ -59,7 +59,7 @@ class Row:
 
     @property
     def method(self) -> str | None:
-        """What the paper's Table 2 calls the network; None where it has no row of it, such as an ablation."""
+        """The network's name in the paper's Table 2; None where it has no row there, such as an ablation."""
         found = {method_of(result["network"]) for result in self.results.values()}
         return found.pop() if len(found) == 1 and self.trials[0].letter in ("", "J") else None
 

@@ -43,7 +43,7 @@ class SuperResolution(Learner):
             none.
         psnr_tolerance: by how many dB the PSNR of a picture may be expected to fall when ``predict`` and ``test`` look
             at the clip first and do only what each part of it needs; 0 for everything everywhere.
-        self_ensemble: 2, 4 or 8 lets ``predict`` and ``test`` give the mean of what they make of so many views of a
+        self_ensemble: 2, 4 or 8 lets ``predict`` and ``test`` give the mean picture of so many views of a
             clip, transposed, turned and mirrored, in so many times the time.
         flow: the motion that training uses. "scene" is that of the data, where they have it: the true one of analytic
             scenes, or that which the frames of a film were interpolated with. "estimated" is that of the network's own

@@ -1,7 +1,8 @@
 """Measure what a tolerance saves and costs, on scenes whose ground truth is known.
 
 ``python -m lightning_modules.trade.adaptive WEIGHTS`` prints the table; with ``--fit`` it fits what the tolerance is
-kept by, the constants of ``WEIGHTS``, writes them beside the weights, and prints what held-out clips lose.
+kept by, the constants of ``WEIGHTS``, writes them beside the weights, and prints what held-out clips lose; with
+``--halo`` it prints how far around a tile their networks see.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from lightning_modules.networks import CSCSR, Network
 from lightning_modules.pretrained import read_weights
 from lightning_modules.trade import error_fit
 from lightning_modules.trade.error_fit import Clip, Errors, fit_error_model, loss, make_clips, measure_errors
+from lightning_modules.trade.halo import measure_halo
 from spikekit import psnr
 from spikekit.arguments import whole
 from spikekit.scenes.analytic import Layer, Motion, Scene
@@ -141,6 +143,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--fit", action="store_true", help="fit the constants of the weights, and write them beside them"
     )
     parser.add_argument(
+        "--halo", action="store_true", help="print the halo that tiles need, to a hundredth of an 8-bit step"
+    )
+    parser.add_argument(
         "--clips", type=whole(1), default=8, help="with --fit: clips that are fitted, and as many others"
     )
     parser.add_argument("--height", type=int, default=250, help="sensor rows")
@@ -156,6 +161,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
         for line in fit(args.weights, shown, others, args.clips):
             print(line, flush=True)  # noqa: T201
+        return
+    if args.halo:
+        for weights in args.weights:
+            print(f"{weights}: {measure_halo(CSCSR.from_pretrained(weights))}", flush=True)  # noqa: T201
         return
     pictures = embedded_pictures(held_out=True) if given is None else given
     ground, thing = (cached_picture(pictures[i % len(pictures)]) for i in (0, 1))

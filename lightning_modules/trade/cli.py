@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import NoReturn
 
 from lightning_modules.cli.errors import InputError
-from lightning_modules.trade.measure import Row, measure, running
+from lightning_modules.cost.measure import Row, measure, running
+from lightning_modules.cost.runner import CannotRunError, Runner, make_runner
 from lightning_modules.trade.plot import plot
-from lightning_modules.trade.runner import CannotRunError, Runner, make_runner
 from lightning_modules.trade.settings import Setting, read_setting, usual_settings
 from lightning_modules.trade.table import COLUMNS, markdown, write_csv
 from spikekit.arguments import whole
@@ -134,7 +134,7 @@ def _check_any(rows: Sequence[Row]) -> None:
 
 
 def _command(setting: Setting, shared: Sequence[str], asked: argparse.Namespace) -> str:
-    """What measures a setting alone, into a folder of its own."""
+    """The command that measures a setting alone, into a folder of its own."""
     folder = asked.output / re.sub(r"[^\w.=+-]+", "_", setting.name).strip("_")
     rounds = [] if asked.rounds == _ROUNDS else ["--rounds", str(asked.rounds)]
     return shlex.join(["lightning", "trade", *shared, *rounds, "-o", str(folder), "--setting", setting.text])

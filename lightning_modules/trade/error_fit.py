@@ -27,9 +27,9 @@ TOLERANCES = (0.1, 0.5)
 
 _SIZE = 96, 128  # sensor pixels of a clip
 _OBJECT = 24  # of the object that moves
-_SHARE = 0.9  # weight of what is expected too small, against what is expected too large
+_SHARE = 0.9  # weight of errors that are expected too small, against those expected too large
 _MARGIN = 0.4  # of a tolerance that the worst of the fitted clips may lose; others lose more
-_STEP = 1.15  # by which what less work costs is scaled until they do
+_STEP = 1.15  # factor by which the cost of less work is raised until they do
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Clip:
 
 @dataclass(frozen=True)
 class Errors:
-    """What a network makes of a clip, cell by cell.
+    """Errors of a network on a clip, cell by cell.
 
     Args:
         clip: name of its picture and scene.
@@ -129,7 +129,7 @@ def _cells(error: Tensor, scale: int) -> Tensor:
 
 
 def loss(errors: Errors, model: ErrorModel, tolerance: float) -> tuple[float, float, float]:
-    """What a clip loses by a tolerance where every cell gets just what it is said to need.
+    """Return the loss of a clip by a tolerance where every cell gets just what it is said to need.
 
     Tiles give a cell as much or more.
 

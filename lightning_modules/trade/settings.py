@@ -7,39 +7,14 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from inspect import signature
-from typing import NamedTuple
 
 from lightning_modules.cli.arguments import arguments_preset, preset_arguments
 from lightning_modules.cli.errors import InputError
+from lightning_modules.cost.setting import Setting
 from lightning_modules.inference.presets import Preset
 from lightning_modules.networks import Network
 from lightning_modules.shipped import shipped_weights
 from spikekit.decoders.methods import DECODERS
-
-
-class Setting(NamedTuple):
-    """One row of the table.
-
-    Args:
-        name: what it is called.
-        args: arguments of ``lightning test`` that make it, behind those that all settings share.
-        preset: the same as columns of a table; ``None`` where the arguments say what a preset cannot.
-    """
-
-    name: str
-    args: list[str]
-    preset: Preset | None = None
-
-    @property
-    def text(self) -> str:
-        """As :func:`read_setting` takes it.
-
-        Example:
-            >>> Setting("small tiles", ["--model.tile", "32"]).text
-            'small tiles: --model.tile 32'
-        """
-        typed = shlex.join(self.args)
-        return typed if typed == self.name else f"{self.name}: {typed}".rstrip()
 
 
 def read_setting(text: str) -> Setting:

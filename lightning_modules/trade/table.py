@@ -10,9 +10,9 @@ from statistics import mean
 
 import torch
 
+from lightning_modules.cost.measure import Row, Timed, quartiles, running
 from lightning_modules.inference.presets import Preset
 from lightning_modules.metrics.image import why_no_lpips
-from lightning_modules.trade.measure import Row, Timed, quartiles, running
 from lightning_modules.trade.pareto import pareto_front
 from spikekit.bench import cpu_name, software
 from spikekit.io.whole_file import whole_file

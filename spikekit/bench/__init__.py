@@ -1,4 +1,4 @@
-"""The benchmark: every operator beside what one would otherwise run, in one process, in turn.
+"""The benchmark: every operator beside its usual alternative, in one process, in turns.
 
 Ratios hold on any machine that is not too different; absolute figures hold on the one that printed them.
 """
@@ -110,7 +110,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure every operator beside what one would otherwise run, and print the table."""
+    """Measure every operator beside its usual alternative, and print the table."""
     unknown = [name for name in args.operators if name not in CASES]
     if unknown:
         raise UsageError(f"operators: expected some of {', '.join(CASES)}, got {', '.join(unknown)}")

@@ -36,7 +36,7 @@ SIZES = {
 
 @dataclass(frozen=True)
 class Other:
-    """What a case is measured beside.
+    """The alternative that a case is measured beside.
 
     Attributes:
         name: what it is called in the table.

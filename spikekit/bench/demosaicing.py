@@ -1,4 +1,4 @@
-"""How good the demosaicings are: pictures whose truth is known, as mosaics and as TFI of what a camera sees of films.
+"""Quality of the demosaicings on pictures whose truth is known: of mosaics, and of TFI of simulated films.
 
 ``python -m spikekit.bench.demosaicing --pictures FOLDER --films FOLDER`` prints the table.
 """

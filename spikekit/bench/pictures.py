@@ -109,7 +109,7 @@ def _warp(warp: Any, features: Tensor, flow: Tensor, grad: Tensor | None, **opti
 
 
 def _search_then_gather(features: Tensor, flow: Tensor, mask: Tensor) -> tuple[Tensor]:
-    """What runs where Numba is not installed."""
+    """The path that runs where Numba is not installed."""
     return (Gather.apply(features.flatten(2), *idw_neighbors(flow, mask, steps=16)).reshape(features.shape),)
 
 

@@ -33,7 +33,7 @@ _LARGEST = 64  # number among the arguments of an interpolation that a file name
 
 @dataclass(frozen=True)
 class Settings:
-    """What a stream depends on beside its source.
+    """Settings that a stream depends on, beside its source.
 
     Args:
         scale: how many pixels a sensor pixel is wide.

@@ -95,7 +95,7 @@ class Moment:
 
     @property
     def frame(self) -> int:
-        """The frame in the middle of what is drawn."""
+        """The frame in the middle of those drawn."""
         return (self.begin + self.end) // 2
 
     @property
@@ -121,12 +121,12 @@ class Moment:
 
     @property
     def white(self) -> float:
-        """What is shown as white."""
+        """The value shown as white."""
         return self.alpha or white_rate(self.rates)
 
     @property
     def said(self) -> str:
-        """What is shown as white, in words."""
+        """The value shown as white, in words."""
         return f"alpha {self.alpha:g} is white" if self.alpha else f"{self.white:.3g} spikes a frame are white"
 
     def picture(self, raw: Tensor) -> Tensor:
@@ -160,7 +160,7 @@ class Moment:
         return self.recording.size[0] // 2 if self.row is None else self.row
 
     def motion(self) -> tuple[Tensor, float, float] | None:
-        """What moves between a window before the middle and one after it: colours, the longest way, and in how long."""
+        """Motion from a window before the middle to one after it: colours, longest displacement, time between."""
         # so many frames that a cell of four pixels has a dozen spikes, or what moves is noise
         enough = math.ceil(3 / max(self.rates.mean().item(), 1e-6))
         length = min(max(_WINDOW // 2, enough), len(self.near) // 2)

@@ -201,7 +201,7 @@ class Mosaic(nn.Module):
 
 
 def bin_to_sensor(rgb: Tensor, pattern: str | CFA = "RGGB", *, scale: int) -> Tensor:
-    r"""What a Bayer sensor of ``scale`` times coarser pixels sees of a high-resolution picture.
+    r"""Average a high-resolution picture to the mosaic of a Bayer sensor with ``scale`` times coarser pixels.
 
     .. math:: R(x, y) = \frac{1}{s^2} \sum_{0 \le a, b < s} I_{C(x, y)}(s x + a, s y + b)
 

@@ -53,12 +53,8 @@ def demosaic(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
         Malvar, He and Cutler, High-quality linear interpolation for demosaicing of Bayer-patterned color images,
         ICASSP 2004. kornia's ``raw_to_rgb`` interpolates bilinearly.
     """
-    check_planes("raw", raw, 2, "(*, H, W)", floating=True)
+    known = wide_mosaics(raw)[:, None]
     height, width = raw.shape[-2:]
-    if height < 3 or width < 3:
-        raise ValueError(f"raw: expected (*, H, W) of at least 3 x 3, got {tuple(raw.shape)}")
-    wide = torch.promote_types(raw.dtype, torch.float32)
-    known = raw.reshape(-1, 1, height, width).to(wide)
     filters = known.new_tensor([_GREEN, _SAME_ROW, _SAME_COLUMN, _DIAGONAL])[:, None] / 8
     with torch.autocast(raw.device.type, enabled=False):
         filtered = F.conv2d(F.pad(known, (2, 2, 2, 2), "reflect"), filters)
@@ -73,6 +69,22 @@ def demosaic(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
     greens = torch.where(red | blue, green, known)
     rgb = torch.stack([reds, greens, blues], dim=1)
     return rgb.to(raw.dtype).reshape(*raw.shape[:-2], 3, height, width)
+
+
+def wide_mosaics(raw: Tensor) -> Tensor:
+    """Check mosaics and return them as (B, H, W), float32 or wider.
+
+    Args:
+        raw: mosaics (*, H, W).
+
+    Raises:
+        TypeError: not a floating-point tensor.
+        ValueError: fewer than two dimensions, or smaller than 3 x 3.
+    """
+    check_planes("raw", raw, 2, "(*, H, W)", floating=True)
+    if min(raw.shape[-2:]) < 3:
+        raise ValueError(f"raw: expected (*, H, W) of at least 3 x 3, got {tuple(raw.shape)}")
+    return raw.reshape(-1, *raw.shape[-2:]).to(torch.promote_types(raw.dtype, torch.float32))
 
 
 class Demosaic(nn.Module):

@@ -1,4 +1,4 @@
-"""Demosaicing by residual interpolation: what another colour predicts, and interpolation only of what is left."""
+"""Demosaicing by residual interpolation: another colour predicts, and only the residual is interpolated."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import torch.nn.functional as F
 from kornia.color import CFA
 from torch import Tensor, nn
 
-from spikekit.check import check_planes
 from spikekit.color.cfa import bayer_mask, bayer_pattern
+from spikekit.color.demosaic import wide_mosaics
 
 _RADIUS = 5  # of the guided filter's windows
 _FLAT = 1e-5  # a guide's variance below which its window counts as flat, white being 1
@@ -59,11 +59,8 @@ def demosaic_residual(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
         Kiku, Monno, Tanaka and Okutomi, Residual interpolation for color image demosaicking, ICIP 2013. Sigma, 2, and
         the two floors are ours; so is that nothing is clamped on the way.
     """
-    check_planes("raw", raw, 2, "(*, H, W)", floating=True)
+    known = wide_mosaics(raw)
     height, width = raw.shape[-2:]
-    if height < 3 or width < 3:
-        raise ValueError(f"raw: expected (*, H, W) of at least 3 x 3, got {tuple(raw.shape)}")
-    known = raw.reshape(-1, height, width).to(torch.promote_types(raw.dtype, torch.float32))
     red, green, blue = bayer_mask(height, width, pattern, device=raw.device, dtype=torch.bool)
     greens = interpolate_green(known, green)
     rgb = torch.stack([guided_by_green(known, greens, red), greens, guided_by_green(known, greens, blue)], dim=1)
@@ -164,7 +161,7 @@ def _between(planes: Tensor, axis: int) -> Tensor:
 
 
 def _further(planes: Tensor, by: int, axis: int) -> Tensor:
-    """What is so many pixels further along an axis, round the edge: only the border sees that."""
+    """Shift planes by so many pixels along an axis, round the edge: only the border sees that."""
     return planes.roll(-by, axis)
 
 

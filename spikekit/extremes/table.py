@@ -17,7 +17,7 @@ Limit = float | Callable[[torch.dtype], float]
 
 
 class Measured(NamedTuple):
-    """What one run of a case found.
+    """Result of one run of a case.
 
     Attributes:
         error: the worst error, in the unit that the case names; NaN where a number was expected and none came.

@@ -45,7 +45,7 @@ def _linearize(moved, times, flow, slope, rest):
 
 @compiled
 def _follow(flow, slope, rest, limit, near):
-    """What the pictures want: the flow, moved along the slope until they agree, by no more than the limit."""
+    """The data term: the flow, moved along the slope until the pictures agree, by no more than the limit."""
     height, width = rest.shape
     tiny = rest.dtype.type(1e-30)
     for y in range(height):

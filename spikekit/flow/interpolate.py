@@ -25,7 +25,7 @@ _DIFFERS = 0.04
 
 
 class Between:
-    """What lies between two frames. Subclasses say what in :meth:`between`.
+    """Base of interpolations between two frames, which subclasses define in :meth:`between`.
 
     Args:
         first: ``rgb`` (3, H, W), floating.

@@ -267,7 +267,7 @@ def _window_size(n, half, frames):
 def _term(
     values, n, exists, frames, step, half, max_range, pixel, pixels, counter: tl.constexpr, adjoint: tl.constexpr
 ):
-    """What frame n adds to a window, 0 where there is no such frame."""
+    """The addend of frame n to a window, 0 where there is no such frame."""
     value = tl.load(values + n * step, mask=pixel < tl.where(exists, pixels, 0), other=0).to(counter)
     if adjoint:
         value *= max_range / tl.maximum(_window_size(n, half, frames), 1).to(counter)

@@ -20,7 +20,7 @@ def launch(kernel: Any, programs: int, *args: Any, **constants: Any) -> None:
 
 
 def wide_dtype(*tensors: Tensor) -> torch.dtype:
-    """What to compute in: float64 where one of the tensors is, else float32."""
+    """The dtype to compute in: float64 where one of the tensors has it, else float32."""
     return torch.float64 if torch.float64 in [tensor.dtype for tensor in tensors] else torch.float32
 
 

@@ -45,7 +45,7 @@ _BLACK = 1e-3  # added to both of two lights whose ratio is a gain
 
 @dataclass(frozen=True)
 class Plan:
-    """What is modelled in an interval between two frames; light is blended linearly in time between what is.
+    """Moments modelled in an interval between two frames; light is blended linearly in time between them.
 
     Args:
         latent: frames that are synthesised in the interval, evenly spaced; with none, its two ends are blended.

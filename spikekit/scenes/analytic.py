@@ -95,7 +95,7 @@ class Layer:
             raise ValueError(f"mask: expected {size}, got {got}")
 
     def _planes(self) -> tuple[Tensor, complex]:
-        """What is sampled, and where its pixel (0, 0) is: an object gets its mask as fourth plane, and an empty rim."""
+        """The planes to sample, and the position of their corner; an object gets a mask as fourth plane, and a rim."""
         if self.mask is None:
             return self.picture, complex(*self.position)
         picture = F.pad(self.picture, (1, 1, 1, 1), "replicate")

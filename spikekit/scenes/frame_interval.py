@@ -48,12 +48,12 @@ class Interval:
 
     @cached_property
     def profile(self) -> SceneProfile:
-        """What happens in the interval."""
+        """Change within the interval."""
         return self._look(*self.frames)
 
     @cached_property
     def plan(self) -> Plan:
-        """What is modelled of it."""
+        """Moments that are modelled."""
         return self._fixed or self._decide(self.profile)
 
     @cached_property

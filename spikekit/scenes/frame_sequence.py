@@ -21,7 +21,7 @@ from spikekit.sensor.noise import SensorNoise
 from spikekit.sensor.simulate import SpikeSensor
 from spikekit.warp.warp import flow_warp
 
-#: Version of what a film and the sensor make of frames. Whoever changes light, spikes or flow, in whatever module,
+#: Version of the simulation from frames to spikes. Whoever changes light, spikes or flow, in whatever module,
 #: counts it up: clips that were kept are simulated again, and a test that knows every version's output passes again.
 SIMULATOR_VERSION = 1
 

@@ -36,7 +36,7 @@ class SpikeChange(NamedTuple):
 
 @dataclass(frozen=True)
 class SensorNoise:
-    r"""What a real sensor adds to light; every source is off unless it is asked for.
+    r"""Noise of a real sensor; every source is off unless it is asked for.
 
     .. math:: I'_t = \theta \, (g \, P_t + D_t), \quad
         P_t \sim \operatorname{Poisson}(p I_t / \theta) / p, \quad

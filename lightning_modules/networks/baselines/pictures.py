@@ -12,9 +12,21 @@ from torch import Tensor
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks.network import Network
 from spikekit import bayer_pattern, demosaic_along_motion, linear_motion, tfi_at, tfp_at
-from spikekit.check import check_planes, check_positive, check_whole
+from spikekit.check import check_positive, check_whole
 
 Decoder = Literal["tfi", "tfp"]
+
+
+def check_decoder(decoder: str, window: int) -> None:
+    """Raise unless mosaics can be decoded so: by TFI, or by TFP of an odd window.
+
+    Raises:
+        ValueError: another decoder, or an even window.
+    """
+    if decoder not in ("tfi", "tfp"):
+        raise ValueError(f"decoder: expected 'tfi' or 'tfp', got {decoder!r}")
+    if window % 2 == 0:
+        raise ValueError(f"tfp_window: expected an odd number, got {window}")
 
 
 @torch.no_grad()
@@ -45,7 +57,7 @@ def mirror_to_multiple(planes: Tensor, multiple: int) -> Tensor:
 
     Args:
         planes: (*, H, W), H and W at least 2.
-        multiple: of what.
+        multiple: the number.
 
     Returns:
         (*, H', W').
@@ -96,18 +108,6 @@ class Baseline(Network):
         settings = {"scale": scale, "frames": frames, "pattern": bayer_pattern(pattern), "alpha": alpha, **more}
         super().__init__(settings, (frames // 8, frames // 2, frames - 1 - frames // 8), motion)
         self.alpha = alpha
-
-    def check_spikes(self, spikes: Tensor) -> None:
-        """Raise unless a clip is one that the network takes.
-
-        Raises:
-            TypeError: not a tensor of real numbers.
-            ValueError: another number of frames, or less than 3 x 3 pixels.
-        """
-        check_planes("spikes", spikes, 4, "(B, N, H, W)")
-        if spikes.ndim != 4 or spikes.shape[1] != self.frames or min(spikes.shape[-2:]) < 3:
-            expected = f"(B, {self.frames}, H, W) of at least 3 x 3 pixels"
-            raise ValueError(f"spikes: expected {expected}, got {tuple(spikes.shape)}")
 
     def flow_or_estimate(self, spikes: Tensor, flow: Tensor | None, static: bool = False) -> Tensor:
         """Return the flow that was given, what the network's estimator sees, or zeros, (B, 2, 2, H, W).

@@ -8,7 +8,13 @@ from torch import Tensor, nn
 
 from lightning_modules.motion import ZeroFlow
 from lightning_modules.networks.baselines.deformable import DeformableConv2d
-from lightning_modules.networks.baselines.pictures import Baseline, Decoder, decode_pictures, mirror_to_multiple
+from lightning_modules.networks.baselines.pictures import (
+    Baseline,
+    Decoder,
+    check_decoder,
+    decode_pictures,
+    mirror_to_multiple,
+)
 from lightning_modules.networks.baselines.skip import begin_at_zero, enlarged_raw
 from lightning_modules.networks.layers import conv, enlarge
 from spikekit import split_bayer
@@ -68,15 +74,10 @@ class RealRawVSR(Baseline):
         blocks: int = 10,
         skip: bool = False,
     ) -> None:
-        if decoder not in ("tfi", "tfp"):
-            raise ValueError(f"decoder: expected 'tfi' or 'tfp', got {decoder!r}")
         sizes = {"tfp_window": tfp_window, "width": width, "blocks": blocks}
         sizes = {name: check_whole(name, size) for name, size in sizes.items()}
+        check_decoder(decoder, tfp_window)
         super().__init__(scale, frames, pattern, alpha, {"decoder": decoder, **sizes, "skip": skip}, ZeroFlow())
-        if frames < 9:
-            raise ValueError(f"frames: expected at least 9, got {frames}")
-        if tfp_window % 2 == 0:
-            raise ValueError(f"tfp_window: expected an odd number, got {tfp_window}")
         self.decoder, self.tfp_window, self.skip = decoder, tfp_window, skip
         self.times = tuple(frames // 2 + n * (frames // 8) for n in range(-(_FRAMES // 2), _FRAMES // 2 + 1))
         self.raw_features, self.packed_features = (_Pyramid(inputs, width, blocks // 2) for inputs in (1, 4))

@@ -1,4 +1,4 @@
-"""A stand-in for SpikeSR-Net, of which neither code nor text is public."""
+"""A stand-in for SpikeSR-Net, whose code and text are not public."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from spikekit.check import check_whole
 
 
 class SpikeSRNetLike(Baseline):
-    r"""What is known of SpikeSR-Net (Zhao et al., AAAI 2023), for grey spike cameras, made into a network.
+    r"""SpikeSR-Net (Zhao et al., AAAI 2023), for grey spike cameras, as far as it is published.
 
     From the publication, of which no more than the abstract and figures in later papers could be had: a spike encoder
     that adapts to every pixel turns the stream into representations of several times; a resolver that is led by the
@@ -139,7 +139,7 @@ class SpikeSRNetLike(Baseline):
 
 
 class _Correction(nn.Module):
-    """What the features of a picture lack, seen at the sensor's resolution."""
+    """The error of the features of a picture, seen at the sensor's resolution."""
 
     def __init__(self, width: int, scale: int) -> None:
         super().__init__()

@@ -194,7 +194,7 @@ def _offsets() -> Tensor:
 
 
 def _hidden(height: int, width: int, device: torch.device) -> Tensor:
-    """What is added to scores of shifted windows: much less than 0 between pixels that are not neighbours.
+    """Mask added to the scores of shifted windows: far below 0 between pixels that are not neighbours.
 
     Returns:
         (windows, 1, pixels of a window, pixels of a window).

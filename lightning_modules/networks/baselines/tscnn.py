@@ -10,10 +10,12 @@ from lightning_modules.motion import ZeroFlow
 from lightning_modules.networks.baselines.pictures import (
     Baseline,
     Decoder,
+    check_decoder,
     decode_pictures,
     enlarge_picture,
     mirror_to_multiple,
 )
+from lightning_modules.networks.baselines.skip import begin_at_zero
 from lightning_modules.networks.layers import ConvBlock, ResBlock, conv
 from spikekit import bayer_mask, demosaic_residual
 from spikekit.check import check_whole
@@ -82,10 +84,7 @@ class TSCNN(Baseline):
     ) -> None:
         sizes = {"tfp_window": tfp_window, "width": width, "blocks": blocks, "low": low, "high": high}
         sizes = {name: check_whole(name, size) for name, size in sizes.items()}
-        if decoder not in ("tfi", "tfp"):
-            raise ValueError(f"decoder: expected 'tfi' or 'tfp', got {decoder!r}")
-        if tfp_window % 2 == 0:
-            raise ValueError(f"tfp_window: expected an odd number, got {tfp_window}")
+        check_decoder(decoder, tfp_window)
         if width % 8:
             raise ValueError(f"width: expected a multiple of 8, got {width}")
         super().__init__(scale, frames, pattern, alpha, {"decoder": decoder, **sizes, "skip": skip}, ZeroFlow())
@@ -96,8 +95,7 @@ class TSCNN(Baseline):
         self.fuse = nn.Sequential(nn.Conv2d(blocks * width, width, 1), conv(width, width))
         self.upsample = nn.Sequential(conv(width, 3 * scale**2), nn.PixelShuffle(scale))
         if skip:
-            nn.init.zeros_(self.upsample[0].weight)
-            nn.init.zeros_(self.upsample[0].bias)
+            begin_at_zero(self.upsample[0])
 
     def forward(self, spikes: Tensor, flow: Tensor | None = None, static: bool = False) -> Tensor:
         """Return rgb; a flow changes nothing."""

@@ -36,7 +36,7 @@ class VidarSR(Baseline):
 
     Args:
         scale: super-resolution factor s.
-        frames: spike frames N of a clip, odd, at least 7.
+        frames: spike frames N of a clip, odd, at least 9.
         pattern: Bayer phase.
         alpha: gain of the camera, what a white pixel receives per clock in thresholds; the input is divided by it.
         width: channels at the sensor's resolution.
@@ -72,8 +72,6 @@ class VidarSR(Baseline):
         width, features = check_whole("width", width), check_whole("features", features)
         more = {"width": width, "features": features, "per_channel": per_channel, "skip": skip}
         super().__init__(scale, frames, pattern, alpha, more, motion)
-        if frames < 7:
-            raise ValueError(f"frames: expected at least 7, got {frames}")
         self.per_channel, self.skip = per_channel, skip
         #: the middle frame, and the neighbours in time
         self.times = frames // 2, frames // 6, frames // 3, frames - 1 - frames // 3, frames - 1 - frames // 6

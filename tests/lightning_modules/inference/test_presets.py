@@ -93,10 +93,16 @@ def test_memory_beyond_a_tile_is_that_of_the_picture_and_of_motion():
     for size, pixels in (((40, 50), 1), ((80, 100), 4), ((4000, 5000), 10_000)):
         found = {choice.name: choice.mib for choice in choices(3, size)}
         assert found["tfi"] == pytest.approx(2 * pixels)
-        tile, small = min(pixels, 248**2 / 2000), min(pixels, 136**2 / 2000)
+        tile, small = min(pixels, 252**2 / 2000), min(pixels, 140**2 / 2000)
         assert found["all"] == pytest.approx((2 + motion) * pixels + (78 - motion) * tile)
         assert found["small tiles"] == pytest.approx((2 + motion) * pixels + (18 - motion) * small)
         assert found["no motion"] == pytest.approx(2 * pixels + 68 * tile)
+
+
+def test_memory_of_a_tile_goes_by_the_halo_of_the_weights(monkeypatch):
+    before = [choice.mib for choice in choices(4, (400, 500)) if choice.preset.weights]
+    monkeypatch.setattr(CSCSR, "halo", 30)
+    assert [choice.mib for choice in choices(4, (400, 500)) if choice.preset.weights] == before
 
 
 @pytest.mark.parametrize(("here", "expected"), [(2.0, "no motion"), (0.1, "all"), (50.0, "tfi")])

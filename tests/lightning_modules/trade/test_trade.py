@@ -15,17 +15,17 @@ import torch
 from lightning_modules.__main__ import main
 from lightning_modules.cli.arguments import arguments_preset
 from lightning_modules.cli.errors import InputError
+from lightning_modules.cost.energy import energy_meter, energy_per_call
+from lightning_modules.cost.measure import Row, Timed, running, time_in_turns
+from lightning_modules.cost.runner import Runner, make_runner
 from lightning_modules.inference import presets
 from lightning_modules.inference.presets import Preset
 from lightning_modules.motion import Spike2Flow
 from lightning_modules.networks import CSCSR, TSCNN
 from lightning_modules.pretrained import settings_of
 from lightning_modules.trade import cli, energy, measure
-from lightning_modules.trade.energy import energy_meter, energy_per_call
-from lightning_modules.trade.measure import Row, Timed, running, time_in_turns
 from lightning_modules.trade.pareto import pareto_front
 from lightning_modules.trade.plot import plot
-from lightning_modules.trade.runner import Runner, make_runner
 from lightning_modules.trade.settings import Setting, read_setting, usual_settings
 from lightning_modules.trade.table import figures, front, markdown, write_csv
 from spikekit import read_picture
@@ -351,7 +351,7 @@ def test_what_fails_while_it_runs_does_not_take_the_others_along(shared, tmp_pat
 @pytest.mark.slow
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is here")
 def test_what_the_machine_lacks_is_a_row(shared, base):
-    from lightning_modules.trade.runner import CannotRunError
+    from lightning_modules.cost.runner import CannotRunError
 
     for args in (["--trainer.accelerator", "gpu"], ["--trainer.precision", "16-mixed"]):
         with pytest.raises(CannotRunError, match=r"gpu|16-mixed: not on this device"):

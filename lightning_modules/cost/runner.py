@@ -69,7 +69,7 @@ class Runner:
 
     @property
     def scenes(self) -> dict[str, Any]:
-        """What says which scenes the clips of the test show."""
+        """The data arguments that decide which scenes the test clips show."""
         data = self.config["data"]
         arguments = {key: value for key, value in data["init_args"].items() if key not in _WITHOUT_EFFECT}
         linked = {name: self.network.settings[name] for name in ("scale", "alpha")}

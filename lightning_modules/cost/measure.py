@@ -13,17 +13,17 @@ from torch.utils.data import DataLoader
 from torch.utils.flop_counter import FlopCounterMode
 from tqdm import tqdm
 
+from lightning_modules.cost.energy import energy_meter, energy_per_call
+from lightning_modules.cost.runner import Runner
+from lightning_modules.cost.setting import Setting
 from lightning_modules.metrics.image import measures
-from lightning_modules.trade.energy import energy_meter, energy_per_call
-from lightning_modules.trade.runner import Runner
-from lightning_modules.trade.settings import Setting
 from spikekit.arguments import one_line
 from spikekit.timing import Timer, peak_memory, timer_of
 
 
 @dataclass
 class Row:
-    """What is known of a setting.
+    """A setting, and its measurements so far.
 
     Args:
         setting: which one.
@@ -73,7 +73,7 @@ class Timed:
 
 
 def measure(rows: Sequence[Row], scenes: DataLoader, rounds: int) -> Timed:
-    """Fill in the rows of what can run; what fails on the way gets a reason, and the others go on.
+    """Measure the settings that can run; one that fails on the way gets a reason, and the others go on.
 
     All settings see a clip before the next one is made. That also warms them up. Then they are timed, see
     :func:`time_in_turns`, on the clips that are of one size with the first. Time does not contain the way of the
@@ -95,7 +95,7 @@ def measure(rows: Sequence[Row], scenes: DataLoader, rounds: int) -> Timed:
 
 
 def measure_costs(rows: Sequence[Row], clips: Sequence[Tensor], rounds: int) -> Timed:
-    """Fill in what rows cost, of what can run; what fails on the way gets a reason, and the others go on.
+    """Measure the cost of settings that can run; one that fails on the way gets a reason, and the others go on.
 
     Args:
         rows: of settings that can run.
@@ -111,7 +111,7 @@ def measure_costs(rows: Sequence[Row], clips: Sequence[Tensor], rounds: int) -> 
 
 
 def running(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows of what can run, as far as is known."""
+    """Return the rows that can run, as far as is known."""
     return [row for row in rows if row.reason is None]
 
 

@@ -1,0 +1,20 @@
+import pytest
+
+from lightning_modules.networks import CSCSR
+from lightning_modules.shipped import list_pretrained
+from lightning_modules.trade.adaptive import main
+from lightning_modules.trade.halo import measure_halo
+
+SHIPPED = [weights for weights in list_pretrained() if weights.scale]
+
+
+@pytest.mark.parametrize("weights", SHIPPED, ids=lambda weights: weights.name)
+def test_shipped_networks_see_no_further_than_their_halo(weights):
+    network = CSCSR.from_pretrained(weights.name)
+    assert network.halo == weights.halo <= CSCSR.halo
+    assert measure_halo(network, start=network.halo) == network.halo
+
+
+def test_the_halo_of_weights_is_the_smallest_that_keeps_the_bound(capsys):
+    main(["cscsr_tiny_x4", "--halo"])
+    assert capsys.readouterr().out == f"cscsr_tiny_x4: {CSCSR.from_pretrained('cscsr_tiny_x4').halo}\n"
