@@ -27,7 +27,7 @@ def main(args: Sequence[str] | None = None) -> None:
             print(f"lightning of spikekit {__version__}")  # noqa: T201
         elif verb not in VERBS and not verb.startswith("-"):
             got = f"got {verb}" if verb else "got none"
-            raise errors.InputError(f"expected a verb, one of {', '.join(VERBS)}, {got} (see lightning --help)")
+            raise errors.UsageError(f"expected a verb, one of {', '.join(VERBS)}, {got} (see lightning --help)")
         elif verb == "models":
             from lightning_modules.cli.models import models
 

@@ -81,39 +81,18 @@ def check_tensors(tensors: Mapping[str, Tensor]) -> None:
             raise ValueError(f"{name}: expected finite weights, got NaN or Inf")
 
 
-def check_training_state(checkpoint: Mapping[str, Any], path: str | Path) -> None:
-    """Refuse a checkpoint that training cannot go on with, before anything is built.
-
-    Args:
-        checkpoint: as :func:`read_checkpoint` returns it.
-        path: its file, for the message.
-
-    Raises:
-        ValueError: no state of the optimizer, the schedule or the loops, or a damaged one; the message is one line.
-    """
-    lacks = f"{path}: not a checkpoint that training can go on with: expected"
-    for name in ("epoch", "global_step"):
-        value = checkpoint.get(name)
-        if type(value) is not int or value < 0:
-            raise ValueError(f"{lacks} {name} as a whole number, got {str(value)[:80]!r}")
-    for name, kind in (("optimizer_states", list), ("lr_schedulers", list), ("loops", dict)):
-        value = checkpoint.get(name)
-        if not isinstance(value, kind) or (kind is list and not all(isinstance(one, dict) for one in value)):
-            raise ValueError(f"{lacks} {name}, got {'none' if value is None else type(value).__name__}")
-    if not checkpoint["optimizer_states"] or not isinstance(checkpoint["loops"].get("fit_loop"), dict):
-        raise ValueError(f"{lacks} the state of an optimizer and of the training loop, got none")
-    for state in checkpoint["optimizer_states"]:
-        if not isinstance(state.get("state"), dict) or not isinstance(state.get("param_groups"), list):
-            raise ValueError(f"{lacks} state and param_groups of the optimizer")
-
-
 class Checkpoints(TorchCheckpointIO):
     """How Lightning reads, writes and removes checkpoints: without running code, whole, and nothing else than them."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
         """Write a checkpoint; one that was there stays until the new one is complete."""
         with whole_file(path) as file:
-            torch.save(checkpoint, file)
+            try:
+                torch.save(checkpoint, file)
+            except RuntimeError as error:  # torch's own writer, when the disk is full
+                if isinstance(error.__context__, OSError):
+                    raise error.__context__ from None
+                raise
 
     def load_checkpoint(self, path: str | Path, *_: Any, **__: Any) -> dict[str, Any]:
         """Read a checkpoint; its callbacks may name files of their own folder, and no others."""

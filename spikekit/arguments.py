@@ -69,6 +69,6 @@ def positive(text: str) -> float:
 
 
 def one_line(error: BaseException) -> str:
-    """Return what an error says, on one line."""
-    text = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    return " ".join(text.split())
+    """Return what an error says, on one line, and nothing that a terminal would obey."""
+    text = getattr(error, "strerror", None) or str(error).strip() or type(error).__name__
+    return "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))

@@ -1,9 +1,102 @@
-"""Where tests run side by side (pytest -n), each has one thread, and so do the commands that it starts."""
+"""Where tests run side by side (pytest -n), each has one thread; what damages files for readers."""
 
+import copy
 import os
+import random
+import resource
+import tempfile
+from pathlib import Path
 
+import pytest
 import torch
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ["OMP_NUM_THREADS"] = "1"
     torch.set_num_threads(1)
+
+_ODD = (
+    None, True, False, 0, -1, 1, 2, 2**31, 2**63, 10**400, -(10**30), 0.0, -0.5, 1e308, float("nan"), float("inf"),
+    "", "a", "\n", "a\nb", "..", "os.system(command='false')", "\ud800", "9" * 5000, [], {}, [[]], [1, 2], [None],
+    {"": ""}, {"class_path": "os.system"}, ["a"] * 1000, {"a": {"b": []}},
+)  # fmt: skip
+
+
+def damage(data: bytes, rng: random.Random) -> bytes:
+    """Flip, cut, insert, repeat or swap bytes; twice and more, now and then."""
+    data = bytearray(data)
+    for _ in range(rng.choice((1, 1, 1, 2, 2, 3, 8))):
+        # headers lie at the beginning or, in archives, at the end
+        end = len(data) if rng.random() < 0.5 else min(len(data), 200)
+        start = len(data) - end if rng.random() < 0.3 else 0
+        place, length = start + rng.randrange(end or 1), rng.choice((1, 1, 2, 4, 8, 30))
+        part = slice(place, place + length)
+        kind = rng.choice(("flip", "set", "set", "cut", "insert", "remove", "repeat", "swap"))
+        if kind == "flip" and data:
+            data[min(place, len(data) - 1)] ^= 1 << rng.randrange(8)
+        elif kind == "set":
+            data[part] = rng.choice((b"\0", b"\xff", b"\x7f", b"9", rng.randbytes(1))) * len(data[part])
+        elif kind == "cut":
+            del data[place:]
+        elif kind == "insert":
+            data[place:place] = rng.randbytes(length)
+        elif kind == "remove":
+            del data[part]
+        elif kind == "repeat":
+            data[place:place] = data[part] * rng.choice((1, 3, 100))
+        elif kind == "swap":
+            other = slice(other := rng.randrange(len(data) or 1), other + length)
+            if place + length <= other.start < other.stop <= len(data):
+                data[part], data[other] = data[other], data[part]
+    return bytes(data)
+
+
+def damage_values(value: object, rng: random.Random) -> object:
+    """Put something odd in the place of a value, at any depth of lists and dictionaries; or leave out, or add one."""
+    value, kind = copy.copy(value), rng.random()
+    if not isinstance(value, dict | list) or not value or kind < 0.1:
+        return rng.choice(_ODD)
+    key = rng.choice(list(value)) if isinstance(value, dict) else rng.randrange(len(value))
+    if kind < 0.2:
+        del value[key]
+    elif kind < 0.25 and isinstance(value, dict):
+        value[rng.choice(("odd", "a\nb", ""))] = rng.choice(_ODD)
+    else:
+        value[key] = damage_values(value[key], rng)
+    return value
+
+
+@pytest.fixture(name="fuzz")
+def _fuzz(tmp_path, capfd):
+    """Read damaged files: of each there is a result, or an error of one line that names it, and nothing on stderr."""
+
+    def fuzz(read, make, name, errors=ValueError, cases=1000, megabytes=300):
+        """Give ``read`` the path of a file ``name`` whose bytes are ``make(rng)``; return how many were refused."""
+        path, refused, before = folder / name, 0, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        capfd.readouterr()
+        for seed in range(int(os.environ.get("SPIKEKIT_FUZZ", cases))):
+            path.unlink(missing_ok=True)
+            path.write_bytes(make(random.Random(seed)))
+            try:
+                read(path)
+            except errors as error:
+                said = str(error)
+                refused += 1
+            except BaseException as error:
+                error.add_note(f"seed {seed} of the damage")
+                raise
+            else:
+                continue
+            assert str(path) in said, f"seed {seed}: {said!r}"
+            assert len(said.splitlines()) == 1, f"seed {seed}: {said!r}"
+            assert len(said) < 1000, f"seed {seed}: {said}"
+        assert capfd.readouterr().err == ""
+        grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+        assert grown < megabytes << 10, f"{grown >> 10} MiB for a file of {path.stat().st_size} bytes"
+        assert refused, "nothing was damaged"
+        return refused
+
+    fuzz.damage, fuzz.values = damage, damage_values
+    # thousands of files: in memory where the system has such a place
+    with tempfile.TemporaryDirectory(dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else tmp_path) as folder:
+        folder = Path(folder)
+        yield fuzz

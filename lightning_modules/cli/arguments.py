@@ -15,6 +15,7 @@ from lightning_modules.motion import ESTIMATORS, MotionEstimator
 from lightning_modules.networks import NETWORKS
 from lightning_modules.pretrained import check_weights, read_weights
 from lightning_modules.stored_settings import own_class
+from spikekit.arguments import one_line
 
 WEIGHTS = "--model.weights", "--model.init_args.weights"
 
@@ -111,15 +112,51 @@ def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         yield prefix, config
         return
     for key, value in config.items():
-        yield from flatten(value, f"{prefix}.{key}" if prefix else key)
+        yield from flatten(value, f"{prefix}.{key}" if prefix else str(key))
+
+
+def reason(message: str) -> str:
+    r"""Return jsonargparse's message, which is a tree of alternatives, as one line: the deepest, and where it is.
+
+    Example:
+        >>> reason('Parser key "width":\n  Expected a <class \'int\'>. Got value: abc')
+        "width: Expected a <class 'int'>. Got value: abc"
+    """
+    lines = message.strip().splitlines() or [message]
+    if lines[0].startswith("Problems parsing config"):
+        return " ".join(message.split())[:500]
+    where = [key for line in lines for key in re.findall(r'[Pp]arser key "([^"]+)"', line)]
+    given = next((line.strip() for line in lines if line.strip().startswith("Given value: ")), "")
+    inner = [
+        line for line in lines if not re.match(r"\s*(- Expected a <class 'NoneType'>|Given value|.*arser key)", line)
+    ]
+    deepest = max(inner or lines, key=lambda line: len(line) - len(line.lstrip()))
+    deepest = re.sub(r'^- |[Pp]arser key "[^"]+":\s*', "", deepest.strip())
+    given = given.removeprefix("Given value: ")
+    known = not given or given in deepest or "Got value" in deepest or "required: network" in deepest
+    got = "" if known else f", got {given[:80]}"
+    return ".".join(where) + (": " if where else "") + deepest[:500] + got
 
 
 def _model_in(config: str) -> Any:
-    """Return what a file of configuration says about the model; whether it is one at all is the parser's affair."""
+    """Return what a configuration says about the model; what is no file, or lacks it, is the parser's affair.
+
+    Raises:
+        ValueError: a file that is no YAML; the message is one line and names it.
+    """
     try:
-        return yaml.safe_load(Path(config).read_text())["model"]
-    except (OSError, ValueError, TypeError, LookupError, RecursionError, yaml.YAMLError):
+        text = Path(config).read_text(encoding="utf-8")
+    except (OSError, ValueError):  # not there, or the configuration itself
         return None
+    try:
+        content = yaml.safe_load(text)
+    except (ValueError, RecursionError, yaml.YAMLError) as error:
+        raise ValueError(f"{config}: not a configuration ({one_line(error)[:300]})") from error
+    if content is None:  # an empty file
+        return None
+    if not isinstance(content, dict):
+        raise ValueError(f"{config}: not a configuration (expected names and values, got {type(content).__name__})")
+    return content.get("model")
 
 
 def _init_args(choice: Any) -> dict[str, Any]:

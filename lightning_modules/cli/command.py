@@ -20,17 +20,18 @@ from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveCon
 from pytorch_lightning.loggers import TensorBoardLogger
 from pytorch_lightning.utilities import rank_zero_only
 
-from lightning_modules.checkpoint import Checkpoints, check_training_state, read_checkpoint
+from lightning_modules.checkpoint import Checkpoints, read_checkpoint
 from lightning_modules.cli.arguments import (
     WEIGHTS,
     behind_configurations,
     flatten,
     options,
     preset_arguments,
+    reason,
     with_network_of_weights,
 )
-from lightning_modules.cli.errors import InputError
-from lightning_modules.cli.folder_lock import locked_folder, make_folder
+from lightning_modules.cli.errors import Ended, InputError, UsageError
+from lightning_modules.cli.folder_lock import FolderError, locked_folder, make_folder
 from lightning_modules.cli.renamed_overlays import with_current_overlays
 from lightning_modules.data import FilmScenes, Recording, RecordingClips, StillScenes
 from lightning_modules.inference.presets import SPEEDS, choose
@@ -41,6 +42,8 @@ from lightning_modules.tasks.base import Learner
 from lightning_modules.tasks.callbacks import PredictionPictures
 from lightning_modules.tasks.optical_flow import FlowTraining
 from lightning_modules.tasks.super_resolution import SuperResolution
+from lightning_modules.training_state import Begun, check_like_fresh, check_training_state, restoring
+from spikekit.io import PictureError, SpikeFileError, VideoError
 from spikekit.io.video import PICTURE_ENDINGS, VIDEO_ENDINGS
 from spikekit.io.whole_file import whole_file
 
@@ -93,25 +96,30 @@ class Parser(LightningArgumentParser):
         return text
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        """Say in one line that there is no network: jsonargparse would show what it had tried to build."""
-        if self.exit_on_error and "the following arguments are required: network" in message:
-            sys.exit(
+        """Say in one line what is wrong: jsonargparse would show all that there is and what it had tried."""
+        if not self.exit_on_error:
+            super().error(message, ex)
+        if "the following arguments are required: network" in message:
+            raise Ended(
                 "lightning: expected a network: --speed balanced (predict alone), --model.weights NAME "
-                "(lightning models lists them), or a configuration, -c FILE"
+                "(lightning models lists them), or a configuration, -c FILE",
+                2,
             )
-        super().error(message, ex)
+        if "the following arguments are required: predict.data" in message:
+            message = _NO_RECORDING
+        raise Ended(f"lightning: {reason(message)}", 2)
 
 
 def _with_choice(parser: LightningArgumentParser, args: Sequence[str]) -> list[str]:
     """Put in the setting that ``--speed`` or ``--budget`` asks for, and say which."""
     given = next((option for _, option, _ in options(args) if option in (*WEIGHTS, "--ckpt_path")), None)
     if given:
-        raise InputError(f"--speed and --budget: choose from the weights of the package, got {given} as well")
+        raise UsageError(f"--speed and --budget: choose from the weights of the package, got {given} as well")
     verb, *rest = args
     parsed = parser.parse_args([verb, "--config", '{"model": {"network": {"class_path": "CSCSR"}}}', *rest])[verb]
     recording = parsed.data.get("init_args", {})
     if not recording.get("path"):
-        raise InputError(_NO_RECORDING)
+        raise UsageError(_NO_RECORDING)
     try:
         known = ("path", "height", "width", "pattern", "camera")
         size = RecordingClips(**{name: recording.get(name) for name in known}, frames=1).size
@@ -215,8 +223,18 @@ class Command(LightningCLI):
         alone = subcommand == "fit" and not config.trainer.fast_dev_run and rank_zero_only.rank == 0
         if subcommand in ("test", "predict"):
             make_folder(config.output)
-        with locked_folder(config.output, "training") if alone else nullcontext():
-            super()._run_subcommand(subcommand)
+        begun = Begun()
+        self.trainer.callbacks.append(begun)
+        try:
+            with (
+                locked_folder(config.output, "training") if alone else nullcontext(),
+                restoring(config.get("ckpt_path"), begun),
+            ):
+                super()._run_subcommand(subcommand)
+        except ValueError as error:
+            if begun or isinstance(error, FolderError):
+                raise
+            raise InputError(str(error)) from error
 
     def instantiate_classes(self) -> None:  # noqa: D102
         config = self.config[self.subcommand]
@@ -232,11 +250,12 @@ class Command(LightningCLI):
                 chosen = self.config_dump["model"]["init_args"]
                 self.model.recipe = {name: chosen.get(name) for name in ("optimizer", "lr_scheduler")}
                 if config.ckpt_path:
-                    _check_continuation(config.ckpt_path, self.model)
+                    _check_continuation(config.ckpt_path, self.model, self.trainer)
         except (OSError, ValueError) as error:
             # jsonargparse wraps what a class of a class says into pages about its own types
             said = re.search(r"^ *- (?!Does not validate|Expected a )(.*)$", str(error), re.MULTILINE)
-            raise InputError(said[1] if said else str(error)) from error
+            said = said[1] if said else str(error)
+            raise (InputError if _is_of_file(error, said) else UsageError)(said) from error
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """Send everything to one folder, and use bfloat16 on a GPU that has it."""
@@ -270,6 +289,17 @@ class Command(LightningCLI):
         return [PredictionPictures(output)] if self.subcommand == "predict" else []
 
 
+def _is_of_file(error: BaseException | None, said: str) -> bool:
+    """Return whether a file is to blame, and not what was typed."""
+    if Path(said.partition(": ")[0]).exists():
+        return True
+    while error is not None:
+        if isinstance(error, (OSError, SpikeFileError, PictureError, VideoError)):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
 def check_folder(output: str | Path) -> None:
     """Refuse what cannot be made a folder, or would be a folder that looks like a file.
 
@@ -278,32 +308,32 @@ def check_folder(output: str | Path) -> None:
     """
     ending = Path(output).suffix.lower()
     if ending in _FILE_ENDINGS and not Path(output).is_dir():
-        raise InputError(f"-o: expected a folder, got {output}, which ends like a file, in {ending}")
+        raise UsageError(f"-o: expected a folder, got {output}, which ends like a file, in {ending}")
     there = next(path for path in (Path(output).absolute(), *Path(output).absolute().parents) if path.exists())
     if not there.is_dir():
-        raise InputError(f"-o: expected a folder, got the file {there}")
+        raise UsageError(f"-o: expected a folder, got the file {there}")
 
 
 def _check_trainer(trainer: Any) -> None:
     """Settings of Lightning that would leave a run without what the other commands need."""
     if trainer.enable_checkpointing is False:
-        raise InputError("trainer.enable_checkpointing: expected true, checkpoints are what fit is for, got false")
+        raise UsageError("trainer.enable_checkpointing: expected true, checkpoints are what fit is for, got false")
     if trainer.limit_val_batches == 0:
-        raise InputError("trainer.limit_val_batches: expected more than 0, validation chooses best.ckpt, got 0")
+        raise UsageError("trainer.limit_val_batches: expected more than 0, validation chooses best.ckpt, got 0")
 
 
 def _check_verb(verb: str, model: Learner, data: LightningDataModule) -> None:
     if verb == "predict" and type(model).predict_step is LightningModule.predict_step:
-        raise InputError(f"predict: expected a model that makes pictures, got {type(model).__name__}")
+        raise UsageError(f"predict: expected a model that makes pictures, got {type(model).__name__}")
     loader = _LOADERS[verb]
     if getattr(type(data), loader) is getattr(LightningDataModule, loader):
         scenes = f"{verb}: expected scenes whose truth is known, got {type(data).__name__}"
-        raise InputError(_NO_RECORDING if verb == "predict" else scenes)
+        raise UsageError(_NO_RECORDING if verb == "predict" else scenes)
     if verb == "fit" and not any(parameter.requires_grad for parameter in model.network.parameters()):
-        raise InputError(f"fit: expected a network that learns, got {type(model.network).__name__}")
+        raise UsageError(f"fit: expected a network that learns, got {type(model.network).__name__}")
 
 
-def _check_continuation(path: str, model: Learner) -> None:
+def _check_continuation(path: str, model: Learner, trainer: Trainer | None) -> None:
     """Refuse to go on with another network, optimizer or schedule: the checkpoint's would win without a word."""
     checkpoint = read_checkpoint(path)
     check_settings(model.network, checkpoint["network"], "the checkpoint")
@@ -313,7 +343,9 @@ def _check_continuation(path: str, model: Learner) -> None:
         if there.get(key) != here.get(key):
             name, expected = key.replace(".init_args", ""), f"{there.get(key)}, as {path} was trained with"
             anew = "--model.weights starts anew with other settings"
-            raise InputError(f"model.{name}: expected {expected}, got {here.get(key)}; {anew}")
+            raise UsageError(f"model.{name}: expected {expected}, got {here.get(key)}; {anew}")
+    if trainer is not None:  # a rehearsal has none
+        check_like_fresh(checkpoint, path, model, trainer)
 
 
 def _check_agreement(model: Learner, data: LightningDataModule) -> None:

@@ -2,19 +2,49 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import NoReturn
+
+from pytorch_lightning.utilities.exceptions import MisconfigurationException
 
 from lightning_modules.cli.folder_lock import FolderError
 from lightning_modules.pretrained import CheckpointMismatchError
-from spikekit import SpikeFileError, VideoError
+from spikekit import SpikeFileError, VideoError, arguments
 from spikekit.arguments import one_line
 from spikekit.io import PictureError
 
 
 class InputError(ValueError):
-    """Something that the user gave and that cannot be used; shown as one line."""
+    """Something that the user gave and that cannot be used; shown as one line, and the command ends with 1."""
+
+
+class UsageError(InputError, arguments.UsageError):
+    """A command line that asks for what cannot be; shown as one line, and the command ends with 2."""
+
+
+class Ended(SystemExit):
+    """The end of the command with a line on stderr.
+
+    Args:
+        line: what is wrong.
+        status: 2 for a command line that cannot be, 1 for all else.
+    """
+
+    def __init__(self, line: str, status: int) -> None:
+        super().__init__(line)
+        self.code = line if status == 1 else status  # a text is printed by Python, which then ends with 1
+        if status != 1:
+            print(line, file=sys.stderr)
+
+
+class VerbParser(argparse.ArgumentParser):
+    """The arguments of a verb that is ours; what is wrong with them is one line."""
+
+    def error(self, message: str) -> NoReturn:  # noqa: D102
+        raise UsageError(f"{self.prog.removeprefix('lightning ')}: {message}")
 
 
 @contextmanager
@@ -25,8 +55,10 @@ def as_one_line() -> Iterator[None]:
     except (InputError, SpikeFileError, PictureError, VideoError, CheckpointMismatchError, FolderError) as error:
         # what a worker of a loader raises comes with its traceback, whose last line it is
         said = str(error).strip().splitlines()[-1].split("Error: ", 1)[-1] if "Traceback (" in str(error) else error
-        sys.exit(f"lightning: {said}")
+        raise Ended(f"lightning: {said}", 2 if isinstance(error, UsageError) else 1) from error
+    except MisconfigurationException as error:  # such as a device that is not there
+        raise Ended(f"lightning: {one_line(error)}", 1) from error
     except OSError as error:
         if error.filename is None or isinstance(error, BrokenPipeError):
             raise
-        sys.exit(f"lightning: {error.filename}: {one_line(error)}")
+        raise Ended(f"lightning: {error.filename}: {one_line(error)}", 1) from error

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from lightning_modules.cli.errors import InputError
+from lightning_modules.cli.errors import InputError, VerbParser
 from lightning_modules.motion import ESTIMATORS
 from lightning_modules.networks import NETWORKS
 from lightning_modules.pretrained import check_weights, read_weights, write_weights
@@ -21,7 +20,7 @@ def export(args: Sequence[str]) -> None:
     Raises:
         InputError: no such checkpoint, or a damaged one; or a name of another kind of file.
     """
-    parser = argparse.ArgumentParser(
+    parser = VerbParser(
         prog="lightning export",
         description="Write the weights of a checkpoint as a file of safetensors that knows what network it is of, for "
         "lightning predict --model.weights FILE and CSCSR.from_pretrained(FILE).",

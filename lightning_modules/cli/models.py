@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 
+from lightning_modules.cli.errors import VerbParser
 from lightning_modules.shipped import list_pretrained
 from spikekit.tables import table
 
@@ -15,7 +15,7 @@ def models(args: Sequence[str]) -> None:
     Args:
         args: what was typed after ``lightning models``.
     """
-    parser = argparse.ArgumentParser(
+    parser = VerbParser(
         prog="lightning models",
         description="List the weights that come with the package, for lightning predict --model.weights NAME and "
         "CSCSR.from_pretrained(NAME).",

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import Any
 
 import yaml
 
-from lightning_modules.cli.arguments import flatten
+from lightning_modules.cli.arguments import flatten, reason
 from lightning_modules.cli.command import Command
 
 
@@ -44,19 +43,7 @@ def mistake(error: Exception, args: Sequence[str], names: Sequence[str]) -> str:
     """
     unknown = [word[2:].partition("=")[0] for word in args if word.startswith("--")]
     unknown = [key for key in unknown if names and key not in names]
-    return _reason(str(error)) + _suggestion(unknown, names)
-
-
-def _reason(message: str) -> str:
-    """Return jsonargparse's message, which is a tree of alternatives, as one line: the deepest, and where it is."""
-    lines = message.splitlines()
-    where = [key for line in lines for key in re.findall(r'[Pp]arser key "([^"]+)"', line)]
-    inner = [
-        line for line in lines if not re.match(r"\s*(- Expected a <class 'NoneType'>|Given value|.*arser key)", line)
-    ]
-    deepest = max(inner or lines, key=lambda line: len(line) - len(line.lstrip()))
-    deepest = re.sub(r'^- |[Pp]arser key "[^"]+":\s*', "", deepest.strip())
-    return ".".join(where) + (": " if where else "") + deepest
+    return reason(str(error)) + _suggestion(unknown, names)
 
 
 def _suggestion(unknown: Sequence[str], names: Sequence[str]) -> str:

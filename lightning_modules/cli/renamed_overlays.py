@@ -30,7 +30,7 @@ def with_current_overlays(args: Sequence[str]) -> list[str]:
     """
     args = list(args)
     for end, option, value in list(options(args)):
-        current = _current(value) if option in ("-c", "--config") else None
+        current = _current(value) if value and option in ("-c", "--config") else None
         if current:
             args[end - 1] = args[end - 1].removesuffix(value) + current
     return args

@@ -14,7 +14,7 @@ from pytorch_lightning.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 
 from lightning_modules.cli.command import run
-from lightning_modules.cli.errors import InputError
+from lightning_modules.cli.errors import InputError, UsageError
 from lightning_modules.cli.rehearsal import Rehearsal, argument_names, mistake, resolved
 from lightning_modules.pretrained import load_weights, read_weights
 from spikekit.arguments import one_line
@@ -59,7 +59,7 @@ class Runner:
             command = _built(args, names)
         trainer, module = command.trainer, command.model
         if type(module).predict_step is LightningModule.predict_step:
-            raise InputError(f"expected a model that makes pictures, got {type(module).__name__}")
+            raise UsageError(f"expected a model that makes pictures, got {type(module).__name__}")
         self.config = resolved(command)
         self.data = command.datamodule
         self.device = trainer.strategy.root_device
@@ -103,10 +103,10 @@ def make_runner(shared: Sequence[str], args: Sequence[str], base: Runner) -> Run
     if runner.scenes != base.scenes:
         key = next(key for key in base.scenes if runner.scenes.get(key) != base.scenes[key])
         got = f"got {runner.scenes.get(key)}; what goes for all stands outside of --setting"
-        raise InputError(f"data.{key}: expected {base.scenes[key]}, the same scenes for all, {got}")
+        raise UsageError(f"data.{key}: expected {base.scenes[key]}, the same scenes for all, {got}")
     frames = base.network.frames
     if runner.network.frames > frames:
-        raise InputError(f"frames: expected at most the {frames} of the clips, got {runner.network.frames}")
+        raise UsageError(f"frames: expected at most the {frames} of the clips, got {runner.network.frames}")
     return runner
 
 
@@ -117,11 +117,12 @@ def _built(args: Sequence[str], names: Sequence[str]) -> _Test:
         if path:
             load_weights(command.model.network, read_weights(path))
     except ArgumentError as error:
-        raise InputError(mistake(error, args, names)) from error
+        raise UsageError(mistake(error, args, names)) from error
     except MisconfigurationException as error:
         raise CannotRunError(one_line(error)) from error
     except ValueError as error:
-        kind = CannotRunError if any(isinstance(cause, OSError) for cause in _causes(error)) else InputError
+        wrong = UsageError if isinstance(error, UsageError) else InputError
+        kind = CannotRunError if any(isinstance(cause, OSError) for cause in _causes(error)) else wrong
         raise kind(str(error)) from error
     return command
 

@@ -16,6 +16,7 @@ from lightning_modules.inference.predict import predict
 from lightning_modules.inference.tiles import FAR, TILE
 from lightning_modules.networks import CSCSR, ClassicalDecoder, Network
 from lightning_modules.shipped import find_shipped
+from spikekit.arguments import one_line
 from spikekit.timing import timer_of
 
 _FOLDER = Path(__file__).parents[1] / "weights"
@@ -217,6 +218,8 @@ def choices(scale: int, size: tuple[int, int]) -> list[Choice]:
         mib = everywhere * pixels + (mib - everywhere) * in_tile
         ms = ratio * float(_reference(rows)["ms"]) * pixels
         found.append(Choice(row["setting"], preset, psnr, 0.0, ms, mib))
+    if not found:
+        raise ValueError(f"{_FOLDER / f'x{scale}.csv'}: expected presets with tiles, got none")
     best = max(choice.psnr for choice in found)
     found = [replace(choice, below=best - choice.psnr) for choice in found]
     return sorted(found, key=lambda choice: choice.ms)
@@ -227,8 +230,25 @@ def _table(scale: int) -> list[dict[str, str]]:
     if not path.is_file():
         there = ", ".join(sorted(path.stem for path in _FOLDER.glob("x*.csv"))) or "none"
         raise ValueError(f"scale: expected one that was measured ({there}), got {scale}")
-    with open(path, newline="") as file:
-        return [row for row in csv.DictReader(file) if not row["failed"]]
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            rows = [row for row in csv.DictReader(file) if not row["failed"]]
+        for row in rows:
+            _check_row(row)
+        _reference(rows)
+    except (OSError, ValueError, TypeError, KeyError, StopIteration, csv.Error) as error:
+        raise ValueError(
+            f"{path}: not a table of lightning trade, or a damaged one ({one_line(error)[:300]})"
+        ) from error
+    return rows
+
+
+def _check_row(row: dict[str, str]) -> None:
+    """Raise unless there are the figures that a choice is made from."""
+    Preset.read(row)
+    for name in ("height", "width", "psnr", "ratio", "ms", "mib"):
+        if not 0 < (int if name in ("height", "width") else float)(row[name]) < float("inf"):
+            raise ValueError(f"{name}: expected a number above 0, got {row[name]}")
 
 
 def _reference(rows: list[dict[str, str]]) -> dict[str, str]:

@@ -6,10 +6,9 @@ import argparse
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import NoReturn
 
 from lightning_modules.cli.command import check_folder
-from lightning_modules.cli.errors import InputError
+from lightning_modules.cli.errors import InputError, UsageError, VerbParser
 from lightning_modules.cli.folder_lock import locked_folder
 from lightning_modules.sweep.budget import seconds
 from lightning_modules.sweep.cost import measure_variants
@@ -25,11 +24,6 @@ from spikekit.io.whole_file import whole_file
 _ENGINES = {"local": run_locally, "ray": run_on_ray}
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise InputError(f"sweep: {message}")
-
-
 def _time(text: str) -> float:
     try:
         return seconds(text)
@@ -38,7 +32,7 @@ def _time(text: str) -> float:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+    parser = VerbParser(
         prog="lightning sweep",
         allow_abbrev=False,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -141,7 +135,7 @@ def sweep(args: Sequence[str]) -> None:
     asked = _parser().parse_args(args)
     configs = asked.configs + asked.config
     if not configs:
-        raise InputError("sweep: expected a configuration, such as configs/x4.yaml")
+        raise UsageError("sweep: expected a configuration, such as configs/x4.yaml")
     check_folder(asked.output)
     budget = {"steps": asked.steps, "seconds": asked.time, "flops": asked.flops}
     budget = {name: value for name, value in budget.items() if value is not None}

@@ -89,7 +89,7 @@ class Row:
 
 def own_scores(result: dict[str, Any]) -> dict[str, float]:
     """Return the scores of the trained network; ``psnr, true flow`` and the like for its other rows of the test."""
-    metrics, method = result["metrics"], result["method"]
+    metrics, method = result["metrics"], result.get("method")
     if method not in metrics:
         method = next(iter(metrics), "")
     scores = dict(metrics.get(method, {}))
@@ -181,7 +181,7 @@ def markdown(rows: Sequence[Row], costs: dict[str, Any] | None = None) -> str:
             cells += ["", ""] if gap is None else [f"{row.paper:.2f}", f"{gap:+.2f}"]
         if data:
             cells += [row.method or "", *(str(row.paper_scores.get(name, "")) for name in data)]
-        times = [result["seconds_per_step"] for result in row.results.values() if result["seconds_per_step"]]
+        times = [result["seconds_per_step"] for result in row.results.values() if result.get("seconds_per_step")]
         cells.append(f"{1000 * statistics.mean(times):.0f}" if times else "")
         cells.append(_values(row, lambda result: result["steps"]))
         cells.append(_values(row, lambda result: f"{result['parameters']:,}"))
@@ -236,7 +236,7 @@ def write_csv(rows: Sequence[Row], path: Path, costs: dict[str, Any] | None = No
                 if result:
                     scores = own_scores(result)
                     cells |= {name: _rounded(scores.get(name)) for name in names}
-                    cells |= {name: result[name] for name in ("seconds_per_step", "steps", "parameters")}
+                    cells |= {name: result.get(name) for name in ("seconds_per_step", "steps", "parameters")}
                     cells |= {name: _settings(result).get(name) for name in settings}
                 writer.writerow({**shared, **cells})
             found = {name: list(row.scores(name).values()) for name in names}
@@ -268,7 +268,7 @@ def _others(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     found = _results(rows)
     if not found:
         return {}
-    networks = [result["method"] or "" for result in found]
+    networks = [result.get("method") or "" for result in found]
     return {
         method: scores
         for method, scores in found[0]["metrics"].items()

@@ -15,10 +15,10 @@ import yaml
 
 from lightning_modules.cli.arguments import flatten
 from lightning_modules.cli.command import run
-from lightning_modules.cli.errors import InputError
+from lightning_modules.cli.errors import InputError, UsageError
 from lightning_modules.cli.rehearsal import Rehearsal, argument_names, mistake, resolved
 from lightning_modules.sweep.budget import with_budget
-from lightning_modules.sweep.state import write_json
+from lightning_modules.sweep.state import read_json, read_yaml, write_json
 from spikekit.io.whole_file import whole_file
 
 
@@ -55,7 +55,7 @@ class Trial:
         """
         config, budget = self.folder / "trial.yaml", self.folder / "budget.json"
         if budget.is_file():  # it is written last
-            there = {**yaml.safe_load(config.read_text()), "budget": json.loads(budget.read_text())}
+            there = {**read_yaml(config), "budget": read_json(budget)}
             asked = {**yaml.safe_load(yaml.safe_dump(self.config)), "budget": self.budget}
             if there != asked:
                 raise InputError(f"{self.folder}: {_difference(there, asked)}; -o goes elsewhere, or delete the folder")
@@ -115,7 +115,7 @@ def make_trials(
     folders = [trial.folder for trial in trials]
     twice = next((folder for folder in folders if folders.count(folder) > 1), None)
     if twice:
-        raise InputError(f"two trials are called {twice.name}: give overlays and values names that differ")
+        raise UsageError(f"two trials are called {twice.name}: give overlays and values names that differ")
     _check_differences(trials)
     return trials
 
@@ -129,7 +129,7 @@ def _check_differences(trials: Sequence[Trial]) -> None:
             weights = trial.config["model"]["init_args"].get("weights")
             why = f"; model.weights={weights} says what the network is, whatever overlays say" if weights else ""
             names = f"{other.folder.name} and {trial.folder.name}"
-            raise InputError(f"sweep: expected trials that differ, got the same settings for {names}{why}")
+            raise UsageError(f"sweep: expected trials that differ, got the same settings for {names}{why}")
 
 
 def _key_and_values(setting: str) -> tuple[str, list[str]]:
@@ -137,9 +137,9 @@ def _key_and_values(setting: str) -> tuple[str, list[str]]:
     key, equals, values = setting.partition("=")
     split = re.findall(r"(?:[^,\[{]|\[.*?\]|\{.*?\})+", values)
     if not (key and equals and split):
-        raise InputError(f"--set: expected KEY=VALUE,VALUE,..., such as model.network.width=16,32, got {setting}")
+        raise UsageError(f"--set: expected KEY=VALUE,VALUE,..., such as model.network.width=16,32, got {setting}")
     if key == "output":
-        raise InputError(f"--set: expected the folder of the sweep as -o DIR, got {setting}")
+        raise UsageError(f"--set: expected the folder of the sweep as -o DIR, got {setting}")
     return key.removeprefix("--"), split
 
 
@@ -153,7 +153,7 @@ class _Resolver(Rehearsal):
         path = self.config[self.verb].ckpt_path
         if path:
             instead = "a trial goes on from its own; model.weights=FILE starts from weights"
-            raise InputError(f"ckpt_path: expected none, {instead}, got {path}")
+            raise UsageError(f"ckpt_path: expected none, {instead}, got {path}")
 
     def instantiate_trainer(self, **kwargs: Any) -> None:
         """None: the machine that trains may be another one."""
@@ -163,10 +163,11 @@ def _resolve(args: Sequence[str], trial: str, names: Sequence[str] = ()) -> dict
     try:
         command = run(["fit", *args], _Resolver)
     except (ArgumentError, InputError) as error:
-        raise InputError(trial + mistake(error, args, names)) from error
+        kind = InputError if isinstance(error, InputError) and not isinstance(error, UsageError) else UsageError
+        raise kind(trial + mistake(error, args, names)) from error
     config = resolved(command)
     if config["trainer"]["devices"] not in ("auto", 1, "1"):
-        raise InputError(f"{trial}trainer.devices: expected 1, the one of a trial, got {config['trainer']['devices']}")
+        raise UsageError(f"{trial}trainer.devices: expected 1, the one of a trial, got {config['trainer']['devices']}")
     config["trainer"]["devices"] = 1
     # not part of what the trial is
     return {key: value for key, value in config.items() if key not in ("ckpt_path", "weights_only")}
@@ -175,8 +176,11 @@ def _resolve(args: Sequence[str], trial: str, names: Sequence[str] = ()) -> dict
 def _difference(there: dict[str, Any], asked: dict[str, Any]) -> str:
     there, asked = dict(flatten(there)), dict(flatten(asked))
     keys = sorted(key for key in {**there, **asked} if there.get(key) != asked.get(key))
-    shown = [key.replace(".init_args", "") for key in keys[:3]]
+    if not keys:
+        return "holds a trial of another form than this sweep asks for"
+    shown = [" ".join(key.replace(".init_args", "").split())[:80] for key in keys[:3]]
     more = f" and {len(keys) - 3} more" if len(keys) > 3 else ""
-    first = f"{shown[0]}={there[keys[0]]}" if keys[0] in there else f"no {shown[0]}"
+    holds, wanted = (" ".join(str(values.get(keys[0], "none")).split())[:80] for values in (there, asked))
+    first = f"{shown[0]}={holds}" if keys[0] in there else f"no {shown[0]}"
     others = f" (also {', '.join(shown[1:])}{more})" if shown[1:] else ""
-    return f"holds a trial with {first}, and this sweep asks for {asked.get(keys[0], 'none')}{others}"
+    return f"holds a trial with {first}, and this sweep asks for {wanted}{others}"

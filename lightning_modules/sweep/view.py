@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import sys
 import time
@@ -93,15 +94,14 @@ def _standing(progress: dict[str, Any]) -> str:
     phase = progress["phase"]
     if phase != "training":
         return phase
-    steps = f"/{progress['steps']}" if progress["steps"] else ""
-    rate, share = progress["rate"], progress["share"]
-    parts = [f"step {progress['step']}{steps}"]
+    step, steps, rate, share, val = (progress.get(name) for name in ("step", "steps", "rate", "share", "val"))
+    parts = [f"step {step}/{steps}" if steps else f"step {step}"]
     if rate:
         parts.append(f"{rate:.3g} it/s")
-    if progress["val"]:
-        parts.append(_scores(progress["val"]))
-    if rate and progress["steps"]:
-        parts.append(f"{_duration((progress['steps'] - progress['step']) / rate)} left")
+    if val:
+        parts.append(_scores(val))
+    if rate and steps:
+        parts.append(f"{_duration((steps - (step or 0)) / rate)} left")
     elif share:
         parts.append(f"{share:.0%}")
     return ", ".join(parts)
@@ -112,6 +112,8 @@ def _scores(scores: dict[str, float]) -> str:
 
 
 def _duration(seconds: float) -> str:
+    if not math.isfinite(seconds):
+        return "?"
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"

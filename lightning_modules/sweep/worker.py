@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 import os
 import shutil
@@ -24,7 +23,7 @@ from lightning_modules.checkpoint import read_checkpoint
 from lightning_modules.cli.command import Command, run
 from lightning_modules.cli.errors import as_one_line
 from lightning_modules.sweep.budget import has_end, with_budget
-from lightning_modules.sweep.state import PROGRESS, RESULT, read_json, write_json
+from lightning_modules.sweep.state import PROGRESS, RESULT, read_json, read_yaml, write_json
 from spikekit.io.whole_file import whole_file
 
 _A_MOMENT = 0.5  # seconds between two reports
@@ -154,7 +153,7 @@ def plan(folder: Path) -> Path:
     has an end, a few steps are timed. That is done once: a resumed trial has the plan that it began with.
     """
     own, planned = folder / "trial.yaml", folder / "plan.yaml"
-    config, budget = yaml.safe_load(own.read_text()), json.loads((folder / "budget.json").read_text())
+    config, budget = read_yaml(own), read_json(folder / "budget.json") or {}
     if "flops" not in budget and not ("seconds" in budget and has_end(config)):
         return own
     if not planned.is_file():

@@ -7,9 +7,8 @@ import re
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
-from lightning_modules.cli.errors import InputError
+from lightning_modules.cli.errors import InputError, UsageError, VerbParser
 from lightning_modules.cost.measure import Row, measure, running
 from lightning_modules.cost.runner import CannotRunError, Runner, make_runner
 from lightning_modules.trade.plot import plot
@@ -21,13 +20,8 @@ from spikekit.io.whole_file import whole_file
 _OUTPUT, _ROUNDS = Path("runs/trade"), 9
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise InputError(f"trade: {message}")
-
-
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+    parser = VerbParser(
         prog="lightning trade",
         allow_abbrev=False,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -88,7 +82,7 @@ def trade(args: Sequence[str]) -> None:
     names = [setting.name for setting in settings]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise InputError(f"trade: two settings are called {twice!r}; 'NAME: ARGS' gives them names")
+        raise UsageError(f"trade: two settings are called {twice!r}; 'NAME: ARGS' gives them names")
     rows = [_row(setting, shared, base) for setting in settings]
     _check_any(rows)
     try:
@@ -123,7 +117,7 @@ def _row(setting: Setting, shared: Sequence[str], base: Runner) -> Row:
     try:
         return Row(setting, make_runner(shared, setting.args, base))
     except InputError as error:
-        raise InputError(f"{setting.name}: {error}") from error
+        raise type(error)(f"{setting.name}: {error}") from error
     except CannotRunError as error:
         return Row(setting, reason=str(error))
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 from inspect import signature
 
 from lightning_modules.cli.arguments import arguments_preset, preset_arguments
-from lightning_modules.cli.errors import InputError
+from lightning_modules.cli.errors import UsageError
 from lightning_modules.cost.setting import Setting
 from lightning_modules.inference.presets import Preset
 from lightning_modules.networks import Network
@@ -21,7 +21,7 @@ def read_setting(text: str) -> Setting:
     """Read a setting as it is typed: ``ARGS``, or ``NAME: ARGS``.
 
     Raises:
-        InputError: it is neither.
+        UsageError: it is neither.
 
     Example:
         >>> read_setting("my own: -c my.yaml").args
@@ -34,10 +34,10 @@ def read_setting(text: str) -> Setting:
     try:
         args = shlex.split(typed)
     except ValueError as error:
-        raise InputError(f"--setting: {text!r} cannot be read ({error})") from error
+        raise UsageError(f"--setting: {text!r} cannot be read ({error})") from error
     if not named and not typed.lstrip().startswith("-"):
         expected = "expected arguments of lightning test, or a name, a colon and such arguments"
-        raise InputError(f"--setting: {expected}, as in 'small tiles: --model.tile 32', got {text!r}")
+        raise UsageError(f"--setting: {expected}, as in 'small tiles: --model.tile 32', got {text!r}")
     return Setting(named[1].strip() if named else shlex.join(args), args, arguments_preset(args))
 
 

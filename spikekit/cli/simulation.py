@@ -244,7 +244,7 @@ def simulate(source: Source, settings: Settings, output: Path, replayed: Sidecar
         plans: list[Plan] = []
         shape, bits, digest = _expose(source, settings, film, noise, part, output, plans)
         stream = {"file": output.name, "frames": shape[0], "height": shape[1], "width": shape[2], "sha256": digest}
-        if replayed is not None and replayed.stream["sha256"] != digest:
+        if replayed is not None and any(replayed.stream[name] != stream[name] for name in stream if name != "file"):
             ours = versions()
             changed = [
                 f"{name} {was}, now {ours.get(name)}"

@@ -12,6 +12,7 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
+from spikekit.arguments import one_line
 from spikekit.io.quiet import quiet
 
 # What the field calls the array of a recording; without either name, the only 3-D array is taken.
@@ -66,7 +67,7 @@ def reading(path: Path) -> Iterator[None]:
     except OSError as error:
         raise SpikeFileError(f"{path}: cannot be read ({error.strerror or error})") from error
     except Exception as error:
-        raise SpikeFileError(f"{path}: damaged ({' '.join(str(error).split()) or type(error).__name__})") from error
+        raise SpikeFileError(f"{path}: damaged ({one_line(error)[:300]})") from error
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from kornia.color import hsv_to_rgb
 from kornia_rs.io import read_image_png_u16
 from torch import Tensor
 
+from spikekit.arguments import one_line
 from spikekit.check import check_planes, check_positive
 from spikekit.io.image_bytes import picture_bytes
 from spikekit.io.quiet import quiet
@@ -37,7 +38,7 @@ def read_picture(path: str | Path) -> Tensor:
     see, and where it is opaque it changes nothing. Values stay gamma-encoded as in the file.
 
     Args:
-        path: any file that scikit-image reads (PNG, JPEG, TIFF, ...).
+        path: a PNG, JPEG, TIFF (its first page) or any other file that Pillow reads.
 
     Returns:
         ``rgb`` of shape (3, H, W), float32, in [0, 1].
@@ -65,35 +66,50 @@ def read_picture(path: str | Path) -> Tensor:
         elif pixels.ndim == 2 or pixels.shape[-1] == 1:
             pixels = color.gray2rgb(pixels.reshape(pixels.shape[:2]))
     except Exception as error:
-        said = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise PictureError(f"{path}: not a picture that can be read ({said.removeprefix(f'{path}: ')})") from error
+        said = one_line(error).removeprefix(f"{path}: ")[:300]
+        raise PictureError(f"{path}: not a picture that can be read ({said})") from error
     if pixels.ndim != 3 or pixels.shape[-1] != 3 or 0 in pixels.shape:
         raise PictureError(f"{path}: expected a grey or colour picture, got an array of shape {pixels.shape}")
     return torch.from_numpy(pixels.astype("float32")).permute(2, 0, 1).contiguous()
 
 
 def _pixels(path: str | Path) -> np.ndarray:
-    """Read the numbers of a file: (H, W), (H, W, 3) or (H, W, 4), red first, alpha last, in its own depth."""
+    """Read the numbers of a file: (H, W), (H, W, 3) or (H, W, 4), red first, alpha last, in its own depth.
+
+    By what the file says that it is, and by one library each: one that tries others would hand what no picture is to
+    FFmpeg, for which some files are lists of others to open.
+    """
     from PIL import Image
-    from skimage import io
-    from tifffile import TiffFile
 
     with open(path, "rb") as file:
         head = file.read(26)
-    with suppress(OSError), Image.open(path) as picture:
+    if head[:2] in (b"II", b"MM"):
+        return _tiff_pixels(path)
+    with Image.open(path) as picture:
         _check_pixels(picture.height * picture.width)
-    if head.startswith(b"\x89PNG") and head[24:] in (b"\x10\x02", b"\x10\x06"):
-        # 16 bits in colour, of which Pillow would keep 8
-        return read_image_png_u16(str(path), "rgb" if head[25] == 2 else "rgba")
-    with suppress(OSError), Image.open(path) as picture:
+        if head.startswith(b"\x89PNG") and head[24:] in (b"\x10\x02", b"\x10\x06"):
+            # 16 bits in colour, of which Pillow would keep 8
+            return read_image_png_u16(str(path), "rgb" if head[25] == 2 else "rgba")
+        if picture.mode == "I" and picture.format == "PNG":  # 16 bits, as older versions of Pillow say it
+            return np.asarray(picture).astype(np.uint16)
+        if picture.mode in ("1", "L", "I", "F", "RGB", "RGBA") or picture.mode.startswith("I;16"):
+            return np.asarray(picture)
+        return np.asarray(picture.convert("RGBA" if picture.has_transparency_data else "RGB"))
+
+
+def _tiff_pixels(path: str | Path) -> np.ndarray:
+    """Read the first page of a TIFF."""
+    from PIL import Image
+    from tifffile import TiffFile
+
+    with suppress(OSError, SyntaxError), Image.open(path) as picture:
         if picture.mode in ("P", "PA", "LA", "CMYK", "YCbCr", "LAB"):
+            _check_pixels(picture.height * picture.width)
             return np.asarray(picture.convert("RGBA" if picture.has_transparency_data else "RGB"))
-    if head[:2] in (b"II", b"MM"):  # TIFF that Pillow does not know
-        with TiffFile(path) as file:
-            series = file.series[0]
-            _check_pixels(math.prod(series.shape) / 4)  # of up to four channels
-            return series.asarray()
-    return io.imread(path)
+    with TiffFile(path) as file:
+        page = file.pages.first
+        _check_pixels(max(math.prod(page.shape), math.prod(page.chunks)) / 4)  # of up to four channels
+        return page.asarray()
 
 
 def _check_pixels(count: float) -> None:

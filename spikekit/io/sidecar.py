@@ -18,7 +18,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from spikekit.arguments import one_line
 from spikekit.color.cfa import PATTERNS
+from spikekit.io.whole_file import flush_folder
 
 #: What the first line of a side-car says it is.
 KIND = "spikekit simulation 1"
@@ -83,7 +85,7 @@ def read_sidecar(path: Path) -> Sidecar:
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror or error})") from error
     except (ValueError, TypeError, KeyError, RecursionError) as error:
-        said = f"lacks {error}" if isinstance(error, KeyError) else " ".join(str(error).split())[:300]
+        said = f"lacks {error}" if isinstance(error, KeyError) else one_line(error)[:300]
         raise ValueError(f"{path}: not a side-car that can be read ({said})") from error
     return sidecar
 
@@ -125,6 +127,8 @@ def _is_noise(value: Any) -> bool:
 
 
 _WHOLE = ("a whole number, 1 or more", _is_whole)
+# a minute of a camera between two frames; a few bytes could ask for a stream that never ends
+_CLOCKS = (f"a whole number, 1 .. {1 << 20}", lambda value: _is_whole(value) and value <= 1 << 20)
 _POSITIVE = ("a finite number above 0", _is_positive)
 
 # Of the settings that something is computed from: what to expect, and whether a value is that.
@@ -132,10 +136,10 @@ _SETTINGS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "scale": _WHOLE,
     "pattern": (f"one of {', '.join(PATTERNS)}", lambda value: value in PATTERNS),
     "alpha": _POSITIVE,
-    "clocks": _WHOLE,
+    "clocks": _CLOCKS,
     "frame": ("a whole number, 0 or more, or null", lambda value: value is None or _is_whole(value, 0)),
     "frames": ("a whole number, 1 or more, or null", lambda value: value is None or _is_whole(value)),
-    "readout": _WHOLE,
+    "readout": _CLOCKS,
     "seed": ("a whole number, 0 or more", lambda value: type(value) is int and value >= 0),
     "plan": ("a text or a number of latent frames", lambda value: isinstance(value, str) or _is_whole(value, 0)),
     "tolerance": _POSITIVE,
@@ -253,10 +257,16 @@ def _publish(part: Path, target: Path, last: str) -> None:
     if sidecar.is_file() and sidecar.read_bytes() != (part / last).read_bytes():
         sidecar.unlink()
     files = sorted((path for path in part.rglob("*") if path.is_file()), key=lambda path: path == part / last)
+    folders = {target}
     for path in files:
         final = target / path.relative_to(part)
         final.parent.mkdir(exist_ok=True)
+        folders.add(final.parent)
+        if path == part / last:  # the others have to be on the disk before it says that they are
+            for folder in folders:
+                flush_folder(folder)
         os.replace(path, final)
+    flush_folder(target)
 
 
 @contextmanager

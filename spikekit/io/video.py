@@ -16,6 +16,7 @@ from weakref import WeakSet
 import torch
 from torch import Tensor
 
+from spikekit.arguments import one_line
 from spikekit.check import check_whole
 from spikekit.io.images import MOST_PIXELS, read_picture
 from spikekit.io.quiet import quiet
@@ -25,6 +26,9 @@ PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 #: Endings of video files, which PyAV reads.
 VIDEO_ENDINGS = (".mp4", ".m4v", ".mkv", ".webm", ".avi", ".mov", ".y4m", ".mpg", ".mpeg", ".ts", ".wmv", ".flv")
+
+# What FFmpeg calls the formats of such files.
+_FORMATS = "mov,mp4,matroska,webm,avi,yuv4mpegpipe,mpeg,mpegvideo,mpegts,asf,flv,h264,hevc,m4v"
 
 # Frames of a video file that stay decoded, so that a step back needs no second start.
 _KEPT = 8
@@ -193,8 +197,8 @@ def _reading(path: Path, what: str = "") -> Iterator[None]:
     except OSError as error:
         raise VideoError(f"{path}: {what}cannot be read ({error.strerror or error})") from error
     except Exception as error:
-        said = " ".join(str(getattr(error, "strerror", None) or error).split()).removeprefix(f"{path}: ")
-        raise VideoError(f"{path}: {what}{said or type(error).__name__}") from error
+        said = one_line(error).removeprefix(f"{path}: ")[:300]
+        raise VideoError(f"{path}: {what}{said}") from error
 
 
 # --- folders ----------------------------------------------------------------------------------------------------------
@@ -246,6 +250,8 @@ class _Pictures:
 def _header_size(file: Path) -> tuple[int, int] | None:
     from PIL import Image
 
+    if not file.is_file():  # a pipe would be waited for
+        return None
     try:
         with quiet(), Image.open(file) as picture:
             return picture.height, picture.width
@@ -299,10 +305,10 @@ class _Film:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            import av
+            import av  # noqa: F401
         except ImportError as error:
             raise VideoError(f"{path}: reading a video needs PyAV, pip install 'spikekit[video]'") from error
-        with _reading(path), av.open(str(path)) as container:
+        with _reading(path), _container(path) as container:
             stream = next(iter(container.streams.video), None)
             if stream is None or stream.codec_context is None:
                 raise VideoError(f"{path}: expected a video, got none that can be decoded")
@@ -362,10 +368,15 @@ class _Film:
 
 def _decoded(path: Path) -> Iterator[Any]:
     """Decode a file; no method, so that the file is closed when the frames are let go, without a garbage collector."""
+    with _container(path) as container:
+        yield from container.decode(container.streams.video[0])
+
+
+def _container(path: Path) -> Any:
+    """Open a video file, and nothing that it names: to FFmpeg, a list of other files is a video as well."""
     import av
 
-    with av.open(str(path)) as container:
-        yield from container.decode(container.streams.video[0])
+    return av.open(str(path), options={"format_whitelist": _FORMATS, "protocol_whitelist": "file"})
 
 
 def _rgb(frame: Any) -> Tensor:

@@ -18,6 +18,8 @@ except ImportError:  # Windows, which removes no file that is open
 
 _SIDE_BY_SIDE = 8  # writers of one file whose leftovers are found
 
+_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)  # what the system says without a name
+
 
 @contextmanager
 def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[Any]]:
@@ -76,14 +78,16 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
         if fcntl is None:
             file.close()
         os.replace(part, target)
-    except BaseException:
+    except BaseException as error:
+        if isinstance(error, OSError) and error.errno in _FULL and error.filename is None:
+            error.filename = str(path)
         with suppress(OSError):
             file.close()
         with suppress(OSError):
             part.unlink(missing_ok=True)
         raise
     file.close()  # so late, because the lock that says that somebody is at work ends here
-    _flush_folder(target.parent)
+    flush_folder(target.parent)
 
 
 def _open_part(target: Path, mode: str, **how: Any) -> tuple[Path, IO[Any]]:
@@ -122,7 +126,7 @@ def _lock(file: IO[Any]) -> bool | None:
     return True
 
 
-def _flush_folder(folder: Path) -> None:
+def flush_folder(folder: Path) -> None:
     """Make the renaming last through a loss of power, where the system can."""
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)

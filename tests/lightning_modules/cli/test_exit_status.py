@@ -1,0 +1,84 @@
+"""What every verb ends with: one line on stderr, 2 for wrong use and 1 for a file that is to blame; nothing written."""
+
+import shlex
+import sys
+
+import pytest
+
+from lightning_modules.__main__ import main
+
+OVERLAY = "model: {network: {init_args: {width: 4, representation_width: 4, features: 1, stages: 1, end_blocks: 1}}}"
+FILES = {
+    "tiny.yaml": OVERLAY.encode(),
+    "bad.yaml": b"model: [1\n",
+    "list.yaml": b"[1, 2]",
+    "deep.yaml": b"[" * 100_000,
+    "odd.yaml": b"model: {network: {class_path: CSCSR, init_args: {motion: nonsense.Estimator}}}",
+    "cut.ckpt": b"PK\3\4 and no more",
+    "cut.safetensors": b"\xff" * 30,
+    "odd.dat": bytes(range(256)),
+    "a.txt": b"text",
+}
+
+
+def _rows():
+    x4 = "-c {configs}/x4.yaml -c tiny.yaml"
+    recording = "--data Recording --data.path"
+    wrong = [
+        "",
+        "nonsense",
+        "fit --nonsense 3",
+        "fit",
+        "fit -c",
+        "fit -c nowhere.yaml",
+        f"fit {x4} -c odd.yaml",
+        f"fit {x4} --model.network.motion nonsense",
+        f"fit {x4} --model.network.motion torch.nn.Linear",
+        f"fit {x4} --model.network.motion '{{{{class_path: ZeroFlow, init_args: {{{{a: 3}}}}}}}}'",
+        f"fit {x4} --model.network.width abc",
+        f"fit {x4} --model.network.width -3",
+        f"validate {x4} --data Nonsense",
+        f"test {x4} -o a.txt",
+        "predict --speed nonsense",
+        "predict --speed fast",
+        "sweep",
+        "sweep {configs}/x4.yaml --steps abc",
+        "sweep {configs}/x4.yaml --set a=3",
+        "trade -c {configs}/x4.yaml --rounds 0",
+        "trade -c {configs}/x4.yaml -c odd.yaml",
+        "export --nonsense",
+        "models x",
+    ]
+    failed = [
+        (f"fit {x4} -c bad.yaml", "bad.yaml"),
+        (f"fit {x4} -c list.yaml", "list.yaml"),
+        ("sweep {configs}/x4.yaml -c deep.yaml", "deep.yaml"),
+        (f"fit {x4} --ckpt_path cut.ckpt -o out", "cut.ckpt"),
+        (f"validate {x4} --ckpt_path nowhere.ckpt", "nowhere.ckpt"),
+        (f"test {x4} --model.weights cut.safetensors -o out", "cut.safetensors"),
+        (f"fit {x4} --data.root nowhere", "nowhere"),
+        (f"predict --speed fast {recording} nowhere.dat -o out", "nowhere.dat"),
+        (f"predict --model.weights cscsr_tiny_x4 {recording} odd.dat --data.height 7 --data.width 9", "odd.dat"),
+        ("trade -c {configs}/x4.yaml --ckpt_path cut.ckpt", "cut.ckpt"),
+        ("export cut.ckpt -o a.safetensors", "cut.ckpt"),
+    ]
+    return [(words, 2, "") for words in wrong] + [(words, 1, name) for words, name in failed]
+
+
+@pytest.mark.parametrize(("words", "status", "named"), _rows())
+def test_one_line(words, status, named, configs, tmp_path, monkeypatch, capfd):
+    for name, content in FILES.items():
+        (tmp_path / name).write_bytes(content)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["lightning"])
+    with pytest.raises(SystemExit) as end:
+        main(shlex.split(words.format(configs=configs)))
+    said = capfd.readouterr().err
+    if isinstance(end.value.code, str):  # which Python prints, and then ends with 1
+        said += end.value.code + "\n"
+    assert (1 if isinstance(end.value.code, str) else end.value.code) == status, said
+    assert said.startswith("lightning: ")
+    assert len(said.splitlines()) == 1, said
+    assert named in said
+    assert "Traceback" not in said
+    assert {path.name for path in tmp_path.iterdir()} == set(FILES)

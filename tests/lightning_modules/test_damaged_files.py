@@ -1,0 +1,210 @@
+"""Damaged files of every kind that lightning reads; SPIKEKIT_FUZZ=N in the environment gives each N cases.
+
+Weights and checkpoints as they are loaded are in test_security.py.
+"""
+
+import io
+import json
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from pytorch_lightning.callbacks import ModelCheckpoint
+
+from lightning_modules.checkpoint import read_checkpoint
+from lightning_modules.cli.errors import InputError
+from lightning_modules.data.cache import ClipCache, _digest
+from lightning_modules.error_model import read_error_model
+from lightning_modules.inference import presets
+from lightning_modules.sweep.state import PROGRESS, RESULT, read_json, read_yaml
+from lightning_modules.sweep.table import collect, markdown, write_csv
+from lightning_modules.sweep.trials import Trial
+from lightning_modules.sweep.view import _standing
+from lightning_modules.training_state import check_like_fresh, check_training_state
+
+WEIGHTS = Path(presets.__file__).parents[1] / "weights"
+
+CONFIG = {
+    "seed_everything": 0,
+    "model": {"class_path": "SuperResolution", "init_args": {"weights": None, "network": {"init_args": {"width": 4}}}},
+    "trainer": {"max_steps": 6, "accumulate_grad_batches": 1},
+}
+FINISHED = {
+    "metrics": {"TFI": {"psnr": 20.0, "ssim": 0.5}, "CSCSR": {"psnr": 21.0, "ssim": 0.6}},
+    "method": "CSCSR",
+    "steps": 6,
+    "seconds_per_step": 0.1,
+    "parameters": 100,
+    "network": {"class": "CSCSR", "scale": 4, "width": 4},
+    "optimizer": {"lr": 0.1, "weight_decay": None},
+}
+RUNS = {"phase": "training", "step": 3, "steps": 6, "share": 0.5, "rate": 2.0, "val": {"val/psnr": 20.0}}
+
+
+def _json(value):
+    return json.dumps(value, indent=1).encode()
+
+
+def test_results_of_trials(fuzz, tmp_path):
+    def read(path):
+        trials = [Trial(("a",), None, path.parent, CONFIG, {}), Trial(("b",), 1, tmp_path / "b", CONFIG, {})]
+        (tmp_path / "b").mkdir(exist_ok=True)
+        (tmp_path / "b" / RESULT).write_bytes(_json(FINISHED))
+        rows = collect(trials, {})
+        markdown(rows)
+        write_csv(rows, tmp_path / "a.csv")
+
+    assert fuzz(read, lambda rng: _json(fuzz.values(FINISHED, rng)), RESULT, InputError, 250) > 100
+    assert fuzz(read, lambda rng: fuzz.damage(_json(FINISHED), rng), RESULT, InputError, 250) > 100
+
+
+def test_progress_of_trials(fuzz):
+    def read(path):
+        _standing(read_json(path))
+
+    assert fuzz(read, lambda rng: _json(fuzz.values(RUNS, rng)), PROGRESS, InputError) > 100
+    assert fuzz(read, lambda rng: fuzz.damage(_json(RUNS), rng), PROGRESS, InputError) > 100
+
+
+@pytest.mark.parametrize("damaged", ["trial.yaml", "budget.json"])
+def test_trials(fuzz, damaged):
+    budget = {"steps": 6}
+    text = {"trial.yaml": yaml.safe_dump(CONFIG, sort_keys=False).encode(), "budget.json": _json(budget)}
+    value = {"trial.yaml": CONFIG, "budget.json": budget}[damaged]
+
+    def read(path):
+        for name in text.keys() - {damaged}:
+            (path.parent / name).write_bytes(text[name])
+        Trial(("a",), None, path.parent, CONFIG, budget).write()
+
+    def refuses(path):
+        """Names the folder, where the file is whole and says something else."""
+        try:
+            read(path)
+        except InputError as error:
+            raise InputError(str(error).replace(f"{path.parent}: ", f"{path}: ")) from error
+
+    assert fuzz(refuses, lambda rng: fuzz.damage(text[damaged], rng), damaged, InputError, 300) > 60
+    assert fuzz(refuses, lambda rng: _json(fuzz.values(value, rng)), damaged, InputError, 300) > 200
+
+
+def test_yaml(fuzz):
+    good = yaml.safe_dump(CONFIG).encode()
+    assert fuzz(read_yaml, lambda rng: fuzz.damage(good, rng), "trial.yaml", InputError) > 100
+
+
+def test_tables_of_presets(fuzz, monkeypatch):
+    good = b"\n".join((WEIGHTS / "x4.csv").read_bytes().splitlines()[:6])
+
+    def read(path):
+        monkeypatch.setattr(presets, "_FOLDER", path.parent)
+        presets.choose(4, "balanced")
+
+    assert fuzz(read, lambda rng: fuzz.damage(good, rng), "x4.csv", cases=500) > 50
+
+
+def test_constants_of_the_error_model(fuzz):
+    good = (WEIGHTS / "scene_activity.json").read_bytes()
+    value = {name: json.loads(good)[name] for name in list(json.loads(good))[:2]}
+
+    def read(path):
+        for name in value:
+            read_error_model(path.with_name(name))
+
+    fuzz(read, lambda rng: fuzz.damage(_json(value), rng), "scene_activity.json", cases=500)
+    fuzz(read, lambda rng: _json(fuzz.values(value, rng)), "scene_activity.json", cases=500)
+
+
+def test_cache(fuzz):
+    """A damaged clip is no clip, and said so once; whoever writes the digest, too, gets what can be unpacked."""
+    key = "ab" * 32
+    arrays = {"spikes": np.zeros((4, 3, 2), "uint8"), "rgb": np.zeros((3, 6, 20), "float32")}
+    seen = []
+
+    def read(path):
+        cache = ClipCache(path.parent)
+        cache._path = lambda key: path
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            found = cache.load(key)
+        seen.append(found is None)
+        if found is None:
+            assert len(said) == 1
+            raise ValueError(str(said[0].message))
+
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+
+    def stored(data):
+        return _digest(key, memoryview(data)) + data
+
+    assert fuzz(read, lambda rng: fuzz.damage(stored(file.getvalue()), rng), "a.clip", cases=700) > 300
+    assert fuzz(read, lambda rng: stored(fuzz.damage(file.getvalue(), rng)), "a.clip", cases=700) > 300
+
+
+@pytest.fixture(name="training")
+def _training():
+    """A module, its trainer, and a checkpoint of one step."""
+    from pytorch_lightning import Trainer
+
+    from lightning_modules.networks import CSCSR
+    from lightning_modules.tasks.super_resolution import SuperResolution
+
+    torch.manual_seed(0)
+    small = {"scale": 2, "width": 4, "representation_width": 4, "features": 1, "stages": 1, "end_blocks": 1}
+    model = SuperResolution(CSCSR(**small))
+    trainer = Trainer(
+        max_steps=3, logger=False, accelerator="cpu", enable_progress_bar=False, enable_model_summary=False
+    )
+    made = model.configure_optimizers()
+    for parameter in model.network.parameters():
+        parameter.grad = torch.ones_like(parameter)
+    made["optimizer"].step()
+    made["lr_scheduler"]["scheduler"].step()
+    [saves] = [callback for callback in trainer.callbacks if isinstance(callback, ModelCheckpoint)]
+    content = {
+        "epoch": 0,
+        "global_step": 1,
+        "state_dict": model.state_dict(),
+        "loops": {"fit_loop": trainer.fit_loop.state_dict()},
+        "callbacks": {saves.state_key: {**saves.state_dict(), "best_model_score": torch.tensor(1.0)}},
+        "optimizer_states": [made["optimizer"].state_dict()],
+        "lr_schedulers": [made["lr_scheduler"]["scheduler"].state_dict()],
+    }
+    model.on_save_checkpoint(content)
+    return model, trainer, content
+
+
+def test_states_of_a_training(fuzz, training, tmp_path):
+    """What is let through can be trained on with."""
+    model, trainer, content = training
+    parts = [name for name in content if name not in ("state_dict", "network", "motion", "recipe")]
+
+    def read(path):
+        checkpoint = read_checkpoint(path)
+        check_training_state(checkpoint, path)
+        check_like_fresh(checkpoint, path, model, trainer)
+        made = model.configure_optimizers()
+        made["optimizer"].load_state_dict(checkpoint["optimizer_states"][0])
+        made["lr_scheduler"]["scheduler"].load_state_dict(checkpoint["lr_schedulers"][0])
+        made["optimizer"].step()
+        made["lr_scheduler"]["scheduler"].step()
+
+    def make(rng):
+        name = rng.choice(parts)
+        value = content[name]
+        if name == "optimizer_states" and rng.random() < 0.7:  # which is large, and its parts seldom met
+            state, key = value[0]["state"], rng.randrange(len(value[0]["state"]))
+            odd = rng.choice((torch.ones(3), torch.ones(0), torch.tensor(float("nan")), "a", None, 5, torch.ones(2, 2)))
+            value = [{**value[0], "state": {**state, key: {**state[key], rng.choice(list(state[key])): odd}}}]
+        else:
+            value = fuzz.values(value, rng)
+        torch.save({**content, name: value}, file := io.BytesIO())
+        return file.getvalue()
+
+    torch.save(content, tmp_path / "good.ckpt")
+    read(tmp_path / "good.ckpt")
+    assert fuzz(read, make, "bad.ckpt", cases=60) > 30
