@@ -38,6 +38,7 @@ class RecordingClips(Dataset[dict[str, Any]]):
         frame: N, or A:B or A:B:STEP: the frames in the middle of the clips, from A to B - 1, ``every`` apart where
             STEP is left out; all that a whole clip is around when not given.
         white: spikes a frame of a pixel that is shown white; see :class:`Recording`.
+        calibration: of the pixels; see :class:`Recording`.
 
     Attributes:
         size: (H, W) of a clip.
@@ -62,15 +63,15 @@ class RecordingClips(Dataset[dict[str, Any]]):
         camera: str | None = None,
         frame: str | None = None,
         white: float | None = None,
+        calibration: str | None = None,
     ) -> None:
         if every < 1:
             raise ValueError(f"every: expected at least 1 frame, got {every}")
         if white is not None and not 0 < white < float("inf"):
             raise ValueError(f"white: expected a finite number above 0, got {white}")
         self._white = white
-        self.recording = open_recording(
-            Namespace(file=Path(path), height=height, width=width, flip=flip, pattern=pattern, camera=camera)
-        )
+        known = {"height": height, "width": width, "flip": flip, "pattern": pattern, "camera": camera}
+        self.recording = open_recording(Namespace(file=Path(path), calibration=calibration, **known))
         total, (rows, columns) = self.recording.frames, self.recording.size
         if total < frames:
             raise ValueError(f"{path}: expected at least {frames} frames for a clip, got {total}")
@@ -109,7 +110,7 @@ class RecordingClips(Dataset[dict[str, Any]]):
         return white_rate(torch.stack([self._clip(middle).float().mean(0) for middle in looks]).mean(0))
 
     def _clip(self, middle: int) -> Tensor:
-        spikes = self.recording.read(middle - self.frames // 2, self.frames)
+        spikes = self.recording.correct_spikes(self.recording.read(middle - self.frames // 2, self.frames))
         return spikes[:, self.top :, self.left :].contiguous()
 
 
@@ -134,6 +135,8 @@ class Recording(LightningDataModule):
             out; all when not given.
         white: spikes a frame of a pixel that is shown white; less makes pictures brighter. When not given, that of the
             side-car, or else what 99.9 % of the pixels of the recording do not exceed, the same in all its pictures.
+        calibration: what spikekit calibrate measured of the pixels; the spikes are made those of an ideal sensor by it.
+            When not given, the recording's own, NAME.calibration.safetensors beside it; "none" for none.
     """
 
     def __init__(
@@ -149,6 +152,7 @@ class Recording(LightningDataModule):
         camera: str | None = None,
         frame: str | None = None,
         white: float | None = None,
+        calibration: str | None = None,
     ) -> None:
         super().__init__()
         self.path = path
@@ -163,6 +167,7 @@ class Recording(LightningDataModule):
             "camera": camera,
             "frame": frame,
             "white": white,
+            "calibration": calibration,
         }
 
     def setup(self, stage: str | None = None) -> None:

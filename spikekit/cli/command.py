@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from spikekit import __version__, bench, extremes
 from spikekit.arguments import FRAMES, UsageError, frames_of, one_line, positive, whole
+from spikekit.cli import calibrate as calibrate_cli
 from spikekit.cli import simulate as simulate_cli
 from spikekit.cli import view as view_cli
 from spikekit.color.cfa import PATTERNS
@@ -27,7 +28,7 @@ from spikekit.color.demosaic import demosaic
 from spikekit.decoders.methods import DECODERS, TFI_REACH
 from spikekit.io.files import iter_spikes
 from spikekit.io.images import write_picture
-from spikekit.io.recording import Recording, add_arguments, open_recording, white_rate
+from spikekit.io.recording import Recording, add_arguments, add_calibration, open_recording, white_rate
 from spikekit.io.sidecar import check_unclaimed
 from spikekit.io.video import PICTURE_ENDINGS
 
@@ -66,6 +67,10 @@ def info(args: argparse.Namespace) -> None:
     print(f"brightest    {_at(rates, rates.argmax())}")
     print(f"never fire   {dead} of {pixels} pixels, {dead / pixels:.2%}")
     print(f"always fire  {full} of {pixels} pixels, {full / pixels:.2%}")
+    if recording.calibration is not None:
+        known = recording.calibration
+        bad = int((known.defects != 0).sum())
+        print(f"calibration  gains {known.gain.std():.2%} apart, dark {known.dark.median():.2g} a frame, {bad} defects")
 
 
 def decode(args: argparse.Namespace) -> None:
@@ -95,10 +100,12 @@ def decode(args: argparse.Namespace) -> None:
     key = chosen[len(chosen) // 2]
     alpha = args.alpha or recording.alpha
     white, scaling = _white(alpha, recording, key, reach)
+    scaling += recording.said
     hidden = True if len(chosen) == 1 else None  # None: on a terminal only
     for n, plane in tqdm(_windows(recording, chosen, reach), "pictures", len(chosen), disable=hidden, leave=False):
         first, last = _span(n, reach, frames)
-        raw = torch.from_numpy(decoder.planes(plane, n, range(first, last + 1), frames, **options)) / white
+        raw = torch.from_numpy(decoder.planes(plane, n, range(first, last + 1), frames, **options))
+        raw = recording.correct(raw) / white
         picture = raw if recording.pattern is None else demosaic(raw, recording.pattern)
         _write(paths[n], recording.show(picture, known=alpha is not None))
     if len(chosen) == 1:
@@ -153,6 +160,7 @@ def _parser() -> argparse.ArgumentParser:
 
     verb = _add_verb(verbs, info, "info", "what a recording holds", "info street.dat --height 250 --width 400")
     add_arguments(verb)
+    add_calibration(verb)
 
     verb = _add_verb(
         verbs,
@@ -162,6 +170,7 @@ def _parser() -> argparse.ArgumentParser:
         "decode water.dat --height 1000 --width 1000 --flip --pattern BGGR --method tfi -o water.png",
     )
     add_arguments(verb)
+    add_calibration(verb)
     verb.add_argument(
         "--method",
         required=True,
@@ -213,6 +222,8 @@ def _parser() -> argparse.ArgumentParser:
 
     example = "simulate walk -o walk.dat --scale 4"
     simulate_cli.add_arguments(_add_verb(verbs, simulate_cli.run, "simulate", "a stream of a film", example))
+    example = "calibrate street.dat --height 250 --width 400 --flat wall.dat --dark cap.dat"
+    calibrate_cli.add_arguments(_add_verb(verbs, calibrate_cli.run, "calibrate", "gain and defects of pixels", example))
     example = "view walk.dat -o walk.html"
     view_cli.add_arguments(_add_verb(verbs, view_cli.run, "view", "a recording as a picture or a page", example))
     example = "extremes --operator tfi --markdown"
@@ -263,7 +274,7 @@ def _white(alpha: float | None, recording: Recording, key: int, reach: int) -> t
         return alpha, f"divided by alpha {alpha:g}"
     first, last = _span(key, reach, recording.frames)
     # Of the rate, not of the picture: TFI makes 1 or 1/2 of a bright pixel, and its percentile is one of the two.
-    white = white_rate(_counts(recording, first, last - first + 1) / (last - first + 1))
+    white = white_rate(recording.correct(_counts(recording, first, last - first + 1) / (last - first + 1)))
     scale = f"multiplied by {1 / white:.4g}"
     return white, f"{scale}, so that the 99.9th percentile of the spike rate around frame {key} is white"
 

@@ -122,16 +122,17 @@ class Moment:
     @property
     def white(self) -> float:
         """The value shown as white."""
-        return self.alpha or white_rate(self.rates)
+        return self.alpha or white_rate(self.recording.correct(self.rates))
 
     @property
     def said(self) -> str:
         """The value shown as white, in words."""
-        return f"alpha {self.alpha:g} is white" if self.alpha else f"{self.white:.3g} spikes a frame are white"
+        white = f"alpha {self.alpha:g} is white" if self.alpha else f"{self.white:.3g} spikes a frame are white"
+        return white + self.recording.said
 
     def picture(self, raw: Tensor) -> Tensor:
         """Return raw light as it is shown, (3, H, W) or (H, W)."""
-        light, pattern = raw / self.white, self.recording.pattern
+        light, pattern = self.recording.correct(raw) / self.white, self.recording.pattern
         colour = demosaic(light, pattern) if pattern and min(light.shape) >= 3 else light
         return fit(self.recording.show(colour, known=self.alpha is not None), _SIDE, _SIDE)
 
@@ -172,7 +173,7 @@ class Moment:
 
         # whole cells of the mosaic, so that colours do not matter, and less noise
         cells = [
-            gaussian(F.avg_pool2d(rate[None, :height, :width], 2)[0].numpy() / self.white, 1.5)
+            gaussian(F.avg_pool2d(self.recording.correct(rate)[None, :height, :width], 2)[0].numpy() / self.white, 1.5)
             for rate in (self._rate(self.frame - length, self.frame), self._rate(self.frame, self.frame + length))
         ]
         y, x = optical_flow_ilk(*cells, radius=9, prefilter=True)
@@ -279,6 +280,7 @@ def _span(text: str | None, recording: Recording) -> tuple[int, int]:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     recording.add_arguments(parser)
+    recording.add_calibration(parser)
     add = parser.add_argument
     add("-o", "--output", required=True, type=_output, metavar="OUT", help="what to write: .png, .gif or .html")
     add("--pattern", type=str.upper, choices=PATTERNS, help="Bayer phase after the flip, for colour")

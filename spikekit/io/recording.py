@@ -12,10 +12,13 @@ import torch
 from torch import Tensor
 
 from spikekit.arguments import UsageError, whole
+from spikekit.decoders.calibrated import correct_spikes
+from spikekit.io.calibration import ENDING, read_calibration
 from spikekit.io.cameras import CAMERAS, Camera, camera
 from spikekit.io.files import iter_spikes, read_spikes, spikes_shape
 from spikekit.io.formats import SpikeFileError
 from spikekit.io.sidecar import find_sidecar
+from spikekit.sensor.calibration import Calibration
 
 #: (height, width) of what the field's headerless recordings come from.
 USUAL_SIZES = {
@@ -39,6 +42,7 @@ class Recording:
         pattern: Bayer phase of what is read; ``None`` for grey.
         alpha: light of a white pixel per clock, where it is known.
         camera: where it is known.
+        calibration: that of the pixels that are read, where it is known.
     """
 
     path: Path
@@ -48,6 +52,7 @@ class Recording:
     pattern: str | None = None
     alpha: float | None = None
     camera: Camera | None = None
+    calibration: Calibration | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -71,6 +76,19 @@ class Recording:
         """Return the pixels (H, W) of a packed frame."""
         bits = np.unpackbits(plane, axis=-1, count=self.stored[1], bitorder="little")
         return self.prepare(torch.from_numpy(bits)).numpy()
+
+    def correct(self, raw: Tensor) -> Tensor:
+        """Return rates (*, H, W), in spikes a clock, as an ideal sensor would have them."""
+        return raw if self.calibration is None else self.calibration.correct(raw, self.pattern)
+
+    def correct_spikes(self, spikes: Tensor) -> Tensor:
+        """Return spikes (*, T, H, W) as an ideal sensor would have fired them."""
+        return spikes if self.calibration is None else correct_spikes(spikes, self.calibration, self.pattern)
+
+    @property
+    def said(self) -> str:
+        """What is corrected, in words that follow others."""
+        return "" if self.calibration is None else ", pixels corrected by its calibration"
 
     def show(self, picture: Tensor, *, known: bool) -> Tensor:
         """Return light as it is shown; the gain of the camera is for light whose white is known, not guessed."""
@@ -99,13 +117,41 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_calibration(parser: argparse.ArgumentParser) -> None:
+    """Add what names a calibration."""
+    parser.add_argument(
+        "--calibration",
+        metavar="FILE",
+        help="gain, dark rate and defects of the pixels, from spikekit calibrate, to correct pictures by; "
+        f"the recording's own, NAME{ENDING} beside it, if not given; none for none",
+    )
+
+
 def open_recording(args: argparse.Namespace) -> Recording:
-    """Return the recording of the arguments, with what its side-car or its camera knows.
+    """Return the recording of the arguments, with what its side-car, its camera and its calibration know.
 
     Raises:
         UsageError: a headerless file whose size nobody knows, or a camera and a size as well.
-        ValueError: a file that cannot be read, or is not of the camera.
+        ValueError: a file that cannot be read, or is not of the camera; a calibration of another sensor.
     """
+    recording = _described(args)
+    asked = getattr(args, "calibration", None)
+    file = own_calibration(recording.path) if asked is None else Path(asked)
+    if asked == "none" or (asked is None and not file.is_file()):
+        return recording
+    calibration = read_calibration(file)
+    if calibration.size != tuple(recording.size):
+        sizes = " x ".join(map(str, recording.size)), " x ".join(map(str, calibration.size))
+        raise ValueError(f"{file}: expected {sizes[0]} pixels as {recording.path} has them, got {sizes[1]}")
+    return replace(recording, calibration=calibration.flip() if recording.flip else calibration)
+
+
+def own_calibration(path: Path) -> Path:
+    """Return where the calibration of a recording lies."""
+    return path.with_suffix(ENDING)
+
+
+def _described(args: argparse.Namespace) -> Recording:
     path, pattern = args.file, getattr(args, "pattern", None)
     if args.camera is not None:
         if args.flip or not args.height is args.width is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from spikekit._renamed import renamed_argument
 from spikekit.check import check_positive, check_whole
+from spikekit.sensor.calibration import DEAD, HOT, WORKS, Calibration
 
 # Each has its own random numbers. The place in the list tells them apart: append, never reorder.
 _PURPOSES = ("charge", "gain", "dark current", "defects", "photons", "electrons")
@@ -67,10 +68,13 @@ class SensorNoise:
         gain_spread: :math:`\sigma_g`, standard deviation of the gain between pixels: fixed-pattern noise.
         hot: share of pixels that always fire.
         dead: share of pixels that never fire.
+        calibration: gain, dark current and defects of a sensor that was measured, instead of chance; then the spreads
+            and shares above are 0.
 
     Raises:
         ValueError: a number of photons that is not above 0, a negative or infinite one elsewhere, shares of hot and
-            dead pixels that together exceed 1, a spread of a dark current of 0.
+            dead pixels that together exceed 1, a spread of a dark current of 0, a calibration with what it would
+            replace.
 
     Example:
         The constants of Hu et al. for a camera of 250 x 400 pixels at 20 kHz, which are bare numbers, read as fF, V and
@@ -97,6 +101,7 @@ class SensorNoise:
     gain_spread: float = 0.0
     hot: float = 0.0
     dead: float = 0.0
+    calibration: Calibration | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if self.photons is not None:
@@ -109,6 +114,9 @@ class SensorNoise:
             raise ValueError(f"hot, dead: expected shares that add up to 1 at most, got {self.hot}, {self.dead}")
         if self.dark_spread and not self.dark_current:
             raise ValueError(f"dark_spread: expected a dark_current above 0 with it, got {self.dark_spread} of none")
+        drawn = [name for name in ("dark_current", "gain_spread", "hot", "dead") if getattr(self, name)]
+        if self.calibration is not None and drawn:
+            raise ValueError(f"{drawn[0]}: expected 0, as the calibration has it, got {getattr(self, drawn[0])}")
 
     def spike_changes(self, light: float, frames: int) -> dict[str, SpikeChange]:
         r"""Tell how much each source that is on changes a clip, without simulating it.
@@ -165,7 +173,20 @@ class SensorNoise:
             changes["hot"] = SpikeChange(self.hot * (1 - rate) * frames, self.hot * (1 - rate))
         if self.dead:
             changes["dead"] = SpikeChange(self.dead * rate * frames, self.dead * rate)
+        if self.calibration is not None:
+            changes["calibration"] = self._measured_change(light, frames)
         return changes
+
+    def _measured_change(self, light: float, frames: int) -> SpikeChange:
+        """What the pixels that were measured change: the mean over them of the errors that each has."""
+        known, rate = self.calibration, min(1.0, light)
+        works = known.defects == WORKS
+        noisy = torch.where(works, (known.gain * light + known.dark).clamp(max=1), (known.defects == HOT).float())
+        error = torch.where(works, known.gain * light + known.dark, noisy).sub(light).abs()
+        most = torch.where(works, (rate + noisy).clamp(max=1), (noisy - rate).abs())
+        growing = torch.where(works, error, most)
+        share = sum(((2 * clock + 1) * growing).minimum(most).mean().item() for clock in range(frames)) / frames
+        return SpikeChange(frames * error.mean().item(), share)
 
     @renamed_argument("tolerance", "spike_tolerance")
     def required(self, light: float, frames: int, spike_tolerance: float) -> SensorNoise:
@@ -192,7 +213,7 @@ class SensorNoise:
         off = {source for source, change in changes.items() if change.share <= spike_tolerance}
         if "dark_current" in off:
             off.add("dark_spread")
-        return replace(self, **{field.name: field.default for field in fields(self) if field.name in off})
+        return replace(self, **{source.name: source.default for source in fields(self) if source.name in off})
 
 
 def random_numbers(seed: int, purpose: str, clock: int = 0) -> np.random.Generator:
@@ -210,17 +231,23 @@ class NoisyPixels:
     """
 
     def __init__(self, noise: SensorNoise, size: tuple[int, ...], seed: int) -> None:
+        if noise.calibration is not None and noise.calibration.size != tuple(size[-2:]):
+            expected, got = noise.calibration.size, tuple(size[-2:])
+            raise ValueError(
+                f"light: expected {expected[0]} x {expected[1]} of the calibration, got {got[0]} x {got[1]}"
+            )
         self.noise, self.size, self.seed = noise, size, seed
 
     def charge(self, light: Tensor, threshold: float, clock: int) -> Tensor:
         """Return what the pixels integrate of light (*, T, H, W), whose first frame is that of ``clock``."""
         noise = self.noise
-        if noise.photons is None and not noise.dark_current and not noise.gain_spread:
+        known = noise.calibration
+        if noise.photons is None and known is None and not noise.dark_current and not noise.gain_spread:
             return light
         charge = light.detach().to(torch.promote_types(light.dtype, torch.float32), copy=True)
         quantum = threshold / (noise.photons or math.inf)
-        gain = torch.from_numpy(self._gain).to(charge) if noise.gain_spread else None
-        dark = torch.from_numpy(self._dark * threshold) if noise.dark_current else None
+        gain = torch.from_numpy(self._gain).to(charge) if noise.gain_spread or known else None
+        dark = torch.from_numpy(self._dark * threshold) if noise.dark_current or known else None
         for t, now in enumerate(charge.unbind(-3), clock):
             if noise.photons is not None:
                 now.copy_(_arrive(now, quantum, random_numbers(self.seed, "photons", t)))
@@ -238,14 +265,22 @@ class NoisyPixels:
             if share:
                 fails = self._defects < share if bit else self._defects >= 1 - share
                 spikes.masked_fill_(torch.from_numpy(fails).to(spikes.device).unsqueeze(-3), bit)
+        if self.noise.calibration is not None:
+            for kind, bit in ((HOT, 1), (DEAD, 0)):
+                fails = self.noise.calibration.defects == kind
+                spikes.masked_fill_(fails.to(spikes.device).unsqueeze(-3), bit)
         return spikes
 
     @cached_property
     def _gain(self) -> np.ndarray:
+        if self.noise.calibration is not None:
+            return self.noise.calibration.gain.numpy()
         return self._around_one("gain", self.noise.gain_spread)
 
     @cached_property
     def _dark(self) -> np.ndarray:
+        if self.noise.calibration is not None:
+            return self.noise.calibration.dark.numpy()
         return self.noise.dark_current * self._around_one("dark current", self.noise.dark_spread)
 
     @cached_property

@@ -4,12 +4,16 @@ import torch
 from lightning_modules.__main__ import main
 from lightning_modules.data import Recording, RecordingClips
 from spikekit import (
+    Calibration,
+    SensorNoise,
     SpikeFileError,
+    SpikeSensor,
     bayer_mask,
     mosaic,
     read_picture,
     simulate_spikes,
     split_bayer,
+    write_calibration,
     write_picture,
     write_spikes,
 )
@@ -149,3 +153,26 @@ def test_errors(tmp_path, spikes):
         RecordingClips(str(tmp_path / "none.dat"), 6, 10)
     with pytest.raises(ValueError, match="every"):
         RecordingClips(str(path), 6, 10, every=0)
+
+
+def test_a_calibration_beside_the_recording_makes_ideal_spikes(tmp_path):
+    defects = torch.zeros(6, 10, dtype=torch.uint8)
+    defects[3, 4] = 2
+    gain = torch.linspace(0.5, 1.5, 10).repeat(6, 1)
+    sensor = Calibration(gain, torch.zeros(6, 10), defects)
+    spikes = SpikeSensor(SensorNoise(calibration=sensor)).expose(torch.full((70, 6, 10), 0.2))
+    write_spikes(tmp_path / "clip.npz", spikes)
+    path = str(tmp_path / "clip.npz")
+    (before,) = RecordingClips(path, every=60)
+    write_calibration(tmp_path / "clip.calibration.safetensors", sensor)
+    (after,) = RecordingClips(path, every=60)
+    (without,) = RecordingClips(path, every=60, calibration="none")
+    assert before["spikes"].equal(without["spikes"])
+    assert before["spikes"].equal(spikes[before["frame"] - 20 :][:41])
+    assert (after["spikes"].sum(0) - 41 * 0.2).abs().max() < 2
+    assert (before["spikes"].sum(0) - 41 * 0.2).abs().max() > 30
+    assert after["white"] < 0.3
+    data = Recording(path, every=60, calibration=str(tmp_path / "clip.calibration.safetensors"))
+    data.setup("predict")
+    (batch,) = data.predict_dataloader()
+    assert batch["spikes"][0].equal(after["spikes"])

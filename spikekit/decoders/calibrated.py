@@ -1,0 +1,58 @@
+"""Spikes of a real sensor made those of an ideal one."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from spikekit.check import check_planes, default_float
+from spikekit.decoders.dense import tfi
+from spikekit.sensor.calibration import Calibration
+from spikekit.sensor.integrate_fire import spike_integrate_fire
+
+_GOLDEN = (math.sqrt(5) - 1) / 2
+_ROUNDING = 1e-4  # of a threshold: what sums of light may lack of one
+
+
+def correct_spikes(spikes: Tensor, calibration: Calibration, pattern: str | None = None) -> Tensor:
+    r"""Fire anew what an ideal sensor would have fired, for networks, which take spikes and not light.
+
+    .. math:: \hat I_n = \text{corrected } 1 / \Psi_n, \quad \hat S = \text{spikes of } \hat I
+
+    Convention:
+        The light at every clock is that of :func:`spikekit.tfi`, which brings one threshold between any two spikes,
+        corrected by :meth:`Calibration.correct`, and exposed by :func:`spikekit.spike_integrate_fire`. The charge at
+        the beginning is such that a pixel fires where it first did. A pixel without error keeps its spikes, bit for
+        bit, one that is dead or hot gets those of the mean light of its neighbours. No gradient.
+
+    Args:
+        spikes: zeros and ones, :math:`(*, T, H, W)`.
+        calibration: that of the sensor.
+        pattern: Bayer phase; ``None`` for a grey sensor.
+
+    Returns:
+        Zeros and ones of the same shape and dtype.
+
+    Raises:
+        TypeError: ``spikes`` is not a tensor of real numbers.
+        ValueError: fewer than three dimensions, or another size than that of the calibration.
+
+    Example:
+        >>> spikes = torch.tensor([0, 1, 0, 0, 1, 0, 0, 1, 0, 0]).reshape(10, 1, 1)
+        >>> sensor = Calibration(torch.full((1, 1), 0.5), torch.zeros(1, 1), torch.zeros(1, 1, dtype=torch.uint8))
+        >>> correct_spikes(spikes, sensor).flatten().tolist()
+        [1, 1, 0, 1, 1, 0, 1, 1, 0, 1]
+    """
+    check_planes("spikes", spikes, 3, "(*, T, H, W)")
+    fired = spikes != 0
+    light = calibration.correct(tfi(fired, dtype=torch.promote_types(default_float(spikes), torch.float32)), pattern)
+    first = fired.byte().argmax(-3, keepdim=True)
+    until = light.cumsum(-3).gather(-3, first).squeeze(-3)
+    charge = (1 - until + _ROUNDING) % 1
+    place = torch.arange(charge.shape[-2] * charge.shape[-1], device=spikes.device).reshape(charge.shape[-2:])
+    filled = (calibration.defects != 0).to(spikes.device)
+    charge = torch.where(filled, place * _GOLDEN % 1, charge)
+    again, _ = spike_integrate_fire(light, charge=charge, dtype=torch.uint8)
+    return torch.where(calibration.ideal.to(spikes.device), spikes, again.to(spikes.dtype))

@@ -1,0 +1,80 @@
+"""Calibrations in files: safetensors beside the recordings of a sensor."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from spikekit.arguments import one_line
+from spikekit.io.whole_file import whole_file
+from spikekit.sensor.calibration import Calibration
+
+#: What a recording's own calibration is called: its name with this ending.
+ENDING = ".calibration.safetensors"
+
+_KIND = "spikekit calibration 1"
+_PLANES = {"gain": "F32", "dark": "F32", "defects": "U8"}
+_MOST_PIXELS = 1 << 27
+
+
+def write_calibration(path: str | Path, calibration: Calibration) -> None:
+    """Write a calibration, whole or not at all.
+
+    Args:
+        path: where to; it ends in .safetensors.
+        calibration: that of a sensor. Commands keep its rows as recordings are stored, before any flip.
+
+    Raises:
+        ValueError: another ending.
+        OSError: the file cannot be written.
+
+    Example:
+        >>> import tempfile, torch
+        >>> planes = torch.ones(4, 6), torch.zeros(4, 6), torch.zeros(4, 6, dtype=torch.uint8)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_calibration(f"{folder}/street.calibration.safetensors", Calibration(*planes))
+        ...     read_calibration(f"{folder}/street.calibration.safetensors").size
+        (4, 6)
+    """
+    if Path(path).suffix != ".safetensors":
+        raise ValueError(f"{path}: expected a name that ends in .safetensors")
+    planes = {name: getattr(calibration, name).contiguous() for name in _PLANES}
+    with whole_file(path) as file:
+        file.write(save(planes, {"kind": _KIND}))
+
+
+def read_calibration(path: str | Path) -> Calibration:
+    """Read a calibration; nothing in the file is run, and no more is read than it says and holds.
+
+    Args:
+        path: what :func:`write_calibration` or ``spikekit calibrate`` wrote.
+
+    Returns:
+        The calibration, its rows as they were written.
+
+    Raises:
+        ValueError: the file cannot be read, is damaged, is of something else, or its values make no sense; the message
+            is one line and names the file.
+
+    Example:
+        >>> read_calibration("street.calibration.safetensors")
+        Traceback (most recent call last):
+        ValueError: street.calibration.safetensors: not a calibration that can be read (No such file or directory...
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            kind = (file.metadata() or {}).get("kind")
+            if kind != _KIND:
+                raise ValueError(f"expected {_KIND}, got {str(kind)[:80]}")
+            parts = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118
+            stored = {name: (part.get_dtype(), tuple(part.get_shape())) for name, part in parts.items()}
+            size = stored.get("gain", (None, ()))[1]
+            if stored != {name: (dtype, size) for name, dtype in _PLANES.items()}:
+                raise ValueError(f"expected gain, dark and defects of one size, got {str(stored)[:200]}")
+            if len(size) != 2 or not 0 < size[0] * size[1] <= _MOST_PIXELS:
+                raise ValueError(f"expected (H, W) of at most {_MOST_PIXELS} pixels, got {size}")
+            return Calibration(**{name: file.get_tensor(name) for name in _PLANES})
+    except (SafetensorError, OSError, ValueError) as error:
+        raise ValueError(f"{path}: not a calibration that can be read ({one_line(error)[:300]})") from error

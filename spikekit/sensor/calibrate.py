@@ -1,0 +1,144 @@
+"""Measure the pixels of a sensor: from dark and flat recordings, or from a scene alone."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from spikekit.sensor.calibration import DEAD, HOT, Calibration, colors
+from spikekit.sensor.pixel_rates import PixelRates
+
+_LEAST_SPIKES = 10  # of a pixel's neighbours, before its silence says that it is dead
+_DEAD_GAIN = 0.1  # of that of other pixels
+_HOT_RATE = 0.5  # in the dark
+_ALWAYS = 0.99  # spikes a clock of a pixel that fires whatever the light is
+
+_NEAR = 5  # side of the window that a pixel of a scene is compared with, in pixels of its colour
+
+
+class Measured(NamedTuple):
+    """A calibration, and how exact it is.
+
+    Args:
+        calibration: that of the sensor.
+        gain_error: standard error of a pixel's gain; ``None`` where it was not measured.
+        dark_error: that of its dark rate; likewise.
+    """
+
+    calibration: Calibration
+    gain_error: float | None = None
+    dark_error: float | None = None
+
+
+def calibrate(
+    flat: tuple[PixelRates, PixelRates] | None,
+    dark: tuple[PixelRates, PixelRates] | None,
+    pattern: str | None = None,
+) -> Measured:
+    r"""Measure the pixels in even light and in the dark.
+
+    .. math:: d = r_\text{dark}, \quad g = \frac{r_\text{flat} - d}{\mathrm{E}_C (r_\text{flat} - d)}
+
+    Convention:
+        The mean is over the pixels of a colour that work. A pixel is hot if it fires in half of the dark clocks or in
+        nearly all of the flat ones, dead if its gain is less than a tenth of the others'. Without one of the
+        recordings, there is no dark current, or gains are 1.
+
+        Errors are told by the two halves of a recording: the root mean square of what they differ by, halved. That is
+        right where light or charge come in single electrons, and more than the error where they come evenly.
+
+    Args:
+        flat: rates of both halves of a recording in even light.
+        dark: likewise in the dark.
+        pattern: Bayer phase; ``None`` for a grey sensor.
+
+    Returns:
+        What was measured.
+
+    Raises:
+        ValueError: neither recording, recordings of other sizes, a flat one that is no brighter than the dark one or
+            so bright that its pixels are saturated.
+    """
+    sizes = {tuple(halves[0].count.shape) for halves in (flat, dark) if halves is not None}
+    if len(sizes) != 1:
+        raise ValueError(f"expected a flat or a dark recording, or both of one size, got sizes {sorted(sizes)}")
+    size = next(iter(sizes))
+    leak, gain = torch.zeros(size, dtype=torch.float64), torch.ones(size, dtype=torch.float64)
+    defects = torch.zeros(size, dtype=torch.uint8)
+    gain_error = dark_error = None
+    if dark is not None:
+        leak = (dark[0] + dark[1]).rate
+        defects[leak >= _HOT_RATE] = HOT
+        dark_error = _error(dark[0].rate, dark[1].rate, defects == 0)
+    if flat is not None:
+        whole = flat[0] + flat[1]
+        brightness = whole.rate.median().item()
+        if brightness >= _ALWAYS:
+            raise ValueError(f"expected a flat recording whose pixels are not saturated, got {brightness:.3g} a clock")
+        light = whole.rate - leak
+        if light.median() <= 0:
+            raise ValueError(f"expected a flat recording brighter than the dark one, got {brightness:.3g} a clock")
+        defects[whole.rate >= _ALWAYS] = HOT
+        errors = []
+        for pixels in map(torch.from_numpy, colors(size, pattern)):
+            works = pixels & (defects == 0)
+            defects[works & (light < _DEAD_GAIN * light[works].median())] = DEAD
+            works = pixels & (defects == 0)
+            mean = light[works].mean()
+            gain[works] = light[works] / mean
+            errors.append(_error(flat[0].rate, flat[1].rate, works) / mean.item())
+        gain_error = float(np.mean(errors))
+    leak[defects != 0] = 0
+    return Measured(Calibration(gain.float(), leak.float(), defects), gain_error, dark_error)
+
+
+def _error(one: Tensor, other: Tensor, works: Tensor) -> float:
+    """Return the standard error of the mean of two halves."""
+    return (one - other)[works].square().mean().sqrt().item() / 2
+
+
+def find_defects(scene: PixelRates, pattern: str | None = None) -> Measured:
+    """Find dead and hot pixels by their neighbours, in a recording of any scene.
+
+    Convention:
+        A pixel is dead if it fires less than a tenth as often as the median of the pixels of its colour around it,
+        which fire at least ten times, and hot if it fires at nearly every clock where they do so at less than half.
+        Gains stay 1: from a scene alone they cannot be told from its texture.
+
+    Args:
+        scene: rates of a recording.
+        pattern: Bayer phase; ``None`` for a grey sensor.
+
+    Returns:
+        What was found.
+    """
+    size = tuple(scene.count.shape)
+    defects = torch.zeros(size, dtype=torch.uint8)
+    for place in _lattices(size, pattern):
+        rate = scene.rate[place]
+        around = _median_around(rate)
+        dead = (around * scene.frames >= _LEAST_SPIKES) & (rate < _DEAD_GAIN * around)
+        hot = (rate >= _ALWAYS) & (around < 0.5)
+        defects[place] = dead.byte() * DEAD + hot.byte() * HOT
+    return Measured(Calibration(torch.ones(size), torch.zeros(size), defects))
+
+
+def _lattices(size: tuple[int, int], pattern: str | None) -> list[tuple[slice, slice]]:
+    """Return where neighbours of one colour lie side by side."""
+    if pattern is None:
+        return [(slice(None), slice(None))]
+    starts = [(row, column) for row in range(min(2, size[0])) for column in range(min(2, size[1]))]
+    return [(slice(row, None, 2), slice(column, None, 2)) for row, column in starts]
+
+
+def _median_around(plane: Tensor) -> Tensor:
+    """Median over a window, without the pixel in its middle."""
+    half = _NEAR // 2
+    padded = F.pad(plane[None, None], (half, half, half, half), mode="replicate")
+    windows = F.unfold(padded, _NEAR)[0]
+    others = torch.cat([windows[: _NEAR**2 // 2], windows[_NEAR**2 // 2 + 1 :]])
+    return others.median(dim=0).values.reshape(plane.shape)

@@ -1,0 +1,147 @@
+"""What is known of every pixel of one sensor: gain, dark rate and defects, and pictures corrected by it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from spikekit.check import check_planes
+from spikekit.color.cfa import bayer_sites
+
+#: What ``Calibration.defects`` holds: the pixel works, does not see light, or fires whatever the light is.
+WORKS, DEAD, HOT = 0, 1, 2
+
+_NEIGHBORS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    r"""What the pixels of one sensor make of light.
+
+    .. math:: r = g I + d, \qquad \hat I = \max(0, (r - d) / g)
+
+    Convention:
+        r is how often a pixel fires per clock in light I, g its gain and d its dark rate, all for a threshold of 1:
+        the mean of :class:`SensorNoise`. Gains are relative: their mean is 1 over the pixels of a colour. The light of
+        a pixel that is dead or hot is taken from the four nearest pixels of its colour that work, each weighted by the
+        inverse of its distance.
+
+    Args:
+        gain: g, (H, W), above 0.
+        dark: d, (H, W), in spikes a clock, 0 or more.
+        defects: (H, W), uint8: 0 for a pixel that works, 1 for a dead one, 2 for a hot one.
+
+    Raises:
+        ValueError: planes of other sizes or types, or values out of range; the message names them.
+
+    Example:
+        >>> gain = torch.tensor([[1.25, 0.75, 1.0]])
+        >>> calibration = Calibration(gain, torch.zeros(1, 3), torch.tensor([[0, 0, 1]], dtype=torch.uint8))
+        >>> calibration.correct(torch.tensor([[0.5, 0.3, 0.0]]))
+        tensor([[0.4000, 0.4000, 0.4000]])
+
+    Reference:
+        Flat-field correction; Gao et al., The analysis and suppressing of non-uniformity in a high-speed spike-based
+        image sensor, Sensors 18(12), 4232, 2018.
+    """
+
+    gain: Tensor
+    dark: Tensor
+    defects: Tensor
+    _fills: dict[str | None, tuple[Tensor, Tensor, Tensor]] = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        kinds = {"gain": torch.float32, "dark": torch.float32, "defects": torch.uint8}
+        for name, kind in kinds.items():
+            plane = getattr(self, name)
+            check_planes(name, plane, 2, "(H, W)")
+            if plane.shape != self.gain.shape or plane.ndim != 2 or plane.dtype != kind:
+                got = f"{tuple(plane.shape)} of {plane.dtype}"
+                raise ValueError(f"{name}: expected (H, W) of {kind}, all of one size, got {got}")
+        for name, good in {
+            "gain": (self.gain > 0) & self.gain.isfinite(),
+            "dark": (self.dark >= 0) & self.dark.isfinite(),
+            "defects": self.defects <= HOT,
+        }.items():
+            if not good.all():
+                expected = {
+                    "gain": "finite numbers above 0",
+                    "dark": "finite numbers, 0 or more",
+                    "defects": "0, 1 or 2",
+                }
+                raise ValueError(f"{name}: expected {expected[name]}, got {getattr(self, name)[~good][0].item():g}")
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W) of the sensor."""
+        return tuple(self.gain.shape)
+
+    @property
+    def ideal(self) -> Tensor:
+        """Which pixels need no correction, (H, W)."""
+        return (self.gain == 1) & (self.dark == 0) & (self.defects == WORKS)
+
+    def flip(self) -> Calibration:
+        """Return that of the sensor upside down."""
+        return Calibration(*(plane.flip(0) for plane in (self.gain, self.dark, self.defects)))
+
+    def correct(self, raw: Tensor, pattern: str | None = None) -> Tensor:
+        """Return the light of an ideal sensor.
+
+        Args:
+            raw: rates (*, H, W), in spikes a clock, as decoders give them.
+            pattern: Bayer phase; ``None`` for a grey sensor.
+
+        Raises:
+            TypeError: ``raw`` is not a floating-point tensor.
+            ValueError: another size, or no pixel of a colour that works.
+        """
+        check_planes("raw", raw, 2, "(*, H, W)", floating=True)
+        if tuple(raw.shape[-2:]) != self.size:
+            raise ValueError(f"raw: expected (*, {self.size[0]}, {self.size[1]}), got {tuple(raw.shape)}")
+        light = ((raw - self.dark.to(raw)) / self.gain.to(raw)).clamp(min=0)
+        if pattern not in self._fills:
+            self._fills[pattern] = _nearest_that_work(self.defects.numpy() != WORKS, pattern)
+        bad, near, weight = (part.to(raw.device) for part in self._fills[pattern])
+        if len(bad):
+            pixels = light.flatten(-2)
+            pixels[..., bad] = (pixels[..., near] * weight.to(raw)).sum(-1)
+        return light
+
+
+def _nearest_that_work(bad: np.ndarray, pattern: str | None) -> tuple[Tensor, Tensor, Tensor]:
+    """For every defective pixel the nearest ones of its colour that work, and their weights, which add up to 1."""
+    from scipy.spatial import cKDTree
+
+    places, near, weights = [], [], []
+    for pixels in colors(bad.shape, pattern):
+        wrong, right = np.argwhere(pixels & bad), np.argwhere(pixels & ~bad)
+        if not len(wrong):
+            continue
+        if not len(right):
+            raise ValueError("defects: expected pixels of every colour that work, got none of one")
+        count = min(_NEIGHBORS, len(right))
+        distance, index = cKDTree(right).query(wrong, list(range(1, count + 1)))
+        places.append(np.ravel_multi_index(wrong.T, bad.shape))
+        found = np.zeros((2, len(wrong), _NEIGHBORS))
+        found[0, :, :count] = np.ravel_multi_index(right[index].transpose(2, 0, 1), bad.shape)
+        found[1, :, :count] = 1 / distance
+        near.append(found[0])
+        weights.append(found[1] / found[1].sum(-1, keepdims=True))
+    if not places:
+        return torch.empty(0, dtype=torch.long), torch.empty(0, _NEIGHBORS, dtype=torch.long), torch.empty(0)
+    joined = [torch.from_numpy(np.concatenate(parts)) for parts in (places, near, weights)]
+    return joined[0], joined[1].long(), joined[2]
+
+
+def colors(size: tuple[int, int], pattern: str | None) -> list[np.ndarray]:
+    """Return which pixels (H, W) see each colour: R, G and B, or all of them on a grey sensor."""
+    if pattern is None:
+        return [np.ones(size, bool)]
+    masks = [np.zeros(size, bool) for _ in range(3)]
+    for colour, row, column in bayer_sites(pattern):
+        masks[colour][row::2, column::2] = True
+    return masks

@@ -1,0 +1,169 @@
+"""``spikekit calibrate``: measured, kept beside the recording, and used by the commands that make pictures."""
+
+import os
+import resource
+from argparse import Namespace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from spikekit import Calibration, SensorNoise, SpikeSensor, read_calibration, read_picture, write_calibration
+from spikekit import write_spikes as write
+from spikekit.cli.command import main
+from spikekit.io.calibration import ENDING
+from spikekit.io.recording import open_recording
+from spikekit.sensor.calibration import DEAD, HOT
+
+SIZE = 24, 32
+HOW = ["--height", "24", "--width", "32", "--flip", "--pattern", "BGGR"]
+
+
+@pytest.fixture(name="truth", scope="module")
+def _truth():
+    defects = torch.zeros(SIZE, dtype=torch.uint8)
+    defects[5, 7], defects[20, 3] = DEAD, HOT
+    gain = 1 + 0.1 * torch.randn(SIZE, generator=torch.Generator().manual_seed(0)).clamp(-2, 2)
+    return Calibration(gain, torch.full(SIZE, 0.01), defects)
+
+
+@pytest.fixture(autouse=True)
+def _camera(tmp_path, monkeypatch, truth):
+    """A recording of a wall, one of a scene and one with the cap on, by a camera that stores frames upside down."""
+    monkeypatch.chdir(tmp_path)
+    sensor = SpikeSensor(SensorNoise(calibration=truth))
+    write("wall.dat", sensor.expose(torch.full((300, *SIZE), 0.3)), flip=True)
+    write("cap.dat", sensor.expose(torch.zeros(500, *SIZE)), flip=True)
+    write("scene.dat", sensor.expose(torch.linspace(0.1, 0.4, 32).expand(300, *SIZE)), flip=True)
+
+
+def measured():
+    assert main(["calibrate", "scene.dat", *HOW, "--flat", "wall.dat", "--dark", "cap.dat"]) == 0
+
+
+def test_it_lies_beside_the_recording_and_is_told(capsys, truth):
+    measured()
+    said = capsys.readouterr().out
+    assert "gain         9." in said
+    assert "dark rate    0.01 spikes a frame" in said
+    assert "dead         1 of 768 pixels\nhot          1 of 768 pixels" in said
+    assert "scene.calibration.safetensors: flat 300 frames, dark 500 frames" in said
+    stored = read_calibration(f"scene{ENDING}")
+    assert stored.flip().defects.equal(truth.defects), "rows as they are stored"
+
+
+@pytest.mark.parametrize("command", [["decode", "--method", "tfp"], ["decode", "--method", "tfi"], ["view"]])
+def test_pictures_are_corrected(command, capsys):
+    verb, *method = command
+    run = [verb, "scene.dat", *HOW, *method, "--alpha", "0.4"]
+    assert main([*run, "-o", "before.png"]) == 0
+    assert "corrected" not in capsys.readouterr().out
+    measured()
+    assert main([*run, "-o", "after.png"]) == 0
+    assert "pixels corrected by its calibration" in capsys.readouterr().out
+    assert main([*run, "--calibration", "none", "-o", "without.png"]) == 0
+    assert read_picture("without.png").equal(read_picture("before.png"))
+    if verb == "decode":
+        ramp = torch.linspace(0.25, 1, 32).expand(3, *SIZE)
+        error, corrected = ((read_picture(f"{name}.png") - ramp).square().mean() for name in ("before", "after"))
+        assert corrected < error * (0.4 if "tfp" in method else 0.7)  # light between 1/2 and 1/3 is rounded by tfi
+
+
+def test_another_file_and_rows_that_are_not_turned(truth):
+    measured()
+    os.rename(f"scene{ENDING}", "camera.safetensors")
+    known = {"camera": None, "height": 24, "width": 32}
+    for flip in (False, True):
+        args = Namespace(file=Path("wall.dat"), calibration="camera.safetensors", flip=flip, **known)
+        defects = open_recording(args).calibration.defects
+        assert defects.equal(truth.defects if flip else truth.defects.flip(0))
+
+
+def test_info_tells_of_it(capsys):
+    measured()
+    assert main(["info", "scene.dat", "--height", "24", "--width", "32"]) == 0
+    assert "calibration  gains 9." in capsys.readouterr().out
+
+
+def test_a_scene_alone_tells_defects(capsys, truth):
+    assert main(["calibrate", "scene.dat", *HOW, "-o", "alone.safetensors"]) == 0
+    found = read_calibration("alone.safetensors").flip()
+    assert found.defects.equal(truth.defects)
+    assert (found.gain == 1).all()
+    assert "gain" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("args", "status", "said"),
+    [
+        (
+            ["scene.dat", *HOW, "--flat", "cap.dat", "--dark", "wall.dat"],
+            1,
+            "cap.dat: expected a flat recording",
+        ),
+        (["scene.dat", *HOW, "--flat", "none.dat"], 1, "none.dat: no such file"),
+        (["scene.dat", *HOW, "-o", "a.npz"], 2, "--output: expected a name that ends in .safetensors, got a.npz"),
+        (["scene.dat", *HOW, "-o", "weights.safetensors"], 1, "weights.safetensors: would be lost, and is not a cal"),
+        (["short.npz"], 1, "short.npz: expected at least 100 frames to count, got 50"),
+        (["wide.npz", "--flat", "short.npz"], 1, "short.npz: expected 8 x 10 pixels as wide.npz has them, got 8 x 8"),
+    ],
+)
+def test_what_is_wrong_is_said_in_a_line(args, status, said, capsys):
+    save_file({"weight": torch.ones(3)}, "weights.safetensors")
+    write("short.npz", torch.ones(50, 8, 8, dtype=torch.uint8))
+    write("wide.npz", torch.ones(200, 8, 10, dtype=torch.uint8))
+    assert main(["calibrate", *args]) == status
+    error = capsys.readouterr().err
+    assert error.startswith(f"spikekit: {said}")
+    assert error.count("\n") == 1
+
+
+# Files from strangers
+
+
+def decode_with(name):
+    return main(["decode", "scene.dat", *HOW, "--method", "tfi", "-o", "x.png", "--calibration", name])
+
+
+def planes(size=SIZE, **changed):
+    good = {"gain": torch.ones(size), "dark": torch.zeros(size), "defects": torch.zeros(size, dtype=torch.uint8)}
+    return good | changed
+
+
+KIND = {"kind": "spikekit calibration 1"}
+
+
+@pytest.mark.parametrize(
+    ("tensors", "metadata", "said"),
+    [
+        (planes(), None, "expected spikekit calibration 1, got None"),
+        (planes((24, 30)), KIND, "bad.safetensors: expected 24 x 32 pixels as scene.dat has them, got 24 x 30"),
+        (planes((768,)), KIND, "expected (H, W) of at most"),
+        (planes(dark=torch.zeros(3)), KIND, "expected gain, dark and defects of one size"),
+        (planes(more=torch.zeros(3)), KIND, "expected gain, dark and defects of one size"),
+        (planes(gain=torch.full(SIZE, float("inf"))), KIND, "gain: expected finite numbers above 0, got inf"),
+        (planes(defects=torch.full(SIZE, 9, dtype=torch.uint8)), KIND, "defects: expected 0, 1 or 2, got 9"),
+    ],
+)
+def test_a_file_that_is_no_calibration(tensors, metadata, said, capsys):
+    save_file(tensors, "bad.safetensors", metadata)
+    assert decode_with("bad.safetensors") == 1
+    error = capsys.readouterr().err
+    assert error.startswith("spikekit: bad.safetensors: ")
+    assert said in error
+    assert error.count("\n") == 1
+    assert not os.path.exists("x.png")
+
+
+def test_a_file_cut_anywhere_is_refused_and_takes_no_memory(truth, capsys):
+    write_calibration("whole.safetensors", truth)
+    data = Path("whole.safetensors").read_bytes()
+    huge = data.replace(b'"shape":[24,32]', b'"shape":[99,99]')
+    claims = (1 << 40).to_bytes(8, "little") + data[8:]
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for bad in (b"", data[:7], data[:100], data[:-1], huge, claims):
+        Path("cut.safetensors").write_bytes(bad)
+        assert decode_with("cut.safetensors") == 1
+        assert capsys.readouterr().err.startswith("spikekit: cut.safetensors: not a calibration that can be read")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < most + 100_000  # kB

@@ -1,0 +1,229 @@
+"""Calibration: rates against a brute force, a sensor that is known is recovered, corrected it is an ideal one."""
+
+import numpy as np
+import pytest
+import torch
+
+from spikekit import bayer_mask, correct_spikes, demosaic, psnr, tfi_at
+from spikekit.sensor.calibrate import calibrate, find_defects
+from spikekit.sensor.calibration import DEAD, HOT, WORKS, Calibration
+from spikekit.sensor.noise import SensorNoise
+from spikekit.sensor.pixel_rates import PixelRates
+from spikekit.sensor.simulate import SpikeSensor
+
+SIZE = 40, 48
+
+
+def chance(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.fixture(name="truth", scope="module")
+def _truth():
+    """A sensor: gains 8 % apart, whose mean is 1 in every colour, dark rates, a dead and a hot pixel in a hundred."""
+    gain = 1 + 0.08 * torch.randn(SIZE, generator=chance(1)).clamp(-3, 3)
+    dark = 0.01 * torch.rand(SIZE, generator=chance(2))
+    lot = torch.rand(SIZE, generator=chance(3))
+    defects = (lot < 0.01) * DEAD + (lot > 0.99) * HOT
+    for colour in bayer_mask(*SIZE, "BGGR").bool():
+        gain[colour] /= gain[colour & (defects == WORKS)].mean()
+    gain[defects != WORKS], dark[defects != WORKS] = 1, 0
+    return Calibration(gain, dark, defects.byte())
+
+
+def halves(spikes):
+    middle = len(spikes) // 2
+    return PixelRates.of(spikes[:middle].split(70)), PixelRates.of(spikes[middle:].split(300))
+
+
+def brute_force(times, frames):
+    times = [t for t, fired in enumerate(times) if fired]
+    return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else len(times) / frames
+
+
+@pytest.mark.parametrize("share", [0.004, 0.05, 0.6])
+@pytest.mark.parametrize("chunk", [1, 7, 100])
+def test_rates_are_those_between_the_first_and_the_last_spike(share, chunk):
+    spikes = torch.rand(100, 5, 6, generator=chance()) < share
+    found = PixelRates.of(spikes.split(chunk)).rate
+    expected = [brute_force(pixel, 100) for pixel in spikes.flatten(1).T.tolist()]
+    assert found.dtype == torch.float64
+    assert found.flatten().tolist() == pytest.approx(expected, rel=1e-15)
+
+
+def test_a_rate_is_exact_to_a_share_of_it():
+    light = 0.01 + 0.8 * torch.rand(SIZE, generator=chance(4), dtype=torch.float64)
+    spikes = SpikeSensor(seed=1).expose(light.expand(1000, *SIZE))
+    # the two ends are rounded to clocks
+    assert ((PixelRates.of([spikes]).rate - light).abs() <= 2 * light / (1000 - 2 / light)).all()
+
+
+def test_a_sensor_is_recovered_from_a_flat_and_a_dark_recording(truth):
+    noise = SensorNoise(photons=1000, calibration=truth)
+    flat = SpikeSensor(noise, seed=5).expose(torch.full((1000, *SIZE), 0.15))
+    dark = SpikeSensor(noise, seed=6).expose(torch.zeros(2000, *SIZE))
+    found = calibrate(halves(flat), halves(dark), "BGGR")
+    assert found.calibration.defects.equal(truth.defects)
+    works = truth.defects == WORKS
+    for name, stated in (("gain", found.gain_error), ("dark", found.dark_error)):
+        error = (getattr(found.calibration, name) - getattr(truth, name))[works].square().mean().sqrt()
+        assert 0.3 * stated < error < 1.3 * stated, name
+    assert found.gain_error < 0.005
+    assert found.dark_error < 3e-4
+
+
+def test_one_recording_alone(truth):
+    noise = SensorNoise(calibration=truth)
+    flat = calibrate(halves(SpikeSensor(noise).expose(torch.full((400, *SIZE), 0.3))), None, "BGGR")
+    assert flat.dark_error is None
+    assert not flat.calibration.dark.any()
+    assert flat.calibration.defects.equal(truth.defects)
+    dark = calibrate(None, halves(SpikeSensor(noise).expose(torch.zeros(400, *SIZE))), "BGGR")
+    assert (dark.calibration.gain == 1).all()
+    assert (dark.calibration.defects == HOT).equal(truth.defects == HOT)
+    ramp = torch.linspace(0.2, 0.6, SIZE[1]).expand(400, *SIZE) * (1 + bayer_mask(*SIZE, "BGGR")[1])
+    scene = find_defects(PixelRates.of([SpikeSensor(noise).expose(0.35 * ramp)]), "BGGR")
+    assert scene.calibration.defects.equal(truth.defects)
+
+
+def test_in_the_dark_nobody_is_dead():
+    silent = torch.zeros(200, *SIZE, dtype=torch.uint8)
+    assert not find_defects(PixelRates.of([silent])).calibration.defects.any()
+
+
+@pytest.mark.parametrize(
+    ("light", "said"), [(1.0, "not saturated"), (0.0, "brighter than the dark one")], ids=["white", "black"]
+)
+def test_a_flat_recording_of_the_wrong_brightness(light, said):
+    flat = SpikeSensor().expose(torch.full((200, 4, 4), light))
+    with pytest.raises(ValueError, match=said):
+        calibrate(halves(flat), halves(torch.zeros(200, 4, 4)))
+
+
+def test_recordings_of_two_sensors():
+    with pytest.raises(ValueError, match=r"of one size, got sizes \[\(4, 4\), \(4, 6\)\]"):
+        calibrate(halves(torch.ones(200, 4, 4)), halves(torch.zeros(200, 4, 6)))
+
+
+# What is done with it
+
+
+def test_corrected_by_the_truth_a_rate_is_that_of_an_ideal_sensor(truth):
+    light = torch.rand(3, *SIZE, generator=chance(7)) * 0.5
+    light = torch.where(truth.defects != 0, 0.25, light)
+    rate = truth.gain * light + truth.dark
+    found = truth.correct(torch.where(truth.defects == HOT, 1.0, rate), "BGGR")
+    works = truth.defects == WORKS
+    torch.testing.assert_close(found[:, works], light[:, works], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("pattern", [None, "RGGB", "GBRG"])
+def test_defects_are_filled_from_the_nearest_of_their_colour(truth, pattern):
+    light = torch.rand(SIZE, generator=chance(8), dtype=torch.float64)
+    found = Calibration(torch.ones(SIZE), torch.zeros(SIZE), truth.defects).correct(light, pattern)
+    seen = torch.zeros(SIZE) if pattern is None else bayer_mask(*SIZE, pattern).argmax(0)
+    bad = (truth.defects != WORKS).nonzero().tolist()
+    assert len(bad) > 20
+    for y, x in bad:
+        others = [
+            (((y - v) ** 2 + (x - u) ** 2) ** 0.5, light[v, u].item())
+            for v in range(max(0, y - 6), min(SIZE[0], y + 7))
+            for u in range(max(0, x - 6), min(SIZE[1], x + 7))
+            if seen[v, u] == seen[y, x] and truth.defects[v, u] == WORKS
+        ]
+        others.sort()
+        # which of equally distant ones are taken is open: between the least and the most that any choice gives
+        far = others[3][0]
+        near, equal = [o for o in others if o[0] < far], sorted(o[1] for o in others if o[0] == far)
+        count = 4 - len(near)
+        weight = sum(1 / d for d, _ in near) + count / far
+        low, high = (
+            (sum(value / d for d, value in near) + sum(part) / far) / weight for part in (equal[:count], equal[-count:])
+        )
+        assert low - 1e-9 <= found[y, x] <= high + 1e-9
+    works = truth.defects == WORKS
+    assert found[works].equal(light[works])
+
+
+def test_no_pixel_of_a_colour_works():
+    defects = torch.zeros(2, 2, dtype=torch.uint8)
+    defects[0, 0] = DEAD
+    with pytest.raises(ValueError, match="pixels of every colour that work"):
+        Calibration(torch.ones(2, 2), torch.zeros(2, 2), defects).correct(torch.ones(2, 2), "RGGB")
+
+
+def test_spikes_fired_anew(truth):
+    light = torch.linspace(0.05, 0.4, SIZE[1]).expand(41, *SIZE)
+    spikes = SpikeSensor(SensorNoise(calibration=truth), seed=2).expose(light)
+    found = correct_spikes(spikes, truth, "BGGR")
+    assert found.dtype == spikes.dtype
+    assert set(found.unique().tolist()) == {0, 1}
+    # the count of an ideal sensor: off by one at each end, and by what an interval at the ends does not say
+    works = truth.defects == WORKS
+    assert ((found.sum(0) - light.sum(0)).abs()[works] < 2.5).all()
+    ideal = Calibration(torch.ones(SIZE), torch.zeros(SIZE), truth.defects)
+    again = correct_spikes(torch.stack([spikes, spikes]).bool(), ideal, "BGGR")
+    assert again[1][:, works].equal(spikes.bool()[:, works])
+    assert not again[0][:, truth.defects == HOT].all(0).any()
+
+
+def test_corrected_pictures_are_nearly_those_of_an_ideal_sensor(truth):
+    y, x = torch.meshgrid(torch.linspace(0, 6, SIZE[0]), torch.linspace(0, 6, SIZE[1]), indexing="ij")
+    light = (0.2 + 0.1 * torch.sin(x + y)).expand(101, *SIZE)
+    ideal = SpikeSensor(seed=3).expose(light)
+    real = SpikeSensor(SensorNoise(calibration=truth), seed=3).expose(light)
+
+    def error(spikes, correct=lambda raw: raw):
+        raw = correct(tfi_at(spikes.float(), 50))
+        return psnr(demosaic(raw[None] / 0.4, "BGGR"), (light[50] / 0.4).expand(1, 3, *SIZE)).item()
+
+    best = error(ideal)
+    assert error(real) < best - 5
+    assert error(real, lambda raw: truth.correct(raw, "BGGR")) > best - 0.5
+    assert error(correct_spikes(real, truth, "BGGR")) > best - 1.5
+
+
+# What is refused, and the noise of a measured sensor
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"gain": torch.zeros(2, 3)}, "gain: expected finite numbers above 0, got 0"),
+        ({"gain": torch.ones(2, 3, dtype=torch.float64)}, "gain: expected .H, W. of torch.float32"),
+        ({"dark": torch.full((2, 3), -1.0)}, "dark: expected finite numbers, 0 or more, got -1"),
+        ({"dark": torch.full((2, 3), float("nan"))}, "dark: expected finite numbers, 0 or more, got nan"),
+        ({"dark": torch.zeros(3, 2)}, "dark: expected .H, W."),
+        ({"defects": torch.full((2, 3), 3, dtype=torch.uint8)}, "defects: expected 0, 1 or 2, got 3"),
+    ],
+)
+def test_values_that_make_no_sense(changed, said):
+    good = {"gain": torch.ones(2, 3), "dark": torch.zeros(2, 3), "defects": torch.zeros(2, 3, dtype=torch.uint8)}
+    with pytest.raises(ValueError, match=said):
+        Calibration(**(good | changed))
+
+
+def test_noise_of_a_measured_sensor(truth):
+    noise = SensorNoise(calibration=truth)
+    spikes = SpikeSensor(noise).expose(torch.full((500, *SIZE), 0.2))
+    expected = torch.where(truth.defects == WORKS, 0.2 * truth.gain + truth.dark, (truth.defects == HOT).float())
+    assert ((spikes.float().mean(0) - expected).abs() <= 1 / 500 + 1e-6).all()
+    with pytest.raises(ValueError, match="light: expected 40 x 48 of the calibration, got 8 x 8"):
+        SpikeSensor(noise).expose(torch.ones(3, 8, 8))
+    with pytest.raises(ValueError, match="gain_spread: expected 0, as the calibration has it"):
+        SensorNoise(gain_spread=0.1, calibration=truth)
+
+
+def test_a_scene_that_does_not_require_a_calibration_does_without(truth):
+    changes = SensorNoise(calibration=truth).spike_changes(0.2, 41)
+    light = torch.full((41, *SIZE), 0.2)
+    differing = [
+        (SpikeSensor(SensorNoise(calibration=truth), seed=n).expose(light) != SpikeSensor(seed=n).expose(light))
+        for n in range(3)
+    ]
+    share = np.mean([bits.double().mean() for bits in differing])
+    assert share <= changes["calibration"].share < 1.5 * share
+    nearly = Calibration(1 + (truth.gain - 1) / 1000, torch.zeros(SIZE), torch.zeros(SIZE, dtype=torch.uint8))
+    kept = SensorNoise(photons=10, calibration=nearly).required(0.2, 41, 0.01)
+    assert kept.calibration is None
+    assert kept.photons == 10
