@@ -70,6 +70,7 @@ from spikekit.io import (
     write_calibration,
     write_picture,
     write_spikes,
+    write_video,
 )
 from spikekit.metrics import psnr, ssim
 from spikekit.scenes import Film, FilmClip, Layer, Motion, Plan, Scene, SceneProfile
@@ -169,6 +170,7 @@ __all__ = [
     "write_calibration",
     "write_picture",
     "write_spikes",
+    "write_video",
 ]
 
 # the old name of a module that a function has taken: imported anew, the module would take the place of the function

@@ -21,30 +21,29 @@ from pytorch_lightning.loggers import TensorBoardLogger
 from pytorch_lightning.utilities import rank_zero_only
 
 from lightning_modules.checkpoint import Checkpoints, read_checkpoint
+from lightning_modules.cli import prediction
 from lightning_modules.cli.arguments import (
-    WEIGHTS,
-    behind_configurations,
     flatten,
     options,
-    preset_arguments,
     reason,
     with_network_of_weights,
 )
 from lightning_modules.cli.errors import Ended, InputError, UsageError
 from lightning_modules.cli.folder_lock import FolderError, locked_folder, make_folder
+from lightning_modules.cli.prediction import NO_RECORDING
 from lightning_modules.cli.renamed_overlays import with_current_overlays
-from lightning_modules.data import FilmScenes, Recording, RecordingClips, StillScenes
-from lightning_modules.inference.presets import SPEEDS, choose
+from lightning_modules.data import FilmScenes, Recording, StillScenes
 from lightning_modules.motion import Spike2Flow
 from lightning_modules.networks import CSCSR
 from lightning_modules.pretrained import check_settings
 from lightning_modules.tasks.base import Learner
-from lightning_modules.tasks.callbacks import PredictionPictures
 from lightning_modules.tasks.optical_flow import FlowTraining
+from lightning_modules.tasks.predictions import is_film, pictures_folder
 from lightning_modules.tasks.super_resolution import SuperResolution
 from lightning_modules.training_state import Begun, check_like_fresh, check_training_state, restoring
 from spikekit.io import PictureError, SpikeFileError, VideoError
 from spikekit.io.video import PICTURE_ENDINGS, VIDEO_ENDINGS
+from spikekit.io.video_output import check_film
 from spikekit.io.whole_file import whole_file
 
 #: classes whose arguments ``--help`` lists, by the option that names them
@@ -63,12 +62,11 @@ _NOTHING_TO_DO = (
     r".*does not have many workers",
     r".*isinstance\(treespec, LeafSpec\)",
     r"\s*skip_none parameter was deprecated",
+    r"Total length of",
 )
 
 # of what users may take the output for
 _FILE_ENDINGS = (*PICTURE_ENDINGS, *VIDEO_ENDINGS, ".gif", ".html", ".npz", ".dat", ".ckpt", ".safetensors")
-
-_NO_RECORDING = "predict: expected a recording: --data Recording --data.path FILE"
 
 _LOADERS = {
     "fit": "train_dataloader",
@@ -106,28 +104,8 @@ class Parser(LightningArgumentParser):
                 2,
             )
         if "the following arguments are required: predict.data" in message:
-            message = _NO_RECORDING
+            message = NO_RECORDING
         raise Ended(f"lightning: {reason(message)}", 2)
-
-
-def _with_choice(parser: LightningArgumentParser, args: Sequence[str]) -> list[str]:
-    """Put in the setting that ``--speed`` or ``--budget`` asks for, and say which."""
-    given = next((option for _, option, _ in options(args) if option in (*WEIGHTS, "--ckpt_path")), None)
-    if given:
-        raise UsageError(f"--speed and --budget: choose from the weights of the package, got {given} as well")
-    verb, *rest = args
-    parsed = parser.parse_args([verb, "--config", '{"model": {"network": {"class_path": "CSCSR"}}}', *rest])[verb]
-    recording = parsed.data.get("init_args", {})
-    if not recording.get("path"):
-        raise UsageError(_NO_RECORDING)
-    try:
-        known = ("path", "height", "width", "pattern", "camera")
-        size = RecordingClips(**{name: recording.get(name) for name in known}, frames=1).size
-        choice = choose(parsed.model.init_args.network.init_args.scale, parsed.speed, parsed.budget, size)
-    except (OSError, ValueError) as error:
-        raise InputError(str(error)) from error
-    print(choice, flush=True)
-    return behind_configurations(args, preset_arguments(choice.preset))
 
 
 class Configuration(SaveConfigCallback):
@@ -147,7 +125,8 @@ class Command(LightningCLI):
             "--output",
             type=str,
             default="runs",
-            help="Folder of the run: checkpoints, TensorBoard files, config.yaml, tables and pictures.",
+            help="Folder of the run: checkpoints, TensorBoard files, config.yaml, tables and pictures; of predict also "
+            "a film, .mp4, .mov, .mkv or .gif.",
         )
         parser.set_defaults({"model": {"class_path": "SuperResolution"}})
         network = "model.init_args.network.init_args"
@@ -163,7 +142,7 @@ class Command(LightningCLI):
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:  # noqa: D102
         args = with_current_overlays(sys.argv[1:] if args is None else args)
         if any(option in ("--speed", "--budget") for _, option, _ in options(args)):
-            args = _with_choice(parser, args)
+            args = prediction.with_choice(parser, args)
         try:
             args = with_network_of_weights(args)
         except (OSError, ValueError) as error:
@@ -176,24 +155,16 @@ class Command(LightningCLI):
     def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> LightningArgumentParser:
         parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
         if subcommand == "predict":
-            parser.set_defaults({"return_predictions": False})  # pictures are written; kept, they would fill the memory
-            parser.add_argument(
-                "--speed",
-                choices=list(SPEEDS),
-                help="Weights of the package and how they are used: the best; the fastest at most "
-                f"{SPEEDS['balanced']:g} dB (balanced) or {SPEEDS['fast']:g} dB (fast) below it, as measured by "
-                "lightning trade; the fastest.",
-            )
-            parser.add_argument(
-                "--budget",
-                help="Instead, what a frame may take, such as 40ms or 200MB: the best that fits, by the same table.",
-            )
+            prediction.add_arguments(parser)
         return parser
 
     def before_instantiate_classes(self) -> None:
         """Turn ``--ckpt_path best`` and ``last`` into files, and keep a run from being written over."""
         config = self.config[self.subcommand]
-        check_folder(config.output)
+        if self.subcommand == "predict" and is_film(config.output):
+            check_film(config.output)
+        else:
+            check_folder(config.output)
         checkpoints = Path(config.output) / "checkpoints"
         asked = config.get("ckpt_path")
         if asked in ("best", "last"):
@@ -219,15 +190,17 @@ class Command(LightningCLI):
 
     def _run_subcommand(self, subcommand: str) -> None:
         config = self.config[subcommand]
-        # processes of one distributed training share a folder, which the first of them keeps
-        alone = subcommand == "fit" and not config.trainer.fast_dev_run and rank_zero_only.rank == 0
+        filmed = subcommand == "predict" and is_film(config.output)
+        folder = pictures_folder(config.output) if filmed else config.output
+        alone = filmed or (subcommand == "fit" and not config.trainer.fast_dev_run)
         if subcommand in ("test", "predict"):
-            make_folder(config.output)
+            make_folder(folder)
         begun = Begun()
         self.trainer.callbacks.append(begun)
         try:
             with (
-                locked_folder(config.output, "training") if alone else nullcontext(),
+                # processes of one distributed run share a folder, which the first of them keeps
+                locked_folder(folder, "run") if alone and rank_zero_only.rank == 0 else nullcontext(),
                 restoring(config.get("ckpt_path"), begun),
             ):
                 super()._run_subcommand(subcommand)
@@ -261,14 +234,19 @@ class Command(LightningCLI):
         """Send everything to one folder, and use bfloat16 on a GPU that has it."""
         output = Path(self._get(self.config_init, "output"))
         config = self._get(self.config_init, "trainer")
-        kwargs["default_root_dir"] = output
-        kwargs["callbacks"] = [*(config.get("callbacks") or []), *self._callbacks(output)]
+        kwargs["default_root_dir"] = pictures_folder(output) if self.subcommand == "predict" else output
         if config.get("logger") is None:
             # the tables and pictures of the other commands are files of their own
             kwargs["logger"] = TensorBoardLogger(output, name="", version="") if self.subcommand == "fit" else False
         kwargs["plugins"] = [Checkpoints(), *(config.get("plugins") or [])]
         if config.get("precision") is None:
             kwargs["precision"] = _precision(config.get("accelerator"))
+        if self.subcommand == "predict":
+            precision = kwargs.get("precision", config.get("precision"))
+            callbacks = prediction.callbacks(output, self.config_dump, precision, config.get("callbacks") or [])
+        else:
+            callbacks = self._callbacks(output)
+        kwargs["callbacks"] = [*(config.get("callbacks") or []), *callbacks]
         if self.subcommand != "fit":
             self.save_config_callback = None  # config.yaml is the record of the training
         return super().instantiate_trainer(**kwargs)
@@ -284,9 +262,7 @@ class Command(LightningCLI):
                 *([LearningRateMonitor()] if logs else []),
                 self.model.pictures(),
             ]
-        if self.subcommand == "test":
-            return [self.model.report(output)]
-        return [PredictionPictures(output)] if self.subcommand == "predict" else []
+        return [self.model.report(output)] if self.subcommand == "test" else []
 
 
 def _is_of_file(error: BaseException | None, said: str) -> bool:
@@ -328,7 +304,7 @@ def _check_verb(verb: str, model: Learner, data: LightningDataModule) -> None:
     loader = _LOADERS[verb]
     if getattr(type(data), loader) is getattr(LightningDataModule, loader):
         scenes = f"{verb}: expected scenes whose truth is known, got {type(data).__name__}"
-        raise UsageError(_NO_RECORDING if verb == "predict" else scenes)
+        raise UsageError(NO_RECORDING if verb == "predict" else scenes)
     if verb == "fit" and not any(parameter.requires_grad for parameter in model.network.parameters()):
         raise UsageError(f"fit: expected a network that learns, got {type(model.network).__name__}")
 

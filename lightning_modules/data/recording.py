@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -12,8 +13,9 @@ import numpy as np
 import torch
 from pytorch_lightning import LightningDataModule
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import Dataset, default_collate
 
+from lightning_modules.data.clips_around import clips_around
 from spikekit import bayer_sites
 from spikekit.arguments import frames_of
 from spikekit.io.recording import open_recording, white_rate
@@ -23,14 +25,15 @@ _LOOKS = 8
 
 
 class RecordingClips(Dataset[dict[str, Any]]):
-    """Clips around some frames of a recording, read when they are asked for.
+    """Clips around some frames of a recording, read when they are asked for, or one after the other.
 
     Args:
         path: a ``.dat`` or ``.npz`` file, see :func:`spikekit.read_spikes`.
         height: rows; needed for a ``.dat`` without side-car or camera.
         width: columns; likewise.
         flip: turn the stored frames upside down, as real cameras need.
-        pattern: Bayer phase after the flip; that of the side-car or the camera, or else RGGB, when not given.
+        pattern: Bayer phase after the flip; that of the side-car or the camera, or else RGGB, when not given. "grey"
+            for a camera without colours.
         frames: spike frames N of a clip.
         every: frames between two clips.
         crop_to: Bayer phase that a network wants; up to one row and column are cut off so that clips begin with it.
@@ -43,6 +46,8 @@ class RecordingClips(Dataset[dict[str, Any]]):
     Attributes:
         size: (H, W) of a clip.
         recording: the file and what is known of it.
+        chosen: the frames in the middle of the clips, in order.
+        grey: whether the camera is known to have no colours.
 
     Raises:
         spikekit.SpikeFileError: the file cannot be read.
@@ -70,13 +75,17 @@ class RecordingClips(Dataset[dict[str, Any]]):
         if white is not None and not 0 < white < float("inf"):
             raise ValueError(f"white: expected a finite number above 0, got {white}")
         self._white = white
-        known = {"height": height, "width": width, "flip": flip, "pattern": pattern, "camera": camera}
-        self.recording = open_recording(Namespace(file=Path(path), calibration=calibration, **known))
+        known = {"height": height, "width": width, "flip": flip, "camera": camera, "calibration": calibration}
+        said = None if pattern == "grey" else pattern
+        self.recording = open_recording(Namespace(file=Path(path), pattern=said, **known))
         total, (rows, columns) = self.recording.frames, self.recording.size
         if total < frames:
             raise ValueError(f"{path}: expected at least {frames} frames for a clip, got {total}")
-        # where red is says which of the four phases it is
         phase = self.recording.pattern or "RGGB"
+        self.grey = pattern == "grey" or (self.recording.camera is not None and self.recording.pattern is None)
+        if self.grey:
+            phase = crop_to  # one is as good as another
+        # where red is says which of the four phases it is
         (_, row, column), (_, to_row, to_column) = bayer_sites(phase)[0], bayer_sites(crop_to)[0]
         self.top, self.left = (row - to_row) % 2, (column - to_column) % 2
         self.size = rows - self.top, columns - self.left
@@ -86,7 +95,7 @@ class RecordingClips(Dataset[dict[str, Any]]):
         self._every_clip = range(frames // 2, total - (frames - 1) // 2, every)
         try:
             ends = self._every_clip[0], total - 1 - (frames - 1) // 2
-            self.chosen = self._every_clip if frame is None else frames_of(frame, *ends, every)
+            self.chosen = list(self._every_clip if frame is None else frames_of(frame, *ends, every))
         except ValueError as error:
             raise ValueError(f"frame: {error}; a clip has {frames} frames of the {total} of {path}") from error
 
@@ -97,7 +106,15 @@ class RecordingClips(Dataset[dict[str, Any]]):
         if not 0 <= index < len(self):
             raise IndexError(index)
         middle = self.chosen[index]
-        return {"spikes": self._clip(middle), "frame": middle, "white": torch.tensor(self.white)}
+        spikes = self.recording.read(middle - self.frames // 2, self.frames)
+        return self._item(middle, self._prepared(spikes).contiguous())
+
+    def in_order(self, chosen: Iterable[int]) -> Iterator[dict[str, Any]]:
+        """Yield the clips around some frames, increasing ones, and read the recording but once for all of them."""
+        return (self._item(middle, spikes) for middle, spikes in self._around(list(chosen)))
+
+    def _item(self, middle: int, spikes: Tensor) -> dict[str, Any]:
+        return {"spikes": spikes, "frame": middle, "white": torch.tensor(self.white)}
 
     @cached_property
     def white(self) -> float:
@@ -107,11 +124,35 @@ class RecordingClips(Dataset[dict[str, Any]]):
             return known
         clips = self._every_clip
         looks = sorted({clips[round(n)] for n in np.linspace(0, len(clips) - 1, _LOOKS)})
-        return white_rate(torch.stack([self._clip(middle).float().mean(0) for middle in looks]).mean(0))
+        return white_rate(torch.stack([clip.float().mean(0) for _, clip in self._around(looks)]).mean(0))
 
-    def _clip(self, middle: int) -> Tensor:
-        spikes = self.recording.correct_spikes(self.recording.read(middle - self.frames // 2, self.frames))
-        return spikes[:, self.top :, self.left :].contiguous()
+    def _around(self, middles: list[int]) -> Iterator[tuple[int, Tensor]]:
+        def jump(start: int) -> Iterator[Tensor]:
+            return self.recording.frames_from(start)
+
+        # what is packed is unpacked from its beginning, wherever reading begins
+        packed = self.recording.path.suffix.lower() == ".npz"
+        start = middles[0] - self.frames // 2 if middles else 0
+        clips = clips_around(middles, self.frames, jump(start), start, None if packed else jump)
+        return ((middle, self._prepared(clip)) for middle, clip in clips)
+
+    def _prepared(self, spikes: Tensor) -> Tensor:
+        return self.recording.correct_spikes(spikes)[..., self.top :, self.left :]
+
+
+class _Batches:
+    """Batches of one clip; those of one process, where several share a recording, follow each other."""
+
+    def __init__(self, clips: RecordingClips, process: int, processes: int) -> None:
+        self.clips = clips
+        ends = [len(clips) * n // processes for n in (process, process + 1)]
+        self.chosen = clips.chosen[slice(*ends)]
+
+    def __len__(self) -> int:
+        return len(self.chosen)
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        return (default_collate([clip]) for clip in self.clips.in_order(self.chosen))
 
 
 class Recording(LightningDataModule):
@@ -125,7 +166,7 @@ class Recording(LightningDataModule):
         width: columns; likewise.
         flip: turn the stored frames upside down, as real cameras need.
         pattern: Bayer phase after the flip, one of RGGB, BGGR, GRBG, GBRG; that of the side-car or the camera, or else
-            RGGB, when not given. For a grey camera leave it as it is.
+            RGGB, when not given. "grey" for a camera without colours, whose pictures are grey then.
         every: frames between two reconstructed pictures; 20 is a millisecond at 20 kHz.
         frames: spike frames of a clip, as the network was trained.
         crop_to: Bayer phase that the network was trained with; clips begin with it, a row and a column less at most.
@@ -180,9 +221,12 @@ class Recording(LightningDataModule):
         self.clips = RecordingClips(self.path, **self.how)
 
     def show(self, rgb: Tensor) -> Tensor:
-        """Return light in [0, 1], white being 1, as the camera shows it."""
+        """Return light (3, H, W) in [0, 1], white being 1, as the camera shows it."""
+        if self.clips.grey:
+            rgb = (rgb * rgb.new_tensor([0.25, 0.5, 0.25])[:, None, None]).sum(0, keepdim=True).expand_as(rgb)
         camera = self.clips.recording.camera
         return rgb if camera is None else replace(camera, gain=1.0).display(rgb)
 
-    def predict_dataloader(self) -> DataLoader[dict[str, Any]]:  # noqa: D102
-        return DataLoader(self.clips, batch_size=1)
+    def predict_dataloader(self) -> Iterable[dict[str, Any]]:  # noqa: D102
+        ranks = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+        return _Batches(self.clips, *ranks)

@@ -49,4 +49,4 @@ def predict(
         return forward_in_tiles(network, spikes, tile, psnr_tolerance, flow, static)
 
     rgb = mean_of_views(run, spikes, flow, network.pattern, network.scale, self_ensemble)
-    return (rgb * exposure).clamp(0, 1)
+    return (rgb * exposure).clamp_(0, 1)

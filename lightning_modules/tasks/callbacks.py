@@ -1,4 +1,4 @@
-"""Callbacks for super-resolution: pictures in TensorBoard, the table of a test, the pictures of a prediction."""
+"""Callbacks for super-resolution: pictures in TensorBoard, the table of a test."""
 
 from __future__ import annotations
 
@@ -139,30 +139,3 @@ class TestReport(Callback):
 
 def _rounded(value: float) -> str:
     return f"{value:.4f}"
-
-
-class PredictionPictures(Callback):
-    """Write every predicted picture as PNG, named after the spike frame that it shows.
-
-    Args:
-        output: the folder that they are written to.
-    """
-
-    def __init__(self, output: str | Path) -> None:
-        self.output = Path(output)
-
-    def on_predict_start(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
-        self._written = 0
-
-    def on_predict_batch_end(  # noqa: D102
-        self, trainer: Trainer, module: LightningModule, outputs: Tensor, batch: dict[str, Tensor], *_: Any
-    ) -> None:
-        self._white = batch["white"][0].item()
-        for rgb, frame in zip(outputs, batch["frame"].tolist(), strict=True):
-            write_picture(self.output / f"frame_{frame:06d}.png", trainer.datamodule.show(rgb))
-            self._written += 1
-
-    def on_predict_end(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
-        if trainer.is_global_zero:
-            white = f", {self._white:.4g} spikes a frame are white" if self._written else ""
-            print(f"{self.output}: {self._written} pictures{white}")  # noqa: T201

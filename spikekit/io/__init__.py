@@ -5,6 +5,7 @@ from spikekit.io.cameras import CAMERAS, Camera, camera
 from spikekit.io.files import SpikeFileError, iter_spikes, read_spikes, spikes_shape, write_spikes
 from spikekit.io.images import PictureError, flow_to_rgb, panel, read_picture, write_picture
 from spikekit.io.video import VideoError, VideoFrames, read_video
+from spikekit.io.video_output import write_video
 
 __all__ = [
     "CAMERAS",
@@ -25,4 +26,5 @@ __all__ = [
     "write_calibration",
     "write_picture",
     "write_spikes",
+    "write_video",
 ]

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from spikekit.arguments import one_line
 from spikekit.check import check_planes, check_positive
-from spikekit.io.image_bytes import picture_bytes
+from spikekit.io.image_bytes import PictureError, picture_bytes
 from spikekit.io.quiet import quiet
 from spikekit.io.whole_file import whole_file
 
@@ -24,10 +24,6 @@ from spikekit.io.whole_file import whole_file
 MOST_PIXELS = 1 << 27
 
 _FARTHEST = 1e9  # the length of what is infinite
-
-
-class PictureError(ValueError):
-    """A picture that cannot be read; the message is one line and names the file."""
 
 
 def read_picture(path: str | Path) -> Tensor:

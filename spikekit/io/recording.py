@@ -67,6 +67,10 @@ class Recording:
         """Return some frames (T, H, W), uint8."""
         return self.prepare(read_spikes(self.path, *self.stored, flip=self.flip, start=start, frames=frames))
 
+    def frames_from(self, start: int) -> Iterator[Tensor]:
+        """Read frames (H, W), uint8, one by one from a place on."""
+        return map(self.prepare, iter_spikes(self.path, *self.stored, flip=self.flip, start=start))
+
     def packed(self, start: int, frames: int) -> Iterator[np.ndarray]:
         """Read frames one by one, as they are stored but upright, for :meth:`unpack`."""
         parts = iter_spikes(self.path, *self.stored, flip=self.flip, start=start, frames=frames, packed=True)

@@ -3,6 +3,7 @@ import torch
 
 from lightning_modules.__main__ import main
 from lightning_modules.data import Recording, RecordingClips
+from lightning_modules.data.recording import _Batches
 from spikekit import (
     Calibration,
     SensorNoise,
@@ -142,6 +143,46 @@ def test_a_camera_knows_size_phase_and_crop(tmp_path):
     write_spikes(tmp_path / "a.dat", raw)
     clips = RecordingClips(str(tmp_path / "a.dat"), camera="m1k40-bayer")
     assert clips.size == clips[0]["spikes"].shape[1:] == (992, 992)
+
+
+@pytest.mark.parametrize("name", ["clip.dat", "clip.npz"])
+@pytest.mark.parametrize("frame", ["20:50:1", "21:50:28"])
+def test_clips_in_order_are_those_of_the_file_and_every_frame_is_read_once(tmp_path, spikes, name, frame, monkeypatch):
+    write_spikes(tmp_path / name, spikes)
+    clips = RecordingClips(str(tmp_path / name), 6, 10, frame=frame, frames=5, white=1.0, pattern="BGGR")
+    read, frames_from = [], type(clips.recording).frames_from
+
+    def counted(recording, start):
+        for n, plane in enumerate(frames_from(recording, start), start):
+            read.append(n)
+            yield plane
+
+    monkeypatch.setattr(type(clips.recording), "frames_from", counted)
+    found = list(clips.in_order(clips.chosen))
+    assert [clip["frame"] for clip in found] == [clip["frame"] for clip in clips]
+    assert all(one["spikes"].equal(other["spikes"]) for one, other in zip(found, clips, strict=True))
+    assert read == sorted(set(read))
+    if name == "clip.dat" and frame == "21:50:28":
+        assert read == [*range(19, 24), *range(47, 52)]  # what nobody wants is not read
+
+
+@pytest.mark.parametrize("processes", [1, 2, 3, 5])
+def test_processes_share_the_clips_in_parts_that_follow_each_other(tmp_path, spikes, processes):
+    write_spikes(tmp_path / "clip.npz", spikes)
+    clips = RecordingClips(str(tmp_path / "clip.npz"), every=7, white=1.0)
+    found = [[batch["frame"].item() for batch in _Batches(clips, n, processes)] for n in range(processes)]
+    assert [frame for part in found for frame in part] == clips.chosen
+    assert max(map(len, found)) - min(map(len, found)) <= 1
+
+
+def test_a_grey_recording_is_not_cropped_to_a_phase(tmp_path, spikes):
+    write_spikes(tmp_path / "clip.npz", spikes)
+    clips = RecordingClips(str(tmp_path / "clip.npz"), pattern="grey", crop_to="BGGR")
+    assert clips.grey
+    assert clips[0]["spikes"].equal(spikes[:41])
+    write_spikes(tmp_path / "a.dat", torch.zeros(41, 250, 400, dtype=torch.uint8))
+    assert RecordingClips(str(tmp_path / "a.dat"), camera="vidar").grey
+    assert not RecordingClips(str(tmp_path / "clip.npz")).grey
 
 
 def test_errors(tmp_path, spikes):
