@@ -6,6 +6,7 @@ import sys
 import pytest
 
 from lightning_modules.__main__ import main
+from lightning_modules.cli.folder_lock import locked_folder
 
 OVERLAY = "model: {network: {init_args: {width: 4, representation_width: 4, features: 1, stages: 1, end_blocks: 1}}}"
 FILES = {
@@ -82,3 +83,14 @@ def test_one_line(words, status, named, configs, tmp_path, monkeypatch, capfd):
     assert named in said
     assert "Traceback" not in said
     assert {path.name for path in tmp_path.iterdir()} == set(FILES)
+
+
+def test_two_trainings_in_one_folder(configs, tmp_path, monkeypatch):
+    """The second would write over the first one's checkpoints."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["lightning"])
+    (tmp_path / "tiny.yaml").write_bytes(FILES["tiny.yaml"])
+    words = f"fit -c {configs}/x4.yaml -c tiny.yaml --data.train_clips 2 --data.patch 8 --data.val_clips 1 -o out"
+    with locked_folder("out", "training"), pytest.raises(SystemExit, match="out: another training is at work here"):
+        main(words.split())
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"lock"}

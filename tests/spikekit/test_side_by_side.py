@@ -1,0 +1,62 @@
+"""Every operator for long, with more threads, and from several threads at once: the same bits, and no more memory."""
+
+import resource
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+
+from spikekit.examples import EXAMPLES
+
+SIZE = (32, 48)
+
+
+def names(example):
+    return example.name
+
+
+def equal(some, others):
+    return all(a.equal(b) for a, b in zip(some, others, strict=True))
+
+
+@pytest.fixture(name="threads")
+def _threads():
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=names)
+def test_more_threads_give_the_same_bits(example, threads):
+    inputs = [tensor.float() for tensor in example.tensors((2,), (96, 128))]
+    threads(1)
+    alone = example.results(*inputs)
+    threads(2)
+    assert equal(example.results(*inputs), alone)
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=names)
+def test_several_threads_do_not_disturb_each_other(example):
+    inputs = [[tensor.float() for tensor in example.tensors((2,), SIZE, seed=n)] for n in range(4)]
+    alone = [example.results(*tensors) for tensors in inputs]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda n: example.results(*inputs[n % 4]), range(24)))
+    assert all(equal(results, alone[n % 4]) for n, results in enumerate(found))
+
+
+def test_memory_stays_flat():
+    """Of all operators in turns; the longest lives are those of caches that nobody empties."""
+    inputs = [[tensor.float() for tensor in example.tensors((2,), (64, 96))] for example in EXAMPLES]
+
+    def calls(count):
+        for _ in range(count):
+            for example, tensors in zip(EXAMPLES, inputs, strict=True):
+                example.results(*tensors)
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+    before = calls(5)
+    # one result of each kept at every call would be more
+    kept = sum(
+        result.nbytes for example, tensors in zip(EXAMPLES, inputs, strict=True) for result in example.results(*tensors)
+    )
+    assert calls(25) - before < 25 * kept >> 12
