@@ -303,9 +303,12 @@ def test_config_yaml_stays_the_record_of_the_training(trained, overlay, configs)
 def _checkpoint(overlay, configs, tmp_path):
     """A command that goes on from a checkpoint, and the checkpoint."""
     words = ["fit", "-c", str(configs / "x4.yaml"), "-c", str(overlay), "-o", str(tmp_path)]
-    model = run_command(words, Fit).model
-    content = {"state_dict": model.state_dict(), "epoch": 0, "global_step": 1, "loops": {"fit_loop": {}}}
-    content |= {"optimizer_states": [{"state": {}, "param_groups": []}], "lr_schedulers": []}
+    run = run_command(words, Fit)
+    model, parts = run.model, run.model.configure_optimizers()
+    content = {"state_dict": model.state_dict(), "epoch": 0, "global_step": 0}
+    content |= {"optimizer_states": [parts["optimizer"].state_dict()]}
+    content |= {"lr_schedulers": [parts["lr_scheduler"]["scheduler"].state_dict()]}
+    content |= {"loops": {"fit_loop": run.trainer.fit_loop.state_dict()}}
     model.on_save_checkpoint(content)
     (tmp_path / "checkpoints").mkdir()
     path = tmp_path / "checkpoints" / "last.ckpt"
