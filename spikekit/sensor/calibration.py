@@ -92,7 +92,7 @@ class Calibration:
         """Return the light of an ideal sensor.
 
         Args:
-            raw: rates (*, H, W), in spikes a clock, as decoders give them.
+            raw: rates :math:`(*, H, W)`, in spikes a clock, as decoders give them.
             pattern: Bayer phase; ``None`` for a grey sensor.
 
         Raises:

@@ -161,6 +161,8 @@ def test_spikes_fired_anew(truth):
     # the count of an ideal sensor: off by one at each end, and by what an interval at the ends does not say
     works = truth.defects == WORKS
     assert ((found.sum(0) - light.sum(0)).abs()[works] < 2.5).all()
+    first = spikes.argmax(0, keepdim=True)
+    assert (found.gather(0, first)[0, works] == 1).all()
     ideal = Calibration(torch.ones(SIZE), torch.zeros(SIZE), truth.defects)
     again = correct_spikes(torch.stack([spikes, spikes]).bool(), ideal, "BGGR")
     assert again[1][:, works].equal(spikes.bool()[:, works])
