@@ -304,8 +304,6 @@ def test_not_made_again_with_other_settings(film, fails, capsys):
         ("settings.clocks", "20", "clocks: expected a whole number, 1 .. 1048576, got '20'"),
         ("settings.clocks", 2**31 - 1, "clocks: expected a whole number, 1 .. 1048576, got 2147483647"),
         ("settings.readout", 0, "readout: expected a whole number, 1 .. 1048576, got 0"),
-        ("settings.frames", 2**31 - 1, "expected more frames, or fewer with --frames"),
-        ("stream.frames", 2**31 - 1, "not the stream of its side-car"),
         ("settings.seed", 1.0, "seed: expected a whole number, 0 or more, got 1.0"),
         ("settings.tolerance", True, "tolerance: expected a finite number above 0, got True"),
         ("settings.plan", 1.0, "plan: expected a text or a number of latent frames, got 1.0"),
@@ -375,6 +373,23 @@ def test_one_thread(film, monkeypatch):
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize(
+    ("part", "status", "said"),
+    [
+        ("settings", 2, "expected more frames, or fewer with --frames"),
+        ("stream", 1, "b.dat: not the stream of its side-car"),
+    ],
+)
+def test_a_sidecar_that_asks_for_a_stream_without_end(film, fails, capsys, part, status, said):
+    simulate(film, "-o", "a.dat", *QUICK)
+    data = json.loads(Path("a.json").read_text())
+    data[part]["frames"] = 2**31 - 1
+    Path("a.json").write_text(json.dumps(data))
+    capsys.readouterr()
+    assert said in fails(status, "a.json", "-o", "b.dat")
+    assert not Path("b.dat").exists()
 
 
 # --- whole or not at all ----------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ import io
 import json
 import os
 import random
+import zipfile
 
 import numpy as np
 import pytest
@@ -79,8 +80,6 @@ def test_headers_of_npz(fuzz):
         header.write(b"\x93NUMPY" + bytes((rng.choice((1, 2, 3, 9)), 0)))
         header.write(len(text.encode("latin-1")).to_bytes(rng.choice((2, 2, 4)), "little"))
         header.write(text.encode("latin-1") + bytes(rng.choice((0, 1, 270, 2160))))
-        import zipfile
-
         with zipfile.ZipFile(file := io.BytesIO(), "w", rng.choice((0, 8))) as archive:
             archive.writestr("spk.npy", header.getvalue())
         return file.getvalue()
@@ -126,7 +125,7 @@ _PICTURES = {
     "gif": lambda: _picture("GIF"),
     "bmp": lambda: _picture("BMP"),
     "ppm": lambda: _picture("PPM"),
-    "tif": lambda: _picture("TIFF", compression="tiff_lzw"),
+    "tif": lambda: _picture("TIFF", compression="tiff_adobe_deflate"),
     "tiff": lambda: _tiff(photometric="rgb"),
     "tiles.tif": lambda: _tiff(photometric="rgb", tile=(16, 16)),
     "planes.tif": lambda: _tiff(photometric="minisblack", compression="zlib"),
@@ -211,3 +210,25 @@ def test_folders_of_pictures(tmp_path):
         assert str(folder) in said
         assert len(said.splitlines()) == 1
     assert 20 < refused < 60
+
+
+@pytest.mark.parametrize("kind", ["png", "bmp", "tif", "tiff"])
+def test_a_few_bytes_that_claim_a_large_picture(kind, tmp_path, monkeypatch):
+    """What is refused by its header takes no memory."""
+    (tmp_path / f"a.{kind}").write_bytes(_PICTURES[kind]())
+    assert read_picture(tmp_path / f"a.{kind}").shape == (3, 12, 14)
+    monkeypatch.setattr("spikekit.io.images.MOST_PIXELS", 20)
+    with pytest.raises(PictureError, match=f"a.{kind}: not a picture .*expected at most 20 pixels, got"):
+        read_picture(tmp_path / f"a.{kind}")
+
+
+@pytest.mark.parametrize("shape", [(1, 1 << 20, 1 << 20), (6, 5, 10), (6, 5, 8)])
+def test_an_npz_that_declares_another_size_than_it_holds(shape, tmp_path):
+    np.lib.format.write_array_header_1_0(
+        header := io.BytesIO(), {"descr": "|u1", "fortran_order": False, "shape": shape}
+    )
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("spk.npy", header.getvalue() + SPIKES.numpy().tobytes())
+    assert (tmp_path / "a.npz").stat().st_size < 700
+    with pytest.raises(SpikeFileError, match=r"a.npz: truncated, spk of .* takes \d+ bytes, the file holds 270"):
+        read_spikes(tmp_path / "a.npz")
