@@ -5,8 +5,13 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 
-VERBS = ("fit", "validate", "test", "predict", "sweep", "trade", "export", "models")
+from lightning_modules.cli.errors import Ended
+from lightning_modules.cli.short_help import VERBS, overview, usage
+
+#: where the verbs that are not Lightning's are
+_OURS = {"sweep": "sweep.cli", "trade": "trade.cli", "export": "cli.export", "models": "cli.models"}
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -15,35 +20,34 @@ def main(args: Sequence[str] | None = None) -> None:
     Args:
         args: what was typed after ``lightning``; ``sys.argv`` when not given.
     """
+    verb, *rest = (sys.argv[1:] if args is None else list(args)) or [""]
+    if verb in ("-h", "--help"):
+        print(overview())  # noqa: T201
+    elif verb == "--version":
+        from spikekit import __version__
+
+        print(f"lightning of spikekit {__version__}")  # noqa: T201
+    elif verb not in VERBS and not verb.startswith("-"):
+        got = f"got {verb}" if verb else "got none"
+        raise Ended(f"lightning: expected a verb, one of {', '.join(VERBS)}, {got} (see lightning --help)", 2)
+    elif verb not in _OURS and {"-h", "--help"} & {*rest}:
+        print(usage(verb))  # noqa: T201
+    else:
+        _run(verb, rest, args)
+
+
+def _run(verb: str, rest: Sequence[str], args: Sequence[str] | None) -> None:
     # Threads of torch that spin while they wait hold up the workers that make clips: before torch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    if verb != "models":  # which needs no torch
+        from lightning_modules.quick_import import import_lightning
+
+        import_lightning()
     from lightning_modules.cli import errors
 
-    verb, *rest = (sys.argv[1:] if args is None else args) or [""]
     with errors.as_one_line():
-        if verb == "--version":
-            from spikekit import __version__
-
-            print(f"lightning of spikekit {__version__}")  # noqa: T201
-        elif verb not in VERBS and not verb.startswith("-"):
-            got = f"got {verb}" if verb else "got none"
-            raise errors.UsageError(f"expected a verb, one of {', '.join(VERBS)}, {got} (see lightning --help)")
-        elif verb == "models":
-            from lightning_modules.cli.models import models
-
-            models(rest)
-        elif verb == "sweep":
-            from lightning_modules.sweep.cli import sweep
-
-            sweep(rest)
-        elif verb == "trade":
-            from lightning_modules.trade.cli import trade
-
-            trade(rest)
-        elif verb == "export":
-            from lightning_modules.cli.export import export
-
-            export(rest)
+        if verb in _OURS:
+            getattr(import_module(f"lightning_modules.{_OURS[verb]}"), verb)(rest)
         else:
             from lightning_modules.cli.command import Command, run
 

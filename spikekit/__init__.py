@@ -1,177 +1,39 @@
 """spikekit: differentiable operators for the colour spike camera."""
 
-import sys
+from __future__ import annotations
 
-from spikekit import _renamed  # noqa: F401
-from spikekit.color import (
-    PATTERNS,
-    BayerMask,
-    BinToSensor,
-    Demosaic,
-    DemosaicResidual,
-    MergeBayer,
-    Mosaic,
-    SplitBayer,
-    SplitColors,
-    bayer_mask,
-    bayer_pattern,
-    bayer_sites,
-    bin_to_sensor,
-    demosaic,
-    demosaic_residual,
-    merge_bayer,
-    mosaic,
-    split_bayer,
-    split_colors,
-)
-from spikekit.decoders import (
-    SpikeInterval,
-    Tfi,
-    Tfp,
-    correct_spikes,
-    decode_in_chunks,
-    pack_spikes,
-    spike_interval,
-    spike_interval_at,
-    tfi,
-    tfi_at,
-    tfp,
-    tfp_at,
-    unpack_spikes,
-)
-from spikekit.flow import (
-    Between,
-    Blend,
-    FlowInterpolation,
-    JointFlow,
-    LinearMotion,
-    Still,
-    UpsampleFlow,
-    joint_flow,
-    linear_motion,
-    upsample_flow,
-)
-from spikekit.io import (
-    CAMERAS,
-    Camera,
-    PictureError,
-    SpikeFileError,
-    VideoError,
-    VideoFrames,
-    camera,
-    flow_to_rgb,
-    iter_spikes,
-    panel,
-    read_calibration,
-    read_picture,
-    read_spikes,
-    read_video,
-    spikes_shape,
-    write_calibration,
-    write_picture,
-    write_spikes,
-    write_video,
-)
-from spikekit.metrics import psnr, ssim
-from spikekit.scenes import Film, FilmClip, Layer, Motion, Plan, Scene, SceneProfile
-from spikekit.sensor import (
-    Calibration,
-    SensorNoise,
-    SpikeChange,
-    SpikeIntegrateFire,
-    SpikeSensor,
-    simulate_spikes,
-    spike_integrate_fire,
-)
-from spikekit.warp import DemosaicAlongMotion, FlowWarp, FlowWarpIdw, demosaic_along_motion, flow_warp, flow_warp_idw
+import sys
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from spikekit import _renamed
+
+if TYPE_CHECKING:
+    from spikekit._public import *  # noqa: F403
+    from spikekit._public import __all__ as __all__
 
 __version__ = "0.1.0.dev0"
 
-__all__ = [
-    "CAMERAS",
-    "PATTERNS",
-    "BayerMask",
-    "Between",
-    "BinToSensor",
-    "Blend",
-    "Calibration",
-    "Camera",
-    "Demosaic",
-    "DemosaicAlongMotion",
-    "DemosaicResidual",
-    "Film",
-    "FilmClip",
-    "FlowInterpolation",
-    "FlowWarp",
-    "FlowWarpIdw",
-    "JointFlow",
-    "Layer",
-    "LinearMotion",
-    "MergeBayer",
-    "Mosaic",
-    "Motion",
-    "PictureError",
-    "Plan",
-    "Scene",
-    "SceneProfile",
-    "SensorNoise",
-    "SpikeChange",
-    "SpikeFileError",
-    "SpikeIntegrateFire",
-    "SpikeInterval",
-    "SpikeSensor",
-    "SplitBayer",
-    "SplitColors",
-    "Still",
-    "Tfi",
-    "Tfp",
-    "UpsampleFlow",
-    "VideoError",
-    "VideoFrames",
-    "bayer_mask",
-    "bayer_pattern",
-    "bayer_sites",
-    "bin_to_sensor",
-    "camera",
-    "correct_spikes",
-    "decode_in_chunks",
-    "demosaic",
-    "demosaic_along_motion",
-    "demosaic_residual",
-    "flow_to_rgb",
-    "flow_warp",
-    "flow_warp_idw",
-    "iter_spikes",
-    "joint_flow",
-    "linear_motion",
-    "merge_bayer",
-    "mosaic",
-    "pack_spikes",
-    "panel",
-    "psnr",
-    "read_calibration",
-    "read_picture",
-    "read_spikes",
-    "read_video",
-    "simulate_spikes",
-    "spike_integrate_fire",
-    "spike_interval",
-    "spike_interval_at",
-    "spikes_shape",
-    "split_bayer",
-    "split_colors",
-    "ssim",
-    "tfi",
-    "tfi_at",
-    "tfp",
-    "tfp_at",
-    "unpack_spikes",
-    "upsample_flow",
-    "write_calibration",
-    "write_picture",
-    "write_spikes",
-    "write_video",
-]
+_OLD_DEMOSAIC = dict.fromkeys(("demosaic", "Demosaic"), "spikekit.color.demosaic")
 
-# the old name of a module that a function has taken: imported anew, the module would take the place of the function
-sys.modules["spikekit.demosaic"] = sys.modules["spikekit.color.demosaic"]
+
+def __getattr__(name: str) -> Any:
+    """Import everything when the first of it is asked for: the commands answer ``--help`` without torch."""
+    if name == "__all__" or not name.startswith("_"):
+        from spikekit import _public
+
+        globals().update({public: getattr(_public, public) for public in ("__all__", *_public.__all__)})
+        if name in globals():
+            return globals()[name]
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    from spikekit._public import __all__
+
+    return [*__all__, "__version__"]
+
+
+# the old name of a module that a function has taken: as a module, it would take the place of the function
+sys.modules["spikekit.demosaic"] = ModuleType("spikekit.demosaic")
+sys.modules["spikekit.demosaic"].__getattr__ = _renamed.moved("spikekit.demosaic", _OLD_DEMOSAIC)

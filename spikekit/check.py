@@ -75,6 +75,8 @@ def check_whole(name: str, value: int) -> int:
     Raises:
         ValueError: anything else, True and False among it.
     """
+    if isinstance(value, torch.SymInt):  # a size that torch.export leaves open
+        return value
     if not isinstance(value, int) and hasattr(value, "__index__"):  # NumPy's
         value = operator.index(value)
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:

@@ -25,6 +25,20 @@ _SHORTEST = 2e-3  # seconds: what is faster is called several times within one t
 _FEWEST_ROUNDS = 3
 
 
+def duration(seconds: float) -> str:
+    """Return a time in words.
+
+    Example:
+        >>> [duration(time) for time in (0.21, 47.4, 192.0, 15_500.0)]
+        ['0.2 s', '47 s', '3 min 12 s', '4 h 18 min']
+    """
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes_left = divmod(minutes, 60)
+    return f"{hours} h {minutes_left} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
+
+
 def cpu_timer(now: Callable[[], float]) -> Timer:
     """Time by a clock of this process: :func:`time.process_time` for one thread, :func:`time.perf_counter` for more."""
 

@@ -28,7 +28,7 @@ MOVED = {
         "lightning_modules.cli.errors": ["InputError"],
         "lightning_modules.cli.command": ["CHOICES", "Command", "Parser", "check_folder", "run"],
     },
-    "spikekit.cli": {"spikekit.cli.command": ["CLOCK_HZ", "TFI_REACH", "TFP_WINDOW", "decode", "info"]},
+    "spikekit.cli": {"spikekit.cli.info": ["CLOCK_HZ"], "spikekit.cli.decode": ["TFI_REACH", "TFP_WINDOW"]},
     "spikekit.decoders": {"spikekit.decoders.dense": ["cast_light", "check_window", "interval_dtype"]},
 }
 
@@ -117,7 +117,8 @@ def test_old_names_of_the_tolerance_that_is_a_share_of_spikes():
         with pytest.raises(TypeError, match="tolerance: expected spike_tolerance alone, of which it is the old name"):
             call(tolerance=0.1, spike_tolerance=0.1)
     for option in ("--tolerance", "--spike-tolerance"):
-        asked = command_parser().parse_args(["simulate", "film", "-o", "out.dat", "--scale", "4", option, "0.2"])
+        words = ["simulate", "film", "-o", "out.dat", "--scale", "4", option, "0.2"]
+        asked = command_parser("simulate").parse_args(words)
         assert asked.tolerance == 0.2
 
 

@@ -38,6 +38,10 @@ _PRESET = {
     "self_ensemble": "--model.self_ensemble",
     "precision": "--trainer.precision",
 }
+#: arguments of the Trainer that count batches where they are whole, and are shares where they are not
+_COUNTS = {f"limit_{stage}_batches" for stage in ("train", "val", "test", "predict")}
+_COUNTS |= {"overfit_batches", "val_check_interval"}
+
 _OLD = {"--model.tolerance": "psnr_tolerance"}
 
 
@@ -57,7 +61,7 @@ def with_network_of_weights(args: Sequence[str]) -> list[str]:
     asked, named, alpha = None, None, None
     for _, option, value in options(args):
         if option in ("-c", "--config"):
-            model = _init_args(_model_in(value))
+            model = _init_args(_part_of(value, "model"))
             asked = model.get("weights") or asked
             network = _init_args(model.get("network"))
             named = _with_class(network.get("motion")) or named
@@ -101,6 +105,40 @@ def behind_configurations(args: Sequence[str], more: Sequence[str]) -> list[str]
     return [*args[:place], *more, *args[place:]]
 
 
+def classes_first(args: Sequence[str]) -> list[str]:
+    """Put what names a class before the first argument of it, where it was typed behind: the parser needs it there.
+
+    Example:
+        >>> classes_first(["predict", "--data.path", "a.dat", "--data", "Recording"])
+        ['predict', '--data', 'Recording', '--data.path', 'a.dat']
+    """
+    args = list(args)
+    for key in ("--model", "--model.network", "--model.network.motion", "--data"):
+        first = next((n for n, word in enumerate(args) if word.startswith(f"{key}.")), len(args))
+        place = next((n for n, word in enumerate(args) if word == key or word.startswith(f"{key}=")), 0)
+        if place > first:
+            end = place + 1 + (args[place] == key)
+            args[first:end] = [*args[place:end], *args[first:place]]
+    return args
+
+
+def whole_counts(args: Sequence[str]) -> dict[str, int]:
+    """Return the numbers of batches in arguments of the Trainer, by name, of which the parser makes 1.0: everything.
+
+    Example:
+        >>> whole_counts(["test", "--trainer.limit_test_batches", "1", "--trainer.limit_val_batches", "0.5"])
+        {'limit_test_batches': 1}
+    """
+    given: dict[str, Any] = {}
+    for _, option, value in options(args):
+        if option in ("-c", "--config"):
+            trainer = _part_of(value, "trainer")
+            given |= trainer if isinstance(trainer, dict) else {}
+        elif option.startswith("--trainer."):
+            given[option.removeprefix("--trainer.")] = int(value) if value.isdecimal() else value
+    return {name: given[name] for name in sorted(_COUNTS & given.keys()) if type(given[name]) is int}
+
+
 def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield dotted keys and what is no dictionary.
 
@@ -115,31 +153,8 @@ def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         yield from flatten(value, f"{prefix}.{key}" if prefix else str(key))
 
 
-def reason(message: str) -> str:
-    r"""Return jsonargparse's message, which is a tree of alternatives, as one line: the deepest, and where it is.
-
-    Example:
-        >>> reason('Parser key "width":\n  Expected a <class \'int\'>. Got value: abc')
-        "width: Expected a <class 'int'>. Got value: abc"
-    """
-    lines = message.strip().splitlines() or [message]
-    if lines[0].startswith("Problems parsing config"):
-        return " ".join(message.split())[:500]
-    where = [key for line in lines for key in re.findall(r'[Pp]arser key "([^"]+)"', line)]
-    given = next((line.strip() for line in lines if line.strip().startswith("Given value: ")), "")
-    inner = [
-        line for line in lines if not re.match(r"\s*(- Expected a <class 'NoneType'>|Given value|.*arser key)", line)
-    ]
-    deepest = max(inner or lines, key=lambda line: len(line) - len(line.lstrip()))
-    deepest = re.sub(r'^- |[Pp]arser key "[^"]+":\s*', "", deepest.strip())
-    given = given.removeprefix("Given value: ")
-    known = not given or given in deepest or "Got value" in deepest or "required: network" in deepest
-    got = "" if known else f", got {given[:80]}"
-    return ".".join(where) + (": " if where else "") + deepest[:500] + got
-
-
-def _model_in(config: str) -> Any:
-    """Return what a configuration says about the model; what is no file, or lacks it, is the parser's affair.
+def _part_of(config: str, name: str) -> Any:
+    """Return what a configuration says about a part; what is no file, or lacks it, is the parser's affair.
 
     Raises:
         ValueError: a file that is no YAML; the message is one line and names it.
@@ -156,7 +171,7 @@ def _model_in(config: str) -> Any:
         return None
     if not isinstance(content, dict):
         raise ValueError(f"{config}: not a configuration (expected names and values, got {type(content).__name__})")
-    return content.get("model")
+    return content.get(name)
 
 
 def _init_args(choice: Any) -> dict[str, Any]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import logging
-import re
 import sys
 import warnings
 from collections.abc import Sequence
 from contextlib import nullcontext
+from inspect import signature
 from pathlib import Path
+from time import perf_counter
 from typing import Any, NoReturn
 
 import torch
@@ -19,32 +20,32 @@ from pytorch_lightning.callbacks import LearningRateMonitor, ModelCheckpoint
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from pytorch_lightning.loggers import TensorBoardLogger
 from pytorch_lightning.utilities import rank_zero_only
+from pytorch_lightning.utilities.exceptions import MisconfigurationException
 
-from lightning_modules.checkpoint import Checkpoints, read_checkpoint
+from lightning_modules.checkpoint import read_checkpoint
 from lightning_modules.cli import prediction
-from lightning_modules.cli.arguments import (
-    flatten,
-    options,
-    reason,
-    with_network_of_weights,
-)
-from lightning_modules.cli.errors import Ended, InputError, UsageError
+from lightning_modules.cli.arguments import classes_first, flatten, options, whole_counts, with_network_of_weights
+from lightning_modules.cli.errors import InputError, UsageError
 from lightning_modules.cli.folder_lock import FolderError, locked_folder, make_folder
 from lightning_modules.cli.prediction import NO_RECORDING
+from lightning_modules.cli.reasons import reason, suggestion, unknown
 from lightning_modules.cli.renamed_overlays import with_current_overlays
 from lightning_modules.data import FilmScenes, Recording, StillScenes
 from lightning_modules.motion import Spike2Flow
 from lightning_modules.networks import CSCSR
 from lightning_modules.pretrained import check_settings
 from lightning_modules.tasks.base import Learner
+from lightning_modules.tasks.checkpoint_io import Checkpoints
 from lightning_modules.tasks.optical_flow import FlowTraining
 from lightning_modules.tasks.predictions import is_film, pictures_folder
 from lightning_modules.tasks.super_resolution import SuperResolution
 from lightning_modules.training_state import Begun, check_like_fresh, check_training_state, restoring
+from spikekit.arguments import one_line
 from spikekit.io import PictureError, SpikeFileError, VideoError
 from spikekit.io.video import PICTURE_ENDINGS, VIDEO_ENDINGS
 from spikekit.io.video_output import check_film
 from spikekit.io.whole_file import whole_file
+from spikekit.timing import duration
 
 #: classes whose arguments ``--help`` lists, by the option that names them
 CHOICES = (
@@ -57,12 +58,15 @@ CHOICES = (
     ("data", Recording),
 )
 
-# warnings about the insides of Lightning and jsonargparse, and about data that need no processes to read them
+# warnings about the insides of Lightning and jsonargparse, about seeds, and about data that need no processes to read
 _NOTHING_TO_DO = (
     r".*does not have many workers",
     r".*isinstance\(treespec, LeafSpec\)",
     r"\s*skip_none parameter was deprecated",
     r"Total length of",
+    r"\s*``[\w.]+`` was deprecated",
+    r"No seed found",
+    r".*the `outputs` folder",
 )
 
 # of what users may take the output for
@@ -86,26 +90,20 @@ class Parser(LightningArgumentParser):
                 parser = ArgumentParser(add_help=False, usage=argparse.SUPPRESS)
                 parser.add_class_arguments(choice, option)
                 text += f"\nwith --{option} {choice.__name__}:\n\n{parser.format_help()}"
-        elif "{fit," in text:
-            text += "    sweep               Train and test every combination of overlays, values and seeds.\n"
-            text += "    trade               Measure what every setting costs and what it is worth.\n"
-            text += "    export              Write the weights of a checkpoint as safetensors.\n"
-            text += "    models              List the weights that come with the package.\n"
         return text
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        """Say in one line what is wrong: jsonargparse would show all that there is and what it had tried."""
+        """Say in one line what is wrong: jsonargparse would show every option, and what it had tried to build."""
         if not self.exit_on_error:
             super().error(message, ex)
         if "the following arguments are required: network" in message:
-            raise Ended(
-                "lightning: expected a network: --speed balanced (predict alone), --model.weights NAME "
-                "(lightning models lists them), or a configuration, -c FILE",
-                2,
+            message = (
+                "expected a network: --speed balanced (predict alone), --model.weights NAME (lightning models lists "
+                "them), or a configuration, -c FILE"
             )
         if "the following arguments are required: predict.data" in message:
             message = NO_RECORDING
-        raise Ended(f"lightning: {reason(message)}", 2)
+        sys.exit(reason(message))
 
 
 class Configuration(SaveConfigCallback):
@@ -117,7 +115,22 @@ class Configuration(SaveConfigCallback):
 
 
 class Command(LightningCLI):
-    """The ``lightning`` command."""
+    """The ``lightning`` command.
+
+    Attributes:
+        typed: verb and arguments.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        typed = kwargs.get("args")
+        typed = sys.argv[1:] if typed is None else typed
+        self.typed = ["--help" if word == "--help=all" else word for word in typed]
+        super().__init__(*args, **kwargs)
+
+    def subcommands(self) -> dict[str, set[str]]:
+        """Return the verb that was typed alone, as building the parser of every verb takes time."""
+        verbs = LightningCLI.subcommands()
+        return {verb: verbs[verb] for verb in self.typed[:1] if verb in verbs} or verbs
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:  # noqa: D102
         parser.add_argument(
@@ -140,14 +153,28 @@ class Command(LightningCLI):
         )
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:  # noqa: D102
-        args = with_current_overlays(sys.argv[1:] if args is None else args)
-        if any(option in ("--speed", "--budget") for _, option, _ in options(args)):
-            args = prediction.with_choice(parser, args)
+        args = classes_first(with_current_overlays(self.typed))
         try:
-            args = with_network_of_weights(args)
-        except (OSError, ValueError) as error:
-            raise InputError(str(error)) from error
-        self.config = parser.parse_args(args)
+            if any(option in ("--speed", "--budget") for _, option, _ in options(args)):
+                args = prediction.with_choice(parser, args)
+            try:
+                args = with_network_of_weights(args)
+            except (OSError, ValueError) as error:
+                raise InputError(str(error)) from error
+            self.config = parser.parse_args(args)
+        except SystemExit as error:
+            if not isinstance(error.code, str):
+                raise
+            names = self._names()
+            meant = suggestion(unknown(self.typed, names), names)
+            raise UsageError(error.code + (meant or f" (see lightning {self.typed[0]} --help)")) from error
+        self.counts = whole_counts(args)
+
+    def _names(self) -> list[str]:
+        """Options that there are, without dashes."""
+        own = [option for part in self._subcommand_parsers.values() for option in part._option_string_actions]
+        classes = [f"--{option}.{name}" for option, choice in CHOICES for name in signature(choice).parameters]
+        return sorted({option.removeprefix("--") for option in (*own, *classes)})
 
     def _parse_ckpt_path(self) -> None:
         """Take no hyper-parameters out of a checkpoint: jsonargparse would build whatever they name."""
@@ -195,7 +222,7 @@ class Command(LightningCLI):
         alone = filmed or (subcommand == "fit" and not config.trainer.fast_dev_run)
         if subcommand in ("test", "predict"):
             make_folder(folder)
-        begun = Begun()
+        begun, begin = Begun(), perf_counter()
         self.trainer.callbacks.append(begun)
         try:
             with (
@@ -204,10 +231,14 @@ class Command(LightningCLI):
                 restoring(config.get("ckpt_path"), begun),
             ):
                 super()._run_subcommand(subcommand)
+        except (MisconfigurationException, ModuleNotFoundError) as error:  # of Lightning's, such as a callback's
+            raise InputError(one_line(error)) from error
         except ValueError as error:
             if begun or isinstance(error, FolderError):
                 raise
             raise InputError(str(error)) from error
+        if rank_zero_only.rank == 0:
+            print(f"{config.output}: {subcommand} took {duration(perf_counter() - begin)}")
 
     def instantiate_classes(self) -> None:  # noqa: D102
         config = self.config[self.subcommand]
@@ -224,10 +255,9 @@ class Command(LightningCLI):
                 self.model.recipe = {name: chosen.get(name) for name in ("optimizer", "lr_scheduler")}
                 if config.ckpt_path:
                     _check_continuation(config.ckpt_path, self.model, self.trainer)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, ModuleNotFoundError, MisconfigurationException) as error:
             # jsonargparse wraps what a class of a class says into pages about its own types
-            said = re.search(r"^ *- (?!Does not validate|Expected a )(.*)$", str(error), re.MULTILINE)
-            said = said[1] if said else str(error)
+            said = reason(str(error))
             raise (InputError if _is_of_file(error, said) else UsageError)(said) from error
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
@@ -235,18 +265,19 @@ class Command(LightningCLI):
         output = Path(self._get(self.config_init, "output"))
         config = self._get(self.config_init, "trainer")
         kwargs["default_root_dir"] = pictures_folder(output) if self.subcommand == "predict" else output
+        kwargs |= self.counts
         if config.get("logger") is None:
             # the tables and pictures of the other commands are files of their own
             kwargs["logger"] = TensorBoardLogger(output, name="", version="") if self.subcommand == "fit" else False
-        kwargs["plugins"] = [Checkpoints(), *(config.get("plugins") or [])]
+        kwargs["plugins"] = [Checkpoints(), *_listed(config.get("plugins"))]
         if config.get("precision") is None:
             kwargs["precision"] = _precision(config.get("accelerator"))
         if self.subcommand == "predict":
             precision = kwargs.get("precision", config.get("precision"))
-            callbacks = prediction.callbacks(output, self.config_dump, precision, config.get("callbacks") or [])
+            callbacks = prediction.callbacks(output, self.config_dump, precision, _listed(config.get("callbacks")))
         else:
             callbacks = self._callbacks(output)
-        kwargs["callbacks"] = [*(config.get("callbacks") or []), *callbacks]
+        kwargs["callbacks"] = [*_listed(config.get("callbacks")), *callbacks]
         if self.subcommand != "fit":
             self.save_config_callback = None  # config.yaml is the record of the training
         return super().instantiate_trainer(**kwargs)
@@ -274,6 +305,10 @@ def _is_of_file(error: BaseException | None, said: str) -> bool:
             return True
         error = error.__cause__ or error.__context__
     return False
+
+
+def _listed(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [] if value is None else [value]
 
 
 def check_folder(output: str | Path) -> None:
@@ -349,8 +384,8 @@ def _precision(accelerator: str) -> str:
 
 def run(args: Sequence[str] | None, command: type[Command]) -> Command:
     """Run what was typed after ``lightning``, with one of Lightning's verbs; what is wrong with it is raised."""
-    lightning_says = logging.getLogger("pytorch_lightning.utilities.rank_zero")
-    lightning_says.addFilter(lambda line: not re.search("litlogger|litmodels", str(line.msg)))
+    for says in ("pytorch_lightning.utilities.rank_zero", "lightning_fabric.utilities.seed"):
+        logging.getLogger(says).setLevel(logging.WARNING)  # tips, and which devices there are
     for nothing_to_do in _NOTHING_TO_DO:
         warnings.filterwarnings("ignore", nothing_to_do)
     return command(

@@ -8,13 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NoReturn
 
-from pytorch_lightning.utilities.exceptions import MisconfigurationException
-
-from lightning_modules.cli.folder_lock import FolderError
-from lightning_modules.pretrained import CheckpointMismatchError
-from spikekit import SpikeFileError, VideoError, arguments
+from spikekit import arguments
 from spikekit.arguments import one_line
-from spikekit.io import PictureError
 
 
 class InputError(ValueError):
@@ -47,18 +42,31 @@ class VerbParser(argparse.ArgumentParser):
         raise UsageError(f"{self.prog.removeprefix('lightning ')}: {message}")
 
 
+def _of_users() -> tuple[type[Exception], ...]:
+    """Return what is raised where a user made a mistake; importing it takes torch."""
+    from pytorch_lightning.utilities.exceptions import MisconfigurationException
+
+    from lightning_modules.cli.folder_lock import FolderError
+    from lightning_modules.pretrained import CheckpointMismatchError
+    from spikekit import SpikeFileError, VideoError
+    from spikekit.io import PictureError
+
+    ours = InputError, SpikeFileError, PictureError, VideoError, CheckpointMismatchError, FolderError
+    return *ours, MisconfigurationException  # of Lightning, such as a device that is not there
+
+
 @contextmanager
 def as_one_line() -> Iterator[None]:
     """End the program with one line, and no traceback, where the user made a mistake."""
     try:
         yield
-    except (InputError, SpikeFileError, PictureError, VideoError, CheckpointMismatchError, FolderError) as error:
-        # what a worker of a loader raises comes with its traceback, whose last line it is
-        said = str(error).strip().splitlines()[-1].split("Error: ", 1)[-1] if "Traceback (" in str(error) else error
-        raise Ended(f"lightning: {said}", 2 if isinstance(error, UsageError) else 1) from error
-    except MisconfigurationException as error:  # such as a device that is not there
-        raise Ended(f"lightning: {one_line(error)}", 1) from error
     except OSError as error:
         if error.filename is None or isinstance(error, BrokenPipeError):
             raise
         raise Ended(f"lightning: {error.filename}: {one_line(error)}", 1) from error
+    except Exception as error:
+        if not isinstance(error, _of_users()):
+            raise
+        # what a worker of a loader raises comes with its traceback, whose last line it is
+        said = str(error).strip().splitlines()[-1].split("Error: ", 1)[-1] if "Traceback (" in str(error) else error
+        raise Ended(f"lightning: {said}", 2 if isinstance(error, UsageError) else 1) from error

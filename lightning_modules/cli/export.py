@@ -4,34 +4,55 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from time import perf_counter
 
 from lightning_modules.cli.errors import InputError, VerbParser
+from lightning_modules.exporting import FORMATS, export_network
 from lightning_modules.motion import ESTIMATORS
 from lightning_modules.networks import NETWORKS
 from lightning_modules.pretrained import check_weights, read_weights, write_weights
+from spikekit.timing import duration
 
 
 def export(args: Sequence[str]) -> None:
-    """Write the weights of a checkpoint as a file of safetensors.
+    """Write a network as a file for other programs.
 
     Args:
         args: what was typed after ``lightning export``.
 
     Raises:
-        InputError: no such checkpoint, or a damaged one; or a name of another kind of file.
+        InputError: no such weights, or damaged ones; a name of another kind of file; a network that cannot be exported.
     """
     parser = VerbParser(
         prog="lightning export",
-        description="Write the weights of a checkpoint as a file of safetensors that knows what network it is of, for "
-        "lightning predict --model.weights FILE and CSCSR.from_pretrained(FILE).",
+        description="Write a network for other programs. safetensors are weights that know what network they are of, "
+        "for lightning predict --model.weights FILE and CSCSR.from_pretrained(FILE). torch is a program of "
+        "torch.export, which needs torch alone; onnx is for onnxruntime and others (the extra export writes it). "
+        "Both take a clip of any even height and width, and the motion as a second input where the network follows "
+        "motion: an estimate of motion cannot be exported. They are compared with the network on three sizes.",
     )
-    parser.add_argument("checkpoint", help="checkpoint of lightning fit")
-    parser.add_argument("-o", "--output", required=True, metavar="FILE", help="name.safetensors")
+    parser.add_argument("weights", help="a name that lightning models lists, a .safetensors, or a checkpoint")
+    parser.add_argument("--format", choices=("safetensors", *FORMATS), default="safetensors", help="safetensors")
+    parser.add_argument("--still", action="store_true", help="nothing moves: no motion as an input, for torch and onnx")
+    parser.add_argument("-o", "--output", required=True, metavar="FILE", help="name.safetensors, .pt2 or .onnx")
     asked = parser.parse_args(args)
+    begin = perf_counter()
+    ending = FORMATS.get(asked.format, ".safetensors")
+    if Path(asked.output).suffix != ending:
+        raise InputError(f"-o: expected a name that ends in {ending} for {asked.format}, got {asked.output}")
+    said = ""
     try:
-        weights = read_weights(asked.checkpoint)
+        weights = read_weights(asked.weights)
         check_weights(weights, {**NETWORKS, **ESTIMATORS})
-        write_weights(weights, asked.output)
-    except (OSError, ValueError) as error:
+        if asked.format == "safetensors":
+            write_weights(weights, asked.output)
+        else:
+            kind = NETWORKS.get(weights.settings.get("class"))
+            if kind is None:
+                raise ValueError(f"{asked.weights}: expected weights of a network, got those of an estimator of motion")
+            network = kind.from_pretrained(asked.weights)
+            said = f", {export_network(network, asked.output, asked.format, still=asked.still)}"
+    except (OSError, ValueError, ImportError) as error:
         raise InputError(str(error)) from error
-    print(f"{asked.output}: {Path(asked.output).stat().st_size / 2**20:.1f} MiB")
+    size = Path(asked.output).stat().st_size / 2**20
+    print(f"{asked.output}: {size:.1f} MiB{said}, in {duration(perf_counter() - begin)}")

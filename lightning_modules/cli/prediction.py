@@ -18,8 +18,12 @@ from lightning_modules.inference.presets import SPEEDS, choose
 from lightning_modules.tasks.predictions import PictureProgress, Predictions, file_identity
 from spikekit import __version__
 from spikekit.decoders.methods import DECODERS
+from spikekit.timing import duration
 
 NO_RECORDING = "predict: expected a recording: --data Recording --data.path FILE"
+
+# milliseconds a pixel of a picture, written as PNG by one core
+_WRITING = 7e-5
 
 
 def add_arguments(parser: LightningArgumentParser) -> None:
@@ -56,11 +60,19 @@ def with_choice(parser: LightningArgumentParser, args: Sequence[str]) -> list[st
         raise UsageError(NO_RECORDING)
     try:
         known = ("path", "height", "width", "pattern", "camera")
-        size = RecordingClips(**{name: recording.get(name) for name in known}, frames=1).size
-        choice = choose(parsed.model.init_args.network.init_args.scale, parsed.speed, parsed.budget, size)
+        clips = RecordingClips(**{name: recording.get(name) for name in (*known, "frame", "every")})
+        scale = parsed.model.init_args.network.init_args.scale
+        choice = choose(scale, parsed.speed, parsed.budget, clips.size)
+        speeds = list(SPEEDS)
+        sooner = speeds[max(speeds.index(parsed.speed) - 1, 0)] if parsed.speed else None
+        other = choose(scale, sooner, None, clips.size) if sooner else choice
     except (OSError, ValueError) as error:
         raise InputError(str(error)) from error
     print(choice, flush=True)
+    writing = _WRITING * scale**2 * clips.size[0] * clips.size[1]
+    took, sooner_took = (duration(len(clips) * (one.ms + writing) / 1e3) for one in (choice, other))
+    instead = f"; --speed {sooner}: {sooner_took}, {other.below:.2f} dB below the best" if other != choice else ""
+    print(f"{len(clips)} pictures, written as PNG: about {took}{instead}", flush=True)
     return behind_configurations(args, preset_arguments(choice.preset))
 
 

@@ -7,19 +7,15 @@ from typing import Any
 
 import yaml
 
-from lightning_modules.cli.arguments import flatten, reason
+from lightning_modules.cli.arguments import flatten
 from lightning_modules.cli.command import Command
+from lightning_modules.cli.reasons import reason, suggestion, unknown
 
 
 class Rehearsal(Command):
     """Parses and builds what a verb would, to find mistakes, which are raised; runs nothing and writes nothing."""
 
     verb = "test"
-
-    @classmethod
-    def subcommands(cls) -> dict[str, set[str]]:
-        """One verb, so that only its parser is built."""
-        return {cls.verb: Command.subcommands()[cls.verb]}
 
     def init_parser(self, **kwargs: Any) -> Any:  # noqa: D102
         return super().init_parser(**kwargs, exit_on_error=False)
@@ -41,21 +37,7 @@ def mistake(error: Exception, args: Sequence[str], names: Sequence[str]) -> str:
         args: they.
         names: of all arguments that there are, of which the one that was meant is looked for.
     """
-    unknown = [word[2:].partition("=")[0] for word in args if word.startswith("--")]
-    unknown = [key for key in unknown if names and key not in names]
-    return reason(str(error)) + _suggestion(unknown, names)
-
-
-def _suggestion(unknown: Sequence[str], names: Sequence[str]) -> str:
-    from difflib import get_close_matches
-
-    for key in unknown:
-        ends = {name.rpartition(".")[2] for name in names}
-        close = get_close_matches(key.rpartition(".")[2], ends, 1, 0.75)
-        meant = [name for name in names if close and name.rpartition(".")[2] == close[0]]
-        if meant:
-            return f"; {key}: did you mean {' or '.join(meant)}?"
-    return ""
+    return reason(str(error)) + suggestion(unknown(args, names), names)
 
 
 def argument_names(config: dict[str, Any]) -> list[str]:

@@ -69,7 +69,8 @@ class ClassicalFlow(MotionEstimator):
     def forward(self, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> tuple[Tensor, Tensor]:  # noqa: D102
         return self._flows(spikes, times, pattern, by_site=False)
 
-    @torch.compiler.disable(reason="Numba compiles its loops")
+    # Numba compiles its loops; torch.compiler.disable would import the compiler for those who compile nothing
+    @torch._disable_dynamo
     @torch.no_grad()
     def _flows(self, spikes: Tensor, times: tuple[int, int, int], pattern: str, by_site: bool) -> tuple[Tensor, Tensor]:
         check_planes("spikes", spikes, 4, "(B, N, H, W)")

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
+from kornia.core.utils import is_exporting
 from kornia.filters import filter2d_separable
 from torch import Tensor, nn
 
@@ -22,6 +23,7 @@ from lightning_modules.networks.refinement import FeatureRefinement, TimeFusion
 from lightning_modules.networks.representation import IntervalRepresentation, SpikeRepresentation, WindowMeans
 from lightning_modules.networks.static_scene import WORTH_IT, convolve_at_rest, rest_response
 from spikekit import bayer_mask, demosaic, flow_warp_idw, linear_motion, split_colors, tfp_at
+from spikekit.warp.bayer_warp import bayer_warp_idw
 
 _SEARCHED = 1 << 19  # positions that are searched in one go
 
@@ -151,7 +153,9 @@ class CSCSR(Network):
         if response is not None:
             colors = list(map(self._at_rest, features, self.refinement, response, range(3)))
         else:
-            if self.config.search:
+            if self.config.search and is_exporting():
+                pixels = map(self._search_in_graph, features, self._offsets(flow, spikes), range(3))
+            elif self.config.search:
                 offsets = self._offsets(flow, spikes)
                 pixels = map(self._search, features, offsets, self._mask(height, width, spikes.device))
             else:
@@ -220,6 +224,16 @@ class CSCSR(Network):
         known = enlarge(mask[None, :: self.scale, :: self.scale].to(pixels.dtype), self.scale)
         return pixels / known.where(mask, 1)
 
+    def _search_in_graph(self, features: Tensor, offsets: Tensor, color: int) -> Tensor:
+        """The same in operations that other programs know, for any even height and width."""
+        if not self.steps or self.config.neighbors != 4:
+            got = f"steps={self.steps}, neighbors={self.config.neighbors}"
+            raise ValueError(f"steps, neighbors: expected rounded positions and 4 neighbours to export, got {got}")
+        offsets = offsets.expand(-1, features.shape[1], -1, -1, -1)
+        pixels = enlarge(features.flatten(0, 1), self.scale)
+        found = bayer_warp_idw(pixels, offsets.flatten(0, 1), self.pattern, color, self.scale, self.steps)
+        return found.unflatten(0, features.shape[:2])
+
     def _base(self, spikes: Tensor) -> Tensor:
         """TFP of the whole clip, demosaiced, smoothed, enlarged."""
         raw = tfp_at(spikes, self.frames // 2, self.frames) / self.config.alpha
@@ -241,7 +255,7 @@ class CSCSR(Network):
 
     def _response_for(self, spikes: Tensor) -> Tensor | None:
         """Weights of the search where nothing moves, if they are known and worth using for a picture of this size."""
-        if self._response is None or min(spikes.shape[-2:]) < WORTH_IT:
+        if self._response is None or is_exporting() or min(spikes.shape[-2:]) < WORTH_IT:
             return None
         key = spikes.device, torch.promote_types(spikes.dtype, torch.float32)
         if key not in self._responses:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import torch
+from kornia.core.utils import is_exporting
 from torch import Tensor, nn
 
 from lightning_modules.error_model import ErrorModel
@@ -137,6 +138,8 @@ class Network(nn.Module):
                 "torch.jit.trace: expected static=True or ZeroFlow, as a trace would keep the motion of its example "
                 "for every clip; torch.compile keeps none"
             )
+        if flow is None and is_exporting():
+            raise ValueError("flow: expected it as an input, as the estimate of motion cannot be exported, got none")
         if flow is None:
             flow = self.estimate_flow(spikes)
         shapes = [(len(spikes), *groups, 2, 2, *spikes.shape[-2:]) for groups in self.flow_groups]

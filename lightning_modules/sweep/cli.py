@@ -141,7 +141,7 @@ def sweep(args: Sequence[str]) -> None:
     budget = {name: value for name, value in budget.items() if value is not None}
     trials = make_trials(configs, asked.over, asked.set, asked.seeds, budget, asked.output)
     if asked.engine == "ray" and find_spec("ray") is None:
-        raise InputError("sweep: --engine ray: Ray is not installed; pip install 'spikekit[ray]' brings it")
+        raise InputError("sweep: --engine ray: Ray is not installed; pip install '.[ray]' in a clone brings it")
     with locked_folder(asked.output, "sweep"):
         for trial in trials:
             trial.write()

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from spikekit._renamed import moved
 
-_COMMAND = "CLOCK_HZ", "TFI_REACH", "TFP_WINDOW", "decode", "info"
-__getattr__ = moved(__name__, dict.fromkeys(_COMMAND, "spikekit.cli.command"))
+_HOMES = {"CLOCK_HZ": "info", "TFI_REACH": "decode", "TFP_WINDOW": "decode"}
+__getattr__ = moved(__name__, {name: f"spikekit.cli.{home}" for name, home in _HOMES.items()})
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -30,6 +30,10 @@ USUAL_SIZES = {
 }
 
 
+# Pixels that are counted at a time.
+_BLOCK = 1 << 24
+
+
 @dataclass(frozen=True)
 class Recording:
     """A file of spikes, read as the camera saw the scene: upright, only pixels, no border.
@@ -93,6 +97,16 @@ class Recording:
     def said(self) -> str:
         """What is corrected, in words that follow others."""
         return "" if self.calibration is None else ", pixels corrected by its calibration"
+
+    def counts(self, start: int, frames: int) -> Tensor:
+        """Count the spikes of every pixel (H, W) in some frames."""
+        height, width = self.stored
+        counts = torch.zeros(height, width, dtype=torch.int64)
+        chunk = min(max(_BLOCK // (height * width), 1), 255)  # whose sum fits into a byte
+        parts = iter_spikes(self.path, height, width, flip=self.flip, start=start, frames=frames, chunk=chunk)
+        for part in parts:
+            counts += torch.from_numpy(part.numpy().sum(axis=0, dtype=np.uint8))
+        return self.prepare(counts)
 
     def show(self, picture: Tensor, *, known: bool) -> Tensor:
         """Return light as it is shown; the gain of the camera is for light whose white is known, not guessed."""

@@ -63,7 +63,7 @@ class VideoFrames(Sequence[Tensor]):
         before ``f10``); folders, hidden files and files with other endings are left out. A single picture is a film
         of one frame.
 
-        Video files need PyAV (``pip install 'spikekit[video]'``). Frames are counted without decoding them. Reading on
+        Video files need PyAV (``pip install '.[video]'``). Frames are counted without decoding them. Reading on
         is cheap, a few frames back too; further back the file is decoded from its start again, so that frame n is
         always the same one.
 
@@ -307,7 +307,7 @@ class _Film:
         try:
             import av  # noqa: F401
         except ImportError as error:
-            raise VideoError(f"{path}: reading a video needs PyAV, pip install 'spikekit[video]'") from error
+            raise VideoError(f"{path}: reading a video needs PyAV, pip install '.[video]'") from error
         with _reading(path), _container(path) as container:
             stream = next(iter(container.streams.video), None)
             if stream is None or stream.codec_context is None:

@@ -98,7 +98,7 @@ def flow_warp_idw(
         With ``steps`` the flow is rounded to that many positions per pixel and axis, and positions outside the image
         are moved to its edge, so that neighbours and weights can be looked up in a table, made once for a mask. The
         gradient is that of the rounded flow, 0 where a position was moved. Fewer than 32 channels on a CPU are warped
-        in loops that Numba compiles, where it is installed (``pip install 'spikekit[fast]'``): the same result sooner.
+        in loops that Numba compiles, where it is installed (``pip install '.[fast]'``): the same result sooner.
 
     Args:
         features: :math:`(*, C, H, W)`, floating.

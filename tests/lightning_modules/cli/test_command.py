@@ -21,6 +21,7 @@ from lightning_modules.cli.command import run as run_command
 from lightning_modules.cli.errors import InputError
 from lightning_modules.cli.rehearsal import Rehearsal
 from lightning_modules.cli.renamed_overlays import FORMER_SIZES, _current, with_current_overlays
+from lightning_modules.cli.short_help import options_of
 from lightning_modules.networks import CSCSR
 from spikekit import read_picture, write_spikes
 
@@ -256,6 +257,48 @@ def test_every_verb_is_named_where_none_was_typed(typed):
     assert str(exit.value) == f"lightning: expected a verb, one of {verbs}, got {got} (see lightning --help)"
 
 
+@pytest.mark.parametrize("verb", ["fit", "validate", "test", "predict"])
+def test_the_short_help_names_options_that_there_are(verb, capsys):
+    main([verb, "--help"])
+    assert len(capsys.readouterr().out.splitlines()) < 40
+    with pytest.raises(SystemExit):
+        main([verb, "--help=all"])
+    text = capsys.readouterr().out
+    assert [option for option in options_of(verb) if option not in text] == []
+
+
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        (["--data.patern", "RGGB"], "data: Option 'patern' is not accepted; data.patern: did you mean data.pattern?"),
+        (["--trainer.logger", "WandbLogger"], "Requirement 'wandb"),
+        (["--data.every", "many"], "data.every: expected int, got 'many'"),
+        (["--trainer.callbacks", "Foo"], "trainer.callbacks: expected the name of a class, got Foo"),
+    ],
+)
+def test_a_mistake_is_one_line_with_its_cause(typed, said, decoder):
+    with pytest.raises(SystemExit) as exit:
+        main([*decoder, *typed])
+    assert said in exit.value.code
+    assert "\n" not in exit.value.code
+
+
+def test_a_number_of_batches_is_no_share(decoder):
+    command = run_command([*decoder, "--trainer.limit_predict_batches", "1"], Predict)
+    assert command.trainer.limit_predict_batches == 1
+    assert isinstance(command.trainer.limit_predict_batches, int)
+    run_command([*decoder, "--trainer.callbacks", "DeviceStatsMonitor"], Predict)
+
+
+def test_help_answers_without_torch():
+    code = "import sys; from lightning_modules.__main__ import main; main(sys.argv[1:]); print(*sys.modules)"
+    for words in (["--help"], ["predict", "--help"], ["models"]):
+        done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
+        imported = done.stdout.splitlines()[-1].split()
+        assert "torch" not in imported
+        assert len(imported) < 400
+
+
 def test_version(capsys):
     main(["--version"])
     assert capsys.readouterr().out == f"lightning of spikekit {spikekit.__version__}\n"
@@ -388,7 +431,7 @@ def test_configurations_are_found_however_they_are_typed():
 
 def test_help_explains_every_option(configs, capsys):
     with pytest.raises(SystemExit):
-        main(["fit", "-c", str(configs / "x4.yaml"), "--help"])
+        main(["fit", "-c", str(configs / "x4.yaml"), "--help=all"])
     text = " ".join(capsys.readouterr().out.split())
     for option, words in (
         ("--model.network.width", "channels of refinement and reconstruction"),

@@ -255,7 +255,7 @@ def test_a_preset_is_the_same_from_python_and_as_it_is_typed(given, configs):
 
 def test_help_says_the_figures_that_speeds_are_chosen_by(capsys):
     with pytest.raises(SystemExit):
-        main(["predict", "--help"])
+        main(["predict", "--help=all"])
     said = " ".join(capsys.readouterr().out.split())
     assert f"at most {SPEEDS['balanced']:g} dB (balanced) or {SPEEDS['fast']:g} dB (fast) below it" in said
 

@@ -377,7 +377,7 @@ def test_time_ends_training(typed, overlays, tmp_path):
         (["X", "--set", "model.network.widht=8,16"], "widht=8: model.network: Option 'widht' is not accepted"),
         (
             ["X", "--set", "model.network.width=8,x"],
-            "width=x: model.network.width: Expected a <class 'int'>. Got value: x",
+            "width=x: model.network.width: expected int, got 'x'",
         ),
         (["X", "--set", "data.motion=1,-1"], "motion=-1: motion: expected 0 or more, got -1.0"),
         (["X", "--set", "trainer.devices=2"], "trainer.devices: expected 1, the one of a trial, got 2"),

@@ -26,8 +26,9 @@ from spikekit import (
     tfp,
     write_spikes,
 )
-from spikekit.cli import command as cli
-from spikekit.cli.command import main
+from spikekit.cli import decode
+from spikekit.cli.command import VERBS, main
+from spikekit.io import recording
 
 SPIKES = Path(__file__).parents[3].parent / "shared" / "data" / "spikes"
 REDS = SPIKES / "reds_sim_mono_203_250x400.dat"
@@ -109,7 +110,7 @@ def test_info_of_many_frames(tmp_path, capsys, monkeypatch, frames):
     spikes[1, 0, 0] = 0
     write_spikes(tmp_path / "a.npz", spikes)
     for block in (1, 800, 1 << 24):
-        monkeypatch.setattr(cli, "_BLOCK", block)
+        monkeypatch.setattr(recording, "_BLOCK", block)
         assert main(["info", str(tmp_path / "a.npz")]) == 0
         out = capsys.readouterr().out
         assert f"bits set     {8 * frames - 1} of {8 * frames}," in out
@@ -222,7 +223,7 @@ def test_decode_reads_only_what_it_needs(tmp_path, monkeypatch, words, expected)
             read[-1][1] += 1
             yield frame
 
-    monkeypatch.setattr(cli, "iter_spikes", count)
+    monkeypatch.setattr(decode, "iter_spikes", count)
     with open(tmp_path / "a.dat", "wb") as file:
         file.truncate(2 * 1_000_000)
     line = ["decode", str(tmp_path / "a.dat"), "--height", "4", "--width", "4", "-o", str(tmp_path / "{frame}.png")]
@@ -233,7 +234,7 @@ def test_decode_reads_only_what_it_needs(tmp_path, monkeypatch, words, expected)
 def test_decode_reads_an_array_once(tmp_path, monkeypatch):
     """Every way into an .npz begins at its start."""
     calls = []
-    monkeypatch.setattr(cli, "iter_spikes", lambda *_, **__: calls.append(__) or iter_spikes(*_, **__))
+    monkeypatch.setattr(decode, "iter_spikes", lambda *_, **__: calls.append(__) or iter_spikes(*_, **__))
     write_spikes(tmp_path / "a.npz", torch.ones(90, 2, 4))
     words = ["--method", "tfp", "--window", "3", "--frame", "10:90:20", "--alpha", "1"]
     assert main(["decode", str(tmp_path / "a.npz"), *words, "-o", str(tmp_path / "{frame}.png")]) == 0
@@ -278,14 +279,14 @@ def test_decode_many_at_one_scale(tmp_path, capsys):
 
 def test_decode_many_until_the_disk_is_full(clip, tmp_path, monkeypatch, fails):
     """The pictures already made stay, and the one that failed leaves nothing."""
-    write, out = cli.write_picture, tmp_path / "out"
+    write, out = decode.write_picture, tmp_path / "out"
 
     def full(path, picture):
         if path.name == "12.png":
             raise OSError(28, "No space left on device")
         write(path, picture)
 
-    monkeypatch.setattr(cli, "write_picture", full)
+    monkeypatch.setattr(decode, "write_picture", full)
     words = ("--method", "tfp", "--frame", "10:20", "-o", out / "{frame}.png")
     assert f"{out / '12.png'}: cannot be written (No space left on device)" in fails(1, "decode", *sized(clip), *words)
     assert sorted(path.name for path in out.iterdir()) == ["10.png", "11.png"]
@@ -463,7 +464,7 @@ def test_stopped(clip, monkeypatch, capsys, error, status):
     def stop(*_, **__):
         raise error
 
-    monkeypatch.setattr(cli, "iter_spikes", stop)
+    monkeypatch.setattr(recording, "iter_spikes", stop)
     assert main(["info", *map(str, sized(clip))]) == status
     assert capsys.readouterr() == ("", "spikekit: no room\n" if status == 1 else "")
 
@@ -476,7 +477,25 @@ def test_installed_command():
     assert script.load() is main
 
 
-@pytest.mark.parametrize("words", [["--help"], ["info", "--help"], ["decode", "--help"]])
+@pytest.mark.parametrize("words", [["--help"], ["--version"]])
+def test_answers_at_once(words):
+    """Modules are counted, not time: no verb is imported that nobody asked for, and neither torch nor NumPy."""
+    code = f"from spikekit.cli.command import main; import sys; main({words}); print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    imported = set(done.stdout.splitlines()[-1].split())
+    assert not {"torch", "numpy", "kornia"} & imported
+    assert len(imported) < 160
+
+
+def test_cameras(capsys):
+    assert main(["cameras"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["camera", "m1k40", "m1k40-bayer", "uhsr", "vidar"]
+    assert "992 x 992" in lines[2]
+    assert "BGGR" in lines[2]
+
+
+@pytest.mark.parametrize("words", [["--help"], *([verb, "--help"] for verb in VERBS)])
 def test_help(words, capsys):
     assert main(words) == 0
     out = capsys.readouterr().out

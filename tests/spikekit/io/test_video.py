@@ -344,4 +344,4 @@ def test_sound_is_no_film(tmp_path):
 def test_without_pyav(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     (tmp_path / "a.mp4").write_bytes(b"0")
-    fails(tmp_path / "a.mp4", "pip install 'spikekit[video]'")
+    fails(tmp_path / "a.mp4", "pip install '.[video]'")

@@ -1,0 +1,21 @@
+"""Entry points of ``torch.hub``: a network with each of the weights in the package, which needs no network.
+
+``torch.hub.load(FOLDER, "cscsr_small_x4", source="local")`` from a clone; ``lightning models``
+lists them. Arguments are those of ``CSCSR.from_pretrained``.
+"""
+
+from functools import partial
+
+from lightning_modules.networks import CSCSR
+from lightning_modules.shipped import list_pretrained
+
+dependencies = ["torch", "kornia", "numpy", "safetensors"]
+
+
+def _entry(name: str) -> partial[CSCSR]:
+    load = partial(CSCSR.from_pretrained, name)
+    load.__doc__ = f"Return CSCSR with the weights {name}, in evaluation mode, on the CPU."
+    return load
+
+
+globals().update({weights.name: _entry(weights.name) for weights in list_pretrained() if weights.scale})

@@ -1,0 +1,72 @@
+"""What is wrong with arguments, in one line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from difflib import get_close_matches
+
+# what jsonargparse writes around a cause
+_AROUND = re.compile(
+    r"\s*(- )?(Expected a <class 'NoneType'>|Given value|.*arser key|Does not validate|Subtypes|Errors:|Problem with|$)"
+)
+_MOST = 500  # characters of it that are shown
+# alternatives that nobody meant
+_UNLIKELY = re.compile(r"\s*- Expected a (<class|path|collections)")
+
+
+def reason(message: str) -> str:
+    r"""Return jsonargparse's message, which is a tree of alternatives, as one line: the cause, and where it is.
+
+    Example:
+        >>> lines = "    - Expected a <class 'int'>", "    - Expected a <class 'NoneType'>", "  Given value: high"
+        >>> reason("\n".join(['Parser key "data.height":', *lines]))
+        "data.height: expected int, got 'high'"
+    """
+    lines = message.strip().splitlines() or [message]
+    if lines[0].startswith("Problems parsing config"):
+        return " ".join(message.split())[:_MOST]
+    where = [key for line in lines for key in re.findall(r'[Pp]arser key "([^"]+)"', line)]
+    inner = [line for line in lines if not _AROUND.match(line)]
+    likely = [line for line in inner if not _UNLIKELY.match(line)]
+    deepest = max(likely or inner or lines, key=lambda line: len(line) - len(line.lstrip()))
+    cause = re.sub(r'^- |[Pp]arser key "[^"]+":\s*', "", deepest.strip())
+    given = re.search(r"^ *Given value: (?!Namespace)(.*)$", message, re.MULTILINE)
+    kind = re.fullmatch(r"Expected a <class '(\w+)'>(?:\. Got value: (.*))?", cause)
+    if kind:
+        got = kind[2] or (given[1] if given else None)
+        cause = f"expected {kind[1]}" + (f", got {got[:80]!r}" if got else "")
+    cause = re.sub("Expected a dot import path string: (.*)", r"expected the name of a class, got \1", cause)
+    return ".".join(where) + (": " if where else "") + cause[:_MOST]
+
+
+def suggestion(unknown: Sequence[str], names: Sequence[str]) -> str:
+    """Return which argument may have been meant, or nothing.
+
+    Args:
+        unknown: arguments as they were typed, without dashes.
+        names: those that there are.
+
+    Example:
+        >>> suggestion(["data.patern"], ["data.path", "data.pattern"])
+        '; data.patern: did you mean data.pattern?'
+    """
+    for key in unknown:
+        ends = {name.rpartition(".")[2] for name in names}
+        close = get_close_matches(key.rpartition(".")[2], ends, 1, 0.75)
+        meant = [name for name in names if close and name.rpartition(".")[2] == close[0]]
+        meant = [name for name in meant if name.partition(".")[0] == key.partition(".")[0]] or meant
+        if meant:
+            return f"; {key}: did you mean {' or '.join(meant)}?"
+    return ""
+
+
+def unknown(words: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Return the options among words, without dashes, that are not names.
+
+    Example:
+        >>> unknown(["--data.path", "a.dat", "--data.patern=RGGB"], ["data.path"])
+        ['data.patern']
+    """
+    typed = [word[2:].partition("=")[0] for word in words if word.startswith("--")]
+    return [key for key in typed if names and key not in names]

@@ -1,0 +1,66 @@
+"""Checkpoints of ``lightning fit`` as Lightning reads, writes and removes them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning_fabric.plugins import TorchCheckpointIO
+
+from lightning_modules.checkpoint import read_checkpoint
+from spikekit.io.whole_file import whole_file
+
+#: of the state of a ModelCheckpoint: files that it may go on to remove
+_PATHS = ("best_model_path", "kth_best_model_path", "last_model_path")
+
+
+class Checkpoints(TorchCheckpointIO):
+    """How Lightning reads, writes and removes checkpoints: without running code, whole, and nothing else than them."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
+        """Write a checkpoint; one that was there stays until the new one is complete."""
+        with whole_file(path) as file:
+            try:
+                torch.save(checkpoint, file)
+            except RuntimeError as error:  # torch's own writer, when the disk is full
+                if isinstance(error.__context__, OSError):
+                    raise error.__context__ from None
+                raise
+
+    def load_checkpoint(self, path: str | Path, *_: Any, **__: Any) -> dict[str, Any]:
+        """Read a checkpoint; its callbacks may name files of their own folder, and no others."""
+        checkpoint = read_checkpoint(path)
+        states = checkpoint.get("callbacks", {})
+        if isinstance(states, dict):
+            checkpoint["callbacks"] = {
+                key: _without_foreign_files(state) if isinstance(state, dict) else state
+                for key, state in states.items()
+            }
+        return checkpoint
+
+    def remove_checkpoint(self, path: str | Path) -> None:
+        """Remove a checkpoint; anything else stays."""
+        path = Path(path)
+        if path.suffix == ".ckpt" and path.is_file():
+            path.unlink()
+
+
+def _without_foreign_files(state: dict[str, Any]) -> dict[str, Any]:
+    """Return the state of a callback that names only checkpoints in the folder that it says it writes to."""
+    folder = state.get("dirpath")
+    own = {name: _own_file(state[name], folder) for name in _PATHS if name in state}
+    best = state.get("best_k_models")
+    if isinstance(best, dict):
+        own["best_k_models"] = {_own_file(path, folder): score for path, score in best.items() if path}
+        own["best_k_models"].pop("", None)
+    return {**state, **own}
+
+
+def _own_file(path: Any, folder: Any) -> str:
+    """Return a path without detours, or nothing where it is not that of a checkpoint in a folder."""
+    if not (isinstance(path, str) and isinstance(folder, str) and path.endswith(".ckpt")):
+        return ""
+    path, folder = Path(os.path.abspath(path)), Path(os.path.abspath(folder))
+    return str(path) if folder in path.parents else ""

@@ -1,0 +1,202 @@
+"""``spikekit decode``: pictures of frames of a recording."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from spikekit.arguments import FRAMES, UsageError, frames_of, one_line, positive, whole
+from spikekit.color.cfa import PATTERNS
+from spikekit.color.demosaic import demosaic
+from spikekit.decoders.methods import DECODERS, TFI_REACH
+from spikekit.io import recording as recordings
+from spikekit.io.files import iter_spikes
+from spikekit.io.images import write_picture
+from spikekit.io.recording import Recording, open_recording, white_rate
+from spikekit.io.sidecar import check_unclaimed
+from spikekit.io.video import PICTURE_ENDINGS
+
+#: Frames that TFP averages when nothing else is said.
+TFP_WINDOW = 41
+
+# Gives the frame of a number, its pixels unpacked.
+_Plane = Callable[[int], np.ndarray]
+
+# Stands for the number of the frame in the name of a picture.
+_NUMBER = "{frame}"
+
+
+def run(args: argparse.Namespace) -> None:
+    """Write the picture of one frame, or of many, reading only as much around each as the method needs."""
+    decoder = DECODERS[args.method]
+    if args.window is not None and ("window" not in decoder.options or args.window % 2 == 0):
+        methods = _with_option("window")
+        raise UsageError(f"--window: expected an odd number, with {methods}, got {args.window} with {args.method}")
+    if args.order > 1 and "order" not in decoder.options:
+        raise UsageError(f"--order: expected {_with_option('order')}, got {args.order} with {args.method}")
+    if args.output.is_dir():
+        raise ValueError(f"{args.output}: expected a picture to write, got a folder")
+    recording = open_recording(args)
+    frames = recording.frames
+    chosen = _chosen(args, frames)
+    if len(chosen) > 1 and _NUMBER not in str(args.output):
+        raise UsageError(f"--output: expected {_NUMBER} in the name of {len(chosen)} pictures, got {args.output}")
+    if args.order > frames:
+        raise UsageError(f"--order: expected 1 .. {frames}, as {args.file} has {frames} frames, got {args.order}")
+
+    paths = {n: Path(str(args.output).replace(_NUMBER, f"{n:0{len(str(frames - 1))}}")) for n in chosen}
+    check_unclaimed(paths.values(), args.file)
+
+    given = {**vars(args), "window": args.window or TFP_WINDOW}
+    options = {name: given[name] for name in decoder.options}
+    reach = decoder.reach(**options)
+    key = chosen[len(chosen) // 2]
+    alpha = args.alpha or recording.alpha
+    white, scaling = _white(alpha, recording, key, reach)
+    scaling += recording.said
+    hidden = True if len(chosen) == 1 else None  # None: on a terminal only
+    for n, plane in tqdm(_windows(recording, chosen, reach), "pictures", len(chosen), disable=hidden, leave=False):
+        first, last = _span(n, reach, frames)
+        raw = torch.from_numpy(decoder.planes(plane, n, range(first, last + 1), frames, **options))
+        raw = recording.correct(raw) / white
+        picture = raw if recording.pattern is None else demosaic(raw, recording.pattern)
+        _write(paths[n], recording.show(picture, known=alpha is not None))
+    if len(chosen) == 1:
+        first, last = _span(key, reach, frames)
+        print(f"{paths[key]}: frame {key} of {frames} by {args.method} from frames {first} .. {last}, {scaling}")
+    else:
+        print(
+            f"{args.output}: {len(chosen)} pictures of frames {chosen[0]} .. {chosen[-1]} of {frames}, {chosen.step} "
+            f"apart, by {args.method} from up to {reach} frames on each side, all {scaling}"
+        )
+
+
+def _with_option(name: str) -> str:
+    return f"--method {' or '.join(method for method, decoder in DECODERS.items() if name in decoder.options)}"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    recordings.add_arguments(parser)
+    recordings.add_calibration(parser)
+    add = parser.add_argument
+    add(
+        "--method",
+        required=True,
+        choices=DECODERS,
+        help="by the interval between the two spikes around the frame, or by the number of spikes in a window around "
+        f"it; tfi looks up to {TFI_REACH} frames to each side, and a pixel with no spike there is taken to have fired "
+        "just outside",
+    )
+    add(
+        "-o",
+        "--output",
+        required=True,
+        type=_picture,
+        metavar="OUT.png",
+        help=f"the picture to write; {_NUMBER} in it becomes the number of the frame, with leading zeros",
+    )
+    add("--pattern", type=str.upper, choices=PATTERNS, help="Bayer phase after the flip, for colour; grey without it")
+    add(
+        "--frame",
+        type=_frames,
+        metavar="N|A:B[:STEP]",
+        help="which frame, from 0, or which frames, from A to B - 1, as in Python; the middle one if not given",
+    )
+    add(
+        "--window",
+        type=whole(1),
+        metavar="W",
+        help=f"frames that tfp averages, odd, the frame in their middle, fewer at the ends of the recording; "
+        f"{TFP_WINDOW} if not given",
+    )
+    add(
+        "--order",
+        type=whole(1),
+        default=1,
+        metavar="K",
+        help="how often tfp takes the mean: --window 13 --order 3 sees 37 frames, with less noise and less blur than a "
+        "window of 37; 1 if not given",
+    )
+    add(
+        "--alpha",
+        type=positive,
+        metavar="A",
+        help="gain of a simulated recording (a white pixel fires A times a frame), to divide by; "
+        "if not given, the picture is scaled until the 99.9th percentile of the spike rate in the frames it is made "
+        "from is white, and many pictures all as the one in their middle",
+    )
+
+
+def _frames(text: str) -> str:
+    if not re.fullmatch(FRAMES, text, re.ASCII):
+        raise argparse.ArgumentTypeError(f"expected a whole number, 0 or more, or A:B or A:B:STEP, got {text}")
+    return text
+
+
+def _picture(text: str) -> Path:
+    path = Path(text)
+    if path.suffix.lower() not in PICTURE_ENDINGS:  # the picture library would write TIFF, over a recording as well
+        raise argparse.ArgumentTypeError(f"expected a picture that ends in {', '.join(PICTURE_ENDINGS)}, got {text}")
+    return path
+
+
+def _chosen(args: argparse.Namespace, frames: int) -> range:
+    """Return the frames to decode."""
+    text = str(frames // 2) if args.frame is None else args.frame
+    try:
+        return frames_of(text, 0, frames - 1)
+    except ValueError as error:
+        said = f"expected 0 .. {frames - 1}, as {args.file} has {frames} frames, got {text}"
+        raise UsageError(f"--frame: {said}") from error
+
+
+def _white(alpha: float | None, recording: Recording, key: int, reach: int) -> tuple[float, str]:
+    """Return what becomes white, and a sentence that says so."""
+    if alpha is not None:
+        return alpha, f"divided by alpha {alpha:g}"
+    first, last = _span(key, reach, recording.frames)
+    # Of the rate, not of the picture: TFI makes 1 or 1/2 of a bright pixel, and its percentile is one of the two.
+    white = white_rate(recording.correct(recording.counts(first, last - first + 1) / (last - first + 1)))
+    scale = f"multiplied by {1 / white:.4g}"
+    return white, f"{scale}, so that the 99.9th percentile of the spike rate around frame {key} is white"
+
+
+def _span(frame: int, reach: int, frames: int) -> tuple[int, int]:
+    """Return the first and the last frame that the picture of one is made from."""
+    return max(frame - reach, 0), min(frame + reach, frames - 1)
+
+
+def _windows(recording: Recording, chosen: range, reach: int) -> Iterator[tuple[int, _Plane]]:
+    """Read forwards; yield every chosen frame and what unpacks it and its neighbours."""
+    path, frames, (height, width) = recording.path, recording.frames, recording.stored
+    held = np.empty((min(2 * reach + 1, frames), height, -(-width // 8)), np.uint8)  # frame n at n modulo the length
+
+    def plane(n: int) -> np.ndarray:
+        return recording.unpack(held[n % len(held)])
+
+    stream, stop = None, 0
+    for n in chosen:
+        first, last = _span(n, reach, frames)
+        if stream is None or (stop < first and path.suffix.lower() == ".dat"):  # an .npz has no short cut
+            stream = iter_spikes(path, height, width, flip=recording.flip, start=first, packed=True)
+            stop = first
+        for k in range(stop, last + 1):
+            held[k % len(held)] = next(stream).numpy()
+        stop = last + 1
+        yield n, plane
+
+
+def _write(path: Path, picture: Tensor) -> None:
+    """Write a picture; what is wrong is said in one line."""
+    try:
+        write_picture(path, picture)
+    except Exception as error:  # what a picture library raises depends on the ending
+        raise ValueError(f"{path}: cannot be written ({one_line(error)})") from error

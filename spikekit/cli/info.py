@@ -1,0 +1,49 @@
+"""``spikekit info``: what a recording holds."""
+
+from __future__ import annotations
+
+import argparse
+
+from torch import Tensor
+
+from spikekit.io import recording as recordings
+from spikekit.io.recording import open_recording
+
+#: Clocks a second of the cameras.
+CLOCK_HZ = 20_000
+
+
+def run(args: argparse.Namespace) -> None:
+    """Print what a recording holds, in one pass over its frames."""
+    recording = open_recording(args)
+    frames, (height, width) = recording.frames, recording.size
+    counts = recording.counts(0, frames)
+    pixels, spikes = counts.numel(), int(counts.sum())
+    rates = counts.double() / frames
+    dead, full = int((counts == 0).sum()), int((counts == frames).sum())
+    packed = args.file.suffix.lower() == ".dat"
+    print(f"file         {args.file}")
+    print(f"format       {'.dat, 8 pixels a byte, no header' if packed else '.npz, an array of zeros and ones'}")
+    print(f"size         {height} x {width} (H x W), {args.file.stat().st_size} bytes")
+    print(f"frames       {frames}, {1e3 * frames / CLOCK_HZ:g} ms at {CLOCK_HZ // 1000} kHz")
+    print(f"bits set     {spikes} of {pixels * frames}, {spikes / (pixels * frames):.2%}")
+    print(f"median       {rates.median():.4f} spikes a frame")
+    print(f"darkest      {_at(rates, rates.argmin())}")
+    print(f"brightest    {_at(rates, rates.argmax())}")
+    print(f"never fire   {dead} of {pixels} pixels, {dead / pixels:.2%}")
+    print(f"always fire  {full} of {pixels} pixels, {full / pixels:.2%}")
+    if recording.calibration is not None:
+        known = recording.calibration
+        bad = int((known.defects != 0).sum())
+        print(f"calibration  gains {known.gain.std():.2%} apart, dark {known.dark.median():.2g} a frame, {bad} defects")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the verb."""
+    recordings.add_arguments(parser)
+    recordings.add_calibration(parser)
+
+
+def _at(rates: Tensor, index: Tensor) -> str:
+    row, column = divmod(int(index), rates.shape[-1])
+    return f"{rates.flatten()[index]:.4f} spikes a frame, at row {row}, column {column}"
