@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NoReturn
 
-from spikekit import arguments
+from spikekit.arguments import UsageError as SpikekitUsageError
 from spikekit.arguments import one_line
 
 
@@ -16,7 +16,7 @@ class InputError(ValueError):
     """Something that the user gave and that cannot be used; shown as one line, and the command ends with 1."""
 
 
-class UsageError(InputError, arguments.UsageError):
+class UsageError(InputError, SpikekitUsageError):
     """A command line that asks for what cannot be; shown as one line, and the command ends with 2."""
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from lightning_modules.checkpoint import Checkpoints
+from lightning_modules.tasks.checkpoint_io import Checkpoints
 from lightning_modules.data.cache import ClipCache
 from lightning_modules.pretrained import Weights, write_weights
 from lightning_modules.sweep.state import write_json

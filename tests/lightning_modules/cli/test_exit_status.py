@@ -91,6 +91,6 @@ def test_two_trainings_in_one_folder(configs, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["lightning"])
     (tmp_path / "tiny.yaml").write_bytes(FILES["tiny.yaml"])
     words = f"fit -c {configs}/x4.yaml -c tiny.yaml --data.train_clips 4 --data.patch 8 --data.val_clips 1 -o out"
-    with locked_folder("out", "training"), pytest.raises(SystemExit, match="out: another training is at work here"):
+    with locked_folder("out", "run"), pytest.raises(SystemExit, match="out: another run is at work here"):
         main(words.split())
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"lock"}

@@ -34,9 +34,7 @@ def both(network, spikes):
 
 @torch.no_grad()
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
-@pytest.mark.parametrize(
-    "settings", [{}, {"scale": 4, "refinement": False}, {"neighbors": 1}, {"representation": "spikes"}]
-)
+@pytest.mark.parametrize("settings", [{}, {"scale": 4, "refinement": False}, {"neighbors": 1}])
 def test_search_and_convolution_are_one(pattern, settings, searched):
     network = tiny(**settings, pattern=pattern)
     for size in SIZES:
@@ -55,7 +53,10 @@ def test_gradients_are_those_of_a_search():
 
 
 @torch.no_grad()
-@pytest.mark.parametrize(("settings", "side"), [({"scale": 2}, 64), ({"neighbors": 5}, 64), ({}, WORTH_IT - 2)])
+@pytest.mark.parametrize(
+    ("settings", "side"),
+    [({"scale": 2}, 64), ({"neighbors": 5}, 64), ({"representation": "spikes"}, 64), ({}, WORTH_IT - 2)],
+)
 def test_what_is_not_worth_it_is_searched(settings, side, searched):
     network = tiny(**settings)
     torch.testing.assert_close(*both(network, clip(side, side)), rtol=0, atol=1e-12)
