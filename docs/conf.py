@@ -36,7 +36,7 @@ html_title = f"spikekit {version}"
 nitpicky = True
 nitpick_ignore_regex = [
     ("py:.*", r"(torch|kornia|collections|pathlib|optional|numpy|pytorch_lightning)\b.*"),
-    ("py:.*", "(CFA|CSCSRConfig|Tensor|Path|Callback|InputError)"),
+    ("py:.*", "(CFA|CSCSRConfig|Tensor|Path|Callback|InputError|UsageError)"),
 ]
 
 autosummary_generate = False  # every name has a page already

@@ -25,7 +25,7 @@ _DIFFERS = 0.04
 
 
 class Between:
-    """Base of interpolations between two frames, which subclasses define in :meth:`between`.
+    """Base of interpolations between two frames, which subclasses define in ``between``.
 
     Args:
         first: ``rgb`` (3, H, W), floating.
