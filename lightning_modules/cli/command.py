@@ -255,7 +255,7 @@ class Command(LightningCLI):
                 self.model.recipe = {name: chosen.get(name) for name in ("optimizer", "lr_scheduler")}
                 if config.ckpt_path:
                     _check_continuation(config.ckpt_path, self.model, self.trainer)
-        except (OSError, ValueError, ModuleNotFoundError, MisconfigurationException) as error:
+        except (OSError, ValueError, ModuleNotFoundError) as error:
             # jsonargparse wraps what a class of a class says into pages about its own types
             said = reason(str(error))
             raise (InputError if _is_of_file(error, said) else UsageError)(said) from error

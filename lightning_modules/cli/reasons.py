@@ -26,6 +26,8 @@ def reason(message: str) -> str:
     lines = message.strip().splitlines() or [message]
     if lines[0].startswith("Problems parsing config"):
         return " ".join(message.split())[:_MOST]
+    if not any(line and _AROUND.match(line) for line in lines):
+        return message.strip()  # of somebody else, who may show a list
     where = [key for line in lines for key in re.findall(r'[Pp]arser key "([^"]+)"', line)]
     inner = [line for line in lines if not _AROUND.match(line)]
     likely = [line for line in inner if not _UNLIKELY.match(line)]

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from lightning_modules.tasks.checkpoint_io import Checkpoints
 from lightning_modules.data.cache import ClipCache
 from lightning_modules.pretrained import Weights, write_weights
 from lightning_modules.sweep.state import write_json
+from lightning_modules.tasks.checkpoint_io import Checkpoints
 from spikekit import write_picture, write_spikes
 
 SPIKES = (torch.rand(200, 64, 64) < 0.4).to(torch.uint8)

@@ -269,7 +269,7 @@ def test_predict_needs_nothing_but_weights(file, how, tmp_path):
     still = network()(SPIKES, torch.zeros(1, 2, 2, 8, 10))[0].clamp(0, 1)
     assert (read_picture(tmp_path / "still" / "frame_000020.png") - still).abs().max() < 0.51 / 255
     refused = predict(*args, "--model.network.width", "8", *recording, "-o", "no", cwd=tmp_path)
-    assert refused.returncode == 1
+    assert refused.returncode == 2
     assert refused.stderr.endswith("was trained with width=4; this run asks for width=8\n")
 
 

@@ -501,7 +501,7 @@ def test_times_that_are_none(text):
 
 def test_ray_that_is_missing_is_said(typed, tmp_path, monkeypatch):
     monkeypatch.setattr(cli, "find_spec", lambda _: None)
-    with pytest.raises(SystemExit, match=r"pip install 'spikekit\[ray\]'"):
+    with pytest.raises(SystemExit, match=r"pip install '.\[ray\]' in a clone"):
         main([*typed, "--engine", "ray", "-o", str(tmp_path / "sweep")])
     assert not (tmp_path / "sweep").exists()
 
