@@ -120,7 +120,9 @@ def _onnx(program: torch.export.ExportedProgram, moves: bool) -> tuple[bytes, Ca
         options = {"dynamo": True, "optimize": False, "verbose": False, "opset_version": OPSET}
         made = torch.onnx.export(program, input_names=names, output_names=["rgb"], **options)
     data = made.model_proto.SerializeToString()
-    session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
+    quiet = onnxruntime.SessionOptions()
+    quiet.log_severity_level = 3  # what it cannot fold at load time is nobody's affair
+    session = onnxruntime.InferenceSession(data, quiet, providers=["CPUExecutionProvider"])
 
     def run(*inputs: Tensor) -> Tensor:
         given = {name: value.numpy() for name, value in zip(names, inputs, strict=True)}
