@@ -41,9 +41,9 @@ def check_film(path: str | Path) -> None:
     try:
         import av
     except ImportError as error:
-        raise VideoError(f"{path}: writing a film needs PyAV, pip install 'spikekit[video]'") from error
+        raise VideoError(f"{path}: writing a film needs PyAV, pip install '.[video]'") from error
     if "libx264" not in av.codecs_available and not _is_gif(path):
-        raise VideoError(f"{path}: expected a PyAV with libx264, as pip install 'spikekit[video]' brings, got none")
+        raise VideoError(f"{path}: expected a PyAV with libx264, as pip install '.[video]' brings, got none")
 
 
 def write_video(path: str | Path, frames: Iterable[Tensor], fps: float = 25.0) -> None:

@@ -83,6 +83,6 @@ def test_what_cannot_be_a_film_is_one_line_and_leaves_nothing(tmp_path, monkeypa
     with pytest.raises(ValueError, match="fps"):
         write_video(tmp_path / "a.mp4", good, fps=0)
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(VideoError, match=r"a.mp4: writing a film needs PyAV, pip install 'spikekit\[video\]'"):
+    with pytest.raises(VideoError, match=r"a.mp4: writing a film needs PyAV, pip install '.\[video\]'"):
         write_video(tmp_path / "a.mp4", good)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
