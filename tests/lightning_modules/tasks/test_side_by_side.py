@@ -1,0 +1,25 @@
+"""Pictures made in several threads of one process."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import torch
+
+from lightning_modules.tasks.super_resolution import SuperResolution
+
+
+def test_pictures_made_in_several_threads_are_those_of_one():
+    model = SuperResolution.from_pretrained(speed="fast").eval()
+    generator = torch.Generator().manual_seed(0)
+    clips = [
+        (torch.rand(1, 41, 24 + 2 * n, 40, generator=generator) < 0.1 * (1 + n % 5)).to(torch.uint8) for n in range(8)
+    ]
+
+    def picture(spikes):
+        with torch.no_grad():  # a setting of each thread
+            return model(spikes)
+
+    expected = list(map(picture, clips))
+    with ThreadPoolExecutor(4) as pool:
+        for _ in range(3):
+            for found, alone in zip(pool.map(picture, clips), expected, strict=True):
+                torch.testing.assert_close(found, alone, rtol=0, atol=1e-5)
