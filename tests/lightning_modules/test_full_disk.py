@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from lightning_modules.charts import chart
 from lightning_modules.data.cache import ClipCache
 from lightning_modules.pretrained import Weights, write_weights
 from lightning_modules.sweep.state import write_json
@@ -28,9 +29,15 @@ def full(room):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
+def draw(path):
+    with chart(path, 3, 2) as axes:
+        axes.plot([0, 1])
+
+
 @pytest.mark.parametrize(
     ("name", "write"),
     [
+        ("chart.png", draw),
         ("a.png", lambda path: write_picture(path, torch.rand(3, 64, 64))),
         ("a.dat", lambda path: write_spikes(path, SPIKES)),
         ("a.npz", lambda path: write_spikes(path, SPIKES)),
