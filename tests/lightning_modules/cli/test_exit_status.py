@@ -6,6 +6,7 @@ import sys
 import pytest
 
 from lightning_modules.__main__ import main
+from lightning_modules.cli.errors import as_one_line
 from lightning_modules.cli.folder_lock import locked_folder
 
 OVERLAY = "model: {network: {init_args: {width: 4, representation_width: 4, features: 1, stages: 1, end_blocks: 1}}}"
@@ -94,3 +95,11 @@ def test_two_trainings_in_one_folder(configs, tmp_path, monkeypatch):
     with locked_folder("out", "run"), pytest.raises(SystemExit, match="out: another run is at work here"):
         main(words.split())
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"lock"}
+
+
+def test_a_disk_that_refuses_is_failed_work():
+    with pytest.raises(SystemExit) as ended, as_one_line():
+        raise OSError(28, "No space left on device", "a.png")
+    assert ended.value.code == "lightning: a.png: No space left on device"  # Python prints it and ends with 1
+    with pytest.raises(BrokenPipeError), as_one_line():
+        raise BrokenPipeError(32, "Broken pipe", "a.png")
