@@ -9,6 +9,7 @@ from importlib import import_module
 
 from lightning_modules.cli.errors import Ended
 from lightning_modules.cli.short_help import VERBS, overview, usage
+from spikekit.completion import OPTION
 
 #: where the verbs that are not Lightning's are
 _OURS = {"sweep": "sweep.cli", "trade": "trade.cli", "export": "cli.export", "models": "cli.models"}
@@ -46,7 +47,11 @@ def _run(verb: str, rest: Sequence[str], args: Sequence[str] | None) -> None:
     from lightning_modules.cli import errors
 
     with errors.as_one_line():
-        if verb in _OURS:
+        if verb == OPTION:
+            from lightning_modules.cli.completion import print_completion
+
+            print_completion("".join(rest), _OURS)
+        elif verb in _OURS:
             getattr(import_module(f"lightning_modules.{_OURS[verb]}"), verb)(rest)
         else:
             from lightning_modules.cli.command import Command, run

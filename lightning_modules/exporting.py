@@ -81,12 +81,12 @@ def export_network(network: Network, path: str | Path, kind: str, *, still: bool
     except Exception as error:  # what torch raises depends on what it cannot follow
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
         raise ValueError(f"{type(network).__name__}: cannot be exported ({reason})") from error
-    data, run = (_onnx if kind == "onnx" else _torch)(program, moves)
-    worst = 0.0
+    data = (_onnx if kind == "onnx" else _torch)(program, moves)
+    run = exported(data, kind)
     with torch.no_grad():
-        for size in _SIZES:
-            inputs = _example(network, size, moves)
-            worst = max(worst, (run(*inputs) - module(*inputs)).abs().max().item())
+        clips = [_example(network, size, moves) for size in _SIZES]
+        # of a tensor, as max() of numbers forgets NaN
+        worst = torch.stack([(run(*clip) - module(*clip)).abs().max() for clip in clips]).max().item()
     if not worst <= _WITHIN:
         raise ValueError(
             f"{type(network).__name__}: expected an export within {_WITHIN} of the network, got {worst:.2g}"
@@ -103,32 +103,48 @@ def _example(network: Network, size: tuple[int, int], moves: bool) -> tuple[Tens
     return (spikes, torch.randn(1, 2, 2, *size, generator=generator))[: 1 + moves]
 
 
-def _torch(program: torch.export.ExportedProgram, moves: bool) -> tuple[bytes, Callable[..., Tensor]]:
-    file = io.BytesIO()
-    torch.export.save(program, file)
-    file.seek(0)
-    return file.getvalue(), torch.export.load(file).module()
+def exported(data: bytes, kind: str, threads: int | None = None) -> Callable[..., Tensor]:
+    """Return what runs an export, in this process.
 
+    Args:
+        data: the file.
+        kind: ``"torch"`` or ``"onnx"``.
+        threads: of onnxruntime, which takes all cores when not given; torch has its own.
 
-def _onnx(program: torch.export.ExportedProgram, moves: bool) -> tuple[bytes, Callable[..., Tensor]]:
+    Returns:
+        Takes the inputs in their order, and returns the picture.
+    """
+    if kind == "torch":
+        return torch.export.load(io.BytesIO(data)).module()
     import onnxruntime
 
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3  # what it cannot fold at load time is nobody's affair
+    options.intra_op_num_threads = threads or 0
+    session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    names = [one.name for one in session.get_inputs()]
+
+    def run(*inputs: Tensor) -> Tensor:
+        given = {name: value.numpy() for name, value in zip(names, inputs, strict=True)}
+        return torch.from_numpy(session.run(None, given)[0])
+
+    return run
+
+
+def _torch(program: torch.export.ExportedProgram, moves: bool) -> bytes:
+    file = io.BytesIO()
+    torch.export.save(program, file)
+    return file.getvalue()
+
+
+def _onnx(program: torch.export.ExportedProgram, moves: bool) -> bytes:
     names = ["spikes", "flow"][: 1 + moves]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         # its optimizer takes minutes, and onnxruntime has one of its own
         options = {"dynamo": True, "optimize": False, "verbose": False, "opset_version": OPSET}
         made = torch.onnx.export(program, input_names=names, output_names=["rgb"], **options)
-    data = made.model_proto.SerializeToString()
-    quiet = onnxruntime.SessionOptions()
-    quiet.log_severity_level = 3  # what it cannot fold at load time is nobody's affair
-    session = onnxruntime.InferenceSession(data, quiet, providers=["CPUExecutionProvider"])
-
-    def run(*inputs: Tensor) -> Tensor:
-        given = {name: value.numpy() for name, value in zip(names, inputs, strict=True)}
-        return torch.from_numpy(session.run(None, given)[0])
-
-    return data, run
+    return made.model_proto.SerializeToString()
 
 
 def _check_onnx() -> None:

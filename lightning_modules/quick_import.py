@@ -1,6 +1,9 @@
 """Lightning imported without two parts of other packages, half of the time, of which it reads a single name each.
 
 Whoever asks for anything else of them meanwhile, or for anything at all afterwards, gets the parts themselves.
+
+Python's own ``importlib.util.LazyLoader`` does not serve: a name of both is read while Lightning and torchmetrics are
+imported, which would load them at once, and imports inside of these are not ours to move.
 """
 
 from __future__ import annotations

@@ -1,174 +1,25 @@
-"""What ``spikekit`` offers, all of which needs torch."""
+"""What ``spikekit`` offers, all of which needs torch: what its rooms offer, and the metrics."""
 
 import sys
 
-from spikekit.color import (
-    PATTERNS,
-    BayerMask,
-    BinToSensor,
-    Demosaic,
-    DemosaicResidual,
-    MergeBayer,
-    Mosaic,
-    SplitBayer,
-    SplitColors,
-    bayer_mask,
-    bayer_pattern,
-    bayer_sites,
-    bin_to_sensor,
-    demosaic,
-    demosaic_residual,
-    merge_bayer,
-    mosaic,
-    split_bayer,
-    split_colors,
-)
-from spikekit.decoders import (
-    SpikeInterval,
-    Tfi,
-    Tfp,
-    correct_spikes,
-    decode_in_chunks,
-    pack_spikes,
-    spike_interval,
-    spike_interval_at,
-    tfi,
-    tfi_at,
-    tfp,
-    tfp_at,
-    unpack_spikes,
-)
-from spikekit.flow import (
-    Between,
-    Blend,
-    FlowInterpolation,
-    JointFlow,
-    LinearMotion,
-    Still,
-    UpsampleFlow,
-    joint_flow,
-    linear_motion,
-    upsample_flow,
-)
-from spikekit.io import (
-    CAMERAS,
-    Camera,
-    PictureError,
-    SpikeFileError,
-    VideoError,
-    VideoFrames,
-    camera,
-    flow_to_rgb,
-    iter_spikes,
-    panel,
-    read_calibration,
-    read_picture,
-    read_spikes,
-    read_video,
-    spikes_shape,
-    write_calibration,
-    write_picture,
-    write_spikes,
-    write_video,
-)
+from spikekit import color, decoders, flow, io, scenes, sensor, warp
+from spikekit.color import *  # noqa: F403
+from spikekit.decoders import *  # noqa: F403
+from spikekit.flow import *  # noqa: F403
+from spikekit.io import *  # noqa: F403
 from spikekit.metrics import psnr, ssim
-from spikekit.scenes import Film, FilmClip, Layer, Motion, Plan, Scene, SceneProfile
-from spikekit.sensor import (
-    Calibration,
-    SensorNoise,
-    SpikeChange,
-    SpikeIntegrateFire,
-    SpikeSensor,
-    simulate_spikes,
-    spike_integrate_fire,
-)
-from spikekit.warp import DemosaicAlongMotion, FlowWarp, FlowWarpIdw, demosaic_along_motion, flow_warp, flow_warp_idw
+from spikekit.scenes import *  # noqa: F403
+from spikekit.sensor import *  # noqa: F403
+from spikekit.warp import *  # noqa: F403
 
-__all__ = [
-    "CAMERAS",
-    "PATTERNS",
-    "BayerMask",
-    "Between",
-    "BinToSensor",
-    "Blend",
-    "Calibration",
-    "Camera",
-    "Demosaic",
-    "DemosaicAlongMotion",
-    "DemosaicResidual",
-    "Film",
-    "FilmClip",
-    "FlowInterpolation",
-    "FlowWarp",
-    "FlowWarpIdw",
-    "JointFlow",
-    "Layer",
-    "LinearMotion",
-    "MergeBayer",
-    "Mosaic",
-    "Motion",
-    "PictureError",
-    "Plan",
-    "Scene",
-    "SceneProfile",
-    "SensorNoise",
-    "SpikeChange",
-    "SpikeFileError",
-    "SpikeIntegrateFire",
-    "SpikeInterval",
-    "SpikeSensor",
-    "SplitBayer",
-    "SplitColors",
-    "Still",
-    "Tfi",
-    "Tfp",
-    "UpsampleFlow",
-    "VideoError",
-    "VideoFrames",
-    "bayer_mask",
-    "bayer_pattern",
-    "bayer_sites",
-    "bin_to_sensor",
-    "camera",
-    "correct_spikes",
-    "decode_in_chunks",
-    "demosaic",
-    "demosaic_along_motion",
-    "demosaic_residual",
-    "flow_to_rgb",
-    "flow_warp",
-    "flow_warp_idw",
-    "iter_spikes",
-    "joint_flow",
-    "linear_motion",
-    "merge_bayer",
-    "mosaic",
-    "pack_spikes",
-    "panel",
-    "psnr",
-    "read_calibration",
-    "read_picture",
-    "read_spikes",
-    "read_video",
-    "simulate_spikes",
-    "spike_integrate_fire",
-    "spike_interval",
-    "spike_interval_at",
-    "spikes_shape",
-    "split_bayer",
-    "split_colors",
-    "ssim",
-    "tfi",
-    "tfi_at",
-    "tfp",
-    "tfp_at",
-    "unpack_spikes",
-    "upsample_flow",
-    "write_calibration",
-    "write_picture",
-    "write_spikes",
-    "write_video",
-]
+__all__ = ["psnr", "ssim"]
+__all__ += color.__all__
+__all__ += decoders.__all__
+__all__ += flow.__all__
+__all__ += io.__all__
+__all__ += scenes.__all__
+__all__ += sensor.__all__
+__all__ += warp.__all__
 
 # the old name of a module that a function has taken: imported anew, the module would take the place of the function
 sys.modules["spikekit.demosaic"] = sys.modules["spikekit.color.demosaic"]

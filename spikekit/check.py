@@ -31,6 +31,27 @@ def check_planes(name: str, value: Tensor, ndim: int, shape: str, *, floating: b
         raise TypeError(f"{name}: expected {kind} tensor, got {value.dtype}")
 
 
+def check_picture(
+    name: str, value: Tensor, shape: str = "(3, H, W)", *, grey: bool = False, floating: bool = True
+) -> None:
+    """Raise unless ``value`` is one picture, (3, H, W), or perhaps (H, W); not of a batch.
+
+    Args:
+        name: what the caller calls it.
+        value: what came.
+        shape: the expected shape, for the message.
+        grey: take (H, W), too.
+        floating: refuse integer and bool tensors.
+
+    Raises:
+        TypeError: as :func:`check_planes`.
+        ValueError: another shape.
+    """
+    check_planes(name, value, 2 if grey else 3, shape, floating=floating)
+    if value.ndim > 3 or (value.ndim == 3 and value.shape[0] != 3):
+        raise ValueError(f"{name}: expected {shape}, got {tuple(value.shape)}")
+
+
 def check_dtype(dtype: torch.dtype | None, *others: torch.dtype) -> None:
     """Raise unless the type asked for is None, floating, or one of ``others``.
 
@@ -82,6 +103,11 @@ def check_whole(name: str, value: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
         raise ValueError(f"{name}: expected a whole number >= 1, got {value!r}")
     return value
+
+
+def wide_dtype(*tensors: Tensor) -> torch.dtype:
+    """Return the dtype to compute in: float64 where one of the tensors has it, else float32."""
+    return torch.float64 if torch.float64 in [tensor.dtype for tensor in tensors] else torch.float32
 
 
 def default_float(value: Tensor) -> torch.dtype:

@@ -19,7 +19,7 @@ class Example:
 
     Attributes:
         name: of the public function; the module has the same in CamelCase.
-        inputs: makes the tensors, given their leading dimensions, (H, W), and a generator.
+        inputs: what the tensors are.
         options: the other arguments, of the function and of the module's constructor.
         constants: makes tensors without leading dimensions, which follow the others, from the first of these.
         axis_in: of the tensors' first leading dimension.
@@ -28,7 +28,7 @@ class Example:
     """
 
     name: str
-    inputs: Callable[[tuple[int, ...], tuple[int, int], torch.Generator], tuple[Tensor, ...]]
+    inputs: tuple[str, ...]
     options: dict[str, Any] = field(default_factory=dict)
     constants: Callable[[Tensor], tuple[Tensor, ...]] = lambda _: ()
     axis_in: int = 0
@@ -50,51 +50,30 @@ class Example:
 
     def tensors(self, lead: tuple[int, ...], size: tuple[int, int] = (4, 6), seed: int = 0) -> tuple[Tensor, ...]:
         """Return inputs of float64, always the same."""
-        return self.inputs(lead, size, torch.Generator().manual_seed(seed))
+        rng = torch.Generator().manual_seed(seed)
+        return tuple(_draw(name, lead, size, rng) for name in self.inputs)
 
 
-def _random(*shape: int, rng: torch.Generator) -> Tensor:
-    return torch.rand(shape, dtype=torch.float64, generator=rng)
+# What inputs are called, and their sizes around the leading dimensions and before (H, W).
+_SIZES: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
+    "light": ((), (9,)),
+    "spikes": ((), (9,)),
+    "rgb": ((), (3,)),
+    "raw": ((), ()),
+    "planes": ((4,), ()),
+    "flow": ((), (2,)),
+    "four flows": ((4,), (2,)),
+    "three mosaics": ((), (3,)),
+    "flow to three": ((), (3, 2)),
+}
 
 
-def _light(lead: tuple[int, ...], size: tuple[int, int], rng: torch.Generator) -> tuple[Tensor, ...]:
-    return (_random(*lead, 9, *size, rng=rng),)
-
-
-def _spikes(lead: tuple[int, ...], size: tuple[int, int], rng: torch.Generator) -> tuple[Tensor, ...]:
-    return ((_random(*lead, 9, *size, rng=rng) < 0.4).double(),)
-
-
-def _rgb(lead: tuple[int, ...], size: tuple[int, int], rng: torch.Generator) -> tuple[Tensor, ...]:
-    return (_random(*lead, 3, *size, rng=rng),)
-
-
-def _raw(lead: tuple[int, ...], size: tuple[int, int], rng: torch.Generator) -> tuple[Tensor, ...]:
-    return (_random(*lead, *size, rng=rng),)
-
-
-def _planes(lead: tuple[int, ...], size: tuple[int, int], rng: torch.Generator) -> tuple[Tensor, ...]:
-    return (_random(4, *lead, *size, rng=rng),)
-
-
-def _flow(lead: tuple[int, ...], size: tuple[int, int], rng: torch.Generator) -> tuple[Tensor, ...]:
-    return (4 * _random(*lead, 2, *size, rng=rng) - 2,)
-
-
-def _two_flows(lead: tuple[int, ...], size: tuple[int, int], rng: torch.Generator) -> tuple[Tensor, ...]:
-    return (*_flow(lead, size, rng), *_flow(lead, size, rng))
-
-
-def _four_flows(lead: tuple[int, ...], size: tuple[int, int], rng: torch.Generator) -> tuple[Tensor, ...]:
-    return _flow((4, *lead), size, rng)
-
-
-def _image_and_flow(lead: tuple[int, ...], size: tuple[int, int], rng: torch.Generator) -> tuple[Tensor, ...]:
-    return (*_rgb(lead, size, rng), *_flow(lead, size, rng))
-
-
-def _mosaics_and_flow(lead: tuple[int, ...], size: tuple[int, int], rng: torch.Generator) -> tuple[Tensor, ...]:
-    return _random(*lead, 3, *size, rng=rng), *_flow((*lead, 3), size, rng)
+def _draw(name: str, lead: tuple[int, ...], size: tuple[int, int], rng: torch.Generator) -> Tensor:
+    before, behind = _SIZES[name]
+    uniform = torch.rand((*before, *lead, *behind, *size), dtype=torch.float64, generator=rng)
+    if name == "spikes":
+        return (uniform < 0.4).double()
+    return 4 * uniform - 2 if "flow" in name else uniform
 
 
 def _green(features: Tensor) -> tuple[Tensor, ...]:
@@ -104,21 +83,21 @@ def _green(features: Tensor) -> tuple[Tensor, ...]:
 _TIMES = {"times": (0.0, 2.0, 5.0), "first": -1, "middle": 2, "last": 6, "scale": 2}
 _GRBG = {"pattern": "GRBG"}
 EXAMPLES = [
-    Example("spike_integrate_fire", _light, {"threshold": 0.75}, smooth=0),
-    Example("spike_interval", _spikes, smooth=0),
-    Example("tfi", _spikes, {"max_range": 2.0}, smooth=0),
-    Example("tfp", _spikes, {"window": 5, "max_range": 2.0}),
-    Example("flow_warp", _image_and_flow),
-    Example("flow_warp_idw", _image_and_flow, {"neighbors": 3}, _green),
-    Example("mosaic", _rgb, _GRBG),
-    Example("bin_to_sensor", _rgb, {**_GRBG, "scale": 2}),
-    Example("split_colors", _raw, _GRBG, axis_out=1),
-    Example("split_bayer", _raw, _GRBG, axis_out=1),
-    Example("merge_bayer", _planes, _GRBG, axis_in=1),
-    Example("demosaic", _raw, _GRBG),
-    Example("demosaic_residual", _raw, _GRBG),
-    Example("demosaic_along_motion", _mosaics_and_flow, _GRBG),
-    Example("joint_flow", _four_flows, axis_in=1),
-    Example("upsample_flow", _flow, {"scale": 3}),
-    Example("linear_motion", _two_flows, _TIMES),
+    Example("spike_integrate_fire", ("light",), {"threshold": 0.75}, smooth=0),
+    Example("spike_interval", ("spikes",), smooth=0),
+    Example("tfi", ("spikes",), {"max_range": 2.0}, smooth=0),
+    Example("tfp", ("spikes",), {"window": 5, "max_range": 2.0}),
+    Example("flow_warp", ("rgb", "flow")),
+    Example("flow_warp_idw", ("rgb", "flow"), {"neighbors": 3}, _green),
+    Example("mosaic", ("rgb",), _GRBG),
+    Example("bin_to_sensor", ("rgb",), {**_GRBG, "scale": 2}),
+    Example("split_colors", ("raw",), _GRBG, axis_out=1),
+    Example("split_bayer", ("raw",), _GRBG, axis_out=1),
+    Example("merge_bayer", ("planes",), _GRBG, axis_in=1),
+    Example("demosaic", ("raw",), _GRBG),
+    Example("demosaic_residual", ("raw",), _GRBG),
+    Example("demosaic_along_motion", ("three mosaics", "flow to three"), _GRBG),
+    Example("joint_flow", ("four flows",), axis_in=1),
+    Example("upsample_flow", ("flow",), {"scale": 3}),
+    Example("linear_motion", ("flow", "flow"), _TIMES),
 ]

@@ -5,6 +5,7 @@ import os
 import random
 import resource
 import tempfile
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -100,3 +101,45 @@ def _fuzz(tmp_path, capfd):
     with tempfile.TemporaryDirectory(dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else tmp_path) as folder:
         folder = Path(folder)
         yield fuzz
+
+
+@pytest.fixture(name="full_disk", scope="session")
+def _full_disk():
+    """No file grows beyond so many bytes; Python ignores the signal, so that writing fails as on a full disk."""
+
+    @contextmanager
+    def full(room):
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, before[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    return full
+
+
+@pytest.fixture(name="stays_whole")
+def _stays_whole(full_disk, tmp_path):
+    """A writer has no room, whatever there was before: one line names the file, and nothing has changed; later it has.
+
+    Args of the fixture's function: the name of the file, and what writes it, given its path.
+    """
+
+    def check(name, write, rooms=(0, 2000), errors=(OSError, ValueError)):
+        path = tmp_path / name
+        for before in (None, b"old"):
+            if before is not None:
+                path.write_bytes(before)
+            for room in rooms:
+                with full_disk(room), pytest.raises(errors) as raised:
+                    write(path)
+                assert str(path) in str(raised.value), raised.value
+                assert len(str(raised.value).splitlines()) == 1
+                left = {other.name: other.read_bytes() for other in tmp_path.iterdir()}
+                assert left == ({} if before is None else {name: before})
+        write(path)
+        assert path.stat().st_size > max(rooms)
+        assert {other.name for other in tmp_path.iterdir()} == {name}
+
+    return check

@@ -99,6 +99,31 @@ def options(args: Sequence[str]) -> Iterator[tuple[int, str, str]]:
         yield (n + 1, option, value) if equals else (n + 2, option, args[n + 1] if n + 1 < len(args) else "")
 
 
+def given(args: Sequence[str], key: str) -> dict[str, str]:
+    """Return what arguments say about an object, unparsed: configurations and options, the later over the earlier.
+
+    Args:
+        args: verb and arguments of ``lightning``.
+        key: names the object, such as ``model.network``.
+
+    Example:
+        >>> given(["predict", "--data", "Recording", "--data.path=a.dat", "--data.init_args.height", "250"], "data")
+        {'path': 'a.dat', 'height': '250'}
+    """
+    found: dict[str, str] = {}
+    for _, option, value in options(args):
+        name = option.removeprefix("--").replace("init_args.", "")
+        if option in ("-c", "--config"):
+            first, *others = key.split(".")
+            part = _init_args(_part_of(value, first))
+            for inner in others:
+                part = _init_args(part.get(inner))
+            found |= {name: str(value) for name, value in part.items() if value is not None}
+        elif name.startswith(f"{key}."):
+            found[name.removeprefix(f"{key}.")] = value
+    return found
+
+
 def behind_configurations(args: Sequence[str], more: Sequence[str]) -> list[str]:
     """Put more behind the verb and all configurations, where other arguments still have the last word."""
     place = max((end for end, option, _ in options(args) if option in ("-c", "--config")), default=1)

@@ -7,7 +7,7 @@ import logging
 import sys
 import warnings
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from inspect import signature
 from pathlib import Path
 from time import perf_counter
@@ -27,6 +27,7 @@ from lightning_modules.cli import prediction
 from lightning_modules.cli.arguments import classes_first, flatten, options, whole_counts, with_network_of_weights
 from lightning_modules.cli.errors import InputError, UsageError
 from lightning_modules.cli.folder_lock import FolderError, locked_folder, make_folder
+from lightning_modules.cli.parts import make_parts
 from lightning_modules.cli.prediction import NO_RECORDING
 from lightning_modules.cli.reasons import reason, suggestion, unknown
 from lightning_modules.cli.renamed_overlays import with_current_overlays
@@ -107,10 +108,10 @@ class Parser(LightningArgumentParser):
 
 
 class Configuration(SaveConfigCallback):
-    """Writes ``config.yaml``, whole or not at all."""
+    """Writes ``config.yaml``, whole or not at all; not to ``trainer.log_dir``, which waits for other processes."""
 
     def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:  # noqa: D102
-        with whole_file(Path(trainer.log_dir) / self.config_filename, "w", encoding="utf-8") as file:
+        with whole_file(Path(trainer.default_root_dir) / self.config_filename, "w", encoding="utf-8") as file:
             file.write(self.parser.dump(self.config, skip_none=False))
 
 
@@ -146,17 +147,16 @@ class Command(LightningCLI):
         for name in ("scale", "frames", "alpha"):
             parser.link_arguments(f"{network}.{name}", f"data.init_args.{name}")
         parser.link_arguments(f"{network}.pattern", "data.init_args.crop_to")
+        parser.link_arguments("model.init_args.flow", "data.init_args.flow_patch", {"scene": 0, "estimated": 48}.get)
         parser.link_arguments(
-            (f"{network}.frames", f"{network}.window"),
-            "data.init_args.flow_times",
-            lambda frames, window: (window // 2, frames - 1 - window // 2),
+            "model", "data.init_args.flow_times", lambda model: model.flow_times[::2], apply_on="instantiate"
         )
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:  # noqa: D102
-        args = classes_first(with_current_overlays(self.typed))
+        args, said = classes_first(with_current_overlays(self.typed)), ""
         try:
             if any(option in ("--speed", "--budget") for _, option, _ in options(args)):
-                args = prediction.with_choice(parser, args)
+                args, said = prediction.with_choice(parser, args)
             try:
                 args = with_network_of_weights(args)
             except (OSError, ValueError) as error:
@@ -165,16 +165,12 @@ class Command(LightningCLI):
         except SystemExit as error:
             if not isinstance(error.code, str):
                 raise
-            names = self._names()
+            names = [name.removeprefix("--") for name in option_names(*self._subcommand_parsers.values())]
             meant = suggestion(unknown(self.typed, names), names)
             raise UsageError(error.code + (meant or f" (see lightning {self.typed[0]} --help)")) from error
         self.counts = whole_counts(args)
-
-    def _names(self) -> list[str]:
-        """Options that there are, without dashes."""
-        own = [option for part in self._subcommand_parsers.values() for option in part._option_string_actions]
-        classes = [f"--{option}.{name}" for option, choice in CHOICES for name in signature(choice).parameters]
-        return sorted({option.removeprefix("--") for option in (*own, *classes)})
+        if said:
+            print(said, flush=True)
 
     def _parse_ckpt_path(self) -> None:
         """Take no hyper-parameters out of a checkpoint: jsonargparse would build whatever they name."""
@@ -217,19 +213,13 @@ class Command(LightningCLI):
 
     def _run_subcommand(self, subcommand: str) -> None:
         config = self.config[subcommand]
-        filmed = subcommand == "predict" and is_film(config.output)
-        folder = pictures_folder(config.output) if filmed else config.output
-        alone = filmed or (subcommand == "fit" and not config.trainer.fast_dev_run)
-        if subcommand in ("test", "predict"):
-            make_folder(folder)
         begun, begin = Begun(), perf_counter()
         self.trainer.callbacks.append(begun)
         try:
-            with (
-                # processes of one distributed run share a folder, which the first of them keeps
-                locked_folder(folder, "run") if alone and rank_zero_only.rank == 0 else nullcontext(),
-                restoring(config.get("ckpt_path"), begun),
-            ):
+            with _locked(subcommand, config), restoring(config.get("ckpt_path"), begun):
+                if subcommand == "predict" and config.engine == "ray":
+                    folder = Path(pictures_folder(config.output))
+                    make_parts(self.typed, folder, str(self.trainer.precision), config.jobs)
                 super()._run_subcommand(subcommand)
         except (MisconfigurationException, ModuleNotFoundError) as error:  # of Lightning's, such as a callback's
             raise InputError(one_line(error)) from error
@@ -264,7 +254,7 @@ class Command(LightningCLI):
         """Send everything to one folder, and use bfloat16 on a GPU that has it."""
         output = Path(self._get(self.config_init, "output"))
         config = self._get(self.config_init, "trainer")
-        kwargs["default_root_dir"] = pictures_folder(output) if self.subcommand == "predict" else output
+        kwargs["default_root_dir"] = output
         kwargs |= self.counts
         if config.get("logger") is None:
             # the tables and pictures of the other commands are files of their own
@@ -294,6 +284,27 @@ class Command(LightningCLI):
                 self.model.pictures(),
             ]
         return [self.model.report(output)] if self.subcommand == "test" else []
+
+
+def _locked(verb: str, config: Any) -> AbstractContextManager[None]:
+    """Keep a second run of a verb out of what it writes; processes of one distributed run share it."""
+    if rank_zero_only.rank != 0 or verb == "validate" or (verb == "fit" and config.trainer.fast_dev_run):
+        return nullcontext()
+    if verb == "fit":
+        return locked_folder(config.output, "run")
+    # what is predicted while a training runs may go to its folder; among pictures the file is hidden
+    folder = pictures_folder(config.output) if verb == "predict" else config.output
+    if verb == "predict" and config.part is not None:  # one of several that share it
+        make_folder(folder)
+        return nullcontext()
+    return locked_folder(folder, f"lightning {verb}", f".{verb}.lock")
+
+
+def option_names(*parsers: ArgumentParser) -> list[str]:
+    """Return the options of parsers, and those of the classes that a configuration may name."""
+    own = [option for parser in parsers for option in parser._option_string_actions]
+    classes = [f"--{option}.{name}" for option, choice in CHOICES for name in signature(choice).parameters]
+    return sorted({*own, *classes})
 
 
 def _is_of_file(error: BaseException | None, said: str) -> bool:
@@ -369,12 +380,6 @@ def _check_agreement(model: Learner, data: LightningDataModule) -> None:
         got = data.options[name]
         if got != expected:
             raise ValueError(f"data.{name}: expected {expected}, as the model has it, got {got}")
-    if isinstance(model, SuperResolution) and model.network.takes_flow:
-        # linked to the frames and the window of CSCSR; other networks have no window
-        ends, got = model.network.flow_times[::2], tuple(data.options["flow_times"])
-        if got not in ((), ends):
-            name = type(model.network).__name__
-            raise ValueError(f"data.flow_times: expected {ends}, between which the flow of {name} runs, got {got}")
 
 
 def _precision(accelerator: str) -> str:

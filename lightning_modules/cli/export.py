@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
@@ -14,6 +15,23 @@ from lightning_modules.pretrained import check_weights, read_weights, write_weig
 from spikekit.timing import duration
 
 
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the verb."""
+    made = VerbParser(
+        prog="lightning export",
+        description="Write a network for other programs. safetensors are weights that know what network they are of, "
+        "for lightning predict --model.weights FILE and CSCSR.from_pretrained(FILE). torch is a program of "
+        "torch.export, which needs torch alone; onnx is for onnxruntime and others (the extra export writes it). "
+        "Both take a clip of any even height and width, and the motion as a second input where the network follows "
+        "motion: an estimate of motion cannot be exported. They are compared with the network on three sizes.",
+    )
+    made.add_argument("weights", help="a name that lightning models lists, a .safetensors, or a checkpoint")
+    made.add_argument("--format", choices=("safetensors", *FORMATS), default="safetensors", help="safetensors")
+    made.add_argument("--still", action="store_true", help="nothing moves: no motion as an input, for torch and onnx")
+    made.add_argument("-o", "--output", required=True, metavar="FILE", help="name.safetensors, .pt2 or .onnx")
+    return made
+
+
 def export(args: Sequence[str]) -> None:
     """Write a network as a file for other programs.
 
@@ -23,19 +41,7 @@ def export(args: Sequence[str]) -> None:
     Raises:
         InputError: no such weights, or damaged ones; a name of another kind of file; a network that cannot be exported.
     """
-    parser = VerbParser(
-        prog="lightning export",
-        description="Write a network for other programs. safetensors are weights that know what network they are of, "
-        "for lightning predict --model.weights FILE and CSCSR.from_pretrained(FILE). torch is a program of "
-        "torch.export, which needs torch alone; onnx is for onnxruntime and others (the extra export writes it). "
-        "Both take a clip of any even height and width, and the motion as a second input where the network follows "
-        "motion: an estimate of motion cannot be exported. They are compared with the network on three sizes.",
-    )
-    parser.add_argument("weights", help="a name that lightning models lists, a .safetensors, or a checkpoint")
-    parser.add_argument("--format", choices=("safetensors", *FORMATS), default="safetensors", help="safetensors")
-    parser.add_argument("--still", action="store_true", help="nothing moves: no motion as an input, for torch and onnx")
-    parser.add_argument("-o", "--output", required=True, metavar="FILE", help="name.safetensors, .pt2 or .onnx")
-    asked = parser.parse_args(args)
+    asked = parser().parse_args(args)
     begin = perf_counter()
     ending = FORMATS.get(asked.format, ".safetensors")
     if Path(asked.output).suffix != ending:

@@ -36,20 +36,31 @@ def make_folder(folder: str | Path) -> None:
 
 
 @contextmanager
-def locked_folder(folder: str | Path, what: str) -> Iterator[None]:
+def locked_folder(folder: str | Path, what: str, name: str = "lock") -> Iterator[None]:
     """Keep other runs out of a folder; the lock goes when the process does, however it ends.
+
+    Where the file system has no locks there is none.
 
     Args:
         folder: where; made when it is missing.
         what: the kind of run, for the message.
+        name: of the file that is locked, and stays; runs that lock different files are no trouble to each other.
 
     Raises:
         FolderInUseError: another process, or another run of this one, is at work there.
-        FolderError: the folder or the file ``lock`` in it cannot be made.
+        FolderError: the folder or the file in it cannot be made.
     """
     make_folder(folder)
+    lock = FileLock(Path(folder) / name, timeout=0)
     try:
-        with FileLock(Path(folder) / "lock", timeout=0):
-            yield
+        lock.acquire()
     except Timeout:
         raise FolderInUseError(f"{folder}: another {what} is at work here; -o goes elsewhere") from None
+    except OSError as error:
+        raise FolderError(f"-o: {Path(folder) / name} cannot be written ({error.strerror or error})") from error
+    except NotImplementedError:
+        pass
+    try:
+        yield
+    finally:
+        lock.release()

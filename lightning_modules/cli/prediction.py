@@ -6,21 +6,23 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from jsonargparse.typing import PositiveFloat
+from jsonargparse.typing import PositiveFloat, PositiveInt, restricted_string_type
 from pytorch_lightning import Callback
 from pytorch_lightning.callbacks import ProgressBar
 from pytorch_lightning.cli import LightningArgumentParser
 
-from lightning_modules.cli.arguments import WEIGHTS, behind_configurations, options, preset_arguments
+from lightning_modules.cli.arguments import WEIGHTS, behind_configurations, given, options, preset_arguments
 from lightning_modules.cli.errors import InputError, UsageError
 from lightning_modules.data import RecordingClips
-from lightning_modules.inference.presets import SPEEDS, choose
-from lightning_modules.tasks.predictions import PictureProgress, Predictions, file_identity
+from lightning_modules.inference.presets import SPEEDS, Preset, choose
+from lightning_modules.tasks.predictions import PictureProgress, Predictions, file_identity, is_film
 from spikekit import __version__
 from spikekit.decoders.methods import DECODERS
 from spikekit.timing import duration
 
 NO_RECORDING = "predict: expected a recording: --data Recording --data.path FILE"
+
+_PART = restricted_string_type("Part", r"[1-9]\d{0,5}/[1-9]\d{0,5}")
 
 # milliseconds a pixel of a picture, written as PNG by one core
 _WRITING = 7e-5
@@ -38,7 +40,7 @@ def add_arguments(parser: LightningArgumentParser) -> None:
     )
     parser.add_argument(
         "--budget",
-        help="Instead, what a frame may take, such as 40ms or 200MB: the best that fits, by the same table.",
+        help="Instead, what a frame may take, such as 40ms, 25fps or 200MB: the best that fits, by the same table.",
     )
     parser.add_argument("--fps", type=PositiveFloat, default=25.0, help="Pictures shown in a second of a film.")
     parser.add_argument(
@@ -46,34 +48,56 @@ def add_arguments(parser: LightningArgumentParser) -> None:
         choices=list(DECODERS),
         help="Show what this decoder makes of the same spikes to the left of every picture.",
     )
+    parser.add_argument(
+        "--engine",
+        choices=["local", "ray"],
+        default="local",
+        help="Make the pictures here, or in parts on a Ray cluster, whose nodes see the same files.",
+    )
+    parser.add_argument(
+        "--jobs", type=PositiveInt | None, default=None, help="Parts at once on the cluster; one a GPU, or a node."
+    )
+    parser.add_argument(
+        "--part", type=_PART | None, default=None, help="Make the pictures of part K of N alone, as K/N; no film."
+    )
 
 
-def with_choice(parser: LightningArgumentParser, args: Sequence[str]) -> list[str]:
-    """Put in the setting that ``--speed`` or ``--budget`` asks for, and say which."""
-    given = next((option for _, option, _ in options(args) if option in (*WEIGHTS, "--ckpt_path")), None)
-    if given:
-        raise UsageError(f"--speed and --budget: choose from the weights of the package, got {given} as well")
-    verb, *rest = args
-    parsed = parser.parse_args([verb, "--config", '{"model": {"network": {"class_path": "CSCSR"}}}', *rest])[verb]
-    recording = parsed.data.get("init_args", {})
+def with_choice(parser: LightningArgumentParser, args: Sequence[str]) -> tuple[list[str], str]:
+    """Put in the setting that ``--speed`` or ``--budget`` asks for, and return what is to be said of it as well.
+
+    What the choice depends on is read without the parser, which takes as long again: it has its say when all is known,
+    and before anything that went wrong here.
+    """
+    wrong = next((option for _, option, _ in options(args) if option in (*WEIGHTS, "--ckpt_path")), None)
+    if wrong:
+        raise UsageError(f"--speed and --budget: choose from the weights of the package, got {wrong} as well")
+    try:
+        preset, said = _choice(args)
+    except (OSError, TypeError, ValueError) as error:
+        verb, *rest = args
+        parser.parse_args([verb, "--config", '{"model": {"network": {"class_path": "CSCSR"}}}', *rest])
+        raise (UsageError if isinstance(error, UsageError) else InputError)(str(error)) from error
+    return behind_configurations(args, preset_arguments(preset)), said
+
+
+def _choice(args: Sequence[str]) -> tuple[Preset, str]:
+    wishes = {option: value for _, option, value in options(args) if option in ("--speed", "--budget")}
+    speed = wishes.get("--speed")
+    recording, network = given(args, "data"), given(args, "model.network")
     if not recording.get("path"):
         raise UsageError(NO_RECORDING)
-    try:
-        known = ("path", "height", "width", "pattern", "camera")
-        clips = RecordingClips(**{name: recording.get(name) for name in (*known, "frame", "every")})
-        scale = parsed.model.init_args.network.init_args.scale
-        choice = choose(scale, parsed.speed, parsed.budget, clips.size)
-        speeds = list(SPEEDS)
-        sooner = speeds[max(speeds.index(parsed.speed) - 1, 0)] if parsed.speed else None
-        other = choose(scale, sooner, None, clips.size) if sooner else choice
-    except (OSError, ValueError) as error:
-        raise InputError(str(error)) from error
-    print(choice, flush=True)
+    known = {name: recording[name] for name in ("path", "pattern", "camera", "frame") if name in recording}
+    sizes = {name: int(recording[name]) for name in ("height", "width", "every") if name in recording}
+    clips, scale = RecordingClips(**known, **sizes), int(network.get("scale", 4))
+    film = any(option in ("-o", "--output") and is_film(value) for _, option, value in options(args) if value)
+    choice = choose(scale, speed, wishes.get("--budget"), clips.size, film)
+    speeds = list(SPEEDS)
+    sooner = speeds[max(speeds.index(speed) - 1, 0)] if speed else None
+    other = choose(scale, sooner, None, clips.size, film) if sooner else choice
     writing = _WRITING * scale**2 * clips.size[0] * clips.size[1]
     took, sooner_took = (duration(len(clips) * (one.ms + writing) / 1e3) for one in (choice, other))
     instead = f"; --speed {sooner}: {sooner_took}, {other.below:.2f} dB below the best" if other != choice else ""
-    print(f"{len(clips)} pictures, written as PNG: about {took}{instead}", flush=True)
-    return behind_configurations(args, preset_arguments(choice.preset))
+    return choice.preset, f"{choice}\n{len(clips)} pictures, written as PNG: about {took}{instead}"
 
 
 def callbacks(
@@ -94,5 +118,11 @@ def callbacks(
     made_of["checkpoint"] = checkpoint and file_identity(checkpoint)
     bar = config["trainer"].get("enable_progress_bar") is not False
     bar = bar and not any(isinstance(callback, ProgressBar) for callback in given)
-    predictions = Predictions(output, made_of, config["fps"], config["beside"])
+    part = (0, 1)
+    if config["part"] is not None:
+        number, count = map(int, config["part"].split("/"))
+        if number > count:
+            raise UsageError(f"--part: expected at most {count} of {count}, got {number}")
+        part = number - 1, count
+    predictions = Predictions(output, made_of, config["fps"], config["beside"], part)
     return [predictions, PictureProgress()] if bar else [predictions]

@@ -93,7 +93,8 @@ def overview() -> str:
     """Return what ``lightning --help`` says."""
     return (
         f"usage: lightning VERB ...\n\n{_aligned(VERBS.items())}\n\n"
-        "lightning VERB --help lists options of a verb, lightning --version says which version this is."
+        "lightning VERB --help lists options of a verb, lightning --version says which version this is, and\n"
+        "lightning --print-completion bash prints what lets bash complete with the tab key, or zsh likewise."
     )
 
 

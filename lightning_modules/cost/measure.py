@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
 from torch.utils.flop_counter import FlopCounterMode
-from tqdm import tqdm
 
 from lightning_modules.cost.energy import energy_meter, energy_per_call
 from lightning_modules.cost.runner import Runner
 from lightning_modules.cost.setting import Setting
 from lightning_modules.metrics.image import measures
 from spikekit.arguments import one_line
+from spikekit.progress import progress
 from spikekit.timing import Timer, peak_memory, timer_of
 
 
@@ -36,6 +36,8 @@ class Row:
         memory: MiB, by how much a clip raises the memory in use; None where that is not to be had.
         macs: multiplications of convolutions and matrices, by sensor pixel.
         joules: by frame; None where that is not to be had.
+        flicker: of pairs of pictures in films, see :func:`lightning_modules.metrics.flicker.film_flicker`.
+        latency: clocks that a film is late; None where it is no film.
     """
 
     setting: Setting
@@ -48,6 +50,8 @@ class Row:
     memory: float | None = None
     macs: float | None = None
     joules: float | None = None
+    flicker: list[float] = field(default_factory=list)
+    latency: int | None = None
 
     @property
     def parameters(self) -> int:
@@ -64,12 +68,14 @@ class Timed:
         size: theirs, (H, W) in sensor pixels.
         rounds: how often every setting was timed.
         unit: what was counted.
+        every: clocks between two pictures of the films that they are; None where they are single clips.
     """
 
     clips: int
     size: tuple[int, int]
     rounds: int
     unit: str
+    every: int | None = None
 
 
 def measure(rows: Sequence[Row], scenes: DataLoader, rounds: int) -> Timed:
@@ -85,12 +91,13 @@ def measure(rows: Sequence[Row], scenes: DataLoader, rounds: int) -> Timed:
         rounds: how often a setting is timed.
     """
     kept: list[Tensor] = []
-    total = len(scenes.dataset)
-    for clip in tqdm(_clips(scenes), "clips", total, disable=None, leave=False):
-        if len(kept) < rounds and (not kept or clip["spikes"].shape == kept[0].shape):
-            kept.append(clip["spikes"])
-        for row in running(rows):
-            _attempt(row, lambda row=row, clip=clip: _score(row, clip))
+    with progress(what="pictures scored", total=len(scenes.dataset) * len(running(rows))) as bar:
+        for clip in _clips(scenes):
+            if len(kept) < rounds and (not kept or clip["spikes"].shape == kept[0].shape):
+                kept.append(clip["spikes"])
+            for row in running(rows):
+                attempt(row, lambda row=row, clip=clip: _score(row, clip))
+                bar.update()
     return measure_costs(rows, kept, rounds)
 
 
@@ -102,8 +109,8 @@ def measure_costs(rows: Sequence[Row], clips: Sequence[Tensor], rounds: int) -> 
         clips: spikes (1, N, H, W), of one size, which take turns at being timed; the first of them is also weighed.
         rounds: how often a setting is timed.
     """
-    for row in running(rows):
-        _attempt(row, lambda row=row: _weigh(row, clips[0]))
+    for row in progress(running(rows), "settings weighed"):
+        attempt(row, lambda row=row: _weigh(row, clips[0]))
     rows = running(rows)
     time_in_turns(rows, clips, rounds)
     units = dict.fromkeys(_timer(row)[1] for row in rows)
@@ -126,12 +133,16 @@ def time_in_turns(rows: Sequence[Row], clips: Sequence[Tensor], rounds: int) -> 
         clips: spikes (1, N, H, W), which take turns.
         rounds: how many.
     """
-    for turn in tqdm(range(rounds), "rounds of timing", disable=None, leave=False):
-        first = turn % max(1, len(rows))
-        for row in [*rows[first:], *rows[:first]]:
-            spikes = clips[turn % len(clips)].to(row.runner.device)
-            timer, _ = _timer(row)
-            row.seconds.append(timer(lambda row=row, spikes=spikes: row.runner(spikes), 1))
+    turns = [(turn, row) for turn in range(rounds) for row in _from(rows, turn)]
+    for turn, row in progress(turns, "timings"):
+        spikes = clips[turn % len(clips)].to(row.runner.device)
+        timer, _ = _timer(row)
+        row.seconds.append(timer(lambda row=row, spikes=spikes: row.runner(spikes), 1))
+
+
+def _from(rows: Sequence[Row], turn: int) -> list[Row]:
+    first = turn % max(1, len(rows))
+    return [*rows[first:], *rows[:first]]
 
 
 def _timer(row: Row) -> tuple[Timer, str]:
@@ -145,7 +156,8 @@ def _clips(scenes: DataLoader) -> Iterator[dict[str, Tensor]]:
             yield {name: value[n : n + 1] for name, value in batch.items()}
 
 
-def _attempt(row: Row, work: Callable[[], None]) -> None:
+def attempt(row: Row, work: Callable[[], None]) -> None:
+    """Do some work for a row; where it fails, the row gets the reason."""
     try:
         work()
     except Exception as error:  # the others are worth their rows

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 from argparse import ArgumentError
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -16,6 +15,8 @@ from torch import Tensor
 from lightning_modules.cli.command import run
 from lightning_modules.cli.errors import InputError, UsageError
 from lightning_modules.cli.rehearsal import Rehearsal, argument_names, mistake, resolved
+from lightning_modules.inference.film import FilmFrame, film
+from lightning_modules.networks import RecurrentCSCSR
 from lightning_modules.pretrained import load_weights, read_weights
 from spikekit.arguments import one_line
 
@@ -55,8 +56,11 @@ class Runner:
     """
 
     def __init__(self, args: Sequence[str], names: Sequence[str] = ()) -> None:
-        with _quiet():
+        logging.disable(logging.INFO)  # Lightning would say for every setting anew what machine this is
+        try:
             command = _built(args, names)
+        finally:
+            logging.disable(logging.NOTSET)
         trainer, module = command.trainer, command.model
         if type(module).predict_step is LightningModule.predict_step:
             raise UsageError(f"expected a model that makes pictures, got {type(module).__name__}")
@@ -85,6 +89,19 @@ class Runner:
         batch = {"spikes": spikes[:, first : first + self.network.frames]}
         with torch.inference_mode(), self.precision.predict_step_context():
             return self.module.predict_step(self.precision.convert_input(batch), 0)
+
+    def film(self, chunks: Iterable[Tensor], every: int) -> Iterator[FilmFrame]:
+        """Yield the pictures of a film, see :func:`lightning_modules.inference.film.film`.
+
+        Args:
+            chunks: spikes (T, H, W), on the device.
+            every: clocks between two pictures.
+        """
+        module, alpha = self.module, self.network.settings["alpha"]
+        names = ("tile",) if isinstance(self.network, RecurrentCSCSR) else ("tile", "psnr_tolerance", "self_ensemble")
+        how = {name: getattr(module, name) for name in ("future", *names)}
+        with torch.inference_mode(), self.precision.predict_step_context():
+            yield from film(self.network, map(self.precision.convert_input, chunks), every, white=alpha, **how)
 
 
 def make_runner(shared: Sequence[str], args: Sequence[str], base: Runner) -> Runner:
@@ -131,13 +148,3 @@ def _causes(error: BaseException) -> Iterator[BaseException]:
     while error.__cause__ is not None:
         error = error.__cause__
         yield error
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep Lightning from saying for every setting anew what machine this is."""
-    logging.disable(logging.INFO)
-    try:
-        yield
-    finally:
-        logging.disable(logging.NOTSET)

@@ -142,7 +142,7 @@ def pack_clip(clip: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
     becomes numbers of 8 (16) bits and a table.
 
     Args:
-        clip: ``spikes`` (N, H, W) of zeros and ones, ``rgb`` (3, s H, s W), perhaps ``flow`` (times, 2, H, W).
+        clip: ``spikes`` (N, H, W) of zeros and ones, ``rgb`` (*, 3, s H, s W), perhaps ``flow`` (times, 2, H, W).
 
     Returns:
         Arrays for :func:`unpack_clip`.
@@ -173,7 +173,7 @@ def unpack_clip(packed: Mapping[str, np.ndarray], part: tuple[int, int, int, int
         scale: pixels of the picture for a sensor pixel.
 
     Returns:
-        ``spikes`` uint8 (N, H, W), ``rgb`` (3, s H, s W), and ``flow`` (times, 2, H, W) float32 where there is any.
+        ``spikes`` uint8 (N, H, W), ``rgb`` (*, 3, s H, s W), and ``flow`` (times, 2, H, W) float32 where there is any.
 
     Example:
         >>> clip = {"spikes": torch.rand(41, 6, 10).round(), "rgb": torch.rand(3, 12, 20)}
@@ -188,7 +188,7 @@ def unpack_clip(packed: Mapping[str, np.ndarray], part: tuple[int, int, int, int
     bits = np.ascontiguousarray(packed["spikes"][:, rows, first : -(-(left + width) // 8)])
     skipped = left - 8 * first
     spikes = unpack_spikes(torch.from_numpy(bits), skipped + width)[..., skipped:].contiguous()
-    rgb = packed["rgb"][:, scale * top : scale * (top + height), scale * left : scale * (left + width)]
+    rgb = packed["rgb"][..., scale * top : scale * (top + height), scale * left : scale * (left + width)]
     rgb = packed["shades"][rgb] if "shades" in packed else np.ascontiguousarray(rgb)
     clip = {"spikes": spikes, "rgb": torch.from_numpy(rgb)}
     if "flow" in packed:

@@ -21,7 +21,8 @@ from torch.utils.data import DataLoader, Dataset
 
 from lightning_modules.data.cache import ClipCache, clip_key, file_digest, pack_clip, unpack_clip
 from lightning_modules.data.layouts import EXPECTED, Collection, FilmFiles, find_films
-from lightning_modules.data.loading import FreshClips, default_workers, load_clips
+from lightning_modules.data.loading import FreshClips, OwnPart, default_workers, load_clips
+from lightning_modules.data.margin import flow_margin, trim
 from lightning_modules.data.pictures import split_pictures
 from spikekit import bayer_pattern
 from spikekit.check import check_positive, check_whole
@@ -41,6 +42,8 @@ class ClipRecipe:
         pattern: Bayer phase of the sensor.
         alpha: light of a white pixel per clock, the threshold being 1.
         clocks: clocks from one source frame to the next.
+        key_frames: clips that follow each other, around so many source frames, an odd number; their truth is all of
+            these frames, and there is no flow.
         flow_times: spike frames to which the flow from the middle is given; empty for no flow.
         interpolation: what makes latent frames.
         noise: what the sensor adds.
@@ -55,6 +58,7 @@ class ClipRecipe:
     pattern: str = "RGGB"
     alpha: float = 0.4
     clocks: int = 20
+    key_frames: int = 1
     flow_times: tuple[int, ...] = (5, 35)
     interpolation: Callable[[Tensor, Tensor], Any] = field(default_factory=FlowInterpolation)
     noise: SensorNoise = field(default_factory=SensorNoise)
@@ -66,6 +70,8 @@ class ClipRecipe:
         check_whole("frames", self.frames)
         check_whole("clocks", self.clocks)
         bayer_pattern(self.pattern)
+        if check_whole("key_frames", self.key_frames) % 2 == 0:
+            raise ValueError(f"key_frames: expected an odd number, got {self.key_frames}")
         if any(not 0 <= time < self.frames for time in self.flow_times):
             raise ValueError(f"flow_times: expected clocks in [0, {self.frames}), got {self.flow_times}")
         if self.seed < 0:
@@ -74,7 +80,8 @@ class ClipRecipe:
     @property
     def reach(self) -> tuple[int, int]:
         """Source frames that a clip needs before and after the one in its middle."""
-        return -(-(self.frames // 2) // self.clocks), -(-((self.frames - 1) // 2) // self.clocks)
+        more = self.key_frames // 2
+        return -(-(self.frames // 2) // self.clocks) + more, -(-((self.frames - 1) // 2) // self.clocks) + more
 
     def files(self, film: FilmFiles, middle: int) -> list[Path]:
         """Return the files that a clip is made of, the truth last where it is a file of its own."""
@@ -92,7 +99,7 @@ class ClipRecipe:
             noise=asdict(self.noise),
             pattern=bayer_pattern(self.pattern),
             flow_times=list(self.flow_times),
-            **{name: getattr(self, name) for name in ("scale", "frames", "alpha", "clocks", "seed")},
+            **{name: getattr(self, name) for name in ("scale", "frames", "alpha", "clocks", "key_frames", "seed")},
         )
 
     def clip(self, film: FilmFiles, middle: int) -> dict[str, Tensor]:
@@ -104,30 +111,65 @@ class ClipRecipe:
 
         Returns:
             ``spikes`` uint8 (N, H, W), ``rgb`` (3, s H, s W), the truth, and ``flow`` (times, 2, H, W), in sensor
-            pixels, all of the whole view. Where the film is cut, nothing can be followed, and flow is 0.
+            pixels, all of the whole view. Where the film is cut, nothing can be followed, and flow is 0. Of several
+            key frames K all their clocks as ``spikes``, and ``rgb`` (K, 3, s H, s W).
 
         Raises:
             spikekit.io.video.VideoError: a file that cannot be read; the message names it.
             ValueError: frames too small for the sensor, or a truth of another size than theirs.
         """
-        paths = self.files(film, middle)
-        pictures = [_shrunk(read_video(path)[0], film.shrink) for path in paths[: sum(self.reach) + 1]]
-        own = film.truth is None
+        paths, pictures = self.files(film, middle), self._pictures(film, middle)
+        clip = self._view(film, pictures)
+        chance = self._chance(paths)
+        spikes = torch.cat(list(clip.film.spikes(clip.first, clip.frames, noise=self.noise, seed=chance)))
+        if self.key_frames > 1:
+            key_frames = (
+                clip.middle + n * self.clocks for n in range(-(self.key_frames // 2), self.key_frames // 2 + 1)
+            )
+            return {"spikes": spikes, "rgb": torch.stack([clip.rgb(clock) for clock in key_frames])}
+        if film.truth is None:
+            rgb = clip.rgb(clip.middle)
+        else:
+            rgb = _truth(paths[-1], tuple(pictures[0].shape[1:]), self.scale, spikes)
+        made = {"spikes": spikes, "rgb": rgb}
+        if self.flow_times:
+            made["flow"] = torch.stack([self._flow(clip, time) for time in self.flow_times])
+        return made
+
+    def view(self, film: FilmFiles, middle: int) -> FilmClip:
+        """Return what the camera sees around a source frame.
+
+        Args:
+            film: the film.
+            middle: which of its frames is in the middle.
+
+        Raises:
+            spikekit.io.video.VideoError: a file that cannot be read; the message names it.
+            ValueError: frames too small for the sensor.
+        """
+        return self._view(film, self._pictures(film, middle))
+
+    def _pictures(self, film: FilmFiles, middle: int) -> list[Tensor]:
+        paths = self.files(film, middle)[: sum(self.reach) + 1]
+        return [_shrunk(read_video(path)[0], film.shrink) for path in paths]
+
+    def _view(self, film: FilmFiles, pictures: list[Tensor]) -> FilmClip:
         seen = Film(
             pictures,
-            scale=self.scale if own else 1,
+            scale=self.scale if film.truth is None else 1,
             pattern=self.pattern,
             alpha=self.alpha,
             clocks=self.clocks,
             interpolation=self.interpolation,
         )
-        clip = seen.clip(self.reach[0], self.frames)
-        spikes = torch.cat(list(seen.spikes(clip.first, self.frames, noise=self.noise, seed=self._chance(paths))))
-        rgb = clip.rgb(clip.middle) if own else _truth(paths[-1], tuple(pictures[0].shape[1:]), self.scale, spikes)
-        made = {"spikes": spikes, "rgb": rgb}
-        if self.flow_times:
-            made["flow"] = torch.stack([self._flow(clip, time) for time in self.flow_times])
-        return made
+        return seen.clip(self.reach[0], self.frames + (self.key_frames - 1) * self.clocks)
+
+    def cut(self, clip: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Cut what :meth:`clip` returned into the clips of its key frames, (K, N, H, W), ``every`` clocks apart."""
+        if self.key_frames == 1:
+            return clip
+        spikes = clip["spikes"].unfold(0, self.frames, self.clocks).movedim(-1, 1).contiguous()
+        return {**clip, "spikes": spikes, "every": torch.tensor(self.clocks)}
 
     def _flow(self, clip: FilmClip, time: int) -> Tensor:
         try:
@@ -185,6 +227,8 @@ class FilmClips(Dataset):
         clips: clips of a film; fewer where it has too few frames, and one of a film with a middle of its own.
         patch: side of a patch in sensor pixels; None for whole clips.
         cache: where clips are kept; None to simulate each whenever it is asked for.
+        flow_patch: smallest side of the spikes of a patch, which reach beyond it as far as that takes and the view
+            goes, for an estimate of motion; truth and flow are those of the patch.
 
     Raises:
         ValueError: no films, a film too short for a clip, a number of clips or a patch below 1.
@@ -197,8 +241,9 @@ class FilmClips(Dataset):
         clips: int = 1,
         patch: int | None = None,
         cache: ClipCache | None = None,
+        flow_patch: int = 0,
     ) -> None:
-        self.recipe, self.patch, self.cache = recipe, patch, cache
+        self.recipe, self.patch, self.cache, self.flow_patch = recipe, patch, cache, flow_patch
         check_whole("clips", clips)
         if patch is not None:
             check_whole("patch", patch)
@@ -250,17 +295,21 @@ class FilmClips(Dataset):
             if self.cache is not None:
                 self.cache.store(key, packed)
         scale = self.recipe.scale
-        height, width = (length // scale for length in packed["rgb"].shape[1:])
-        part = 0, 0, height, width
+        height, width = (length // scale for length in packed["rgb"].shape[-2:])
+        part, margin = (0, 0, height, width), 0
         if rng is not None:
             if self.patch > min(height, width):
                 raise ValueError(
                     f"patch: expected at most {min(height, width)}, as {film.folder} gives {height} x {width} sensor "
                     f"pixels at scale {scale}, got {self.patch}"
                 )
-            corner = (2 * int(rng.integers((length - self.patch) // 2 + 1)) for length in (height, width))
-            part = *corner, self.patch, self.patch
-        return unpack_clip(packed, part, scale)
+            margin = min(flow_margin(self.patch, self.flow_patch), (min(height, width) - self.patch) // 4 * 2)
+            side = self.patch + 2 * margin
+            corner = (2 * int(rng.integers((length - side) // 2 + 1)) for length in (height, width))
+            part = *corner, side, side
+        clip = unpack_clip(packed, part, scale)
+        inner = {"rgb": scale * margin, "flow": margin}
+        return self.recipe.cut({name: trim(planes, inner.get(name, 0)) for name, planes in clip.items()})
 
 
 class FilmScenes(pl.LightningDataModule):
@@ -282,6 +331,8 @@ class FilmScenes(pl.LightningDataModule):
         pattern: Bayer phase of the sensor: RGGB, BGGR, GRBG or GBRG.
         alpha: light of a white pixel per clock; a threshold of charge is 1.
         clocks: spike frames from one source frame to the next.
+        key_frames: clips that follow each other, around so many source frames, for a network that makes films; an odd
+            number.
         clips: clips of a film, spread over it. Null for 5 of REDS and of other films, 1 of Vid4 and Vimeo-90K.
         flow: give the interpolation's flow from the middle to ``flow_times``. False for an interpolation that has
             none; training then uses the network's own estimator.
@@ -289,6 +340,8 @@ class FilmScenes(pl.LightningDataModule):
         interpolation: what makes frames between two source frames, by its class path; motion-compensated, without
             weights, when null.
         noise: what the sensor adds, such as ``{photons: 1000}``; nothing when null.
+        flow_patch: smallest side, in sensor pixels, of what motion is estimated on in training, see
+            :class:`StillScenes`.
         cache: folder where simulated clips are kept, found again by the content of their frames, by all settings and
             by the code of the simulator. It is never emptied: delete it, or files in it, at any time. Null for none.
         batch_size: training clips in a batch; everything else goes one by one.
@@ -305,18 +358,20 @@ class FilmScenes(pl.LightningDataModule):
         pattern: str = "RGGB",
         alpha: float = 0.4,
         clocks: int = 20,
+        key_frames: int = 1,
         clips: int | None = None,
         flow: bool = True,
         flow_times: tuple[int, int] = (5, 35),
         interpolation: Callable[[Tensor, Tensor], Any] | None = None,
         noise: SensorNoise | None = None,
+        flow_patch: int = 0,
         cache: str | None = None,
         batch_size: int = 4,
         workers: int | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__()
-        self.root, self.patch, self.clips, self.cache = root, patch, clips, cache
+        self.root, self.patch, self.clips, self.cache, self.flow_patch = root, patch, clips, cache, flow_patch
         self.batch_size, self.seed = batch_size, seed
         self.workers = default_workers() if workers is None else workers
         self.options = {
@@ -325,6 +380,7 @@ class FilmScenes(pl.LightningDataModule):
             "pattern": pattern,
             "alpha": alpha,
             "clocks": clocks,
+            "key_frames": key_frames,
             "flow_times": tuple(flow_times) if flow else (),
             "seed": seed,
         }
@@ -364,7 +420,7 @@ class FilmScenes(pl.LightningDataModule):
             )
         clips, cache = self.clips or found.clips, self.cache and ClipCache(self.cache)
         if found.train:
-            self.train_set = FilmClips(found.train, recipe, clips, self.patch, cache or None)
+            self.train_set = FilmClips(found.train, recipe, clips, self.patch, cache or None, self.flow_patch)
         if found.val:
             self.val_set = FilmClips(found.val, recipe, clips, None, cache or None)
         if found.test:
@@ -390,7 +446,7 @@ class FilmScenes(pl.LightningDataModule):
         return load_clips(self.train_set, self.batch_size, self.workers, sampler=clips, drop_last=True)
 
     def val_dataloader(self) -> DataLoader:  # noqa: D102
-        return load_clips(self.val_set, 1, self.workers)
+        return load_clips(self.val_set, 1, self.workers, sampler=OwnPart(self, len(self.val_set)))
 
     def test_dataloader(self) -> DataLoader:  # noqa: D102
-        return load_clips(self.test_set, 1, self.workers)
+        return load_clips(self.test_set, 1, self.workers, sampler=OwnPart(self, len(self.test_set)))

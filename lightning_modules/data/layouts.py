@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from lightning_modules.data.pictures import existing_folder
 from spikekit.io.video import PICTURE_ENDINGS
 
 #: What a folder may look like, for messages.
@@ -85,11 +86,7 @@ def find_films(root: str | Path, hold_out: Callable[[list], tuple[list, list]]) 
             message shows what was expected.
         NotADirectoryError: it is a file.
     """
-    root = Path(root).expanduser()
-    if not root.exists():
-        raise FileNotFoundError(f"{root}: no such folder of films")
-    if not root.is_dir():
-        raise NotADirectoryError(f"{root}: expected a folder of films, got a file")
+    root = existing_folder(root, "films")
     found = _reds(root) or _vimeo(root) or _vid4(root) or _others(root, hold_out)
     if found is None:
         raise FileNotFoundError(f"{root}: no films in this folder; expected one of\n{EXPECTED}")
@@ -131,11 +128,8 @@ def _vimeo(root: Path) -> Collection | None:
     train = test = ()
     for folder in (root, root / "vimeo_septuplet"):
         if (folder / "sequences").is_dir():
-            small = _first_folder(
-                folder / "BIx4",
-                folder / "low_resolution",
-                folder.with_name("vimeo_septuplet_matlabLRx4") / "sequences",
-            )
+            matlab = folder.with_name("vimeo_septuplet_matlabLRx4") / "sequences"
+            small = next(filter(Path.is_dir, (folder / "BIx4", folder / "low_resolution", matlab)), None)
             train, test = (_septuplets(folder, small, f"sep_{split}list.txt") for split in ("train", "test"))
             break
     for folder in (root, root / "vimeo_super_resolution_test"):
@@ -178,10 +172,6 @@ def _films(folders: Iterable[Path], only: str | None = None) -> tuple[FilmFiles,
             if frames:
                 films.setdefault(name, FilmFiles(name, folder / name, frames))
     return tuple(films[name] for name in sorted(films, key=natural))
-
-
-def _first_folder(*folders: Path) -> Path | None:
-    return next((folder for folder in folders if folder.is_dir()), None)
 
 
 def _subfolders(folder: Path) -> list[str]:

@@ -12,33 +12,77 @@ import numpy as np
 import torch
 from pytorch_lightning import LightningDataModule
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 _MOST_WORKERS = 8
 _A_MOMENT = 2.0  # seconds
 
 
-class FreshClips(Sampler[int]):
+class FreshClips(DistributedSampler[int]):
     """Consecutive indices that go on where training stands, so that a resumed run sees what an unbroken one would.
+
+    Where several processes train, each takes its batch of every step, so that every clip is seen once: two processes
+    see in a step what one of twice the batch size would.
 
     Args:
         data: whose training says where it stands.
         batch_size: clips in a batch.
         length: clips in an epoch.
+
+    Raises:
+        ValueError: less than a batch for every process.
     """
 
     def __init__(self, data: LightningDataModule, batch_size: int, length: int) -> None:
-        self.data, self.batch_size, self.length = data, batch_size, length
+        super().__init__(range(length), 1, 0, shuffle=False)  # Lightning would cut any other kind into parts itself
+        self.data, self.batch_size = data, batch_size
+        _, processes = _process(data)
+        a_batch = batch_size * processes
+        if length < a_batch:
+            raise ValueError(f"batch_size: {batch_size} x {processes} processes need {a_batch} clips, got {length}")
+        self.length = length // a_batch * batch_size
 
     def __len__(self) -> int:
         return self.length
 
     def __iter__(self) -> Iterator[int]:
-        start, trainer = 0, self.data.trainer
-        if trainer is not None:
-            a_step = self.batch_size * trainer.accumulate_grad_batches * trainer.world_size
-            start = trainer.global_step * a_step
-        return iter(range(start, start + len(self)))
+        rank, processes = _process(self.data)
+        trainer = self.data.trainer
+        steps = 0 if trainer is None else trainer.global_step * trainer.accumulate_grad_batches
+        for batch in range(self.length // self.batch_size):
+            start = ((steps + batch) * processes + rank) * self.batch_size
+            yield from range(start, start + self.batch_size)
+
+
+class OwnPart(DistributedSampler[int]):
+    """The indices of one process: all of them, or a part, one part behind the other, where several share them.
+
+    Args:
+        data: whose trainer says how many processes there are.
+        length: how many indices there are in all.
+
+    Raises:
+        ValueError: fewer than there are processes.
+    """
+
+    def __init__(self, data: LightningDataModule, length: int) -> None:
+        super().__init__(range(length), 1, 0, shuffle=False)
+        rank, processes = _process(data)
+        if length < processes:
+            raise ValueError(f"devices: expected at most {length}, a clip for every process, got {processes}")
+        self.part = range(length * rank // processes, length * (rank + 1) // processes)
+
+    def __len__(self) -> int:
+        return len(self.part)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.part)
+
+
+def _process(data: LightningDataModule) -> tuple[int, int]:
+    """Return which process this is, and of how many."""
+    trainer = data.trainer
+    return (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
 
 
 def load_clips(clips: Dataset, batch_size: int, workers: int, **options: object) -> DataLoader:

@@ -29,6 +29,21 @@ _TRAIN = [
 _HELD_OUT = ["coffee.png", "chelsea.png", "motorcycle_left.png", "gravel.png"]
 
 
+def existing_folder(root: str | Path, what: str) -> Path:
+    """Return the path of a folder of ``what``.
+
+    Raises:
+        FileNotFoundError: there is no such folder.
+        NotADirectoryError: it is a file.
+    """
+    root = Path(root).expanduser()
+    if not root.exists():
+        raise FileNotFoundError(f"{root}: no such folder of {what}")
+    if not root.is_dir():
+        raise NotADirectoryError(f"{root}: expected a folder of {what}, got a file")
+    return root
+
+
 def folder_pictures(root: str | Path) -> list[Path]:
     """List the pictures of a folder and of all folders in it, sorted; hidden ones are left out.
 
@@ -42,11 +57,7 @@ def folder_pictures(root: str | Path) -> list[Path]:
         FileNotFoundError: there is no such folder, or no picture in it.
         NotADirectoryError: it is a file.
     """
-    root = Path(root).expanduser()
-    if not root.exists():
-        raise FileNotFoundError(f"{root}: no such folder of pictures")
-    if not root.is_dir():
-        raise NotADirectoryError(f"{root}: expected a folder of pictures, got a file")
+    root = existing_folder(root, "pictures")
     inside = sorted(root.rglob("*"))
     found = [path for path in inside if path.suffix.lower() in _ENDINGS and path.is_file()]
     found = [path for path in found if not any(part.startswith(".") for part in path.relative_to(root).parts)]

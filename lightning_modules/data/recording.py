@@ -6,6 +6,7 @@ from argparse import Namespace
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,8 @@ class RecordingClips(Dataset[dict[str, Any]]):
         size: (H, W) of a clip.
         recording: the file and what is known of it.
         chosen: the frames in the middle of the clips, in order.
+        made: those of them whose pictures are there already.
+        part: which part of them is wanted, counted from 0, and of how many.
         grey: whether the camera is known to have no colours.
 
     Raises:
@@ -92,6 +95,8 @@ class RecordingClips(Dataset[dict[str, Any]]):
         if min(self.size) < 3:
             raise ValueError(f"{path}: expected at least 3 x 3 pixels that begin with {crop_to}, got {self.size}")
         self.frames = frames
+        self.made: set[int] = set()
+        self.part = 0, 1
         self._every_clip = range(frames // 2, total - (frames - 1) // 2, every)
         try:
             ends = self._every_clip[0], total - 1 - (frames - 1) // 2
@@ -141,18 +146,31 @@ class RecordingClips(Dataset[dict[str, Any]]):
 
 
 class _Batches:
-    """Batches of one clip; those of one process, where several share a recording, follow each other."""
+    """Groups of clips that follow each other; those of one process, where several share a recording, do so as well.
 
-    def __init__(self, clips: RecordingClips, process: int, processes: int) -> None:
+    Groups whose pictures are made already are left out, but for those that a network which carries on what it knows of
+    one key frame to the next has to see again: their clips are not ``shown``.
+    """
+
+    def __init__(self, clips: RecordingClips, process: int, processes: int, group: int = 1, warm_up: int = 0) -> None:
         self.clips = clips
-        ends = [len(clips) * n // processes for n in (process, process + 1)]
-        self.chosen = clips.chosen[slice(*ends)]
+        groups = [clips.chosen[n : n + group] for n in range(0, len(clips), group)]
+        part, parts = clips.part
+        wanted = range(*(len(groups) * n // parts for n in (part, part + 1)))
+        wanted = [n for n in wanted if not clips.made.issuperset(groups[n])]
+        mine = {*wanted[slice(*(len(wanted) * n // processes for n in (process, process + 1)))]}
+        before = -(-warm_up // group)
+        seen = sorted({n for last in mine for n in range(max(last - before, 0), last + 1)})
+        self.groups = [(groups[n], n in mine) for n in seen]
 
     def __len__(self) -> int:
-        return len(self.chosen)
+        return len(self.groups)
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        return (default_collate([clip]) for clip in self.clips.in_order(self.chosen))
+        clips = self.clips.in_order(frame for frames, _ in self.groups for frame in frames)
+        for frames, mine in self.groups:
+            shown = [mine and frame not in self.clips.made for frame in frames]
+            yield {**default_collate(list(islice(clips, len(frames)))), "shown": torch.tensor(shown)}
 
 
 class Recording(LightningDataModule):
@@ -228,5 +246,8 @@ class Recording(LightningDataModule):
         return rgb if camera is None else replace(camera, gain=1.0).display(rgb)
 
     def predict_dataloader(self) -> Iterable[dict[str, Any]]:  # noqa: D102
-        ranks = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
-        return _Batches(self.clips, *ranks)
+        if not self.trainer:
+            return _Batches(self.clips, 0, 1)
+        module = self.trainer.lightning_module
+        group, warm_up = module.future + 1, module.network.warm_up
+        return _Batches(self.clips, self.trainer.global_rank, self.trainer.world_size, group, warm_up)

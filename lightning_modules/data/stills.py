@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +14,23 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from lightning_modules.data.loading import FreshClips, default_workers, load_clips
+from lightning_modules.data.cache import ClipCache, clip_key, file_digest, pack_clip, unpack_clip
+from lightning_modules.data.loading import FreshClips, OwnPart, default_workers, load_clips
+from lightning_modules.data.margin import flow_margin, trim
 from lightning_modules.data.pictures import cached_picture, embedded_pictures, folder_pictures, split_pictures
 from lightning_modules.data.textures import outline_mask, texture
 from spikekit import bayer_pattern
 from spikekit.check import check_positive, check_whole
+from spikekit.scenes import analytic
 from spikekit.scenes.analytic import Layer, Motion, Scene
+from spikekit.scenes.frame_sequence import SIMULATOR_VERSION
 from spikekit.sensor.noise import SensorNoise
 from spikekit.sensor.simulate import simulate_spikes
 
+#: what says how a clip looks, besides the sensor
+_CODE = [Path(__file__).with_name(f"{name}.py") for name in ("stills", "textures", "pictures")] + [
+    Path(analytic.__file__)
+]
 _TEXTURES = 0.3  # share of procedural pictures among embedded ones
 
 
@@ -45,10 +54,15 @@ class StillClips(Dataset):
             number between.
         photons: photons that make one threshold, for photon noise; ``None`` for none.
         flow_times: clocks to which the flow from the middle is given.
+        key_frames: clips that follow each other, for a network that makes films; what moves, goes on as it does.
+        every: clocks from the middle of one to the middle of the next.
         seed: where chance begins.
         augment: mirror, turn and recolour the pictures. Without it the pictures take their turns, one an index.
         textures: take some of the pictures from :func:`lightning_modules.data.textures.texture`.
         length: what ``len`` says; any index from 0 on can be had.
+        flow_patch: smallest side of the spikes, which reach beyond the patch as far as that takes, for an estimate of
+            motion; the truth and the flow are those of the patch.
+        cache: where clips are kept; None to make each whenever it is asked for.
 
     Raises:
         ValueError: an argument that makes no sense; the message names it.
@@ -71,43 +85,88 @@ class StillClips(Dataset):
         brightness: tuple[float, float] = (0.5, 1.0),
         photons: float | None = None,
         flow_times: tuple[int, int] = (5, 35),
+        key_frames: int = 1,
+        every: int = 20,
         seed: int = 0,
         augment: bool = True,
         textures: bool = False,
         length: int = 1200,
+        flow_patch: int = 0,
+        cache: ClipCache | None = None,
     ) -> None:
         self.pictures = list(pictures)
         self.scale, self.patch, self.frames, self.pattern, self.alpha = scale, patch, frames, pattern, alpha
         self.motion, self.bend, self.rotation, self.zoom, self.objects = motion, bend, rotation, zoom, objects
         self.brightness, self.photons, self.flow_times = tuple(brightness), photons, tuple(flow_times)
+        self.key_frames, self.every = key_frames, every
         self.seed, self.augment, self.textures, self.length = seed, augment, textures, length
+        self.margin, self.cache = flow_margin(patch, flow_patch), cache
         _check(self)
+        self.clocks = self.frames + (self.key_frames - 1) * self.every
 
     def __len__(self) -> int:
         return self.length
 
     def __getitem__(self, index: int) -> dict[str, Tensor]:
-        """Return a clip: ``spikes`` uint8 (N, H, W), ``rgb`` (3, s H, s W) and ``flow`` (times, 2, H, W) float32."""
+        """Return a clip: ``spikes`` uint8 (N, H, W), ``rgb`` (3, s h, s w) and ``flow`` (times, 2, h, w) float32.
+
+        H and W are h and w, those of the patch, unless motion is to be estimated on more. Several key frames K have
+        ``spikes`` (K, N, H, W), ``rgb`` (K, 3, s h, s w) and ``every``, and no flow.
+        """
+        if self.cache is None:
+            return self._cut(self._make(index))
+        key = clip_key(source=self._source, index=index)
+        packed = self.cache.load(key)
+        if packed is None:
+            packed = pack_clip(self._make(index))
+            self.cache.store(key, packed)
+        side = self.patch + 2 * self.margin
+        return self._cut(unpack_clip(packed, (0, 0, side, side), self.scale))
+
+    @cached_property
+    def _source(self) -> str:
+        """Digest of all that a clip is made of, besides its index."""
+        aside = {"pictures", "length", "cache"}
+        options = {name: value for name, value in vars(self).items() if name not in aside}
+        files = [file_digest(path) for path in (*_CODE, *self.pictures)]
+        return clip_key(simulator=SIMULATOR_VERSION, files=files, **options)
+
+    def _make(self, index: int) -> dict[str, Tensor]:
+        """Spikes of all key frames, (T, H, W), and truth, or flow and truth of the one."""
         scene = self.scene(index)
+        spikes = self.spikes(index, scene)
+        middles = [self.frames // 2 + n * self.every for n in range(self.key_frames)]
+        rgb = torch.stack([trim(scene.rgb(middle), self.scale * self.margin) for middle in middles])
+        if self.key_frames > 1:
+            return {"spikes": spikes, "rgb": rgb}
+        flow = torch.stack([scene.flow(clock, scale=self.scale) for clock in self.flow_times])
+        return {"spikes": spikes, "rgb": rgb[0], "flow": trim(flow, self.margin)}
+
+    def _cut(self, clip: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Cut the spikes of several key frames into their clips."""
+        if self.key_frames == 1:
+            return clip
+        spikes = clip["spikes"].unfold(0, self.frames, self.every).movedim(-1, 1).contiguous()
+        return {**clip, "spikes": spikes, "every": torch.tensor(self.every)}
+
+    def spikes(self, index: int, scene: Scene) -> Tensor:
+        """Return what the sensor makes of the scene of a clip, uint8 (clocks, H, W)."""
         light = scene.light(self.pattern, scale=self.scale, alpha=self.alpha)
         generator = torch.Generator().manual_seed(int(self._rng(index, "spikes").integers(2**63)))
-        return {
-            "spikes": simulate_spikes(light, noise=SensorNoise(photons=self.photons), generator=generator),
-            "rgb": scene.rgb(scene.middle),
-            "flow": torch.stack([scene.flow(clock, scale=self.scale) for clock in self.flow_times]),
-        }
+        return simulate_spikes(light, noise=SensorNoise(photons=self.photons), generator=generator)
 
     def scene(self, index: int) -> Scene:
         """Return the scene of a clip, to look at other clocks or sizes than the clip has."""
         rng = self._rng(index, "scene")
-        side, half = self.scale * self.patch, max(self.frames // 2, 1)
+        side, half = self.scale * (self.patch + 2 * self.margin), max(self.frames // 2, 1)
         brightness = rng.uniform(*self.brightness)
         middle = (side - 1) / 2
         velocity = _in_disc(rng) * self.motion * self.scale / half
 
         # what comes into view: the corners by motion, rotation and zoom
+        longer = (self.clocks // 2) / half if self.key_frames > 1 else 1
         turns = middle * math.sqrt(2) * (math.radians(self.rotation) + self.zoom)
-        reach = turns + (self.motion + self.bend) * self.scale
+        reach = turns * longer + (self.motion * longer + self.bend * longer**2) * self.scale
         margin = math.ceil(reach) + 2
         background = self._picture(side + 2 * margin, rng, index) * brightness
         layers = [Layer(background, self._motion(velocity, (middle, middle), half, rng), (-margin, -margin))]
@@ -118,7 +177,7 @@ class StillClips(Dataset):
             moves = velocity + _in_disc(rng) * self.motion * self.scale / half
             centre = (x + (size - 1) / 2, y + (size - 1) / 2)
             layers.append(Layer(picture, self._motion(moves, centre, half, rng), (x, y), outline_mask(size, rng)))
-        return Scene(layers, side, side, self.frames)
+        return Scene(layers, side, side, self.clocks)
 
     def _rng(self, index: int, purpose: str) -> np.random.Generator:
         return np.random.default_rng([self.seed, self.augment, index, purpose == "spikes"])
@@ -157,6 +216,8 @@ def _check(clips: StillClips) -> None:
         ("zoom", 0 <= clips.zoom < math.inf, "0 or more"),
         ("objects", clips.objects >= 0, "0 or more"),
         ("brightness", 0 <= low <= high < math.inf, "two numbers 0 <= low <= high"),
+        ("key_frames", clips.key_frames >= 1, "at least 1"),
+        ("every", clips.every >= 1, "at least 1 clock"),
         ("flow_times", all(0 <= t < clips.frames for t in clips.flow_times), f"clocks in [0, {clips.frames})"),
         ("photons", clips.photons is None or 0 < clips.photons < math.inf, "a number above 0, or null for no noise"),
         ("seed", clips.seed >= 0, "0 or more"),
@@ -235,6 +296,13 @@ class StillScenes(pl.LightningDataModule):
         photons: photons that make one threshold, for photon noise; null for none.
         flow_times: frames to which the flow from the middle frame is given; with 41 frames and a window of 11, 5 and 35
             are the centres of the first and of the last window.
+        key_frames: clips that follow each other, of one scene, for a network that makes films.
+        every: frames from the middle of one to the middle of the next.
+        flow_patch: smallest side, in sensor pixels, of the part of a scene that motion is estimated on in training: on
+            less the estimate is poor. Spikes of training clips reach so far beyond their patch. ``lightning`` says 48
+            where ``model.flow`` is estimated, else 0.
+        cache: folder where training clips are kept, for trials of a sweep that train on the same ones. It is never
+            emptied: delete it, or files in it, at any time. Null for none.
         train_clips: training clips in an epoch. They are new in every epoch.
         val_clips: validation clips, the same every time; also those of ``test``.
         batch_size: clips in a batch.
@@ -261,6 +329,10 @@ class StillScenes(pl.LightningDataModule):
         brightness: tuple[float, float] = (0.5, 1.0),
         photons: float | None = None,
         flow_times: tuple[int, int] = (5, 35),
+        key_frames: int = 1,
+        every: int = 20,
+        flow_patch: int = 0,
+        cache: str | None = None,
         train_clips: int = 1200,
         val_clips: int = 16,
         batch_size: int = 4,
@@ -269,7 +341,7 @@ class StillScenes(pl.LightningDataModule):
     ) -> None:
         super().__init__()
         self.root, self.val_root = root, val_root
-        self.patch, self.val_patch = patch, val_patch
+        self.patch, self.val_patch, self.flow_patch, self.cache = patch, val_patch, flow_patch, cache
         self.train_clips, self.val_clips = train_clips, val_clips
         self.batch_size, self.seed = batch_size, seed
         self.workers = default_workers() if workers is None else workers
@@ -286,6 +358,8 @@ class StillScenes(pl.LightningDataModule):
             "brightness": brightness,
             "photons": photons,
             "flow_times": flow_times,
+            "key_frames": key_frames,
+            "every": every,
             "seed": seed,
         }
 
@@ -294,6 +368,7 @@ class StillScenes(pl.LightningDataModule):
 
         Raises:
             FileNotFoundError: a folder is missing or holds no picture.
+            OSError: the cache cannot be made.
             ValueError: an argument that makes no sense.
         """
         if self.batch_size < 1 or self.train_clips < self.batch_size:
@@ -301,7 +376,10 @@ class StillScenes(pl.LightningDataModule):
         train, val = self._pictures()
         embedded = self.root is None
         options = self.options
-        self.train_set = StillClips(train, **options, patch=self.patch, length=self.train_clips, textures=embedded)
+        more = {"flow_patch": self.flow_patch, "cache": ClipCache(self.cache) if self.cache else None}
+        self.train_set = StillClips(
+            train, **options, patch=self.patch, length=self.train_clips, textures=embedded, **more
+        )
         self.val_set = StillClips(val, **options, patch=self.val_patch, length=self.val_clips, augment=False)
 
     def _pictures(self) -> tuple[list[Path], list[Path]]:
@@ -318,7 +396,7 @@ class StillScenes(pl.LightningDataModule):
         return load_clips(self.train_set, self.batch_size, self.workers, sampler=clips, drop_last=True)
 
     def val_dataloader(self) -> DataLoader:  # noqa: D102
-        return load_clips(self.val_set, self.batch_size, self.workers)
+        return load_clips(self.val_set, self.batch_size, self.workers, sampler=OwnPart(self, len(self.val_set)))
 
     def test_dataloader(self) -> DataLoader:  # noqa: D102
-        return load_clips(self.val_set, self.batch_size, self.workers)
+        return load_clips(self.val_set, self.batch_size, self.workers, sampler=OwnPart(self, len(self.val_set)))

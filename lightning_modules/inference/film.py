@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from itertools import count
+from collections.abc import Callable, Iterable, Iterator
+from itertools import count, islice
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from lightning_modules.data.clips_around import clips_around
+from lightning_modules.inference.film_reader import FilmReader, check_future
 from lightning_modules.inference.predict import predict
-from lightning_modules.networks import Network
+from lightning_modules.inference.tiles import TILE
+from lightning_modules.networks import Network, RecurrentCSCSR
 from spikekit.check import check_planes, check_positive, check_whole
 from spikekit.io.recording import white_rate
 
@@ -32,6 +35,7 @@ def film(
     chunks: Iterable[Tensor],
     every: int = 20,
     *,
+    future: int = 0,
     white: float | None = None,
     **how: Any,
 ) -> Iterator[FilmFrame]:
@@ -43,6 +47,10 @@ def film(
         millisecond at 20 kHz; with chunks of c clocks up to c - 1 more, and by the time that the network takes. The
         first shows clock N // 2. N frames and the present chunk are held, however long the stream.
 
+        A :class:`lightning_modules.networks.RecurrentCSCSR` carries on what it knows of the key frame before. With a
+        ``future`` it makes pictures in groups of ``future + 1``, when the last of them has come: they are up to
+        ``future * every`` clocks later, and better. A group is held meanwhile.
+
         White is the same in all pictures: ``white``, or else what 99.9 % of the pixels of the first clip do not exceed.
 
     Args:
@@ -50,17 +58,19 @@ def film(
         chunks: spikes (T, H, W) of any lengths, such as :func:`spikekit.iter_spikes` reads with a ``chunk``; they begin
             with the network's Bayer phase.
         every: clocks between two pictures.
+        future: key frames that a picture may wait for.
         white: spikes a clock of a pixel that is shown white.
         how: ``tile``, ``psnr_tolerance``, ``self_ensemble`` and ``static`` of
-            :func:`lightning_modules.inference.predict.predict`.
+            :func:`lightning_modules.inference.predict.predict`; a network that carries on takes ``tile`` and
+            ``static``.
 
     Returns:
         An iterator over pictures.
 
     Raises:
-        TypeError: ``every`` is not a whole number, ``white`` not a number; when iterated, a chunk that is not a tensor
-            of real numbers.
-        ValueError: one of them is out of range; when iterated, a chunk of another shape.
+        TypeError: ``white`` is not a number; when iterated, a chunk that is not a tensor of real numbers.
+        ValueError: an argument is out of range, or a ``future`` for a network that takes every clip by itself; when
+            iterated, a chunk of another shape.
 
     Example:
         >>> import torch
@@ -69,20 +79,40 @@ def film(
         >>> [(clock, rgb.shape) for clock, rgb in film(ClassicalDecoder(scale=2), stream)]
         [(20, torch.Size([3, 16, 20])), (40, torch.Size([3, 16, 20])), (60, torch.Size([3, 16, 20]))]
     """
-    every = check_whole("every", every)
+    every, group = check_whole("every", every), check_future(network, future) + 1
     if white is not None:
         check_positive("white", white)
-    return _pictures(network, chunks, every, white, how)
+    if isinstance(network, RecurrentCSCSR):
+        how = {"tile": TILE, "static": False, **how}
+        if how.keys() != {"tile", "static"}:
+            raise ValueError(f"how: expected tile or static with {type(network).__name__}, got {', '.join(how)}")
+        reader = FilmReader(network, how["tile"])
+
+        def run(clips: Tensor, clocks: list[int], exposure: float) -> Tensor:
+            return (reader(clips, clocks, static=how["static"]) * exposure).clamp_(0, 1)
+    else:
+
+        def run(clips: Tensor, clocks: list[int], exposure: float) -> Tensor:
+            return predict(network, clips, exposure=exposure, **how)
+
+    return _pictures(network, chunks, every, group, white, run)
 
 
 def _pictures(
-    network: Network, chunks: Iterable[Tensor], every: int, white: float | None, how: dict[str, Any]
+    network: Network,
+    chunks: Iterable[Tensor],
+    every: int,
+    group: int,
+    white: float | None,
+    run: Callable[[Tensor, list[int], float], Tensor],
 ) -> Iterator[FilmFrame]:
     length, alpha = network.frames, network.settings["alpha"]
-    for clock, clip in clips_around(count(length // 2, every), length, _frames(chunks)):
+    clips = clips_around(count(length // 2, every), length, _frames(chunks))
+    while some := list(islice(clips, group)):
+        clocks, seen = [clock for clock, _ in some], torch.stack([clip for _, clip in some])
         if white is None:
-            white = white_rate(clip.float().mean(0).cpu())
-        yield FilmFrame(clock, predict(network, clip[None], exposure=alpha / white, **how)[0])
+            white = white_rate(seen[0].float().mean(0).cpu())
+        yield from map(FilmFrame, clocks, run(seen, clocks, alpha / white))
 
 
 def _frames(chunks: Iterable[Tensor]) -> Iterator[Tensor]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import count
+
 from torch import Tensor
 
 from lightning_modules.inference.self_ensemble import self_ensemble as mean_of_views
@@ -19,6 +22,7 @@ def predict(
     psnr_tolerance: float = 0.0,
     self_ensemble: int = 1,
     exposure: float | Tensor = 1.0,
+    done: Callable[[float], object] | None = None,
 ) -> Tensor:
     r"""Return the picture of the middle of a clip.
 
@@ -34,6 +38,7 @@ def predict(
         self_ensemble: mean over so many views of the clip, 1, 2, 4 or 8, see
             :func:`lightning_modules.inference.self_ensemble.self_ensemble`.
         exposure: what the picture is multiplied by before it is clamped, a number or (B, 1, 1, 1).
+        done: called after every tile and every view, with the share of the picture that is done.
 
     Returns:
         rgb :math:`(B, 3, s H, s W)`, clamped to [0, 1].
@@ -44,9 +49,15 @@ def predict(
         >>> predict(ClassicalDecoder(scale=2), torch.ones(1, 41, 16, 16), self_ensemble=2).shape
         torch.Size([1, 3, 32, 32])
     """
+    views = count()
 
     def run(spikes: Tensor, flow: Tensor | None) -> Tensor:
-        return forward_in_tiles(network, spikes, tile, psnr_tolerance, flow, static)
+        before = next(views)
+        told = done and (lambda share: done((before + share) / self_ensemble))
+        rgb = forward_in_tiles(network, spikes, tile, psnr_tolerance, flow, static, told)
+        if told:
+            told(1)  # a small view has no tiles
+        return rgb
 
     rgb = mean_of_views(run, spikes, flow, network.pattern, network.scale, self_ensemble)
     return (rgb * exposure).clamp_(0, 1)

@@ -6,6 +6,7 @@ import csv
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -122,8 +123,12 @@ class Preset:
             >>> Preset.read({"weights": "cscsr_small_x4", "tile": "64", "psnr_tolerance": ""})
             Preset(weights='cscsr_small_x4', ..., tile=64, psnr_tolerance=None, ...)
         """
-        kinds = {name: get_args(hint)[0] for name, hint in get_type_hints(cls).items()}
-        return cls(**{name: kind(row[name]) for name, kind in kinds.items() if row.get(name)})
+        return cls(**{name: kind(row[name]) for name, kind in cls._kinds().items() if row.get(name)})
+
+    @classmethod
+    @cache
+    def _kinds(cls) -> dict[str, type]:
+        return {name: get_args(hint)[0] for name, hint in get_type_hints(cls).items()}
 
     def write(self) -> dict[str, str]:
         """Return the cells of a row, as :meth:`read` takes it."""
@@ -184,7 +189,7 @@ class Choice:
         return f"{self.name}: {cost}, {self.below:.2f} dB below the best"
 
 
-def choices(scale: int, size: tuple[int, int]) -> list[Choice]:
+def choices(scale: int, size: tuple[int, int], film: bool = False) -> list[Choice]:
     """Return the presets of the table for a scale that leave the precision as it is, fastest first.
 
     Time is taken to grow with the number of pixels; times are the table's ratios, taken times that of the row which it
@@ -196,11 +201,13 @@ def choices(scale: int, size: tuple[int, int]) -> list[Choice]:
     Args:
         scale: super-resolution factor.
         size: of a frame, (H, W) in sensor pixels.
+        film: whether frames are made one after the other, as ``lightning trade --film`` measures them; where no such
+            table comes with the package, a frame in a film is taken for one by itself.
 
     Raises:
         ValueError: no table comes with the package for this scale.
     """
-    rows = _table(scale)
+    rows = _table(scale, film)
     frame = min(float(row["mib"]) for row in rows)
     found = []
     for row in rows:
@@ -225,10 +232,12 @@ def choices(scale: int, size: tuple[int, int]) -> list[Choice]:
     return sorted(found, key=lambda choice: choice.ms)
 
 
-def _table(scale: int) -> list[dict[str, str]]:
-    path = _FOLDER / f"x{scale}.csv"
+def _table(scale: int, film: bool = False) -> list[dict[str, str]]:
+    path, filmed = (_FOLDER / f"x{scale}{ending}.csv" for ending in ("", "_film"))
+    if film and filmed.is_file():
+        path = filmed
     if not path.is_file():
-        there = ", ".join(sorted(path.stem for path in _FOLDER.glob("x*.csv"))) or "none"
+        there = ", ".join(sorted(path.stem for path in _FOLDER.glob("x?.csv"))) or "none"
         raise ValueError(f"scale: expected one that was measured ({there}), got {scale}")
     try:
         with open(path, newline="", encoding="utf-8") as file:
@@ -256,16 +265,17 @@ def _reference(rows: list[dict[str, str]]) -> dict[str, str]:
     return next(row for row in rows if row["setting"] == row["reference"])
 
 
-def pace(scale: int) -> float:
+def pace(scale: int, film: bool = False) -> float:
     """Measure how many times longer a frame takes here than in the table: its reference, on a quarter of a clip.
 
     Args:
         scale: super-resolution factor.
+        film: whether it is the table of films.
 
     Returns:
         1 on the machine of the table, 2 on one that takes twice as long.
     """
-    row = _reference(_table(scale))
+    row = _reference(_table(scale, film))
     preset = Preset.read(row)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network = preset.build().to(device)
@@ -278,7 +288,11 @@ def pace(scale: int) -> float:
 
 
 def choose(
-    scale: int, speed: str | None = None, budget: str | None = None, size: tuple[int, int] = (250, 400)
+    scale: int,
+    speed: str | None = None,
+    budget: str | None = None,
+    size: tuple[int, int] = (250, 400),
+    film: bool = False,
 ) -> Choice:
     """Pick the preset that serves best.
 
@@ -289,9 +303,10 @@ def choose(
         scale: super-resolution factor.
         speed: ``"best"``, ``"balanced"`` or ``"fast"``, the fastest that is at most so many dB below the most exact as
             :data:`SPEEDS` says, or ``"fastest"``; of those that take hardly longer the most exact.
-        budget: instead, what a frame may take: a time, such as ``"40ms"``, or memory, such as ``"200MB"``. The best
-            preset that fits is chosen.
+        budget: instead, what a frame may take: a time, such as ``"40ms"`` or ``"25fps"``, or memory, such as
+            ``"200MB"``. The best preset that fits is chosen.
         size: of a frame, (H, W) in sensor pixels, which a budget depends on.
+        film: whether frames are made one after the other, see :func:`choices`.
 
     Raises:
         ValueError: an unknown speed, a budget that cannot be read or that nothing fits, a scale without a table.
@@ -302,23 +317,23 @@ def choose(
         >>> choose(4, budget="1h")
         Traceback (most recent call last):
             ...
-        ValueError: budget: expected a time or memory, such as 40ms, 2s, 200MB or 1GiB, got '1h'
+        ValueError: budget: expected a time or memory, such as 40ms, 2s, 25fps, 200MB or 1GiB, got '1h'
     """
     if (speed is None) == (budget is None):
         raise ValueError(f"speed, budget: expected one of them, got {speed!r} and {budget!r}")
-    found = choices(scale, size)
+    found = choices(scale, size, film)
     if speed is not None:
         if speed not in SPEEDS:
             raise ValueError(f"speed: expected one of {', '.join(SPEEDS)}, got {speed!r}")
         near = [choice for choice in found if choice.below <= SPEEDS[speed]]
         return max((choice for choice in near if choice.ms <= _AS_FAST * near[0].ms), key=lambda choice: choice.psnr)
     read = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([a-zA-Z]+)\s*", budget)
-    if read is None or read[2] not in _UNITS:
-        raise ValueError(f"budget: expected a time or memory, such as 40ms, 2s, 200MB or 1GiB, got {budget!r}")
-    what, unit = _UNITS[read[2]]
-    limit = float(read[1]) * unit
+    if read is None or read[2] not in (*_UNITS, "fps") or (read[2] == "fps" and not float(read[1])):
+        raise ValueError(f"budget: expected a time or memory, such as 40ms, 2s, 25fps, 200MB or 1GiB, got {budget!r}")
+    what, unit = _UNITS.get(read[2], ("ms", 1e3))
+    limit = unit / float(read[1]) if read[2] == "fps" else unit * float(read[1])
     if what == "ms":
-        here = pace(scale)
+        here = pace(scale, film)
         where = f"on this machine, which takes {here:.2g} times as long as that of the table"
         found = [replace(choice, ms=here * choice.ms, where=where) for choice in found]
     fitting = [choice for choice in found if getattr(choice, what) <= limit]

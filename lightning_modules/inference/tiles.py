@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,6 +30,7 @@ def forward_in_tiles(
     tolerance: float = 0.0,
     flow: Tensor | None = None,
     static: bool = False,
+    done: Callable[[float], object] | None = None,
 ) -> Tensor:
     r"""Run a network on tiles that overlap, and put the results together.
 
@@ -49,6 +51,7 @@ def forward_in_tiles(
         tolerance: by how many dB the PSNR of the picture is expected to fall at most; 0 for everything everywhere.
         flow: as the network takes it; when not given, the network's own estimate.
         static: nothing moves, instead of a flow.
+        done: called after every tile, with the share of them that is done.
 
     Returns:
         rgb :math:`(B, 3, s H, s W)`.
@@ -56,21 +59,61 @@ def forward_in_tiles(
     if network.halo is None:
         return network(spikes, flow, static)
     if tolerance:
-        return _forward_where_needed(network, spikes, tile, tolerance, flow, static)
+        return _forward_where_needed(network, spikes, tile, tolerance, flow, static, done)
     height, width = spikes.shape[-2:]
     if not tile or max(height, width) <= tile:
         return network(spikes, flow, static)
-    flow, s = network.resolve_flow(spikes, flow, static), network.scale
-    whole, rgb = Box(0, 0, height, width), None
-    for top in range(0, height, tile):
-        for left in range(0, width, tile):
-            box = Box(top, left, top + tile, left + tile).grown(0, whole)
-            outer = box.grown(_reach(flow, box, whole, network.halo), whole)
-            part = network(outer.of(spikes), None if flow is None else outer.of(flow), flow is None)
-            if rgb is None:
-                rgb = part.new_empty(*part.shape[:-2], s * height, s * width)
-            box.of(rgb, scale=s).copy_(box.of(part, outer[:2], s))
-    return rgb
+    flow = network.resolve_flow(spikes, flow, static)
+    whole = Box(0, 0, height, width)
+
+    def run(outer: Box) -> Tensor:
+        return network(outer.of(spikes), None if flow is None else outer.of(flow), flow is None)
+
+    return tiled(run, whole, tile, lambda box: reach(flow, box, whole, network.halo), network.scale, done)
+
+
+def tiled(
+    run: Callable[[Box], Tensor],
+    whole: Box,
+    tile: int,
+    around: Callable[[Box], int],
+    scale: int = 1,
+    done: Callable[[float], object] | None = None,
+) -> Tensor:
+    """Put planes together of what is computed of tiles.
+
+    Args:
+        run: makes planes (*, s h, s w) of a box of h x w sensor pixels.
+        whole: box of all planes.
+        tile: side of a tile in sensor pixels, 0 for a single one.
+        around: how much around a box is to be seen.
+        scale: pixels of the planes for a sensor pixel, s.
+        done: called after every tile, with the share of them that is done.
+
+    Returns:
+        (*, s H, s W).
+    """
+    height, width = whole.bottom - whole.top, whole.right - whole.left
+    if not tile or max(height, width) <= tile:
+        return run(whole)
+    planes = None
+    corners = [(top, left) for top in range(0, height, tile) for left in range(0, width, tile)]
+    for top, left in _told(corners, done):
+        box = Box(top, left, top + tile, left + tile).grown(0, whole)
+        outer = box.grown(around(box), whole)
+        part = run(outer)
+        if planes is None:
+            planes = part.new_empty(*part.shape[:-2], scale * height, scale * width)
+        box.of(planes, scale=scale).copy_(box.of(part, outer[:2], scale))
+    return planes
+
+
+def _told(tiles: Iterable[Any], done: Callable[[float], object] | None) -> Iterator[Any]:
+    tiles = list(tiles)
+    for count, tile in enumerate(tiles, 1):
+        yield tile
+        if done is not None:
+            done(count / len(tiles))
 
 
 class Box(NamedTuple):
@@ -92,8 +135,8 @@ class Box(NamedTuple):
         return planes[..., rows, scale * (self.left - corner[1]) : scale * (self.right - corner[1])]
 
 
-def _reach(flow: Tensor | None, box: Box, frame: Box, halo: int) -> int:
-    """How much around a box of a frame a network has to see: even, as the Bayer phase is kept."""
+def reach(flow: Tensor | None, box: Box, frame: Box, halo: int) -> int:
+    """Return how much around a box of a frame a network has to see: even, as the Bayer phase is kept."""
     if flow is None:
         return halo
     near = box.grown(halo, frame).of(flow, frame[:2])
@@ -120,7 +163,13 @@ def _boxes(network: Tensor, motion: Tensor, tile: int) -> dict[Box, bool]:
 
 
 def _forward_where_needed(
-    network: Network, spikes: Tensor, tile: int, tolerance: float, given: Tensor | None, static: bool
+    network: Network,
+    spikes: Tensor,
+    tile: int,
+    tolerance: float,
+    given: Tensor | None,
+    static: bool,
+    done: Callable[[float], object] | None,
 ) -> Tensor:
     height, width = spikes.shape[-2:]
     s, halo = network.scale, max(network.halo, 2 * BLEND)  # what is blended is seen as well
@@ -134,9 +183,9 @@ def _forward_where_needed(
         around = Box(min(tops), min(lefts), max(bottoms), max(rights)).grown(AROUND, whole)
         flow = network.resolve_flow(around.of(spikes), None if given is None else around.of(given), static)
     rgb = seen.picture
-    for box, moves in boxes.items():
+    for box, moves in _told(boxes.items(), done):
         if moves and flow is not None:
-            outer = box.grown(_reach(flow, box, around, halo), around)
+            outer = box.grown(reach(flow, box, around, halo), around)
             part = network(outer.of(spikes), outer.of(flow, around[:2]))
         else:
             outer = box.grown(halo, whole)

@@ -1,1 +1,1 @@
-"""Metrics of pictures and of optical flow."""
+"""Metrics of pictures, of films and of optical flow."""

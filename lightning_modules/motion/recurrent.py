@@ -12,19 +12,19 @@ from torch import Tensor, nn
 _ALL_PAIRS = 1600  # most pixels that are correlated with each other; beyond, looking up is faster and takes less memory
 
 
+def _convolved(inputs: int, outputs: int, size: int, stride: int = 1, *, norm: bool = False) -> list[nn.Module]:
+    """A convolution that keeps the size, or divides it by the stride; perhaps instance normalisation; ReLU."""
+    convolution = nn.Conv2d(inputs, outputs, size, stride, padding=size // 2)
+    return [convolution, *([nn.InstanceNorm2d(outputs)] if norm else []), nn.ReLU(inplace=True)]
+
+
 class ResidualBlock(nn.Module):
     """Two 3 x 3 convolutions with instance normalisation, and a shortcut."""
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1) -> None:
         super().__init__()
-        self.body = nn.Sequential(
-            nn.Conv2d(inputs, outputs, 3, stride, padding=1),
-            nn.InstanceNorm2d(outputs),
-            nn.ReLU(inplace=True),
-            nn.Conv2d(outputs, outputs, 3, padding=1),
-            nn.InstanceNorm2d(outputs),
-            nn.ReLU(inplace=True),
-        )
+        first, second = _convolved(inputs, outputs, 3, stride, norm=True), _convolved(outputs, outputs, 3, norm=True)
+        self.body = nn.Sequential(*first, *second)
         self.shortcut = nn.Identity()
         if stride > 1:
             self.shortcut = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride), nn.InstanceNorm2d(outputs))
@@ -71,11 +71,7 @@ class Encoder(nn.Sequential):
     """
 
     def __init__(self, window: int, widths: Sequence[int], blocks: int, outputs: int, attention: int) -> None:
-        layers = [
-            nn.Conv2d(window, widths[0], 7, 2, padding=3),
-            nn.InstanceNorm2d(widths[0]),
-            nn.ReLU(inplace=True),
-        ]
+        layers = _convolved(window, widths[0], 7, 2, norm=True)
         for stage, (before, width) in enumerate(zip([widths[0], *widths], widths, strict=False)):
             layers.append(ResidualBlock(before, width, 1 if stage == 0 else 2))
             layers += [ResidualBlock(width, width) for _ in range(blocks - 1)]
@@ -144,21 +140,9 @@ class MotionEncoder(nn.Module):
 
     def __init__(self, looked_up: int, correlation: tuple[int, int], motion: int) -> None:
         super().__init__()
-        self.correlation = nn.Sequential(
-            nn.Conv2d(looked_up, correlation[0], 1),
-            nn.ReLU(inplace=True),
-            nn.Conv2d(correlation[0], correlation[1], 3, padding=1),
-            nn.ReLU(inplace=True),
-        )
-        self.flow = nn.Sequential(
-            nn.Conv2d(2, motion, 7, padding=3),
-            nn.ReLU(inplace=True),
-            nn.Conv2d(motion, motion // 2, 3, padding=1),
-            nn.ReLU(inplace=True),
-        )
-        self.both = nn.Sequential(
-            nn.Conv2d(correlation[1] + motion // 2, motion - 2, 3, padding=1), nn.ReLU(inplace=True)
-        )
+        self.correlation = nn.Sequential(*_convolved(looked_up, correlation[0], 1), *_convolved(*correlation, 3))
+        self.flow = nn.Sequential(*_convolved(2, motion, 7), *_convolved(motion, motion // 2, 3))
+        self.both = nn.Sequential(*_convolved(correlation[1] + motion // 2, motion - 2, 3))
 
     def forward(self, correlation: Tensor, flow: Tensor) -> Tensor:  # noqa: D102
         both = self.both(torch.cat([self.correlation(correlation), self.flow(flow)], dim=1))
@@ -258,7 +242,7 @@ class RecurrentFlow(nn.Module):
 
 def _head(inputs: int, width: int, outputs: int, size: int) -> nn.Sequential:
     last = nn.Conv2d(width, outputs, size, padding=size // 2)
-    return nn.Sequential(nn.Conv2d(inputs, width, 3, padding=1), nn.ReLU(inplace=True), last)
+    return nn.Sequential(*_convolved(inputs, width, 3), last)
 
 
 def upsample_convex(flow: Tensor, weights: Tensor, scale: int) -> Tensor:

@@ -139,13 +139,8 @@ class Spike2Flow(MotionEstimator):
         check_planes("spikes", spikes, 4, "(B, N, H, W)")
         first, middle, last = times
         end = spikes.shape[1] - 1
-        windows = torch.stack(
-            [
-                self._windows(spikes.flip(1), end - middle, end - first, pattern),
-                self._windows(spikes, middle, last, pattern),
-            ],
-            dim=2,
-        )
+        backwards = self._windows(spikes.flip(1), end - middle, end - first, pattern)
+        windows = torch.stack([backwards, self._windows(spikes, middle, last, pattern)], dim=2)
         # large clips stream by stream: every position takes memory for all that is looked up
         few = max(1, _PIXELS // (windows.shape[-2] * windows.shape[-1]))
         with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):

@@ -5,11 +5,13 @@ from lightning_modules.networks.classical import ClassicalDecoder
 from lightning_modules.networks.cscsr import CSCSR
 from lightning_modules.networks.cscsr_config import CSCSRConfig
 from lightning_modules.networks.network import Network
+from lightning_modules.networks.recurrent_cscsr import RecurrentCSCSR
+from lightning_modules.networks.two_span_cscsr import TwoSpanCSCSR
 
 #: what weights and configurations may name
 NETWORKS = {
     kind.__name__: kind
-    for kind in (CSCSR, ClassicalDecoder, BasicVSR, RealRawVSR, SpikeSRNetLike, SwinIR, TSCNN, VidarSR)
+    for kind in (CSCSR, RecurrentCSCSR, ClassicalDecoder, BasicVSR, RealRawVSR, SpikeSRNetLike, SwinIR, TSCNN, VidarSR)
 }
 
 __all__ = [
@@ -21,7 +23,9 @@ __all__ = [
     "ClassicalDecoder",
     "Network",
     "RealRawVSR",
+    "RecurrentCSCSR",
     "SpikeSRNetLike",
     "SwinIR",
+    "TwoSpanCSCSR",
     "VidarSR",
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks.configuration import takes
 from lightning_modules.networks.cscsr_config import CSCSRConfig
-from lightning_modules.networks.layers import ResBlock, enlarge, fold
+from lightning_modules.networks.layers import enlarge, fold, start_pixel_by_pixel
 from lightning_modules.networks.motion_fusion import assembled_motion, independent_motion, joint_motion
 from lightning_modules.networks.network import Network
 from lightning_modules.networks.reconstruction import ColorCorrelation, EarlyFusion, SeparateColors
@@ -84,10 +84,11 @@ class CSCSR(Network):
 
     halo = 14  #: enough for every shipped network; its weights bring their own
     flow_groups = ((), (3,))
+    configuration: ClassVar[type[CSCSRConfig]] = CSCSRConfig  #: of the fields that ``settings`` are
 
     @takes(CSCSRConfig)
     def __init__(self, *args: Any, steps: int = 16, motion: MotionEstimator | None = None, **settings: Any) -> None:
-        config = CSCSRConfig(*args, **settings)
+        config = self.configuration(*args, **settings)
         if steps < 0 or steps % 2:
             raise ValueError(f"steps: expected an even number, or 0 for the exact search, got {steps}")
         times = config.times
@@ -117,21 +118,8 @@ class CSCSR(Network):
         self._responses: dict[Any, Tensor] = {}
 
     def _initialize(self) -> None:
-        """Start nearly pixel by pixel: orthogonal centre taps, small ones around (Xiao et al., ICML 2018).
-
-        A dozen random 3 x 3 filters in a row would blur what the network is to sharpen: training then rests for
-        hundreds of steps on a plateau, or dies on it.
-        """
-        modules = list(nn.ModuleList([self.representation, self.refinement, self.reconstruction]).modules())
-        for module in modules:
-            if isinstance(module, nn.Conv2d):
-                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
-                module.weight.data *= 0.2
-                module.weight.data[:, :, 1, 1] += nn.init.orthogonal_(torch.empty(module.weight.shape[:2]), gain=1.2)
-                nn.init.zeros_(module.bias)
-        for module in modules:
-            if isinstance(module, ResBlock):
-                module.body[-1].weight.data *= 0.1
+        for part in (self.representation, self.refinement, self.reconstruction):
+            start_pixel_by_pixel(part)
         for part in self.representation:
             if isinstance(part, SpikeRepresentation):
                 part.start_at_the_mean()
@@ -143,27 +131,28 @@ class CSCSR(Network):
 
     def forward(self, spikes: Tensor, flow: Tensor | None = None, static: bool = False) -> Tensor:  # noqa: D102
         self.check_spikes(spikes)
-        height, width = spikes.shape[-2:]
         spikes = spikes.to(self.reconstruction.rgb.weight.dtype)
-        flow = self.resolve_flow(spikes, flow, static)
+        rgb = self.reconstruction(self._colors(spikes, self.resolve_flow(spikes, flow, static)))
+        return rgb + self._base(spikes) if self.config.skip else rgb
+
+    def _colors(self, spikes: Tensor, flow: Tensor | None) -> list[Tensor]:
+        """Features of R, G and B, refined over time, each (B, width, H, W) at the resolution of the reconstruction."""
+        height, width = spikes.shape[-2:]
         planes = split_colors(spikes, self.pattern)
         # one colour after the other: high resolution takes memory
         features = (encode(plane) for encode, plane in zip(self.representation, planes, strict=True))
         response = self._response_for(spikes) if flow is None else None
         if response is not None:
-            colors = list(map(self._at_rest, features, self.refinement, response, range(3)))
+            return list(map(self._at_rest, features, self.refinement, response, range(3)))
+        if self.config.search and is_exporting():
+            pixels = map(self._search_in_graph, features, self._offsets(flow, spikes), range(3))
+        elif self.config.search:
+            offsets = self._offsets(flow, spikes)
+            pixels = map(self._search, features, offsets, self._mask(height, width, spikes.device))
         else:
-            if self.config.search and is_exporting():
-                pixels = map(self._search_in_graph, features, self._offsets(flow, spikes), range(3))
-            elif self.config.search:
-                offsets = self._offsets(flow, spikes)
-                pixels = map(self._search, features, offsets, self._mask(height, width, spikes.device))
-            else:
-                pixels = (enlarge(part, self.scale) for part in features)
-            pixels = (fold(part.flatten(1, 2), self.fold) for part in pixels)
-            colors = [refine(part) for refine, part in zip(self.refinement, pixels, strict=True)]
-        rgb = self.reconstruction(colors)
-        return rgb + self._base(spikes) if self.config.skip else rgb
+            pixels = (enlarge(part, self.scale) for part in features)
+        pixels = (fold(part.flatten(1, 2), self.fold) for part in pixels)
+        return [refine(part) for refine, part in zip(self.refinement, pixels, strict=True)]
 
     @torch.no_grad()
     def scale_picture(self, factor: float) -> None:  # noqa: D102

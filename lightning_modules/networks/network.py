@@ -32,6 +32,8 @@ class Network(nn.Module):
             not run in tiles. Shipped weights bring their own.
         takes_flow: whether a flow changes anything.
         error_model: what less work costs it, for a tolerance; that of the weights, once they are loaded.
+        warm_up: how many key frames before a picture of a film it depends on, as far as one can see; 0 where every
+            clip stands for itself.
         flow_groups: leading dimensions of the flows that the network takes, behind the batch.
 
     Shape:
@@ -42,6 +44,7 @@ class Network(nn.Module):
 
     halo: int | None = None
     takes_flow: bool = True
+    warm_up: int = 0
     flow_groups: tuple[tuple[int, ...], ...] = ((),)
 
     def __init__(

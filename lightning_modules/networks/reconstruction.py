@@ -62,12 +62,16 @@ class ColorCorrelation(nn.Module):
         self.end = res_blocks(end_width, end_blocks)
         self.rgb = ToRgb(end_width, enlarge)
 
-    def forward(self, colors: list[Tensor]) -> Tensor:  # noqa: D102
+    def features(self, colors: list[Tensor]) -> Tensor:
+        """Features of all colours that the picture is made of, (B, end_width, H, W)."""
         fused: list[Tensor] = []
         for refine, fuse in zip(self.refine, self.fuse, strict=True):
             colors = [branch(color) for branch, color in zip(refine, colors, strict=True)]
             fused = [fuse(torch.cat(colors + fused, dim=1))]
-        return self.rgb(fused[0] + self.end(fused[0]))
+        return fused[0] + self.end(fused[0])
+
+    def forward(self, colors: list[Tensor]) -> Tensor:  # noqa: D102
+        return self.rgb(self.features(colors))
 
 
 class SeparateColors(nn.Module):

@@ -31,8 +31,9 @@ def _time(text: str) -> float:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = VerbParser(
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the verb."""
+    made = VerbParser(
         prog="lightning sweep",
         allow_abbrev=False,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -57,13 +58,13 @@ examples:
   lightning sweep configs/x4.yaml --set model.network.width=16,32,64 --set data.root=DIR --flops 1e15
 """,
     )
-    parser.add_argument(
+    made.add_argument(
         "configs", nargs="*", metavar="CONFIG", help="configuration of all trials, as for lightning fit -c"
     )
-    parser.add_argument(
+    made.add_argument(
         "-c", "--config", action="append", default=[], metavar="OVERLAY", help="more of them, over those before"
     )
-    what = parser.add_argument_group("what is combined")
+    what = made.add_argument_group("what is combined")
     what.add_argument(
         "--over",
         action="append",
@@ -87,7 +88,7 @@ examples:
         metavar="SEED",
         help="seeds of the initial weights (seed_everything); clips stay those of data.seed, the same for all trials",
     )
-    group = parser.add_argument_group("budget of each trial; without one, what the configuration says")
+    group = made.add_argument_group("budget of each trial; without one, what the configuration says")
     budget = group.add_mutually_exclusive_group()
     budget.add_argument("--steps", type=whole(1), help="training steps; a schedule with an end (T_max) ends with them")
     budget.add_argument(
@@ -103,7 +104,7 @@ examples:
         help="floating-point operations of training: as many steps as they pay for, going by those counted in one step "
         "(convolutions and matrix products, forward and backward; not what is done element by element, nor the warp)",
     )
-    how = parser.add_argument_group("how")
+    how = made.add_argument_group("how")
     how.add_argument("-o", "--output", type=Path, default=Path("runs/sweep"), metavar="DIR", help="default: runs/sweep")
     how.add_argument(
         "--engine",
@@ -120,7 +121,7 @@ examples:
         metavar="SECONDS",
         help="time between two checkpoints, besides those at the end of each epoch (default: 60)",
     )
-    return parser
+    return made
 
 
 def sweep(args: Sequence[str]) -> None:
@@ -132,7 +133,7 @@ def sweep(args: Sequence[str]) -> None:
     Raises:
         InputError: what was asked for cannot be; or trials failed.
     """
-    asked = _parser().parse_args(args)
+    asked = parser().parse_args(args)
     configs = asked.configs + asked.config
     if not configs:
         raise UsageError("sweep: expected a configuration, such as configs/x4.yaml")

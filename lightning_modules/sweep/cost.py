@@ -14,6 +14,7 @@ from lightning_modules.cost.setting import Setting
 from lightning_modules.sweep.state import read_json, write_json
 from lightning_modules.sweep.table import Row
 from spikekit.bench import cpu_name
+from spikekit.progress import progress
 
 _ROUNDS = 5
 
@@ -41,7 +42,8 @@ def measure_variants(rows: Sequence[Row], path: Path) -> dict[str, Any]:
     known = read_json(path)
     if known and known["trials"] == names:
         return known
-    measured = [row for row in map(_ready, trials, trials.values()) if row is not None]
+    ready = (_ready(variant, folder) for variant, folder in progress(trials.items(), "variants built"))
+    measured = [row for row in ready if row is not None]
     variants, where = {}, ""
     if measured:
         longest = max(measured, key=lambda row: row.runner.network.frames)

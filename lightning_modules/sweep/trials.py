@@ -20,6 +20,7 @@ from lightning_modules.cli.rehearsal import Rehearsal, argument_names, mistake, 
 from lightning_modules.sweep.budget import with_budget
 from lightning_modules.sweep.state import read_json, read_yaml, write_json
 from spikekit.io.whole_file import whole_file
+from spikekit.progress import progress
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,7 @@ def make_trials(
     base = _resolve(common, "")
     names = argument_names(base)
     trials = []
-    for combination in itertools.product(*groups):
+    for combination in progress(list(itertools.product(*groups)), "combinations built"):
         labels = tuple(label for label, _ in combination) or (Path(configs[-1]).stem,)
         args = [*common, *(word for _, words in combination for word in words)]
         overlays = [Path(words[-1]) for _, words in combination]

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import csv
 import math
-import os
 import shutil
 import sys
-import threading
 import time
 from datetime import timedelta
 from pathlib import Path
@@ -23,6 +21,7 @@ from lightning_modules.checkpoint import read_checkpoint
 from lightning_modules.cli.command import Command, run
 from lightning_modules.cli.errors import as_one_line
 from lightning_modules.sweep.budget import has_end, with_budget
+from lightning_modules.sweep.engines import end_with_parent
 from lightning_modules.sweep.state import PROGRESS, RESULT, read_json, read_yaml, write_json
 from spikekit.io.whole_file import whole_file
 
@@ -226,19 +225,8 @@ def _metrics(path: Path) -> dict[str, dict[str, float]]:
     }
 
 
-def _end_with_parent() -> None:
-    """Stop where the sweep does, even when it is killed: its end of our standard input then closes."""
-
-    def wait() -> None:
-        while os.read(0, 1):
-            pass
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
-
-
 if __name__ == "__main__":
-    _end_with_parent()
+    end_with_parent()
     arguments, sys.argv = sys.argv[1:], sys.argv[:1]
     try:
         with as_one_line():

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 import torch
 from pytorch_lightning import Callback, LightningModule
 from pytorch_lightning.cli import LRSchedulerCallable, OptimizerCallable
-from torch import nn
+from torch import Tensor, nn
 
 from lightning_modules.checkpoint import read_checkpoint
 from lightning_modules.pretrained import check_settings, motion_of, settings_of
@@ -25,6 +25,7 @@ class Learner(LightningModule):
     Args:
         network: what learns; its ``settings`` say, as plain values, what it was built with.
         needs: options of the data, by name, that must be as they are here.
+        flow_times: frames that flow runs between, the first, the middle and the last; ``lightning`` tells the data.
         optimizer: builds the optimizer from the parameters.
         lr_scheduler: builds the schedule from the optimizer, counted in steps.
 
@@ -41,11 +42,16 @@ class Learner(LightningModule):
     report: ClassVar[type[Callback]]
 
     def __init__(
-        self, network: nn.Module, needs: dict[str, Any], optimizer: OptimizerCallable, lr_scheduler: LRSchedulerCallable
+        self,
+        network: nn.Module,
+        needs: dict[str, Any],
+        flow_times: tuple[int, int, int],
+        optimizer: OptimizerCallable,
+        lr_scheduler: LRSchedulerCallable,
     ) -> None:
         super().__init__()
         self.network = network
-        self.needs = needs
+        self.needs, self.flow_times = needs, flow_times
         self.make_optimizer = optimizer
         self.make_lr_scheduler = lr_scheduler
         self.recipe: dict[str, Any] = {}
@@ -74,6 +80,18 @@ class Learner(LightningModule):
             "optimizer": optimizer,
             "lr_scheduler": {"scheduler": self.make_lr_scheduler(optimizer), "interval": "step"},
         }
+
+    def log_mean(self, name: str, values: Tensor, **how: Any) -> None:
+        """Log the mean over the clips that all processes validate, however many each of them has.
+
+        Args:
+            name: of the figure.
+            values: of a batch, one a clip.
+            how: others of :meth:`log`.
+        """
+        processes = torch.distributed.get_world_size() if torch.distributed.is_initialized() else 1
+        # Lightning divides the number of clips by that of processes, and rounds down
+        self.log(name, values.mean(), batch_size=len(values) * processes, sync_dist=True, **how)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:  # noqa: D102
         checkpoint["network"] = settings_of(self.network)

@@ -13,13 +13,27 @@ from pytorch_lightning import Callback, LightningModule, Trainer
 from pytorch_lightning.loggers import TensorBoardLogger
 from torch import Tensor
 
-from lightning_modules.metrics.image import measures, why_no_lpips
+from lightning_modules.metrics.image import Measure, measures, why_no_lpips
 from lightning_modules.networks import ClassicalDecoder
 from spikekit import panel, write_picture
 from spikekit.io.whole_file import whole_file
 from spikekit.tables import table
 
 _MOST_TABLES = 20
+
+
+def middle_clip(batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return the clip of a batch, of a film that around the key frame in its middle, with its truth."""
+    if "every" not in batch:
+        return batch
+    middle = batch["rgb"].shape[1] // 2
+    return {name: batch[name][:, middle] for name in ("spikes", "rgb")}
+
+
+def middle_half(batch: dict[str, Tensor]) -> slice:
+    """Return which key frames of a film are judged: not those that have few neighbours."""
+    count = batch["rgb"].shape[1]
+    return slice(count // 4, count - count // 4)
 
 
 class ValidationPictures(Callback):
@@ -37,7 +51,7 @@ class ValidationPictures(Callback):
 
     def rows(self, module: LightningModule, outputs: Any, batch: dict[str, Tensor]) -> list[list[Tensor]]:
         """Return the pictures of every clip of a batch."""
-        settings = module.network.settings
+        settings, batch = module.network.settings, middle_clip(batch)
         decoded = ClassicalDecoder("tfi", settings["scale"], settings["pattern"], settings["alpha"])(batch["spikes"])
         return [list(row) for row in zip(decoded.clamp(0, 1), outputs, batch["rgb"], strict=True)]
 
@@ -77,10 +91,15 @@ class TestReport(Callback):
         return [(measure.name, measure.heading, measure.digits) for measure in measures()]
 
     def score(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, list[tuple[float, ...]]]:
-        """Return the measures of every clip of a batch, by method."""
-        truth = batch["rgb"]
+        """Return the measures of every clip of a batch, by method; of a film their mean."""
+        truth = batch["rgb"][:, middle_half(batch)] if "every" in batch else batch["rgb"]
+
+        def means(measure: Measure, rgb: Tensor) -> list[float]:
+            values = measure.of(rgb.reshape(-1, *rgb.shape[-3:]), truth.reshape(-1, *truth.shape[-3:]))
+            return values.reshape(len(truth), -1).mean(dim=1).tolist()
+
         return {
-            method: list(zip(*(measure.of(rgb, truth).tolist() for measure in measures()), strict=True))
+            method: list(zip(*(means(measure, rgb) for measure in measures()), strict=True))
             for method, rgb in outputs.items()
         }
 
@@ -89,7 +108,10 @@ class TestReport(Callback):
         return why_no_lpips()
 
     def rows(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> list[list[Tensor]]:
-        """Return the pictures of every clip of a batch: one of every method, and the truth."""
+        """Return the pictures of every clip of a batch: one of every method, and the truth; those amid a film."""
+        if "every" in batch:
+            outputs = {method: rgb[:, rgb.shape[1] // 2] for method, rgb in outputs.items()}
+            batch = middle_clip(batch)
         return [[rgb.clamp(0, 1).cpu() for rgb in row] for row in zip(*outputs.values(), batch["rgb"], strict=True)]
 
     def on_test_start(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
@@ -105,10 +127,13 @@ class TestReport(Callback):
             self._rows += self.rows(outputs, batch)[: self.clips - len(self._rows)]
 
     def on_test_end(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
+        self._gather(trainer.world_size)
         if not trainer.is_global_zero:
             return
         clips = len(next(iter(self._scores.values())))
         named = getattr(trainer.datamodule, "test_names", None)
+        if trainer.world_size > 1 and named and clips < len(named):  # of every process the first clips
+            named = None
         names = range(clips) if named is None else named[:clips]
         means = {
             method: torch.tensor(scores, dtype=torch.float64).mean(dim=0).tolist()
@@ -128,6 +153,15 @@ class TestReport(Callback):
         missing = self.missing()
         print("\n" + "\n\n".join([*tables, missing or ""]))  # noqa: T201
         print(f"{self.output / 'test.csv'}, {self.output / 'test.png'} (columns: {', '.join(self._scores)}, truth)")  # noqa: T201
+
+    def _gather(self, processes: int) -> None:
+        """Put together what all processes have seen, whose clips follow each other."""
+        if processes == 1:
+            return
+        parts: list[Any] = [None] * processes
+        torch.distributed.all_gather_object(parts, (dict(self._scores), self._rows))
+        self._scores = {method: [score for scores, _ in parts for score in scores[method]] for method in self._scores}
+        self._rows = [row for _, rows in parts for row in rows][: self.clips]
 
     def _table(self, clips: str, scores: dict[str, Sequence[float]]) -> str:
         lines = []

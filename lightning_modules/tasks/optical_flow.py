@@ -54,22 +54,22 @@ class FlowTraining(Learner):
         optimizer: OptimizerCallable = _adamw,
         lr_scheduler: LRSchedulerCallable = step_schedule,
     ) -> None:
-        first, last = window // 2, frames - 1 - window // 2
-        needs = {"pattern": bayer_pattern(pattern), "frames": frames, "flow_times": (first, last)}
-        super().__init__(network, needs, optimizer, lr_scheduler)
+        needs = {"pattern": bayer_pattern(pattern), "frames": frames}
+        times = window // 2, frames // 2, frames - 1 - window // 2
+        super().__init__(network, needs, times, optimizer, lr_scheduler)
         if frames % 2 == 0 or window % 2 == 0 or not 1 <= window < frames:
             raise ValueError(f"frames, window: expected odd numbers, window below frames, got {frames}, {window}")
         if not any(parameter.requires_grad for parameter in network.parameters()):
             raise ValueError("network: expected one that learns, got a frozen one")
-        self.pattern, self.times = needs["pattern"], (first, frames // 2, last)
+        self.pattern = needs["pattern"]
 
     def forward(self, spikes: Tensor) -> Tensor:
         """Estimate the joint flows to the first and to the last time point, (B, 2, 2, H, W)."""
-        return torch.stack(self.network(spikes, self.times, self.pattern), dim=1)
+        return torch.stack(self.network(spikes, self.flow_times, self.pattern), dim=1)
 
     def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:  # noqa: D102
         truth = split_bayer(batch["flow"], self.pattern) / 2  # (4, B, 2, 2, h, w) in Bayer cells
-        flows = self.network.refinements(batch["spikes"], self.times, self.pattern)
+        flows = self.network.refinements(batch["spikes"], self.flow_times, self.pattern)
         shares = truth.new_tensor([1 / 3, 2 / 3, 1]).reshape(3, 1, 1, 1)
         errors = [(flow - shares * truth.unsqueeze(3)).abs().mean() for flow in flows]
         loss = sum(_DISCOUNT**age * error for age, error in enumerate(reversed(errors)))
@@ -82,7 +82,7 @@ class FlowTraining(Learner):
             error = end_point_error(estimate, truth)
             measures = {"epe": error, "over_1px": (error > 1).float(), "outliers": outliers(error, truth).float()}
             for measure, value in measures.items():
-                self.log(f"val/{measure}{name}", value.mean(), batch_size=len(flow), sync_dist=True)
+                self.log_mean(f"val/{measure}{name}", value.flatten(1).mean(dim=1))
         return flow
 
     def test_step(self, batch: dict[str, Tensor], batch_index: int) -> dict[str, tuple[Tensor, float]]:
@@ -90,7 +90,7 @@ class FlowTraining(Learner):
         results = {}
         for estimator in (self.network, ClassicalFlow(), ZeroFlow()):
             start = time.perf_counter()
-            flow = torch.stack(estimator(batch["spikes"], self.times, self.pattern), dim=1)
+            flow = torch.stack(estimator(batch["spikes"], self.flow_times, self.pattern), dim=1)
             if flow.is_cuda:
                 torch.cuda.synchronize(flow.device)
             results[type(estimator).__name__] = flow, time.perf_counter() - start

@@ -13,16 +13,16 @@ from typing import Any
 
 import torch
 from pytorch_lightning import Callback, LightningModule, Trainer
-from pytorch_lightning.callbacks import TQDMProgressBar
+from pytorch_lightning.callbacks import ProgressBar
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from lightning_modules.networks import ClassicalDecoder
 from spikekit import write_video
-from spikekit.arguments import one_line
+from spikekit.io.failures import writing
 from spikekit.io.image_bytes import PictureError, png_bytes, png_notes, png_pixels, to_bytes
 from spikekit.io.video import VIDEO_ENDINGS
 from spikekit.io.whole_file import whole_file
+from spikekit.progress import progress
 
 _NOTE = "spikekit"
 _GAP = 4  # white pixels between two pictures
@@ -51,6 +51,7 @@ class Predictions(Callback):
         made_of: settings of the pictures, as plain values; pictures are made again whatever is there when not given.
         fps: pictures shown in a second of the film.
         beside: ``"tfi"`` or ``"tfp"`` shows what this decoder makes of the same clip left of every picture.
+        part: which part of the pictures is made here, counted from 0, and of how many; of one alone there is a film.
     """
 
     def __init__(
@@ -59,16 +60,19 @@ class Predictions(Callback):
         made_of: dict[str, Any] | None = None,
         fps: float = 25.0,
         beside: str | None = None,
+        part: tuple[int, int] = (0, 1),
     ) -> None:
         self.output = Path(output)
         self.folder = pictures_folder(output)
         self.made_of = made_of
         self.fps = fps
         self.beside = beside
+        self.part = part
 
     def setup(self, trainer: Trainer, module: LightningModule, stage: str) -> None:  # noqa: D102
         clips = trainer.datamodule.clips
-        self._film, self._white, self._written = is_film(self.output), clips.white, 0
+        clips.part = self.part
+        self._film, self._white, self._written = is_film(self.output) and self.part[1] == 1, clips.white, 0
         self._paths = {frame: self.folder / f"frame_{frame:06d}.png" for frame in clips.chosen}
         self._notes = {}
         if self.made_of is not None:
@@ -77,7 +81,7 @@ class Predictions(Callback):
             self._notes[_NOTE] = hashlib.sha256(json.dumps(made_of, sort_keys=True, default=str).encode()).hexdigest()
             if trainer.strategy.broadcast(self._notes) != self._notes:  # each has tried its machine for a --budget
                 raise PictureError(f"{self.output}: expected all processes to use the same weights; name them")
-            clips.chosen = [frame for frame, path in self._paths.items() if not self._is_there(path)]
+            clips.made = {frame for frame, path in self._paths.items() if self._is_there(path)}
 
     def _is_there(self, path: Path) -> bool:
         return png_notes(path).items() >= self._notes.items()
@@ -99,16 +103,15 @@ class Predictions(Callback):
         self._watch.lap("network")
         show = trainer.datamodule.show
         for n, (rgb, frame) in enumerate(zip(outputs, batch["frame"].tolist(), strict=True)):
+            if not batch["shown"][n]:
+                continue
             shown = to_bytes(show(rgb))  # (H, W, 3), a quarter of the memory
             if self.beside:
                 decoded = to_bytes(show(self._decoded(module, batch, n)))
                 shown = torch.cat([decoded, shown.new_full((len(shown), _GAP, 3), 255), shown], dim=1)
             path = self._paths[frame]
-            try:
-                with whole_file(path) as file:
-                    file.write(png_bytes(shown.movedim(-1, 0), self._notes))
-            except OSError as error:
-                raise PictureError(f"{path}: cannot be written ({one_line(error)})") from error
+            with writing(path, PictureError), whole_file(path) as file:
+                file.write(png_bytes(shown.movedim(-1, 0), self._notes))
             self._written += 1
         self._watch.lap("writing")
 
@@ -130,7 +133,7 @@ class Predictions(Callback):
         there, total = len(self._paths) - len(lacking), len(self._paths)
         if self._film and not lacking:
             pictures = (png_pixels(path) for path in self._paths.values())
-            write_video(self.output, tqdm(pictures, "film", total, disable=None, leave=False), self.fps)
+            write_video(self.output, progress(pictures, "film", total), self.fps)
             shutil.rmtree(self.folder, ignore_errors=True)
         count = f"{there} of {total}" if lacking else total
         made = f", {self._written} of them new" if self._written < there and trainer.world_size == 1 else ""
@@ -139,15 +142,33 @@ class Predictions(Callback):
             print(self._watch.said(self._written))  # noqa: T201
 
 
-class PictureProgress(TQDMProgressBar):
-    """Pictures a second, or seconds a picture where that is the larger number, and the time that is left."""
+class PictureProgress(ProgressBar):
+    """How many pictures are made and how far the present one is, each with the time that is left."""
 
-    BAR_FORMAT = TQDMProgressBar.BAR_FORMAT.replace("{rate_noinv_fmt}", "{rate_fmt}")
+    def __init__(self) -> None:
+        super().__init__()
+        self._hidden: bool | None = None  # None: shown on a terminal
 
-    def init_predict_tqdm(self) -> Any:  # noqa: D102
-        bar = super().init_predict_tqdm()
-        bar.unit = "frame"
-        return bar
+    def disable(self) -> None:  # noqa: D102
+        self._hidden = True
+
+    def on_predict_start(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
+        total = sum(trainer.num_predict_batches)
+        self._pictures = progress(what="pictures", total=total, unit="picture", delay=0, disable=self._hidden)
+
+    def on_predict_batch_start(self, trainer: Trainer, module: LightningModule, *_: Any) -> None:  # noqa: D102
+        shown = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}, {remaining} left"
+        part = progress(what="this picture", total=1.0, position=1, disable=self._hidden, bar_format=shown)
+        module.done = lambda share: part.update(share - part.n)
+        self._part = part
+
+    def on_predict_batch_end(self, *_: Any) -> None:  # noqa: D102
+        self._part.close()
+        self._pictures.update()
+
+    def on_predict_end(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
+        self._pictures.close()
+        module.done = None
 
 
 class Stopwatch:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, Self
 
 import torch
@@ -11,14 +11,16 @@ import torch.nn.functional as F
 from pytorch_lightning.cli import LRSchedulerCallable, OptimizerCallable
 from torch import Tensor, nn
 
+from lightning_modules.data.margin import trim
+from lightning_modules.inference.film_reader import FilmReader, check_future
 from lightning_modules.inference.predict import predict
 from lightning_modules.inference.presets import Preset, choose
 from lightning_modules.inference.self_ensemble import COUNTS
 from lightning_modules.inference.tiles import TILE
-from lightning_modules.networks import ClassicalDecoder, Network
+from lightning_modules.networks import ClassicalDecoder, Network, RecurrentCSCSR
 from lightning_modules.pretrained import load_weights, read_weights, with_own_motion
 from lightning_modules.tasks.base import Learner, step_schedule
-from lightning_modules.tasks.callbacks import TestReport, ValidationPictures
+from lightning_modules.tasks.callbacks import TestReport, ValidationPictures, middle_clip, middle_half
 from spikekit import psnr, ssim
 from spikekit.decoders.methods import DECODERS
 
@@ -47,7 +49,9 @@ class SuperResolution(Learner):
             clip, transposed, turned and mirrored, in so many times the time.
         flow: the motion that training uses. "scene" is that of the data, where they have it: the true one of analytic
             scenes, or that which the frames of a film were interpolated with. "estimated" is that of the network's own
-            estimator, which learns as well unless it is frozen.
+            estimator, which learns as well unless it is frozen; it sees what there is of a scene around a patch.
+        frozen: parts of the network that do not learn, such as ``representation``.
+        future: key frames that a picture of a film may wait for, where the network makes films.
         weights: what the network starts with: the name of weights that come with the package, such as
             ``cscsr_small_x4``, a file of safetensors, or a checkpoint of which only the weights are taken.
         tolerance: old name of ``psnr_tolerance``.
@@ -66,10 +70,12 @@ class SuperResolution(Learner):
         psnr_tolerance: float = 0.0,
         self_ensemble: Literal[1, 2, 4, 8] = 1,
         flow: Literal["scene", "estimated"] = "scene",
+        frozen: Sequence[str] = (),
+        future: int = 0,
         weights: str | None = None,
         tolerance: float | None = None,
     ) -> None:
-        super().__init__(network, {"pattern": network.pattern}, optimizer, lr_scheduler)
+        super().__init__(network, {"pattern": network.pattern}, network.flow_times, optimizer, lr_scheduler)
         if tile < 0 or tile % 2:
             raise ValueError(f"tile: expected an even number of sensor pixels, or 0 for no tiles, got {tile}")
         if tolerance is not None:
@@ -94,6 +100,20 @@ class SuperResolution(Learner):
         self.psnr_tolerance = psnr_tolerance
         self.self_ensemble = self_ensemble
         self.flow = flow
+        self.future = check_future(network, future)
+        self.done: Callable[[float], object] | None = None  # told how far a picture is, see predict
+        self._reader: FilmReader | None = None
+        if isinstance(network, RecurrentCSCSR) and (psnr_tolerance or self_ensemble > 1):
+            got = f"{psnr_tolerance} and {self_ensemble}"
+            raise ValueError(
+                f"psnr_tolerance, self_ensemble: expected 0 and 1 for a network that makes films, got {got}"
+            )
+        parts = dict(network.named_modules())
+        for name in frozen:
+            if name not in parts:
+                known = ", ".join(name for name, _ in network.named_children())
+                raise ValueError(f"frozen: expected parts of the network, such as {known}, got {name}")
+            parts[name].requires_grad_(False)
         if weights is not None:
             load_weights(network, read_weights(weights))
 
@@ -156,37 +176,88 @@ class SuperResolution(Learner):
         picture is multiplied by ``exposure``.
         """
         how = {"tile": self.tile, "psnr_tolerance": self.psnr_tolerance, "self_ensemble": self.self_ensemble}
-        return predict(self.network, spikes, flow, static, exposure=exposure, **how)
+        return predict(self.network, spikes, flow, static, exposure=exposure, done=self.done, **how)
 
     def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:  # noqa: D102
-        rgb = self.network(batch["spikes"], batch.get("flow") if self.flow == "scene" else None)
-        loss = F.l1_loss(rgb, batch["rgb"])
+        batch, flow = self._with_motion(batch)
+        pictures = self._pictures(batch, flow)
+        loss = sum(F.l1_loss(rgb, batch["rgb"]) for rgb in pictures) / len(pictures)
         self.log("train/loss", loss)
-        self.log("train/psnr", psnr(rgb.detach(), batch["rgb"]).mean(), prog_bar=True)
+        self.log("train/psnr", psnr(pictures[-1].detach(), batch["rgb"]).mean(), prog_bar=True)
         return loss
 
+    def _with_motion(self, batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor | None]:
+        """Clips of patches, and the motion in them: what is around them serves its estimate alone."""
+        spikes, flow = batch["spikes"], batch.get("flow") if self.flow == "scene" else None
+        margin = (spikes.shape[-1] - batch["rgb"].shape[-1] // self.network.scale) // 2
+        if not margin:
+            return batch, flow
+        if flow is None and self.network.takes_flow and not self.network.motion.static:
+            seen = self.network.estimate_flow(spikes.flatten(0, -4))
+            flow = trim(seen, margin).unflatten(0, spikes.shape[:-3])
+        return {**batch, "spikes": trim(spikes, margin)}, flow
+
+    def _pictures(self, batch: dict[str, Tensor], flow: Tensor | None = None) -> list[Tensor]:
+        """Pictures of clips; of films after every time that they were read.
+
+        A film that was read from its end is the mirror image of one that is read but once: both learn.
+        """
+        spikes = batch["spikes"]
+        if "every" not in batch:
+            return [self.network(spikes, flow)]
+        if isinstance(self.network, RecurrentCSCSR):
+            return self.network.film(spikes, flow, every=int(batch["every"][0]), future=self.future)
+        flow = None if flow is None else flow.flatten(0, 1)
+        return [self.network(spikes.flatten(0, 1), flow).unflatten(0, spikes.shape[:2])]
+
     def validation_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:  # noqa: D102
-        rgb = self.network(batch["spikes"])
-        count = len(rgb)
-        self.log("val/psnr", psnr(rgb, batch["rgb"]).mean(), prog_bar=True, batch_size=count, sync_dist=True)
-        self.log("val/ssim", ssim(rgb, batch["rgb"]).mean(), batch_size=count, sync_dist=True)
+        rgb = self._pictures(batch)[-1]
+        if "every" in batch:  # of a film, the key frame in the middle stands for all
+            rgb, batch = rgb[:, rgb.shape[1] // 2], middle_clip(batch)
+        self.log_mean("val/psnr", psnr(rgb, batch["rgb"]), prog_bar=True)
+        self.log_mean("val/ssim", ssim(rgb, batch["rgb"]))
         return rgb.clamp(0, 1)
 
     def test_step(self, batch: dict[str, Tensor], batch_index: int) -> dict[str, Tensor]:
-        """Return the picture of every method, by name."""
+        """Return the picture of every method, by name; of a film those that are judged, (B, K, 3, s H, s W)."""
         spikes, settings = batch["spikes"], self.network.settings
         name = type(self.network).__name__
         shared = settings["scale"], settings["pattern"], settings["alpha"]
-        pictures = {method.upper(): ClassicalDecoder(method, *shared)(spikes) for method in DECODERS}
-        pictures[name] = self(spikes)
+        if "every" in batch:
+            judged = middle_half(batch)
+            clips = spikes[:, judged]
+            alone = self._of_clips(clips.flatten(0, 1), shared) | {f"{name}, single clips": self(clips.flatten(0, 1))}
+            pictures = {method: rgb.unflatten(0, clips.shape[:2]) for method, rgb in alone.items()}
+            if isinstance(self.network, RecurrentCSCSR):
+                films = [self._film(clip, int(batch["every"][0])) for clip in spikes]
+                pictures[f"{name}, film"] = torch.stack(films)[:, judged]
+            return pictures
+        pictures = self._of_clips(spikes, shared) | {name: self(spikes)}
         if "flow" in batch and self.network.takes_flow:
             pictures[f"{name}, true flow"] = self(spikes, batch["flow"])
         return pictures
 
+    def _of_clips(self, spikes: Tensor, shared: tuple[int, str, float]) -> dict[str, Tensor]:
+        return {method.upper(): ClassicalDecoder(method, *shared)(spikes) for method in DECODERS}
+
+    def _film(self, clips: Tensor, every: int) -> Tensor:
+        """Pictures (K, 3, s H, s W) of clips (K, N, H, W), every so many clocks."""
+        reader, size = FilmReader(self.network, self.tile), self.future + 1
+        clocks = [every * n for n in range(len(clips))]
+        groups = [slice(first, first + size) for first in range(0, len(clips), size)]
+        return torch.cat([reader(clips[group], clocks[group]) for group in groups]).clamp_(0, 1)
+
     def predict_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:
         """Return rgb (B, 3, s H, s W), clamped to [0, 1]; a rate of ``white``, where it is known, is 1, else alpha."""
         exposure = self.network.settings["alpha"] / batch["white"][:, None, None, None] if "white" in batch else 1.0
-        return self(batch["spikes"], exposure=exposure)
+        if self._reader is None:
+            return self(batch["spikes"], exposure=exposure)
+        return (self._reader(batch["spikes"], batch["frame"].tolist()) * exposure).clamp_(0, 1)
+
+    def on_predict_start(self) -> None:
+        """Begin a film."""
+        if isinstance(self.network, RecurrentCSCSR):
+            self._reader = FilmReader(self.network, self.tile)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:  # noqa: D102
         super().on_load_checkpoint(checkpoint)

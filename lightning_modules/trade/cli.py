@@ -9,19 +9,23 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lightning_modules.cli.errors import InputError, UsageError, VerbParser
-from lightning_modules.cost.measure import Row, measure, running
+from lightning_modules.cli.folder_lock import locked_folder
+from lightning_modules.cost.measure import Row, Timed, measure, running
 from lightning_modules.cost.runner import CannotRunError, Runner, make_runner
+from lightning_modules.trade.films import PICTURES, measure_films
 from lightning_modules.trade.plot import plot
 from lightning_modules.trade.settings import Setting, read_setting, usual_settings
 from lightning_modules.trade.table import COLUMNS, markdown, write_csv
 from spikekit.arguments import whole
 from spikekit.io.whole_file import whole_file
+from spikekit.progress import progress
 
 _OUTPUT, _ROUNDS = Path("runs/trade"), 9
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = VerbParser(
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the verb."""
+    made = VerbParser(
         prog="lightning trade",
         allow_abbrev=False,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -35,6 +39,9 @@ arguments give the clips takes those in the middle. All settings are parsed and 
 that cannot run here, for want of a file, say, is reported as a row, and the others go on. Time is taken in one process
 and in turns: every setting once in every round, on the same clip.
 
+With --film EVERY, the test scenes are films of {PICTURES} pictures, EVERY clocks apart, and time, work and energy are
+those of a picture in a film; PSNR, SSIM and LPIPS are of the pictures between the first and the last.
+
 The result is trade.md, trade.csv and trade.png, with the Pareto front of time and PSNR, and for every row the command
 that measures it alone.
 
@@ -44,11 +51,12 @@ columns:
 examples:
   lightning trade -c configs/x4.yaml
   lightning trade -c configs/x4.yaml -c configs/data/films.yaml --data.root DIR
+  lightning trade -c configs/x4.yaml --film 20
   lightning trade -c configs/x4.yaml -c configs/quick.yaml --ckpt_path runs/quick/checkpoints/best.ckpt
   lightning trade -c configs/x4.yaml --setting "--model.weights cscsr_small_x4" --setting "-c my.yaml --ckpt_path FILE"
 """,
     )
-    parser.add_argument(
+    made.add_argument(
         "--setting",
         action="append",
         default=[],
@@ -56,11 +64,14 @@ examples:
         help="'ARGS' or 'NAME: ARGS'; given again, one more. Without any: the networks whose weights come with the "
         "package, or that of --ckpt_path or --model.weights; variants of the first of them; the decoders",
     )
-    parser.add_argument(
+    made.add_argument(
         "--rounds", type=whole(1), default=_ROUNDS, metavar="N", help=f"timings of every setting; default {_ROUNDS}"
     )
-    parser.add_argument("-o", "--output", type=Path, default=_OUTPUT, metavar="DIR", help=f"default: {_OUTPUT}")
-    return parser
+    made.add_argument(
+        "--film", type=whole(1), metavar="EVERY", help="measure films, with a picture every so many clocks"
+    )
+    made.add_argument("-o", "--output", type=Path, default=_OUTPUT, metavar="DIR", help=f"default: {_OUTPUT}")
+    return made
 
 
 def trade(args: Sequence[str]) -> None:
@@ -72,7 +83,7 @@ def trade(args: Sequence[str]) -> None:
     Raises:
         InputError: what was asked for cannot be; or nothing of it can run.
     """
-    asked, shared = _parser().parse_known_args(args)
+    asked, shared = parser().parse_known_args(args)
     given = [read_setting(text) for text in asked.setting]
     try:
         base = Runner(shared)
@@ -83,18 +94,22 @@ def trade(args: Sequence[str]) -> None:
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise UsageError(f"trade: two settings are called {twice!r}; 'NAME: ARGS' gives them names")
-    rows = [_row(setting, shared, base) for setting in settings]
+    rows = [_row(setting, shared, base) for setting in progress(settings, "settings built")]
     _check_any(rows)
-    try:
-        asked.output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{asked.output}: cannot be made ({error.strerror})") from error
+    with locked_folder(asked.output, "lightning trade"):
+        _measured(rows, base, asked, [_command(setting, shared, asked) for setting in settings])
+
+
+def _measured(rows: Sequence[Row], base: Runner, asked: argparse.Namespace, commands: Sequence[str]) -> None:
+    """Measure the rows, and write them in three ways."""
     for row in rows:
         if row.reason is not None:
             print(f"{row.setting.name} cannot run: {row.reason}", flush=True)
-    timed = measure(rows, base.data.test_dataloader(), asked.rounds)
+    if asked.film is None:
+        timed = measure(rows, base.data.test_dataloader(), asked.rounds)
+    else:
+        timed = _measure_films(rows, base, asked)
     _check_any(rows)
-    commands = [_command(setting, shared, asked) for setting in settings]
     text = markdown(rows, commands, timed)
     with whole_file(asked.output / "trade.md", "w") as file:
         file.write(text)
@@ -102,6 +117,15 @@ def trade(args: Sequence[str]) -> None:
     plot(rows, asked.output / "trade.png")
     print(f"\n{text}")
     print(", ".join(str(path) for path in sorted(asked.output.glob("trade.*"))))
+
+
+def _measure_films(rows: Sequence[Row], base: Runner, asked: argparse.Namespace) -> Timed:
+    try:
+        return measure_films(rows, base.data, base.network.frames, asked.film, asked.rounds)
+    except UsageError:
+        raise
+    except ValueError as error:
+        raise InputError(f"trade: {error}") from error
 
 
 def _own_weights(base: Runner) -> list[str]:
@@ -131,4 +155,5 @@ def _command(setting: Setting, shared: Sequence[str], asked: argparse.Namespace)
     """The command that measures a setting alone, into a folder of its own."""
     folder = asked.output / re.sub(r"[^\w.=+-]+", "_", setting.name).strip("_")
     rounds = [] if asked.rounds == _ROUNDS else ["--rounds", str(asked.rounds)]
-    return shlex.join(["lightning", "trade", *shared, *rounds, "-o", str(folder), "--setting", setting.text])
+    filmed = [] if asked.film is None else ["--film", str(asked.film)]
+    return shlex.join(["lightning", "trade", *shared, *filmed, *rounds, "-o", str(folder), "--setting", setting.text])

@@ -13,6 +13,7 @@ import torch
 from lightning_modules.cost.measure import Row, Timed, quartiles, running
 from lightning_modules.inference.presets import Preset
 from lightning_modules.metrics.image import why_no_lpips
+from lightning_modules.trade.films import PICTURES
 from lightning_modules.trade.pareto import pareto_front
 from spikekit.bench import cpu_name, software
 from spikekit.io.whole_file import whole_file
@@ -30,12 +31,17 @@ parameters  weights, with those of a learned estimator of motion
 MAC a pixel multiplications of convolutions and matrices by sensor pixel, those of a learned estimator included; not
             counted: the search along the motion, classical motion, decoding, whatever is done element by element
 J a frame   energy of the whole device, whoever uses it: NVML on GPUs (with nvidia-ml-py), RAPL on CPUs, if readable
+flicker     of films: error of the difference of two neighbouring pictures, the one warped onto the other by the true
+            motion, in steps of 8 bits; what moves with the scene is none
+latency     of films: clocks that have to come behind a picture before it is made
 front       nothing else here is as fast and, to 0.01 dB, as good"""
 
 _FIGURES = [
     "psnr", "ssim", "lpips", "ms", "ms_q1", "ms_q3", "ratio", "ratio_q1", "ratio_q3",
-    "mib", "parameters", "macs", "joules",
+    "mib", "parameters", "macs", "joules", "flicker", "latency",
 ]  # fmt: skip
+
+_OF_FILMS = "flicker", "latency"
 
 
 def figures(rows: Sequence[Row]) -> list[dict[str, float | None]]:
@@ -54,6 +60,7 @@ def figures(rows: Sequence[Row]) -> list[dict[str, float | None]]:
         values = [
             mean(row.psnr), mean(row.ssim), mean(row.lpips) if row.lpips else None,
             ms, ms_q1, ms_q3, ratio, ratio_q1, ratio_q3, row.memory, row.parameters, row.macs, row.joules,
+            mean(row.flicker) if row.flicker else None, row.latency,
         ]  # fmt: skip
         found.append(dict(zip(_FIGURES, values, strict=True)))
     return found
@@ -81,6 +88,7 @@ def machine(rows: Sequence[Row], timed: Timed) -> str:
             f"quality  mean of {_count(scored, 'clip')}",
             f"time     {timed.unit}; {_count(clips, 'clip')} of {height} x {width} sensor pixels in turns, "
             f"{_count(timed.rounds, 'round')}",
+            *([] if timed.every is None else [f"films    {PICTURES} pictures each, {timed.every} clocks apart"]),
         ]
     )
 
@@ -95,10 +103,11 @@ def markdown(rows: Sequence[Row], commands: Sequence[str], timed: Timed) -> str:
     """
     shown, best = figures(rows), front(rows)
     energy = any(row.joules is not None for row in rows)
+    filmed = timed.every is not None
     perceived = any(row.lpips for row in rows)
     header = ["", "setting", "PSNR (dB)", "SSIM", *["LPIPS"] * perceived]
     header += ["ms a frame", "ratio", "MiB", "parameters", "MAC a pixel"]
-    header += ["J a frame"] * energy + ["front"]
+    header += ["J a frame"] * energy + ["flicker", "latency"] * filmed + ["front"]
     lines = []
     for n, (row, values) in enumerate(zip(rows, shown, strict=True)):
         if not values:
@@ -114,6 +123,7 @@ def markdown(rows: Sequence[Row], commands: Sequence[str], timed: Timed) -> str:
             f"{values['parameters']:,}",
             f"{values['macs']:,.0f}",
             *[_text(values["joules"], ".3g")] * energy,
+            *[_text(values["flicker"], ".3f"), _text(values["latency"], "d")] * filmed,
             "x" if n in best else "",
         ]
         lines.append([n + 1, row.setting.name, *cells])
@@ -134,7 +144,19 @@ def write_csv(rows: Sequence[Row], commands: Sequence[str], timed: Timed, path: 
     """
     height, width = timed.size
     best, reference = front(rows), running(rows)[0].setting.name
-    columns = ["setting", *Preset.columns(), *_FIGURES, "reference", "height", "width", "front", "command", "failed"]
+    figured = _FIGURES if timed.every is not None else [name for name in _FIGURES if name not in _OF_FILMS]
+    columns = [
+        "setting",
+        *Preset.columns(),
+        *figured,
+        *["every"] * (timed.every is not None),
+        "reference",
+        "height",
+        "width",
+        "front",
+        "command",
+        "failed",
+    ]
     with whole_file(path, "w", newline="") as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
@@ -143,7 +165,8 @@ def write_csv(rows: Sequence[Row], commands: Sequence[str], timed: Timed, path: 
                 {
                     "setting": row.setting.name,
                     **(row.setting.preset or Preset()).write(),
-                    **{name: _text(value, ".10g") for name, value in values.items()},
+                    **{name: _text(values.get(name), ".10g") for name in figured},
+                    **({} if timed.every is None else {"every": timed.every}),
                     "reference": reference,
                     "height": height,
                     "width": width,

@@ -14,19 +14,22 @@ import statistics
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from spikekit.arguments import UsageError
+from spikekit.arguments import UsageError, whole
 from spikekit.bench import pictures, streams
 from spikekit.bench.case import SEED, SIZES, Case, Other, Setup, sizes
 from spikekit.examples import EXAMPLES, Example
+from spikekit.io.failures import writing
 from spikekit.io.whole_file import whole_file
+from spikekit.progress import progress
 from spikekit.tables import table
 from spikekit.timing import Ratio, Run, Timer, floor_run, interleave, peak_memory, ratio, timer_of
 
@@ -34,11 +37,9 @@ from spikekit.timing import Ratio, Run, Timer, floor_run, interleave, peak_memor
 def _example(example: Example, setup: Setup) -> Iterator[Case]:
     """The operator beside nothing, where it has no cases of its own."""
     frames, size = 8, (setup.size.height, setup.size.width)
-    tensors = [tensor.float().to(setup.device) for tensor in example.tensors((frames,), size)]
-    results = example.results(*tensors)
-    read, written = (sum(tensor.nbytes for tensor in some) for some in (tensors, results))
-    pixels = frames * results[0].shape[-2] * results[0].shape[-1]
-    yield Case(f"float32 {', '.join(map(sizes, tensors))}", partial(example.call, *tensors), pixels, read, written)
+    tensors = tuple(tensor.float().to(setup.device) for tensor in example.tensors((frames,), size))
+    height, width = example.results(*tensors)[0].shape[-2:]
+    yield Case(f"float32 {', '.join(map(sizes, tensors))}", example.call, tensors, pixels=frames * height * width)
 
 
 #: The cases of every operator.
@@ -51,10 +52,8 @@ CASES = {
 #: Seconds of one case after which no further round is begun.
 CASE_SECONDS = 1.5
 
-COLUMNS = [
-    "operator", "case", "beside", "other / ours", "rounds", "Mpixel/s", "ours / floor", "MiB ours", "MiB other", "equal"
-]  # fmt: skip
-_OURS = {"operator", "case", "rounds", "Mpixel/s", "ours / floor", "MiB ours"}
+# The columns that rows of one case have in common.
+_OURS = ("operator", "case", "rounds", "Mpixel/s", "ours / floor", "MiB ours")
 
 _LEGEND = """\
 other / ours  time of what stands under "beside" over that of spikekit: median of the rounds (least .. most)
@@ -100,9 +99,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "operators", nargs="*", metavar="OPERATOR", help=f"what to measure, all if not given: {', '.join(CASES)}"
     )
     parser.add_argument("--size", choices=SIZES, default="full", help="small shows that everything runs; default full")
-    parser.add_argument("--rounds", type=_rounds, default=7, metavar="N", help="timings of each, in turn; default 7")
+    parser.add_argument("--rounds", type=whole(1), default=7, metavar="N", help="timings of each, in turn; default 7")
     parser.add_argument(
-        "--threads", type=_rounds, default=1, metavar="N", help="threads of torch; 1 counts CPU time, more wall time"
+        "--threads", type=whole(1), default=1, metavar="N", help="threads of torch; 1 counts CPU time, more wall time"
     )
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="default cpu")
     parser.add_argument("--markdown", action="store_true", help="a Markdown table")
@@ -119,8 +118,11 @@ def run(args: argparse.Namespace) -> None:
     except (RuntimeError, AssertionError) as error:
         raise UsageError(f"--device: {args.device} cannot be used here ({str(error).splitlines()[0]})") from error
     timer, unit = timer_of(device, args.threads)
-    with _threads(args.threads):
-        measured = list(rows(args.operators or list(CASES), args.size, device, args.rounds, timer))
+    with ExitStack() as stack:
+        stack.callback(torch.set_num_threads, torch.get_num_threads())
+        torch.set_num_threads(args.threads)
+        operators = progress(args.operators or list(CASES), "operators")
+        measured = list(rows(operators, args.size, device, args.rounds, timer))
         header = _header(device, unit, args.size)
     text = "\n\n".join(
         [_fenced(header, args.markdown), _table(measured, args.markdown), _fenced(_LEGEND, args.markdown)]
@@ -128,16 +130,17 @@ def run(args: argparse.Namespace) -> None:
     if args.output is None:
         sys.stdout.write(f"{text}\n")
         return
-    try:
-        with whole_file(args.output, "w", encoding="utf-8") as file:
-            file.write(f"{text}\n")
-    except OSError as error:
-        raise ValueError(f"{args.output}: cannot be written ({error.strerror or error})") from error
+    with writing(args.output), whole_file(args.output, "w", encoding="utf-8") as file:
+        file.write(f"{text}\n")
 
 
 def rows(operators: Sequence[str], size: str, device: torch.device, rounds: int, timer: Timer) -> Iterator[Row]:
     """Measure all cases of some operators."""
-    with tempfile.TemporaryDirectory() as folder, _frozen():
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        # what is there already is much, and would be searched every time
+        gc.collect()
+        gc.freeze()
+        stack.callback(gc.unfreeze)
         setup = Setup(SIZES[size], device, Path(folder))
         for operator in operators:
             try:
@@ -150,44 +153,35 @@ def rows(operators: Sequence[str], size: str, device: torch.device, rounds: int,
 def compare(case: Case, operator: str, device: torch.device, rounds: int, timer: Timer) -> Iterator[Row]:
     """Measure one case beside everything that can be run; what cannot gets a row that says why."""
     result = case.run()
-    runs: dict[str, Run] = {}
-    equal: dict[str, float | None] = {}
-    failed: dict[str, str] = {}
+    pixels, read, written = case.work(result)
+    runs: dict[str, Run] = {"": case.run}
+    found: dict[str, dict[str, Any]] = {}
     for other in case.others:
         try:
-            run = other.prepare()
-            equal[other.name] = _equal(other, result, run())
+            run = other.prepare(*case.inputs)
+            found[other.name] = {"equal": _equal(other, result, run()), "note": other.note}
             runs[other.name] = run
         except Exception as error:
-            failed[other.name] = _reason(error)
+            found[other.name] = {"note": _reason(error)}
     del result
     gc.collect()
-    floor = floor_run(case.read, case.written, device)
-    times = interleave({"": case.run, **runs, "floor": floor}, rounds, timer, CASE_SECONDS)
-    memory = {name: peak_memory(run, device) for name, run in {"": case.run, **runs}.items()}
+    times = interleave({**runs, "floor": floor_run(read, written, device)}, rounds, timer, CASE_SECONDS)
+    memory = {name: peak_memory(run, device) for name, run in runs.items()}
 
     row = Row(
         operator,
         case.name,
         rounds=len(times[""]),
-        speed=case.pixels / max(statistics.median(times[""]), 1e-9) / 1e6,
+        speed=pixels / max(statistics.median(times[""]), 1e-9) / 1e6,
         floor=ratio(times[""], times["floor"]).median,
         memory=(memory[""], None),
     )
-    if not case.others:
+    if not found:
         yield row
-    for other in case.others:
-        if other.name in failed:
-            yield replace(row, other=other.name, note=failed[other.name])
-        else:
-            yield replace(
-                row,
-                other=other.name,
-                ratio=ratio(times[other.name], times[""]),
-                memory=(memory[""], memory[other.name]),
-                equal=equal[other.name],
-                note=other.note,
-            )
+    for name, how in found.items():
+        if name in runs:
+            how |= {"ratio": ratio(times[name], times[""]), "memory": (memory[""], memory[name])}
+        yield replace(row, other=name, **how)
 
 
 def _equal(other: Other, ours: object, theirs: object) -> float | None:
@@ -244,51 +238,27 @@ def _table(rows: Sequence[Row], markdown: bool) -> str:
     for row in rows:
         cells = _cells(row)
         if case == (row.operator, row.case) and not markdown:  # the line above says what is ours
-            cells = ["" if column in _OURS else cell for column, cell in zip(COLUMNS, cells, strict=True)]
-        lines.append(cells)
+            cells |= dict.fromkeys(_OURS, "")
+        lines.append(list(cells.values()))
         case = row.operator, row.case
-    return table(COLUMNS, lines, markdown=markdown)
+    return table(list(_cells(Row("", ""))), lines, markdown=markdown)
 
 
-def _cells(row: Row) -> list[str]:
+def _cells(row: Row) -> dict[str, str]:
+    """Return what a row shows, by column."""
+
     def number(value: float | None, form: str) -> str:
         return "" if value is None else format(value, form)
 
-    return [
-        row.operator,
-        row.case,
-        row.other,
-        "" if row.ratio is None else f"{row.ratio.median:.3g} ({row.ratio.least:.3g} .. {row.ratio.most:.3g})",
-        str(row.rounds or ""),
-        number(row.speed, ".4g"),
-        number(row.floor, ".3g"),
-        *(number(mib, ".1f") for mib in row.memory),
-        "; ".join(filter(None, ["" if row.equal is None else f"{100 * row.equal:.4g} %", row.note])),
-    ]
-
-
-@contextmanager
-def _frozen() -> Iterator[None]:
-    """Keep what is there already out of the garbage collector's way: it is much, and would be searched every time."""
-    gc.collect()
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()
-
-
-@contextmanager
-def _threads(number: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(number)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-def _rounds(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"expected a whole number, 1 or more, got {text}")
-    return int(text)
+    return {
+        "operator": row.operator,
+        "case": row.case,
+        "beside": row.other,
+        "other / ours": "{:.3g} ({:.3g} .. {:.3g})".format(*row.ratio) if row.ratio else "",
+        "rounds": str(row.rounds or ""),
+        "Mpixel/s": number(row.speed, ".4g"),
+        "ours / floor": number(row.floor, ".3g"),
+        "MiB ours": number(row.memory[0], ".1f"),
+        "MiB other": number(row.memory[1], ".1f"),
+        "equal": "; ".join(filter(None, ["" if row.equal is None else f"{100 * row.equal:.4g} %", row.note])),
+    }

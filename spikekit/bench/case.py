@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,17 +41,22 @@ class Other:
 
     Attributes:
         name: what it is called in the table.
-        prepare: returns the run; imports what it needs, and may raise.
+        prepare: returns the run, given the inputs of the case; imports what it needs, and may raise.
         pair: picks from our result and from the other one what should be equal; None where nothing should be.
         tolerance: largest difference that counts as equal.
         note: how it differs.
     """
 
     name: str
-    prepare: Callable[[], Run]
+    prepare: Callable[..., Run]
     pair: Callable[[Any, Any], tuple[Tensor, Tensor]] | None = lambda ours, other: (ours, other)
     tolerance: float = 1e-4
     note: str = ""
+
+
+def other(name: str, function: Callable[..., object], pair: Any = Other.pair, **how: Any) -> Other:
+    """Return the alternative that is a function of the inputs of the case, which needs no preparation."""
+    return Other(name, partial(partial, function), pair, **how)
 
 
 @dataclass(frozen=True)
@@ -59,19 +65,34 @@ class Case:
 
     Attributes:
         name: what goes in and what comes out.
-        run: our code.
-        pixels: how many pixels of how many frames come out, for the throughput.
-        read: bytes that must be read at least.
-        written: bytes that must be written at least.
+        function: our code.
+        inputs: what it and the others are called with.
         others: what it is measured beside.
+        channels: of a pixel that comes out, which count as one for the throughput.
+        pixels: how many pixels of how many frames come out; those of the result when not given.
+        read: bytes that must be read at least; those of the inputs when not given.
+        written: bytes that must be written at least; those of the first result when not given.
     """
 
     name: str
-    run: Run
-    pixels: int
-    read: float
-    written: float
+    function: Callable[..., Any]
+    inputs: tuple[Any, ...]
     others: Sequence[Other] = ()
+    channels: int = 1
+    pixels: int | None = None
+    read: float | None = None
+    written: float | None = None
+
+    def run(self) -> Any:
+        """Call our code."""
+        return self.function(*self.inputs)
+
+    def work(self, result: Any) -> tuple[int, float, float]:
+        """Return the pixels, the bytes read and the bytes written, given the result."""
+        first = result[0] if isinstance(result, tuple) else result
+        read = sum(value.nbytes for value in self.inputs) if self.read is None else self.read
+        written = first.nbytes if self.written is None else self.written
+        return self.pixels or first.numel() // self.channels, read, written
 
 
 @dataclass(frozen=True)
@@ -110,8 +131,3 @@ class Setup:
 def sizes(value: Tensor) -> str:
     """Write the sizes of a tensor, as ``400x250x400``."""
     return "x".join(map(str, value.shape))
-
-
-def floats(value: Tensor, read: float, written: float) -> tuple[float, float]:
-    """Return the bytes of so many float32 copies of a tensor, read and written."""
-    return 4 * read * value.numel(), 4 * written * value.numel()

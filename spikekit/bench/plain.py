@@ -91,12 +91,16 @@ def integrate_fire(light: Tensor) -> Tensor:
     return torch.stack(spikes)
 
 
+def _pixels(flow: Tensor) -> tuple[Tensor, Tensor]:
+    """Columns and rows of all pixels, (H, W) each."""
+    columns, rows = (torch.arange(length, device=flow.device) for length in (flow.shape[-1], flow.shape[-2]))
+    return torch.meshgrid(columns, rows, indexing="xy")
+
+
 def grid_sample(image: Tensor, flow: Tensor) -> Tensor:
     """The warp that everyone has: bilinear, from all pixels."""
-    _, _, height, width = image.shape
-    y, x = torch.meshgrid(
-        torch.arange(height, device=flow.device), torch.arange(width, device=flow.device), indexing="ij"
-    )
+    height, width = image.shape[-2:]
+    x, y = _pixels(flow)
     grid = torch.stack(
         [2 * (x + flow[:, 0]) / max(width - 1, 1) - 1, 2 * (y + flow[:, 1]) / max(height - 1, 1) - 1], dim=-1
     )
@@ -106,9 +110,7 @@ def grid_sample(image: Tensor, flow: Tensor) -> Tensor:
 def idw_window(features: Tensor, flow: Tensor, mask: Tensor, radius: int) -> Tensor:
     """Inverse distance weighting by search: all pixels of a window around the target, the nearest four known ones."""
     _, channels, height, width = features.shape
-    y, x = torch.meshgrid(
-        torch.arange(height, device=flow.device), torch.arange(width, device=flow.device), indexing="ij"
-    )
+    x, y = _pixels(flow)
     reach = torch.arange(-radius, radius + 1, device=flow.device)
     step_y, step_x = (step.reshape(-1, 1, 1) for step in torch.meshgrid(reach, reach, indexing="ij"))
     pictures = []

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from spikekit.bench import peers, plain
-from spikekit.bench.case import SEED, Case, Other, Setup, floats, sizes
+from spikekit.bench.case import SEED, Case, Other, Setup, other, sizes
 from spikekit.decoders.dense import spike_interval, tfi, tfp
 from spikekit.decoders.packing import pack_spikes, unpack_spikes
 from spikekit.decoders.single_frame import tfi_at, tfp_at
@@ -18,13 +18,13 @@ from spikekit.io.files import read_spikes, write_spikes
 from spikekit.sensor.integrate_fire import spike_integrate_fire
 
 
-def _enclosed(ours: Tensor, other: Tensor, spikes: Tensor) -> tuple[Tensor, Tensor]:
+def _enclosed(spikes: Tensor) -> Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]:
     """Keep the frames that a spike precedes and a spike follows."""
     fired = (spikes != 0).to(torch.int16)
     before = (fired.cumsum(0) - fired) > 0
     after = fired.flip(0).cumsum(0).flip(0) > 0
     both = before & after
-    return ours[both], other[both]
+    return lambda ours, theirs: (ours[both], theirs[both])
 
 
 def _read_spikes(setup: Setup) -> Iterator[Case]:
@@ -33,205 +33,124 @@ def _read_spikes(setup: Setup) -> Iterator[Case]:
     size, spikes = setup.size, setup.spikes(setup.size.frames)
     path = setup.folder / "clip.dat"
     write_spikes(path, spikes, flip=True)
-    shape = str(path), size.height, size.width
-    yield Case(
-        f".dat -> uint8 {sizes(spikes)}",
-        lambda: read_spikes(*shape, flip=True),
-        spikes.numel(),
-        spikes.numel() / 8,
-        spikes.numel(),
-        [
-            Other("plain torch", lambda: partial(plain.read_dat, *shape)),
-            Other("spikezoo, Python", lambda: peers.spikezoo_load(*shape, "python"), note="gives float32"),
-            Other("spikezoo, C++", lambda: peers.spikezoo_load(*shape, "cpp"), note="gives float32"),
-        ],
-    )
+    others = [
+        other("plain torch", plain.read_dat),
+        Other("spikezoo, Python", partial(peers.spikezoo_load, version="python"), note="gives float32"),
+        Other("spikezoo, C++", partial(peers.spikezoo_load, version="cpp"), note="gives float32"),
+    ]
+    inputs, read = (str(path), size.height, size.width), spikes.nbytes / 8
+    yield Case(f".dat -> uint8 {sizes(spikes)}", partial(read_spikes, flip=True), inputs, others, read=read)
 
 
 def _write_spikes(setup: Setup) -> Iterator[Case]:
     if setup.device.type != "cpu":
         return
     spikes = setup.spikes(setup.size.frames)
-    ours, other = setup.folder / "ours.dat", setup.folder / "other.dat"
+    ours, theirs = setup.folder / "ours.dat", setup.folder / "other.dat"
 
-    def pair(_ours: Any, _other: Any) -> tuple[Tensor, Tensor]:
-        return tuple(torch.frombuffer(bytearray(path.read_bytes()), dtype=torch.uint8) for path in (ours, other))
+    def pair(_ours: Any, _theirs: Any) -> tuple[Tensor, Tensor]:
+        return tuple(torch.frombuffer(bytearray(path.read_bytes()), dtype=torch.uint8) for path in (ours, theirs))
 
-    yield Case(
-        f"uint8 {sizes(spikes)} -> .dat",
-        lambda: write_spikes(ours, spikes, flip=True),
-        spikes.numel(),
-        spikes.numel(),
-        spikes.numel() / 8,
-        [
-            Other("plain torch", lambda: partial(plain.write_dat, str(other), spikes), pair),
-            Other("spikezoo", lambda: peers.spikezoo_save(str(other), spikes), pair),
-        ],
-    )
+    others = [
+        other("plain torch", partial(plain.write_dat, str(theirs)), pair),
+        Other("spikezoo", partial(peers.spikezoo_save, str(theirs)), pair),
+    ]
+    work = {"pixels": spikes.numel(), "written": spikes.nbytes / 8}
+    yield Case(f"uint8 {sizes(spikes)} -> .dat", partial(write_spikes, ours, flip=True), (spikes,), others, **work)
 
 
 def _pack_spikes(setup: Setup) -> Iterator[Case]:
     spikes = setup.spikes(setup.size.frames)
-    yield Case(
-        f"uint8 {sizes(spikes)} -> bits",
-        lambda: pack_spikes(spikes),
-        spikes.numel(),
-        spikes.numel(),
-        spikes.numel() / 8,
-        [Other("plain torch", lambda: partial(plain.pack, spikes))],
-    )
+    others = [other("plain torch", plain.pack)]
+    yield Case(f"uint8 {sizes(spikes)} -> bits", pack_spikes, (spikes,), others, pixels=spikes.numel())
 
 
 def _unpack_spikes(setup: Setup) -> Iterator[Case]:
     packed, width = pack_spikes(setup.spikes(setup.size.frames)), setup.size.width
-    yield Case(
-        f"bits {sizes(packed)} -> uint8",
-        lambda: unpack_spikes(packed, width),
-        8 * packed.numel(),
-        packed.numel(),
-        8 * packed.numel(),
-        [Other("plain torch", lambda: partial(plain.unpack, packed))],
-    )
+    others = [other("plain torch", plain.unpack)]
+    yield Case(f"bits {sizes(packed)} -> uint8", partial(unpack_spikes, width=width), (packed,), others)
 
 
 def _spike_interval(setup: Setup) -> Iterator[Case]:
     spikes = setup.spikes(setup.size.frames)
-    yield Case(
-        f"uint8 {sizes(spikes)} -> int16",
-        lambda: spike_interval(spikes),
-        spikes.numel(),
-        spikes.numel(),
-        2 * spikes.numel(),
-        [Other("plain torch", lambda: partial(plain.intervals, spikes), partial(_enclosed, spikes=spikes))],
-    )
+    others = [other("plain torch", plain.intervals, _enclosed(spikes))]
+    yield Case(f"uint8 {sizes(spikes)} -> int16", spike_interval, (spikes,), others)
 
 
 def _tfi(setup: Setup) -> Iterator[Case]:
     spikes = setup.spikes(setup.size.frames)
-    enclosed = partial(_enclosed, spikes=spikes)
-    yield Case(
-        f"uint8 {sizes(spikes)} -> float32",
-        lambda: tfi(spikes),
-        spikes.numel(),
-        spikes.numel(),
-        4 * spikes.numel(),
-        [Other("plain torch", lambda: lambda: 1 / plain.intervals(spikes), enclosed)],
-    )
-    yield Case(
-        f"uint8 {sizes(spikes)} -> uint8 picture",
-        lambda: tfi(spikes, 255, dtype=torch.uint8),
-        spikes.numel(),
-        spikes.numel(),
-        spikes.numel(),
-        [Other("plain torch", lambda: lambda: (255 / plain.intervals(spikes)).round().to(torch.uint8), enclosed)],
-    )
+    name, enclosed = f"uint8 {sizes(spikes)}", _enclosed(spikes)
+    others = [other("plain torch", lambda spikes: 1 / plain.intervals(spikes), enclosed)]
+    yield Case(f"{name} -> float32", tfi, (spikes,), others)
+    picture = partial(tfi, max_range=255, dtype=torch.uint8)
+    others = [other("plain torch", lambda spikes: (255 / plain.intervals(spikes)).round().to(torch.uint8), enclosed)]
+    yield Case(f"{name} -> uint8 picture", picture, (spikes,), others)
+
+    def forward_backward(spikes: Tensor, grad: Tensor) -> Tensor:
+        leaf = spikes.detach().requires_grad_()
+        return torch.autograd.grad(tfi(leaf), leaf, grad)[0]
 
     some = spikes[: setup.size.clip].float()
-    grad = setup.rand(*some.shape)
-
-    def forward_backward() -> tuple[Tensor, ...]:
-        leaf = some.detach().requires_grad_()
-        return torch.autograd.grad(tfi(leaf), leaf, grad)
-
-    yield Case(f"float32 {sizes(some)}, forward + backward", forward_backward, some.numel(), *floats(some, 4, 2))
+    work = {"read": 4 * some.nbytes, "written": 2 * some.nbytes}
+    yield Case(f"float32 {sizes(some)}, forward + backward", forward_backward, (some, setup.rand(*some.shape)), **work)
 
 
 def _tfi_at(setup: Setup) -> Iterator[Case]:
     clip = setup.spikes(setup.size.clip)
     middle = len(clip) // 2
 
-    def enclosed(_: Tensor, other: Tensor, shift: int) -> tuple[Tensor, Tensor]:
+    def enclosed(_: Tensor, theirs: Tensor, shift: int) -> tuple[Tensor, Tensor]:
         frame = middle + shift
         both = (clip[:frame].amax(0) & clip[frame:].amax(0)) != 0
-        return tfi_at(clip, frame)[both], other[both]
+        return tfi_at(clip, frame)[both], theirs[both]
 
-    yield Case(
-        f"uint8 {sizes(clip)} -> float32, the middle frame",
-        lambda: tfi_at(clip, middle),
-        clip[0].numel(),
-        clip.numel(),
-        4 * clip[0].numel(),
-        [
-            Other("plain torch", lambda: partial(plain.tfi_frame, clip, middle), partial(enclosed, shift=0)),
-            Other(
-                "spikezoo",
-                lambda: peers.spikezoo_tfi(clip),
-                partial(enclosed, shift=1),
-                note="from float32; its frame n is n + 1 of eq. (4), a spike at 0 counts as none",
-            ),
-        ],
-    )
+    own = "from float32; its frame n is n + 1 of eq. (4), a spike at 0 counts as none"
+    others = [
+        other("plain torch", partial(plain.tfi_frame, n=middle), partial(enclosed, shift=0)),
+        Other("spikezoo", peers.spikezoo_tfi, partial(enclosed, shift=1), note=own),
+    ]
+    yield Case(f"uint8 {sizes(clip)} -> float32, the middle frame", partial(tfi_at, frame=middle), (clip,), others)
 
 
 def _tfp(setup: Setup) -> Iterator[Case]:
     spikes = setup.spikes(setup.size.frames)
+    name = f"uint8 {sizes(spikes)}"
     for window in (11, 41):
-        yield Case(
-            f"uint8 {sizes(spikes)} -> float32, w = {window}",
-            partial(tfp, spikes, window),
-            spikes.numel(),
-            spikes.numel(),
-            4 * spikes.numel(),
-            [Other("plain torch", lambda window=window: partial(plain.tfp, spikes, window))],
-        )
-    yield Case(
-        f"uint8 {sizes(spikes)} -> uint8 picture, w = 11",
-        lambda: tfp(spikes, 11, 255, dtype=torch.uint8),
-        spikes.numel(),
-        spikes.numel(),
-        spikes.numel(),
-        [Other("plain torch", lambda: lambda: (255 * plain.tfp(spikes, 11)).round().to(torch.uint8), tolerance=1)],
-    )
+        others = [other("plain torch", partial(plain.tfp, window=window))]
+        yield Case(f"{name} -> float32, w = {window}", partial(tfp, window=window), (spikes,), others)
+
+    def rounded(spikes: Tensor) -> Tensor:
+        return (255 * plain.tfp(spikes, 11)).round().to(torch.uint8)
+
+    picture = partial(tfp, window=11, max_range=255, dtype=torch.uint8)
+    yield Case(f"{name} -> uint8 picture, w = 11", picture, (spikes,), [other("plain torch", rounded, tolerance=1)])
 
 
 def _tfp_at(setup: Setup) -> Iterator[Case]:
     clip = setup.spikes(setup.size.clip)
     middle = len(clip) // 2
     for window, order in ((2 * middle + 1, 1), (2 * (middle // 3) + 1, 3)):
-        yield Case(
-            f"uint8 {sizes(clip)} -> float32, the middle frame, w = {window}, order {order}",
-            partial(tfp_at, clip, middle, window, order=order),
-            clip[0].numel(),
-            clip.numel(),
-            4 * clip[0].numel(),
-            [
-                Other(
-                    "plain torch",
-                    lambda window=window, order=order: partial(plain.tfp_frame, clip, middle, window, order),
-                )
-            ],
-        )
+        name = f"uint8 {sizes(clip)} -> float32, the middle frame, w = {window}, order {order}"
+        others = [other("plain torch", partial(plain.tfp_frame, n=middle, window=window, order=order))]
+        yield Case(name, partial(tfp_at, frame=middle, window=window, order=order), (clip,), others)
 
 
 def _spike_integrate_fire(setup: Setup) -> Iterator[Case]:
     light = setup.light(setup.size.frames)
 
-    def first(ours: tuple[Tensor, Tensor], other: Tensor) -> tuple[Tensor, Tensor]:
-        return ours[0], other
+    def first(ours: tuple[Tensor, Tensor], theirs: Tensor) -> tuple[Tensor, Tensor]:
+        return ours[0], theirs
 
-    def others(light: Tensor) -> list[Other]:
-        return [
-            Other("plain torch", lambda: partial(plain.integrate_fire, light), first),
-            Other("spikingjelly", lambda: peers.spikingjelly(light), first),
-            Other("snntorch", lambda: peers.snntorch(light), first),
-        ]
-
-    yield Case(
-        f"float32 {sizes(light)} -> float32, forward",
-        lambda: spike_integrate_fire(light),
-        light.numel(),
-        *floats(light, 1, 1),
-        others(light),
-    )
+    others = [
+        other("plain torch", plain.integrate_fire, first),
+        Other("spikingjelly", peers.spikingjelly, first),
+        Other("snntorch", peers.snntorch, first),
+    ]
+    yield Case(f"float32 {sizes(light)} -> float32, forward", spike_integrate_fire, (light,), others)
     charge = peers.spikezoo_charge(setup.size.height, setup.size.width, SEED).to(setup.device)
-    yield Case(
-        f"float32 {sizes(light)} -> uint8, forward",
-        lambda: spike_integrate_fire(light, charge=charge, dtype=torch.uint8),
-        light.numel(),
-        4 * light.numel(),
-        light.numel(),
-        [Other("spikezoo", lambda: peers.spikezoo_simulate(light, SEED), first, note="charge in float64")],
-    )
+    in_bytes = partial(spike_integrate_fire, charge=charge, dtype=torch.uint8)
+    others = [Other("spikezoo", partial(peers.spikezoo_simulate, seed=SEED), first, note="charge in float64")]
+    yield Case(f"float32 {sizes(light)} -> uint8, forward", in_bytes, (light,), others)
 
     clip = light[: setup.size.clip].clone().requires_grad_()
     grad = setup.rand(*clip.shape)
@@ -243,24 +162,20 @@ def _spike_integrate_fire(setup: Setup) -> Iterator[Case]:
 
         return both
 
-    def spikes_only(ours: Any, other: Any) -> tuple[Tensor, Tensor]:
-        return ours[0], other[0]
-
-    def gradient_only(ours: Any, other: Any) -> tuple[Tensor, Tensor]:
-        return ours[1], other[1]
+    def nth(n: int) -> Callable[[Any, Any], tuple[Tensor, Tensor]]:
+        return lambda ours, theirs: (ours[n], theirs[n])
 
     own = "spikes compared; the gradient is its own"
-    yield Case(
-        f"float32 {sizes(clip)}, forward + backward",
+    others = [
+        Other("plain torch", lambda: with_gradient(partial(plain.integrate_fire, clip)), nth(1)),
+        Other("spikingjelly", lambda: with_gradient(peers.spikingjelly(clip)), nth(0), note=own),
+        Other("snntorch", lambda: with_gradient(peers.snntorch(clip)), nth(0), note=own),
+    ]
+    ours, work = (
         with_gradient(lambda: spike_integrate_fire(clip)[0]),
-        clip.numel(),
-        *floats(clip, 3, 2),
-        [
-            Other("plain torch", lambda: with_gradient(partial(plain.integrate_fire, clip)), gradient_only),
-            Other("spikingjelly", lambda: with_gradient(peers.spikingjelly(clip)), spikes_only, note=own),
-            Other("snntorch", lambda: with_gradient(peers.snntorch(clip)), spikes_only, note=own),
-        ],
+        {"read": 3 * clip.nbytes, "written": 2 * clip.nbytes},
     )
+    yield Case(f"float32 {sizes(clip)}, forward + backward", ours, (), others, **work)
 
 
 #: The cases of every operator, made one after the other so that only one set of inputs is in memory.

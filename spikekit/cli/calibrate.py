@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from tqdm import tqdm
-
-from spikekit.arguments import UsageError, one_line
+from spikekit.arguments import UsageError
 from spikekit.color.cfa import PATTERNS
 from spikekit.io import recording as recordings
 from spikekit.io.calibration import ENDING, read_calibration, write_calibration
+from spikekit.io.failures import writing
 from spikekit.io.files import iter_spikes
 from spikekit.io.recording import Recording, open_recording, own_calibration
+from spikekit.progress import progress
 from spikekit.sensor.calibrate import calibrate, find_defects
 from spikekit.sensor.calibration import DEAD, HOT
 from spikekit.sensor.pixel_rates import PixelRates
@@ -49,10 +49,8 @@ def run(args: argparse.Namespace) -> None:
     except ValueError as error:
         raise ValueError(f"{(args.flat or args.dark or args.file)}: {error}") from error
     known = found.calibration
-    try:
+    with writing(output):
         write_calibration(output, known.flip() if recording.flip else known)
-    except OSError as error:
-        raise ValueError(f"{output}: cannot be written ({one_line(error)})") from error
     works = known.defects == 0
     if found.gain_error is not None:
         print(f"gain         {known.gain[works].std():.2%} apart, each known to {found.gain_error:.2%}")
@@ -75,7 +73,7 @@ def _halves(recording: Recording) -> tuple[PixelRates, PixelRates]:
         raise ValueError(f"{recording.path}: expected at least {_LEAST_FRAMES} frames to count, got {frames}")
     chunk, half = max(1, min(_CHUNK // (height * width), 500)), frames // 2
     halves = []
-    with tqdm(desc=recording.path.name, total=frames, disable=None, leave=False) as bar:
+    with progress(what=recording.path.name, total=frames) as bar:
         for start, count in ((0, half), (half, frames - half)):
             reads = {"flip": recording.flip, "start": start, "frames": count, "chunk": chunk}
 

@@ -14,6 +14,7 @@ from typing import NoReturn
 
 from spikekit import __version__
 from spikekit.arguments import UsageError, one_line
+from spikekit.completion import OPTION, completion
 
 #: what every verb does, the module whose ``add_arguments`` and ``run`` it is, and an example
 VERBS = {
@@ -41,7 +42,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with suppress(SystemExit):  # --help
             words = sys.argv[1:] if argv is None else list(argv)
-            args = _parser(next(iter(words), "")).parse_args(words)
+            if words[:1] == [OPTION]:
+                print(completion(_parser(*VERBS), "".join(words[1:])), end="")
+                return 0
+            args = _parser(*words[:1]).parse_args(words)
             args.run(args)
         print(end="", flush=True)
     except (ValueError, MemoryError) as error:
@@ -68,10 +72,11 @@ class _Parser(argparse.ArgumentParser):
         raise UsageError(f"{message} (see {self.prog} --help)")
 
 
-def _parser(asked: str) -> argparse.ArgumentParser:
-    """Return a parser that knows the arguments of one verb: those of the others would take importing them."""
+def _parser(*asked: str) -> argparse.ArgumentParser:
+    """Return a parser that knows the arguments of some verbs: those of the others would take importing them."""
     parser = _Parser(prog="spikekit", description="Look into spike recordings and turn them into pictures.")
     parser.add_argument("--version", action="version", version=f"spikekit {__version__}")
+    parser.add_argument(OPTION, metavar="SHELL", help="print what lets bash or zsh complete with the tab key")
     verbs = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
     for name, (summary, home, example) in VERBS.items():
         verb = verbs.add_parser(
@@ -80,7 +85,7 @@ def _parser(asked: str) -> argparse.ArgumentParser:
             epilog=f"example:\n  spikekit {example}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        if name == asked:
+        if name in asked:
             module = import_module(f"spikekit.{home}")
             verb.description = inspect.getdoc(module.run)
             verb.set_defaults(run=module.run)

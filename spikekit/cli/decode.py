@@ -10,18 +10,19 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
-from spikekit.arguments import FRAMES, UsageError, frames_of, one_line, positive, whole
+from spikekit.arguments import FRAMES, UsageError, frames_of, positive, whole
 from spikekit.color.cfa import PATTERNS
 from spikekit.color.demosaic import demosaic
 from spikekit.decoders.methods import DECODERS, TFI_REACH
 from spikekit.io import recording as recordings
+from spikekit.io.failures import writing
 from spikekit.io.files import iter_spikes
 from spikekit.io.images import write_picture
 from spikekit.io.recording import Recording, open_recording, white_rate
 from spikekit.io.sidecar import check_unclaimed
 from spikekit.io.video import PICTURE_ENDINGS
+from spikekit.progress import progress
 
 #: Frames that TFP averages when nothing else is said.
 TFP_WINDOW = 41
@@ -61,8 +62,7 @@ def run(args: argparse.Namespace) -> None:
     alpha = args.alpha or recording.alpha
     white, scaling = _white(alpha, recording, key, reach)
     scaling += recording.said
-    hidden = True if len(chosen) == 1 else None  # None: on a terminal only
-    for n, plane in tqdm(_windows(recording, chosen, reach), "pictures", len(chosen), disable=hidden, leave=False):
+    for n, plane in progress(_windows(recording, chosen, reach), "pictures", len(chosen)):
         first, last = _span(n, reach, frames)
         raw = torch.from_numpy(decoder.planes(plane, n, range(first, last + 1), frames, **options))
         raw = recording.correct(raw) / white
@@ -196,7 +196,5 @@ def _windows(recording: Recording, chosen: range, reach: int) -> Iterator[tuple[
 
 def _write(path: Path, picture: Tensor) -> None:
     """Write a picture; what is wrong is said in one line."""
-    try:
+    with writing(path, wrong=Exception):  # what a picture library raises depends on the ending
         write_picture(path, picture)
-    except Exception as error:  # what a picture library raises depends on the ending
-        raise ValueError(f"{path}: cannot be written ({one_line(error)})") from error

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 from spikekit.arguments import UsageError, positive, whole
 from spikekit.cli.simulation import Settings, Source, is_own, simulate
 from spikekit.color.cfa import PATTERNS
+from spikekit.io.calibration import read_calibration
 from spikekit.io.sidecar import Sidecar, read_sidecar
 from spikekit.sensor.noise import SensorNoise
 
@@ -60,10 +61,13 @@ def _names(kind: Any) -> set[str]:
 
 
 def _settings(given: dict[str, Any]) -> Settings:
-    noise = {name: value for name, value in given.items() if name in _names(SensorNoise)}
+    noise = {name: value for name, value in given.items() if name in _NOISE}
+    calibration = given.get("calibration")
+    known = calibration and read_calibration(calibration)
     try:
         return Settings(
-            **{name: value for name, value in given.items() if name not in noise}, noise=SensorNoise(**noise)
+            **{name: value for name, value in given.items() if name not in noise},
+            noise=SensorNoise(**noise, calibration=known),
         )
     except UsageError:
         raise
@@ -85,9 +89,14 @@ def _settings_of(path: Path, sidecar: Sidecar, given: dict[str, Any]) -> Setting
             "--interpolation with the same text"
         )
     try:
-        return Settings(**sidecar.settings | {"noise": SensorNoise(**sidecar.settings["noise"])})
+        settings = Settings(**sidecar.settings | {"noise": SensorNoise(**sidecar.settings["noise"])})
     except (TypeError, ValueError, KeyError) as error:
         raise ValueError(f"{path}: not settings of a simulation ({error})") from error
+    if settings.calibration is None:
+        return settings
+    calibration = path.parent / settings.calibration
+    noise = replace(settings.noise, calibration=read_calibration(calibration))
+    return replace(settings, noise=noise, calibration=str(calibration))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -186,6 +195,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     noise = parser.add_argument_group("noise of the sensor, none if not given")
     for name, said in _NOISE.items():
         noise.add_argument(f"--{name.replace('_', '-')}", type=_number, default=default, metavar="X", help=said)
+    noise.add_argument(
+        "--calibration",
+        default=default,
+        metavar="FILE",
+        help="instead of dark current, spreads and shares, the pixels of a sensor that spikekit calibrate has "
+        "measured, their rows as the stream has them",
+    )
 
 
 def _number(text: str) -> float:

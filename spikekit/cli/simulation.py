@@ -14,15 +14,16 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from spikekit.arguments import UsageError, one_line
+from spikekit.io.failures import writing
 from spikekit.io.files import write_spikes
 from spikekit.io.formats import SpikeFileError, dat_bytes
 from spikekit.io.image_bytes import png_bytes
 from spikekit.io.sidecar import Sidecar, published, versions
 from spikekit.io.video import VideoFrames, read_video
 from spikekit.io.whole_file import whole_file
+from spikekit.progress import progress
 from spikekit.scenes.adaptive_sampling import Plan, SceneProfile
 from spikekit.scenes.frame_sequence import Film
 from spikekit.sensor.noise import SensorNoise
@@ -49,6 +50,7 @@ class Settings:
         step: displacement between latent frames, in sensor pixels.
         interpolation: what makes latent frames: a class by its path, with arguments or without.
         noise: what the sensor adds.
+        calibration: the file of the sensor that was measured, whose pixels ``noise`` has.
 
     Raises:
         UsageError: a plan that is unknown or has more latent frames than clocks.
@@ -67,6 +69,7 @@ class Settings:
     step: float = 0.5
     interpolation: str = "FlowInterpolation"
     noise: SensorNoise = field(default_factory=SensorNoise)
+    calibration: str | None = None
 
     def __post_init__(self) -> None:
         if not (self.plan in ("scene", "everything") or self.plan in range(self.clocks)):
@@ -238,6 +241,7 @@ def simulate(source: Source, settings: Settings, output: Path, replayed: Sidecar
         raise
     except ValueError as error:
         raise ValueError(f"{source.path}: {error}") from error
+    _check_calibration(settings, film, replayed)
     with _one_thread(), published(output) as part:
         prints = _look(source, film, pictures, part, output, replayed)
         noise, told = _needed_noise(source, settings, film)
@@ -258,17 +262,45 @@ def simulate(source: Source, settings: Settings, output: Path, replayed: Sidecar
         sidecar = Sidecar(
             stream=stream,
             truth={path.as_posix(): source.truth[index] / settings.readout for index, path in pictures.items()},
-            source={"path": _relative(source.path, output.parent), "frames": prints},
-            settings=asdict(replace(settings, frame=source.frame)),
+            source={"path": _relative(source.path, output.parent), "frames": prints} | _print_of(settings),
+            settings=asdict(replace(settings, frame=source.frame, noise=replace(settings.noise, calibration=None)))
+            | {"calibration": _calibration(settings, settings.noise, output)},
             plan={
-                "noise": asdict(noise),
+                "noise": asdict(replace(noise, calibration=None))
+                | {"calibration": _calibration(settings, noise, output)},
                 "intervals": [{"latent": plan.latent, "region": plan.region} for plan in plans],
             },
             versions=versions(),
         )
-        with _writing(output.with_suffix(".json")), whole_file(part / f"{stem}.json", "w", encoding="utf-8") as file:
+        with (
+            writing(output.with_suffix(".json"), wrong=Exception),
+            whole_file(part / f"{stem}.json", "w", encoding="utf-8") as file,
+        ):
             file.write(sidecar.dumps())
     return _report(source, settings, film, sidecar, bits, [*_plan_lines(plans, source), *told], output)
+
+
+def _check_calibration(settings: Settings, film: Film, replayed: Sidecar | None) -> None:
+    """Refuse the calibration of a sensor of another size, or one that has changed."""
+    known = settings.noise.calibration
+    sensor = film.height // settings.scale, film.width // settings.scale
+    if known is not None and known.size != sensor:
+        sizes = " x ".join(map(str, sensor)), " x ".join(map(str, known.size))
+        raise ValueError(f"{settings.calibration}: expected {sizes[0]} pixels as the film gives them, got {sizes[1]}")
+    if replayed is not None and replayed.source.get("calibration") != _print_of(settings).get("calibration"):
+        raise ValueError(f"{settings.calibration}: changed since the side-car was written")
+
+
+def _print_of(settings: Settings) -> dict[str, str]:
+    """Return the hash of the calibration, where there is one."""
+    if settings.calibration is None:
+        return {}
+    return {"calibration": hashlib.sha256(Path(settings.calibration).read_bytes()).hexdigest()}
+
+
+def _calibration(settings: Settings, noise: SensorNoise, output: Path) -> str | None:
+    """Return the way from the stream to the calibration, where noise has it."""
+    return None if noise.calibration is None else _relative(Path(settings.calibration), output.parent)
 
 
 def _look(
@@ -281,7 +313,7 @@ def _look(
         raise ValueError(f"{source.path}: not the frames of the side-car: expected {_few(expected)}, got {_few(names)}")
     prints = {}
     still = source.still
-    for index, name in enumerate(tqdm(names, "frames read", disable=None, leave=False)):
+    for index, name in enumerate(progress(names, "frames read")):
         frame = source.used[index]
         prints[name] = hashlib.sha256(frame.numpy().tobytes()).hexdigest()
         if expected is not None and expected[name] != prints[name]:
@@ -289,7 +321,7 @@ def _look(
             raise ValueError(f"{source.file(name)}: changed since the side-car was written{where}")
         index = next(iter(pictures)) if still else index
         if index in pictures:
-            with _writing(output.parent / pictures[index]), whole_file(part / pictures[index]) as file:
+            with writing(output.parent / pictures[index], wrong=Exception), whole_file(part / pictures[index]) as file:
                 file.write(png_bytes(frame[:, : film.height, : film.width]))
     return prints
 
@@ -336,7 +368,7 @@ def _expose(
 
     frames = source.clocks // settings.readout
     try:
-        with tqdm(desc=f"frames of {output.name}", total=frames, disable=None, leave=False) as bar:
+        with progress(what=f"frames of {output.name}", total=frames) as bar:
             write_spikes(part / output.name, passing())
     except SpikeFileError as error:
         raise ValueError(str(error).replace(str(part / output.name), str(output))) from error
@@ -365,11 +397,15 @@ def _report(
     stored, seen = (source.used.height, source.used.width), (film.height, film.width)
     where = f"{source.path}, {_few(source.used.names)}" if source.path.is_dir() else f"{source.path}"
     cropped = "" if stored == seen else f", the first {seen[0]} x {seen[1]} of them"
+    pixels = [f"pixels as {settings.calibration} has them"] if settings.calibration else []
     picture, frame = next(iter(sidecar.truth.items()))
     others = len(sidecar.truth) - 1
     report = {
         "source": [f"{where}: {stored[0]} x {stored[1]} (H x W){cropped}"],
-        "sensor": [f"{height} x {width}, {film.pattern}, a white pixel fires {settings.alpha:g} times a clock"],
+        "sensor": [
+            f"{height} x {width}, {film.pattern}, a white pixel fires {settings.alpha:g} times a clock",
+            *pixels,
+        ],
         "plan": plan,
         "stream": [f"{output}: {frames} frames, {bits / (frames * height * width):.2%} of the bits set"],
         "truth": [
@@ -391,15 +427,6 @@ def _relative(path: Path, folder: Path) -> str:
         return Path(os.path.relpath(os.path.realpath(path), os.path.realpath(folder))).as_posix()
     except ValueError:  # another drive
         return Path(os.path.realpath(path)).as_posix()
-
-
-@contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    """Turn whatever goes wrong with a file into one line that names it."""
-    try:
-        yield
-    except Exception as error:  # what a picture library raises depends on the ending
-        raise ValueError(f"{path}: cannot be written ({one_line(error)})") from error
 
 
 @contextmanager

@@ -5,30 +5,32 @@ from __future__ import annotations
 import argparse
 import base64
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from tqdm import tqdm
 
-from spikekit.arguments import UsageError, one_line, positive, whole
+from spikekit.arguments import UsageError, positive, whole
 from spikekit.cli.drawing import fit, histogram, raster, sheet
 from spikekit.color.cfa import PATTERNS
 from spikekit.color.demosaic import demosaic
 from spikekit.decoders.single_frame import search
 from spikekit.flow.fields import upsample_flow
 from spikekit.io import recording
-from spikekit.io.image_bytes import gif_bytes, png_bytes
+from spikekit.io.failures import writing
+from spikekit.io.image_bytes import gif_bytes, picture_bytes, png_bytes
 from spikekit.io.images import flow_to_rgb
 from spikekit.io.recording import Recording, open_recording, white_rate
 from spikekit.io.sidecar import check_unclaimed
 from spikekit.io.whole_file import whole_file
+from spikekit.progress import progress
 
 #: Frames on each side of the one in the middle that are looked at.
 REACH = 200
@@ -38,6 +40,8 @@ MOST = 60
 
 _SIDE = 480  # pixels of a picture, at most
 _WINDOW = 41
+_QUALITY = 85  # of the JPEGs of a page: a fifth of what PNG takes for pictures that are noisy by nature
+_FEW, _ENOUGH = 4, 8  # spikes of a pixel in a window: below the one there is a hint at a window of the other
 
 
 def run(args: argparse.Namespace) -> None:
@@ -58,19 +62,22 @@ def run(args: argparse.Namespace) -> None:
     if args.row is not None and args.row >= shown.size[0]:
         raise UsageError(f"--row: expected 0 .. {shown.size[0] - 1}, got {args.row}")
     moment = Moment(shown, begin, end, window, args.alpha or shown.alpha, args.row)
+    hint = "" if args.window else moment.hint
     if ending == ".png":
         data = png_bytes(sheet(moment.drawings()))
     else:
         if args.window is None:
             window = min(window, max(1, (end - begin) // 2))  # or nothing slides
         starts = [int(start) for start in np.linspace(begin, end - window, min(MOST, end - window - begin + 1))]
-        pictures = list(tqdm(moment.sliding(starts, window), "pictures", len(starts), disable=None, leave=False))
+        pictures = progress(moment.sliding(starts, window), "pictures", len(starts))
         if ending == ".gif":
-            data = gif_bytes(pictures, args.seconds / len(pictures))
+            data = gif_bytes(pictures, args.seconds / len(starts))
         else:
-            data = _page(moment, starts, window, pictures).encode()
+            data = _page(moment, starts, window, pictures, hint).encode()
     _write(args.output, data)
     print(f"{args.output}: frames {begin} .. {end - 1} of {shown.frames}, {moment.said}")
+    if hint:
+        print(hint)
 
 
 @dataclass(frozen=True)
@@ -130,6 +137,18 @@ class Moment:
         white = f"alpha {self.alpha:g} is white" if self.alpha else f"{self.white:.3g} spikes a frame are white"
         return white + self.recording.said
 
+    @property
+    def hint(self) -> str:
+        """A longer window, where a pixel hardly fires in this one; nothing where there is enough to see."""
+        share = self.rates.mean().item()
+        if not 0 < self.window * share < _FEW or self.window == self.end - self.begin:
+            return ""
+        longer = min(2 * math.ceil(_ENOUGH / (2 * share)) + 1, self.end - self.begin)
+        return (
+            f"{share:.1%} of the bits are set, {self.window * share:.1f} spikes of a pixel in {self.window} frames: "
+            f"--window {longer} shows less noise, and more blur where something moves"
+        )
+
     def picture(self, raw: Tensor) -> Tensor:
         """Return raw light as it is shown, (3, H, W) or (H, W)."""
         light, pattern = self.recording.correct(raw) / self.white, self.recording.pattern
@@ -148,11 +167,11 @@ class Moment:
     def sliding(self, starts: list[int], window: int) -> Iterator[Tensor]:
         """Pictures by TFP of the windows that begin at these frames."""
         for start in starts:
-            yield self.picture(self.recording.read(start, window).float().mean(0))
+            yield self.picture(self.recording.counts(start, window) / window)
 
     def raster(self) -> Tensor:
         """The spikes of one row of pixels, time to the right."""
-        spikes = np.stack([self._plane(n)[self.line] for n in self.near])
+        spikes = np.stack([self._plane(n)[self.line].copy() for n in self.near])  # a view would hold its frame
         return raster(torch.from_numpy(spikes), _SIDE, _SIDE)
 
     @property
@@ -210,16 +229,18 @@ class Moment:
 
 
 _STYLE = (
-    "body{font:15px system-ui,sans-serif;margin:2em auto;padding:0 2em;max-width:1500px;color:#222;background:#fff}"
-    "figure{display:inline-block;margin:0 1.5em 1.5em 0;vertical-align:top}figcaption{margin-bottom:.4em}"
+    "body{font:15px system-ui,sans-serif;margin:2em auto;padding:0 max(1em,2vw);max-width:1500px;color:#222;"
+    "background:#fff;overflow-wrap:anywhere}"
+    "figure{display:inline-block;margin:0 1.5em 1.5em 0;max-width:100%;vertical-align:top}"
+    "figcaption{margin-bottom:.4em}"
     "img{image-rendering:pixelated;max-width:100%;height:auto}img:not([hidden]){display:block}"
-    "input{width:100%}"
+    "figure div+div{display:flex;gap:.6em;margin-top:.4em}input{flex:1;min-width:0}"
 )
 
 
-def _page(moment: Moment, starts: list[int], window: int, pictures: list[Tensor]) -> str:
-    def image(picture: Tensor, more: str = "") -> str:
-        return f'<img {more}src="{_data(picture)}" alt="">'
+def _page(moment: Moment, starts: list[int], window: int, pictures: Iterable[Tensor], hint: str) -> str:
+    def image(picture: Tensor, more: str = "", **how: Any) -> str:
+        return f'<img {more}src="{_data(picture, **how)}" alt="">'
 
     name = escape(moment.recording.path.name)
     frames, (height, width) = moment.recording.frames, moment.recording.size
@@ -228,41 +249,60 @@ def _page(moment: Moment, starts: list[int], window: int, pictures: list[Tensor]
         for row in moment.drawings()
         for title, picture in row
     )
-    frames_of = "".join(image(picture, "hidden ") for picture in pictures)
+    # encoded one by one, as they come: a page holds no more than one of them as numbers
+    frames_of = "".join(image(picture, "hidden ", ending=".jpg", quality=_QUALITY) for picture in pictures)
+    windows = moment.end - moment.begin - window + 1
+    cut = f", {len(starts)} of {windows} windows" if len(starts) < windows else ""
+    cut += f", shrunk to at most {_SIDE} pixels" if max(height, width) > _SIDE else ""
     last = len(starts) - 1
     return f"""<!DOCTYPE html>
 <html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <title>{name}</title><style>{_STYLE}</style>
 <h1>{name}</h1>
-<p>{frames} frames of {height} x {width}, {escape(moment.said)}</p>
+<p>{frames} frames of {height} x {width}, {escape(moment.said)}{cut}</p>{f"<p>{hint}</p>" if hint else ""}
 <figure><figcaption>TFP, frames <output id="at"></output></figcaption><div id="film">{frames_of}</div>
-<input id="time" type="range" min="0" max="{last}" value="{last // 2}" aria-label="time"></figure>
+<div><button id="play" aria-label="play">&#9654;</button>
+<input id="time" type="range" min="0" max="{last}" value="{last // 2}" aria-label="time"></div></figure>
 {figures}
 <script type="module">
 const starts = {starts}, length = {window}, time = document.getElementById("time");
+const play = document.getElementById("play");
+let timer = 0;
 function show() {{
   const n = +time.value;
   [...document.getElementById("film").children].forEach((picture, k) => picture.hidden = k !== n);
   document.getElementById("at").value = starts[n] + " .. " + (starts[n] + length - 1);
 }}
-time.oninput = show;
+function stop() {{
+  clearInterval(timer);
+  timer = 0;
+  play.textContent = "\u25b6";
+}}
+function next() {{
+  time.value = (+time.value + 1) % starts.length;
+  show();
+}}
+play.onclick = () => {{
+  if (timer) return stop();
+  timer = setInterval(next, 100);
+  play.textContent = "\u23f8";
+}};
+time.oninput = () => {{ stop(); show(); }};
 show();
 </script>
 </html>
 """
 
 
-def _data(picture: Tensor) -> str:
-    return "data:image/png;base64," + base64.b64encode(png_bytes(picture)).decode()
+def _data(picture: Tensor, ending: str = ".png", **how: Any) -> str:
+    kind = {".png": "png", ".jpg": "jpeg"}[ending]
+    return f"data:image/{kind};base64," + base64.b64encode(picture_bytes(picture, ending, **how)).decode()
 
 
 def _write(path: Path, data: bytes) -> None:
     """Write a file; what is wrong is said in one line."""
-    try:
-        with whole_file(path) as file:
-            file.write(data)
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be written ({one_line(error)})") from error
+    with writing(path), whole_file(path) as file:
+        file.write(data)
 
 
 def _span(text: str | None, recording: Recording) -> tuple[int, int]:

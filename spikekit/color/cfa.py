@@ -62,6 +62,17 @@ def bayer_sites(pattern: str | CFA) -> tuple[tuple[int, int, int], ...]:
     return tuple(sorted(sites, key=lambda site: site[0]))
 
 
+class PatternModule(nn.Module):
+    """Base of the modules whose only option is the Bayer phase, see :func:`bayer_pattern`."""
+
+    def __init__(self, pattern: str | CFA = "RGGB") -> None:
+        super().__init__()
+        self.pattern = bayer_pattern(pattern)
+
+    def extra_repr(self) -> str:  # noqa: D102
+        return f"pattern={self.pattern!r}"
+
+
 def bayer_mask(
     height: int,
     width: int,
@@ -133,9 +144,8 @@ class BayerMask(nn.Module):
 
     def __init__(self, pattern: str | CFA = "RGGB", *, scale: int = 1) -> None:
         super().__init__()
-        scale = check_whole("scale", scale)
+        self.scale = check_whole("scale", scale)
         self.pattern = bayer_pattern(pattern)
-        self.scale = scale
 
     def forward(self, raw: Tensor) -> Tensor:  # noqa: D102
         check_planes("raw", raw, 2, "(*, H, W)")
@@ -177,7 +187,7 @@ def mosaic(rgb: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
     return bin_to_sensor(rgb, pattern, scale=1)
 
 
-class Mosaic(nn.Module):
+class Mosaic(PatternModule):
     r"""See the Convention block on :func:`mosaic`.
 
     Shape:
@@ -189,15 +199,8 @@ class Mosaic(nn.Module):
         torch.Size([2, 4, 4])
     """
 
-    def __init__(self, pattern: str | CFA = "RGGB") -> None:
-        super().__init__()
-        self.pattern = bayer_pattern(pattern)
-
     def forward(self, rgb: Tensor) -> Tensor:  # noqa: D102
         return mosaic(rgb, self.pattern)
-
-    def extra_repr(self) -> str:  # noqa: D102
-        return f"pattern={self.pattern!r}"
 
 
 def bin_to_sensor(rgb: Tensor, pattern: str | CFA = "RGGB", *, scale: int) -> Tensor:
@@ -265,9 +268,8 @@ class BinToSensor(nn.Module):
 
     def __init__(self, pattern: str | CFA = "RGGB", *, scale: int) -> None:
         super().__init__()
-        scale = check_whole("scale", scale)
+        self.scale = check_whole("scale", scale)
         self.pattern = bayer_pattern(pattern)
-        self.scale = scale
 
     def forward(self, rgb: Tensor) -> Tensor:  # noqa: D102
         return bin_to_sensor(rgb, self.pattern, scale=self.scale)
@@ -312,7 +314,7 @@ def split_colors(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
     return colors
 
 
-class SplitColors(nn.Module):
+class SplitColors(PatternModule):
     r"""See the Convention block on :func:`split_colors`.
 
     Shape:
@@ -324,15 +326,8 @@ class SplitColors(nn.Module):
         torch.Size([3, 2, 41, 8, 6])
     """
 
-    def __init__(self, pattern: str | CFA = "RGGB") -> None:
-        super().__init__()
-        self.pattern = bayer_pattern(pattern)
-
     def forward(self, raw: Tensor) -> Tensor:  # noqa: D102
         return split_colors(raw, self.pattern)
-
-    def extra_repr(self) -> str:  # noqa: D102
-        return f"pattern={self.pattern!r}"
 
 
 def split_bayer(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
@@ -371,7 +366,7 @@ def split_bayer(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
     return torch.stack([raw[..., row::2, column::2] for _, row, column in bayer_sites(pattern)])
 
 
-class SplitBayer(nn.Module):
+class SplitBayer(PatternModule):
     r"""See the Convention block on :func:`split_bayer`.
 
     Shape:
@@ -383,15 +378,8 @@ class SplitBayer(nn.Module):
         torch.Size([4, 2, 41, 4, 3])
     """
 
-    def __init__(self, pattern: str | CFA = "RGGB") -> None:
-        super().__init__()
-        self.pattern = bayer_pattern(pattern)
-
     def forward(self, raw: Tensor) -> Tensor:  # noqa: D102
         return split_bayer(raw, self.pattern)
-
-    def extra_repr(self) -> str:  # noqa: D102
-        return f"pattern={self.pattern!r}"
 
 
 def merge_bayer(planes: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
@@ -429,7 +417,7 @@ def merge_bayer(planes: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
     return torch.stack(rows, dim=-2).flatten(-3, -2)
 
 
-class MergeBayer(nn.Module):
+class MergeBayer(PatternModule):
     r"""See the Convention block on :func:`merge_bayer`.
 
     Shape:
@@ -441,12 +429,5 @@ class MergeBayer(nn.Module):
         torch.Size([41, 8, 6])
     """
 
-    def __init__(self, pattern: str | CFA = "RGGB") -> None:
-        super().__init__()
-        self.pattern = bayer_pattern(pattern)
-
     def forward(self, planes: Tensor) -> Tensor:  # noqa: D102
         return merge_bayer(planes, self.pattern)
-
-    def extra_repr(self) -> str:  # noqa: D102
-        return f"pattern={self.pattern!r}"

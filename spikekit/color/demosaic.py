@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 from kornia.color import CFA
-from torch import Tensor, nn
+from torch import Tensor
 
 from spikekit.check import check_planes
-from spikekit.color.cfa import bayer_mask, bayer_pattern, bayer_sites
+from spikekit.color.cfa import PatternModule, bayer_mask, bayer_sites
 
 # Malvar, He and Cutler (2004), Fig. 2, in eighths: the estimate at the centre.
 _GREEN = [[0, 0, -1, 0, 0], [0, 0, 2, 0, 0], [-1, 2, 4, 2, -1], [0, 0, 2, 0, 0], [0, 0, -1, 0, 0]]
@@ -87,7 +87,7 @@ def wide_mosaics(raw: Tensor) -> Tensor:
     return raw.reshape(-1, *raw.shape[-2:]).to(torch.promote_types(raw.dtype, torch.float32))
 
 
-class Demosaic(nn.Module):
+class Demosaic(PatternModule):
     r"""See the Convention block on :func:`demosaic`.
 
     Shape:
@@ -99,12 +99,5 @@ class Demosaic(nn.Module):
         torch.Size([2, 11, 3, 8, 8])
     """
 
-    def __init__(self, pattern: str | CFA = "RGGB") -> None:
-        super().__init__()
-        self.pattern = bayer_pattern(pattern)
-
     def forward(self, raw: Tensor) -> Tensor:  # noqa: D102
         return demosaic(raw, self.pattern)
-
-    def extra_repr(self) -> str:  # noqa: D102
-        return f"pattern={self.pattern!r}"

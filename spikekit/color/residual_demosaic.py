@@ -8,9 +8,9 @@ from collections.abc import Callable
 import torch
 import torch.nn.functional as F
 from kornia.color import CFA
-from torch import Tensor, nn
+from torch import Tensor
 
-from spikekit.color.cfa import bayer_mask, bayer_pattern
+from spikekit.color.cfa import PatternModule, bayer_mask
 from spikekit.color.demosaic import wide_mosaics
 
 _RADIUS = 5  # of the guided filter's windows
@@ -67,7 +67,7 @@ def demosaic_residual(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
     return rgb.to(raw.dtype).reshape(*raw.shape[:-2], 3, height, width)
 
 
-class DemosaicResidual(nn.Module):
+class DemosaicResidual(PatternModule):
     r"""See the Convention block on :func:`demosaic_residual`.
 
     Shape:
@@ -79,15 +79,8 @@ class DemosaicResidual(nn.Module):
         torch.Size([2, 11, 3, 8, 8])
     """
 
-    def __init__(self, pattern: str | CFA = "RGGB") -> None:
-        super().__init__()
-        self.pattern = bayer_pattern(pattern)
-
     def forward(self, raw: Tensor) -> Tensor:  # noqa: D102
         return demosaic_residual(raw, self.pattern)
-
-    def extra_repr(self) -> str:  # noqa: D102
-        return f"pattern={self.pattern!r}"
 
 
 def interpolate_green(known: Tensor, green: Tensor) -> Tensor:

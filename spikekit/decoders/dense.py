@@ -8,11 +8,11 @@ import torch
 from torch import Tensor, nn
 
 from spikekit.check import check_dtype, check_planes, check_positive, check_whole, default_float
-from spikekit.kernels import batch_first, register
+from spikekit.kernels import operator
 
 
 # The loops over time are custom operators: torch.compile would unroll them.
-@torch.library.custom_op("spikekit::spike_interval", mutates_args=())
+@operator(lambda spikes: torch.empty_like(spikes, dtype=interval_dtype(spikes.shape[-3])))
 def _spike_interval(spikes: Tensor) -> Tensor:
     fired, frames = spikes != 0, spikes.shape[-3]
     interval = torch.empty_like(fired, dtype=interval_dtype(frames))
@@ -38,17 +38,12 @@ def _spike_interval(spikes: Tensor) -> Tensor:
     return interval
 
 
-@_spike_interval.register_fake
-def _(spikes: Tensor) -> Tensor:
-    return torch.empty_like(spikes, dtype=interval_dtype(spikes.shape[-3]))
-
-
 def interval_dtype(frames: int) -> torch.dtype:
     """Return the smallest type that holds every interval of a clip."""
     return torch.int16 if frames < 32767 else torch.int32
 
 
-@torch.library.custom_op("spikekit::tfi", mutates_args=())
+@operator(lambda spikes, max_range, dtype: torch.empty_like(spikes, dtype=dtype))
 def _tfi(spikes: Tensor, max_range: float, dtype: torch.dtype) -> Tensor:
     wide = torch.promote_types(dtype, torch.float32)
     interval = torch.ops.spikekit.spike_interval(spikes)
@@ -56,17 +51,12 @@ def _tfi(spikes: Tensor, max_range: float, dtype: torch.dtype) -> Tensor:
     return cast_light(torch.full_like(interval, max_range, dtype=wide) / interval, dtype)
 
 
-@_tfi.register_fake
-def _(spikes: Tensor, max_range: float, dtype: torch.dtype) -> Tensor:
-    return torch.empty_like(spikes, dtype=dtype)
-
-
 def cast_light(value: Tensor, dtype: torch.dtype) -> Tensor:
     """Cast; to uint8 by rounding to the nearest whole number, and cutting what is beyond."""
     return value.round().clamp(0, 255).to(dtype) if dtype is torch.uint8 else value.to(dtype)
 
 
-@torch.library.custom_op("spikekit::tfi_grad", mutates_args=())
+@operator(lambda grad, spikes, rate: torch.empty_like(spikes))
 def _tfi_grad(grad: Tensor, spikes: Tensor, rate: Tensor) -> Tensor:
     """Sum the gradient over (last spike before n, first spike at or after n], spread it there, weigh it by the rate."""
     result = torch.empty_like(spikes)
@@ -82,11 +72,6 @@ def _tfi_grad(grad: Tensor, spikes: Tensor, rate: Tensor) -> Tensor:
         spread = torch.where(fired_n, running, spread)
         result_n.copy_(spread * rate_n)
     return result
-
-
-@_tfi_grad.register_fake
-def _(grad: Tensor, spikes: Tensor, rate: Tensor) -> Tensor:
-    return torch.empty_like(spikes)
 
 
 class _Tfi(torch.autograd.Function):
@@ -123,29 +108,19 @@ class _SumOnIntervals(torch.autograd.Function):
         return _SumOnIntervals.apply(grad, *ctx.saved_tensors), None, None
 
 
-@torch.library.custom_op("spikekit::tfp", mutates_args=())
+@operator(lambda spikes, window, max_range, dtype: torch.empty_like(spikes, dtype=dtype))
 def _tfp(spikes: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Tensor:
     wide = torch.promote_types(torch.promote_types(dtype, torch.float32), spikes.dtype)
     total = _inside(spikes, window, wide if spikes.is_floating_point() else torch.int32)
     return cast_light(total.to(wide) * max_range / _window_sizes(spikes, window), dtype)
 
 
-@_tfp.register_fake
-def _(spikes: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Tensor:
-    return torch.empty_like(spikes, dtype=dtype)
-
-
-@torch.library.custom_op("spikekit::tfp_grad", mutates_args=())
+@operator(lambda grad, window, max_range, dtype: torch.empty_like(grad, dtype=dtype))
 def _tfp_grad(grad: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Tensor:
     """The adjoint of TFP: every frame shares its gradient among the frames of its window."""
     wide = torch.promote_types(torch.promote_types(dtype, torch.float32), grad.dtype)
     share = grad.to(wide) * max_range / _window_sizes(grad, window)
     return _inside(share, window, wide).to(dtype)
-
-
-@_tfp_grad.register_fake
-def _(grad: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Tensor:
-    return torch.empty_like(grad, dtype=dtype)
 
 
 def _ends(values: Tensor, window: int) -> tuple[Tensor, Tensor]:
@@ -183,17 +158,6 @@ class _Tfp(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None]:
         return _Tfp.apply(grad, *ctx.options, ctx.dtype, not ctx.adjoint), None, None, None, None
-
-
-for _name, _op in {
-    "spike_interval": _spike_interval,
-    "tfi": _tfi,
-    "tfi_grad": _tfi_grad,
-    "tfp": _tfp,
-    "tfp_grad": _tfp_grad,
-}.items():
-    register(_op, _name)
-    batch_first(_op)
 
 
 def spike_interval(spikes: Tensor) -> Tensor:

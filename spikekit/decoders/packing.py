@@ -8,12 +8,12 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from spikekit.check import check_planes, check_whole
-from spikekit.kernels import batch_first
+from spikekit.kernels import operator
 
 _NOT_BITS = "spikes: expected zeros and ones, got other values"
 
 
-@torch.library.custom_op("spikekit::pack_bits", mutates_args=())
+@operator(lambda spikes: spikes.new_empty((*spikes.shape[:-1], (spikes.shape[-1] + 7) // 8), dtype=torch.uint8))
 def _pack_bits(spikes: Tensor) -> Tensor:
     bits = spikes != 0
     if not torch.equal(bits.to(spikes.dtype), spikes):
@@ -31,12 +31,7 @@ def _(spikes: Tensor) -> Tensor:
     return torch.from_numpy(np.packbits(bits, axis=-1, bitorder="little"))
 
 
-@_pack_bits.register_fake
-def _(spikes: Tensor) -> Tensor:
-    return spikes.new_empty((*spikes.shape[:-1], (spikes.shape[-1] + 7) // 8), dtype=torch.uint8)
-
-
-@torch.library.custom_op("spikekit::unpack_bits", mutates_args=())
+@operator(lambda packed, width: packed.new_empty((*packed.shape[:-1], width)))
 def _unpack_bits(packed: Tensor, width: int) -> Tensor:
     places = torch.arange(8, dtype=torch.uint8, device=packed.device)
     return ((packed[..., None] >> places) & 1).flatten(-2)[..., :width].contiguous()
@@ -45,15 +40,6 @@ def _unpack_bits(packed: Tensor, width: int) -> Tensor:
 @_unpack_bits.register_kernel("cpu")
 def _(packed: Tensor, width: int) -> Tensor:
     return torch.from_numpy(np.unpackbits(packed.numpy(), axis=-1, count=width, bitorder="little"))
-
-
-@_unpack_bits.register_fake
-def _(packed: Tensor, width: int) -> Tensor:
-    return packed.new_empty((*packed.shape[:-1], width))
-
-
-batch_first(_pack_bits)
-batch_first(_unpack_bits)
 
 
 def pack_spikes(spikes: Tensor) -> Tensor:

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from spikekit.check import check_dtype, check_index, check_planes, check_positive, check_whole, default_float
 from spikekit.decoders.dense import cast_light, check_window, interval_dtype
-from spikekit.kernels import batch_first
+from spikekit.kernels import operator
 
 
-@torch.library.custom_op("spikekit::spike_interval_at", mutates_args=())
+@operator(lambda spikes, frame: spikes.new_empty(spikes[..., 0, :, :].shape, dtype=interval_dtype(spikes.shape[-3])))
 def _spike_interval_at(spikes: Tensor, frame: int) -> Tensor:
     fired = spikes != 0
     after, gap_after = _look(fired[..., frame:, :, :])
@@ -42,15 +42,6 @@ def _(spikes: Tensor, frame: int) -> Tensor:
     if spikes.dtype in (torch.uint8, torch.bool):
         return torch.from_numpy(search(planes.view(torch.uint8).numpy().__getitem__, frame, range(frames)))
     return torch.from_numpy(search(lambda n: (planes[n] != 0).view(torch.uint8).numpy(), frame, range(frames)))
-
-
-@_spike_interval_at.register_fake
-def _(spikes: Tensor, frame: int) -> Tensor:
-    size = spikes.shape[:-3] + spikes.shape[-2:]
-    return spikes.new_empty(size, dtype=interval_dtype(spikes.shape[-3]))
-
-
-batch_first(_spike_interval_at)
 
 
 def search(plane: Callable[[int], np.ndarray], frame: int, clip: range) -> np.ndarray:

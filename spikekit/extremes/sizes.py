@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from spikekit.examples import EXAMPLES, Example
-from spikekit.extremes.table import Cases, Measured, differ, state, ulps, worst
+from spikekit.extremes.table import Cases, Measured, On, differ, measured, ulps, worst
 
 CASES = Cases()
 
@@ -24,40 +24,35 @@ def _run(operator: Example, tensors: tuple[Tensor, ...], device: torch.device) -
     # a view of a leaf, so that the operator sees the strides of the input
     leaves = [tensor.to(device).requires_grad_() for tensor in tensors]
     results = operator.results(*leaves)
-    tracked = [result for result in results if result.requires_grad]
-    if not tracked:
+    total = sum(result.sum() for result in results if result.requires_grad)
+    if not isinstance(total, Tensor):
         return list(results), []
-    total = sum((result.sum() for result in tracked), torch.zeros((), device=device))
     return [result.detach() for result in results], list(torch.autograd.grad(total, leaves))
 
 
-def _measured(error: float, results: list[Tensor], grads: list[Tensor]) -> Measured:
-    return Measured(error, state(*results), state(*grads) if grads else "-")
-
-
-def _empty_batch(operator: Example, dtype: torch.dtype, device: torch.device) -> Measured:
-    one = [tensor.to(dtype) for tensor in operator.tensors((1,))]
+def _empty_batch(operator: Example, on: On) -> Measured:
+    one = [tensor.to(on.dtype) for tensor in operator.tensors((1,))]
     none = tuple(tensor.narrow(operator.axis_in, 0, 0) for tensor in one)
-    expected, _ = _run(operator, tuple(one), device)
-    results, grads = _run(operator, none, device)
+    expected, _ = _run(operator, tuple(one), on.device)
+    results, grads = _run(operator, none, on.device)
     error = sum(
         differ(result, like.narrow(operator.axis_out, 0, 0)) for result, like in zip(results, expected, strict=True)
     )
     error += sum(differ(grad, tensor) for grad, tensor in zip(grads, none, strict=False))
-    return _measured(error, results, grads)
+    return measured(error, results, grads)
 
 
-def _leading(operator: Example, dtype: torch.dtype, device: torch.device) -> Measured:
+def _leading(operator: Example, on: On) -> Measured:
     """(2, 1, 3, ...) is six times the same as one."""
-    tensors = [tensor.to(dtype) for tensor in operator.tensors((2, 1, 3))]
-    results, grads = _run(operator, tuple(tensors), device)
+    tensors = [tensor.to(on.dtype) for tensor in operator.tensors((2, 1, 3))]
+    results, grads = _run(operator, tuple(tensors), on.device)
     error, into, out = 0.0, operator.axis_in, operator.axis_out
     for i in range(2):
         for j in range(3):
-            alone, alone_grads = _run(operator, tuple(_item(tensor, into, i, j) for tensor in tensors), device)
+            alone, alone_grads = _run(operator, tuple(_item(tensor, into, i, j) for tensor in tensors), on.device)
             error += sum(differ(_item(all_, out, i, j), one) for all_, one in zip(results, alone, strict=True))
             error += sum(differ(_item(all_, into, i, j), one) for all_, one in zip(grads, alone_grads, strict=True))
-    return _measured(error, results, grads)
+    return measured(error, results, grads)
 
 
 def _item(tensor: Tensor, axis: int, i: int, j: int) -> Tensor:
@@ -72,28 +67,28 @@ def _same(operator: Example, views: list[Tensor], device: torch.device) -> Measu
         ulps(got, like.cpu(), like.cpu().abs().max().double().expand(like.shape))
         for got, like in zip([*results, *grads], [*expected, *expected_grads], strict=True)
     ]
-    return _measured(worst(*errors), results, grads)
+    return measured(worst(*errors), results, grads)
 
 
-def _strided(operator: Example, dtype: torch.dtype, device: torch.device) -> Measured:
-    wide = [tensor.to(dtype) for tensor in operator.tensors((2,), (12, 8))]
+def _strided(operator: Example, on: On) -> Measured:
+    wide = [tensor.to(on.dtype) for tensor in operator.tensors((2,), (12, 8))]
     views = [tensor.mT[..., ::2, ::2].flip(operator.axis_in) for tensor in wide]
     reversed_ = [view.movedim(operator.axis_in, -1).contiguous().movedim(-1, operator.axis_in) for view in views]
-    return _same(operator, reversed_, device)
+    return _same(operator, reversed_, on.device)
 
 
-def _expanded(operator: Example, dtype: torch.dtype, device: torch.device) -> Measured:
-    one = [tensor.to(dtype) for tensor in operator.tensors((1,))]
+def _expanded(operator: Example, on: On) -> Measured:
+    one = [tensor.to(on.dtype) for tensor in operator.tensors((1,))]
     shapes = [[*tensor.shape] for tensor in one]
     for shape in shapes:
         shape[operator.axis_in] = 3
-    return _same(operator, [tensor.expand(shape) for tensor, shape in zip(one, shapes, strict=True)], device)
+    return _same(operator, [tensor.expand(shape) for tensor, shape in zip(one, shapes, strict=True)], on.device)
 
 
-def _channels_last(operator: Example, dtype: torch.dtype, device: torch.device) -> Measured:
-    tensors = [tensor.to(dtype) for tensor in operator.tensors((2,))]
+def _channels_last(operator: Example, on: On) -> Measured:
+    tensors = [tensor.to(on.dtype) for tensor in operator.tensors((2,))]
     last = [tensor.movedim(-3, -1).contiguous().movedim(-1, -3) for tensor in tensors]
-    return _same(operator, last, device)
+    return _same(operator, last, on.device)
 
 
 _EXACT: dict[str, Any] = {"bound": "0: bit for bit"}
@@ -135,32 +130,27 @@ result = call(stream)
 print((torch.cuda.max_memory_allocated() - before - result.nbytes) / result.numel())
 """
 _BITS = "(torch.arange(1000000).reshape(1000, 1000) % 3 == 0).to(torch.uint8).expand(400, 1000, 1000)"
+_LIGHT = "torch.linspace(0, 1, 1000000).reshape(1000, 1000).expand(400, 1000, 1000)"
 
 
-def _memory(call: str, stream: str, dtype: torch.dtype, device: torch.device) -> Measured:
+def _memory(call: str, stream: str, on: On) -> Measured:
     """Bytes a pixel that an operator takes beside its input and its result, in a process of its own."""
-    code = _PEAK_ON_CUDA if device.type == "cuda" else _PEAK
-    code = code.format(call=call, stream=stream, dtype=dtype)
+    code = _PEAK_ON_CUDA if on.device.type == "cuda" else _PEAK
+    code = code.format(call=call, stream=stream, dtype=on.dtype)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(done.stderr.strip().splitlines()[-1] if done.stderr else f"exit status {done.returncode}")
-    return Measured(max(float(done.stdout), 0.0), "finite")
+    return Measured(max(float(done.stdout), 0.0))
 
 
-_STREAM: dict[str, Any] = {"limit": 1.0, "bound": "1 byte a pixel beside input and result", "gradients": "-"}
+_BESIDE = "1 byte a pixel beside input and result"
+_STREAM: dict[str, Any] = {"limit": 1.0, "bound": _BESIDE, "gradients": "-", "slow": True}
 if Path("/proc/self/status").exists():
     for _name, _call in {
         "spike_interval": "sk.spike_interval(stream)",
         "tfi": "sk.tfi(stream, 255.0, dtype=torch.uint8)",
         "tfp": "sk.tfp(stream, 41, 255.0, dtype=torch.uint8)",
     }.items():
-        CASES.add(_name, "1000 x 1000 x 400 stream", (torch.uint8,), slow=True, **_STREAM)(
-            partial(_memory, _call, _BITS)
-        )
-    CASES.add("spike_integrate_fire", "1000 x 1000 x 400 stream", _FLOAT32, slow=True, **_STREAM)(
-        partial(
-            _memory,
-            "sk.spike_integrate_fire(stream, dtype=torch.uint8)[0]",
-            "torch.linspace(0, 1, 1000000).reshape(1000, 1000).expand(400, 1000, 1000)",
-        )
-    )
+        CASES.add(_name, "1000 x 1000 x 400 stream", (torch.uint8,), **_STREAM)(partial(_memory, _call, _BITS))
+    _call = "sk.spike_integrate_fire(stream, dtype=torch.uint8)[0]"
+    CASES.add("spike_integrate_fire", "1000 x 1000 x 400 stream", _FLOAT32, **_STREAM)(partial(_memory, _call, _LIGHT))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -26,11 +26,26 @@ class Measured(NamedTuple):
     """
 
     error: float
-    values: str
+    values: str = "finite"
     gradients: str = "-"
 
 
-Measure = Callable[[torch.dtype, torch.device], Measured]
+class On(NamedTuple):
+    """What a case is measured on: tensors of a dtype, on a device."""
+
+    dtype: torch.dtype
+    device: torch.device
+
+
+Measure = Callable[[On], Measured | Iterable[Measured]]
+Tensors = Tensor | Sequence[Tensor]
+_WORSE = ("-", "finite", "Inf", "NaN")
+
+
+def measured(error: float, values: Tensors = (), gradients: Tensors = ()) -> Measured:
+    """Return an error and the states of the tensors that it was found in; without gradients there are none."""
+    values, gradients = ([some] if isinstance(some, Tensor) else some for some in (values, gradients))
+    return Measured(error, state(*values), state(*gradients) if len(gradients) else "-")
 
 
 @dataclass(frozen=True)
@@ -58,7 +73,7 @@ class Case:
         operator: name of the public function.
         extreme: what is extreme about it, in words.
         dtypes: in which types it is measured.
-        measure: runs it in one dtype on one device.
+        measure: runs it in one dtype on one device; of several results, the worst of each counts.
         limit: the error that is allowed, or a function of the dtype that gives it.
         bound: the same in words, with its unit and where it comes from.
         values: which outcome of the values is right.
@@ -82,7 +97,10 @@ class Case:
         limit = self.limit(dtype) if callable(self.limit) else self.limit
         trouble = ""
         try:
-            measured = self.measure(dtype, device)
+            measured = self.measure(On(dtype, device))
+            if not isinstance(measured, Measured):
+                errors, *states = zip(*measured, strict=True)
+                measured = Measured(worst(*errors), *(max(each, key=_WORSE.index) for each in states))
         except Exception as error:
             measured = Measured(float("nan"), type(error).__name__)
             trouble = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
@@ -109,7 +127,7 @@ class Cases(list[Case]):
         gradients: str = "finite",
         slow: bool = False,
     ) -> Callable[[Measure], Measure]:
-        """Add the decorated ``measure(dtype, device)``, see :class:`Case`."""
+        """Add the decorated ``measure(on)``, see :class:`Case`."""
 
         def add(measure: Measure) -> Measure:
             self.append(Case(operator, extreme, tuple(dtypes), measure, limit, bound, values, gradients, slow))

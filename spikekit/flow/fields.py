@@ -254,15 +254,8 @@ class LinearMotion(nn.Module):
         self.scale = scale
 
     def forward(self, flow_to_first: Tensor, flow_to_last: Tensor) -> Tensor:  # noqa: D102
-        return linear_motion(
-            flow_to_first,
-            flow_to_last,
-            self.times,
-            first=self.first,
-            middle=self.middle,
-            last=self.last,
-            scale=self.scale,
-        )
+        options = {name: getattr(self, name) for name in ("first", "middle", "last", "scale")}
+        return linear_motion(flow_to_first, flow_to_last, self.times, **options)
 
     def extra_repr(self) -> str:  # noqa: D102
         return f"times={self.times}, first={self.first}, middle={self.middle}, last={self.last}, scale={self.scale}"

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from spikekit.check import check_planes, check_whole
+from spikekit.check import check_picture, check_planes, check_whole
 from spikekit.flow.fields import upsample_flow
 
 # Pixels around a pixel that are compared with it.
@@ -48,10 +48,8 @@ class Between:
     cut: bool = False
 
     def __init__(self, first: Tensor, second: Tensor) -> None:
-        check_planes("first", first, 3, "(3, H, W)", floating=True)
+        check_picture("first", first)
         check_planes("second", second, 3, "(3, H, W)", floating=True)
-        if first.ndim != 3 or first.shape[0] != 3:
-            raise ValueError(f"first: expected (3, H, W), got {tuple(first.shape)}")
         if second.shape != first.shape or second.dtype != first.dtype:
             expected, got = ((tuple(frame.shape), frame.dtype) for frame in (first, second))
             raise ValueError(f"second: expected {expected[0]}, {expected[1]}, got {got[0]}, {got[1]}")

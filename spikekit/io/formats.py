@@ -6,13 +6,14 @@ import math
 import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import IO, NamedTuple
 
 import numpy as np
 
-from spikekit.arguments import one_line
+from spikekit.io import failures
 from spikekit.io.quiet import quiet
 
 # What the field calls the array of a recording; without either name, the only 3-D array is taken.
@@ -27,6 +28,10 @@ _HELD, _PIECE = 1 << 26, 1 << 22
 
 class SpikeFileError(ValueError):
     """A recording that cannot be read or written; the message is one line and names the file."""
+
+
+reading = partial(failures.reading, kind=SpikeFileError, otherwise="damaged ({})")
+writing = partial(failures.writing, kind=SpikeFileError)
 
 
 class Wanted(NamedTuple):
@@ -53,30 +58,6 @@ class Wanted(NamedTuple):
             upright = plane[::-1] if self.flip else plane
             place[:] = np.packbits(upright, axis=-1, bitorder="little") if self.packed else upright
         return block
-
-
-@contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """Turn whatever goes wrong with the bytes of a file into one line."""
-    try:
-        yield
-    except SpikeFileError:
-        raise
-    except MemoryError as error:
-        raise SpikeFileError(f"{path}: takes more memory than there is") from error
-    except OSError as error:
-        raise SpikeFileError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except Exception as error:
-        raise SpikeFileError(f"{path}: damaged ({one_line(error)[:300]})") from error
-
-
-@contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Turn what the system says of a file that it cannot write into one line."""
-    try:
-        yield
-    except OSError as error:
-        raise SpikeFileError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
 def binary(frames: np.ndarray, name: str, first: int, error: type[ValueError]) -> np.ndarray:

@@ -15,7 +15,7 @@ from kornia_rs.io import read_image_png_u16
 from torch import Tensor
 
 from spikekit.arguments import one_line
-from spikekit.check import check_planes, check_positive
+from spikekit.check import check_picture, check_planes, check_positive
 from spikekit.io.image_bytes import PictureError, picture_bytes
 from spikekit.io.quiet import quiet
 from spikekit.io.whole_file import whole_file
@@ -132,9 +132,7 @@ def write_picture(path: str | Path, image: Tensor) -> None:
         ...     read_picture(f"{folder}/new/red.png").flatten().tolist()
         [1.0, 0.0, 0.0]
     """
-    check_planes("image", image, 2, "(3, H, W) or (H, W)", floating=True)
-    if image.ndim > 3 or (image.ndim == 3 and image.shape[0] != 3):
-        raise ValueError(f"image: expected (3, H, W) or (H, W), got {tuple(image.shape)}")
+    check_picture("image", image, "(3, H, W) or (H, W)", grey=True)
     data = picture_bytes(image, Path(path).suffix)
     with whole_file(path) as file:
         file.write(data)

@@ -18,6 +18,7 @@ from spikekit.io.cameras import CAMERAS, Camera, camera
 from spikekit.io.files import iter_spikes, read_spikes, spikes_shape
 from spikekit.io.formats import SpikeFileError
 from spikekit.io.sidecar import find_sidecar
+from spikekit.progress import progress
 from spikekit.sensor.calibration import Calibration
 
 #: (height, width) of what the field's headerless recordings come from.
@@ -104,8 +105,10 @@ class Recording:
         counts = torch.zeros(height, width, dtype=torch.int64)
         chunk = min(max(_BLOCK // (height * width), 1), 255)  # whose sum fits into a byte
         parts = iter_spikes(self.path, height, width, flip=self.flip, start=start, frames=frames, chunk=chunk)
-        for part in parts:
-            counts += torch.from_numpy(part.numpy().sum(axis=0, dtype=np.uint8))
+        with progress(what="frames counted", total=frames) as bar:
+            for part in parts:
+                counts += torch.from_numpy(part.numpy().sum(axis=0, dtype=np.uint8))
+                bar.update(len(part))
         return self.prepare(counts)
 
     def show(self, picture: Tensor, *, known: bool) -> Tensor:

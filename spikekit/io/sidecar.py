@@ -20,6 +20,7 @@ import torch
 
 from spikekit.arguments import one_line
 from spikekit.color.cfa import PATTERNS
+from spikekit.io.failures import writing
 from spikekit.io.whole_file import flush_folder
 
 #: What the first line of a side-car says it is.
@@ -123,7 +124,8 @@ def _is_positive(value: Any) -> bool:
 
 
 def _is_noise(value: Any) -> bool:
-    return isinstance(value, dict) and all(one is None or _is_number(one) for one in value.values())
+    known = isinstance(value, dict) and value.get("calibration") is None  # that is a file, of the settings
+    return known and all(one is None or _is_number(one) for one in value.values())
 
 
 _WHOLE = ("a whole number, 1 or more", _is_whole)
@@ -146,6 +148,7 @@ _SETTINGS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "step": _POSITIVE,
     "interpolation": ("a text", lambda value: isinstance(value, str)),
     "noise": ("names and finite numbers", _is_noise),
+    "calibration": ("a text or null", lambda value: value is None or isinstance(value, str)),
 }
 
 
@@ -232,7 +235,7 @@ def published(output: Path) -> Iterator[Path]:
         if stream != output.name:
             raise ValueError(f"{output}: its side-car, {last}, would replace that of {stream}; choose another name")
     with ExitStack() as stack:
-        try:
+        with writing(output):
             target.mkdir(parents=True, exist_ok=True)
             with _locked(target):
                 for other in target.glob(f".{glob.escape(output.name)}.*.part"):
@@ -242,8 +245,6 @@ def published(output: Path) -> Iterator[Path]:
                 part = Path(tempfile.mkdtemp(".part", f".{output.name}.", target))
                 stack.callback(shutil.rmtree, part, ignore_errors=True)
                 stack.enter_context(_locked(part))
-        except OSError as error:
-            raise ValueError(f"{output}: cannot be written ({error.strerror or error})") from error
         yield part
         try:
             with _locked(target):

@@ -8,7 +8,7 @@ import os
 import re
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, overload
 from weakref import WeakSet
@@ -16,8 +16,8 @@ from weakref import WeakSet
 import torch
 from torch import Tensor
 
-from spikekit.arguments import one_line
 from spikekit.check import check_whole
+from spikekit.io.failures import reading
 from spikekit.io.images import MOST_PIXELS, read_picture
 from spikekit.io.quiet import quiet
 
@@ -38,13 +38,20 @@ class VideoError(ValueError):
     """Frames that cannot be read; the message is one line and names the file."""
 
 
+_reading = partial(reading, kind=VideoError)
+
+
 class _Source(Protocol):
     """Where frames come from: all of a folder, or all of a file."""
 
     path: Path
-    names: Sequence[str]
+    count: int
     size: tuple[int, int]
     fps: float | None
+
+    def name(self, index: int) -> str:
+        """Return what frame ``index`` is called."""
+        ...
 
     def read(self, index: int) -> Tensor:
         """Return frame ``index`` as ``rgb`` (3, H, W), float32."""
@@ -95,7 +102,7 @@ class VideoFrames(Sequence[Tensor]):
     def __init__(self, path: str | Path, *, start: int = 0, count: int | None = None) -> None:
         start = operator.index(start)
         self._source = _open(Path(path))
-        total = len(self._source.names)
+        total = self._source.count
         stop = total if count is None else start + check_whole("count", count)
         if start < 0 or start >= total or stop > total:
             wanted = f"frame {start}" if count is None else f"{count} frames from frame {start} on"
@@ -120,7 +127,7 @@ class VideoFrames(Sequence[Tensor]):
     @property
     def names(self) -> list[str]:
         """Names of the frames, of files in a folder, and numbers in a video file."""
-        return [self._source.names[i] for i in self._chosen]
+        return list(map(self._source.name, self._chosen))
 
     def __len__(self) -> int:
         return len(self._chosen)
@@ -185,22 +192,6 @@ def _open(path: Path) -> _Source:
     )
 
 
-@contextmanager
-def _reading(path: Path, what: str = "") -> Iterator[None]:
-    """Turn whatever goes wrong with a file into one line that names it."""
-    try:
-        yield
-    except VideoError:
-        raise
-    except MemoryError as error:  # also what PyAV says of damaged sizes
-        raise VideoError(f"{path}: {what}takes more memory than there is") from error
-    except OSError as error:
-        raise VideoError(f"{path}: {what}cannot be read ({error.strerror or error})") from error
-    except Exception as error:
-        said = one_line(error).removeprefix(f"{path}: ")[:300]
-        raise VideoError(f"{path}: {what}{said}") from error
-
-
 # --- folders ----------------------------------------------------------------------------------------------------------
 
 
@@ -226,8 +217,7 @@ class _Pictures:
     fps = None
 
     def __init__(self, path: Path, files: list[Path]) -> None:
-        self.path, self.files = path, files
-        self.names = [file.name for file in files]
+        self.path, self.files, self.count = path, files, len(files)
         # what has no header that can be read is damaged, and raises when it is its turn
         sizes = {file: size for file in files if (size := _header_size(file))}
         if not sizes:
@@ -240,6 +230,9 @@ class _Pictures:
         if size != self.size:
             (h, w), (height, width) = size, self.size
             raise VideoError(f"{file}: expected {height} x {width} (H x W) as in {self.like}, got {h} x {w}")
+
+    def name(self, index: int) -> str:
+        return self.files[index].name
 
     def read(self, index: int) -> Tensor:
         rgb = _load(self.files[index])
@@ -269,19 +262,6 @@ def _load(file: Path) -> Tensor:
 
 
 # --- video files ------------------------------------------------------------------------------------------------------
-
-
-class _Numbers(Sequence[str]):
-    """Names of the frames of a video file, made when they are asked for: a damaged header promises many."""
-
-    def __init__(self, count: int) -> None:
-        self.count = count
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __getitem__(self, index: int) -> str:
-        return f"{range(self.count)[index]:0{len(str(self.count - 1))}}"
 
 
 _films: WeakSet[_Film] = WeakSet()
@@ -320,7 +300,7 @@ class _Film:
             raise VideoError(f"{path}: expected frames, got none")
         if self.size[0] * self.size[1] > MOST_PIXELS:
             raise VideoError(f"{path}: expected at most {MOST_PIXELS} pixels, got {self.size[0]} x {self.size[1]}")
-        self.names = _Numbers(total)
+        self.count = total
         self._rewind()
 
     def _rewind(self) -> None:
@@ -330,11 +310,14 @@ class _Film:
         self._kept: deque[Any] = deque(maxlen=_KEPT)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name in ("path", "size", "fps", "names")}
+        return {name: value for name, value in vars(self).items() if name in ("path", "size", "fps", "count")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self._rewind()
+
+    def name(self, index: int) -> str:
+        return f"{index:0{len(str(self.count - 1))}}"
 
     def read(self, index: int) -> Tensor:
         if index < self._next - len(self._kept):
@@ -343,10 +326,10 @@ class _Film:
             self._decoder = _decoded(self.path)
         while self._next <= index:
             try:
-                with _reading(self.path, f"frame {self._next}: "):
+                with _reading(self.path, what=f"frame {self._next}: "):
                     frame = next(self._decoder, None)
                     if frame is None:
-                        raise VideoError(f"{self.path}: ends after {self._next} of {len(self.names)} frames")
+                        raise VideoError(f"{self.path}: ends after {self._next} of {self.count} frames")
                     if frame.is_corrupt:
                         raise VideoError(f"{self.path}: frame {self._next}: damaged")
                     if (frame.height, frame.width) != self.size:
@@ -360,9 +343,9 @@ class _Film:
                 raise
             self._kept.append(frame)
             self._next += 1
-        if self._next == len(self.names):
+        if self._next == self.count:
             self._decoder = None  # whose file is closed with it
-        with _reading(self.path, f"frame {index}: "):
+        with _reading(self.path, what=f"frame {index}: "):
             return _rgb(self._kept[index - self._next])
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spikekit.arguments import one_line
-from spikekit.check import check_planes, check_positive
+from spikekit.check import check_picture, check_positive
+from spikekit.io.failures import writing
 from spikekit.io.image_bytes import to_bytes
 from spikekit.io.video import VideoError
 from spikekit.io.whole_file import whole_file
@@ -82,10 +82,10 @@ def write_video(path: str | Path, frames: Iterable[Tensor], fps: float = 25.0) -
     if first is None:
         raise VideoError(f"{path}: expected at least one frame, got none")
     encode = _gif if _is_gif(path) else _h264
-    with _writing(path), whole_file(path) as file:
+    with writing(path, VideoError), whole_file(path) as file:  # FFmpeg's errors are the system's, too
         import av
 
-        with av.open(file, "w", format=FILM_FORMATS[Path(path).suffix.lower()]) as container:
+        with av.open(file.name, "w", format=FILM_FORMATS[Path(path).suffix.lower()]) as container:
             encode(container, chain([first], pictures), first.shape, Fraction(fps).limit_denominator(1001))
 
 
@@ -93,21 +93,11 @@ def _is_gif(path: str | Path) -> bool:
     return Path(path).suffix.lower() == ".gif"
 
 
-@contextmanager
-def _writing(path: str | Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:  # FFmpeg's errors, too
-        raise VideoError(f"{path}: cannot be written ({one_line(error)})") from error
-
-
 def _pictures(path: str | Path, frames: Iterable[Tensor]) -> Iterator[np.ndarray]:
     """Frames as (H, W, 3), uint8."""
     size = None
     for frame in frames:
-        check_planes("frames", frame, 2, "(3, H, W) or (H, W)", floating=frame.dtype != torch.uint8)
-        if frame.ndim > 3 or (frame.ndim == 3 and frame.shape[0] != 3):
-            raise ValueError(f"frames: expected (3, H, W) or (H, W), got {tuple(frame.shape)}")
+        check_picture("frames", frame, "(3, H, W) or (H, W)", grey=True, floating=frame.dtype != torch.uint8)
         size = size or frame.shape[-2:]
         if frame.shape[-2:] != size:
             got = " x ".join(map(str, frame.shape[-2:]))

@@ -7,15 +7,33 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from spikekit.kernels import cpu
 
 
-def register(op: Any, name: str) -> None:
-    """Run a custom operator by the function ``name`` of :mod:`spikekit.kernels.cpu` and :mod:`spikekit.kernels.gpu`."""
-    op.register_kernel("cpu")(getattr(cpu, name))
-    register_on_gpu(op, lambda *args: gpu_kernel(name)(*args))
+def operator(fake: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
+    """Make a custom operator of the decorated function, with any number of leading dimensions.
+
+    It is called as the function, less the underscore, and is run by the functions of that name in
+    :mod:`spikekit.kernels.cpu` and :mod:`spikekit.kernels.gpu` where there are such.
+
+    Args:
+        fake: given the arguments, returns empty tensors of the sizes and types of the results.
+    """
+
+    def make(plain: Callable[..., Any]) -> Any:
+        name = plain.__name__.removeprefix("_")
+        op = torch.library.custom_op(f"spikekit::{name}", plain, mutates_args=())
+        op.register_fake(fake)
+        if hasattr(cpu, name):
+            op.register_kernel("cpu")(getattr(cpu, name))
+            register_on_gpu(op, lambda *args: gpu_kernel(name)(*args))
+        batch_first(op)
+        return op
+
+    return make
 
 
 def register_on_gpu(op: Any, kernel: Callable[..., Any]) -> None:

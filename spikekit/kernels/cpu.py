@@ -8,29 +8,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from functools import cache
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from spikekit.kernels.layout import new_tensor
 
 _TILE = 1 << 16  # pixels
 
 _Slices = tuple[slice, slice]
 
 
-@cache
-def _numpy_dtype(dtype: torch.dtype) -> np.dtype:
-    """Return the NumPy type, or float32 for the halves, which are widened tile by tile."""
-    if dtype in (torch.bfloat16, torch.float16):
-        return np.dtype(np.float32)
-    return torch.empty(0, dtype=dtype).numpy().dtype
-
-
-def _empty(shape: torch.Size, dtype: torch.dtype) -> Tensor:
-    if dtype is torch.bfloat16:
-        return torch.from_numpy(np.empty(shape, np.int16)).view(dtype)
-    return torch.from_numpy(np.empty(shape, torch.empty(0, dtype=dtype).numpy().dtype))
+def _wide(*dtypes: torch.dtype) -> type[np.floating]:
+    """Return the type to compute in: halves are widened tile by tile."""
+    return np.float64 if torch.float64 in dtypes else np.float32
 
 
 def _flat(stream: Tensor) -> Tensor:
@@ -59,7 +51,7 @@ class _Output:
     """An output that is filled tile by tile, through a float32 buffer where it is half precision."""
 
     def __init__(self, shape: torch.Size, dtype: torch.dtype) -> None:
-        self.tensor = _empty(shape, dtype)
+        self.tensor = new_tensor(shape, dtype)
         self._flat = _flat(self.tensor)
         self._through_buffer = dtype in (torch.bfloat16, torch.float16)
 
@@ -112,7 +104,7 @@ def integrate_fire_grad(grad: Tensor, light: Tensor, threshold: float) -> Tensor
     """Three passes over memory: gradient and light in, gradient out."""
     result = _Output(grad.shape, grad.dtype)
     grads, lights = _flat(grad), _flat(light)
-    theta = _numpy_dtype(grad.dtype).type(threshold)
+    theta = _wide(grad.dtype)(threshold)
     for tile, out in result.tiles():
         planes = zip(_read(grads, tile), _read(lights, tile), out, strict=True)
         linear, beyond = np.empty(out.shape[1:], bool), np.empty(out.shape[1:], bool)
@@ -181,7 +173,7 @@ def tfi(spikes: Tensor, max_range: float, dtype: torch.dtype) -> Tensor:
     light = _Output(spikes.shape, dtype)
     flat = _flat(spikes)
     counter = np.int16 if spikes.shape[-3] < 32767 else np.int32
-    white = (np.float64 if dtype is torch.float64 else np.float32)(max_range)
+    white = _wide(dtype)(max_range)
     for tile, out in light.tiles():
         interval = np.empty(out.shape, counter)
         _interval_tile(_read(flat, tile), interval)
@@ -235,7 +227,7 @@ def tfp(spikes: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Te
     """Read the spikes twice, as they enter and leave the window, and write the light once, whatever the window."""
     light = _Output(spikes.shape, dtype)
     flat = _flat(spikes)
-    wide = np.dtype(np.float64 if torch.float64 in (spikes.dtype, dtype) else np.float32)
+    wide = np.dtype(_wide(spikes.dtype, dtype))
     sizes = _window_sizes(spikes.shape[-3], window).astype(wide)
     for tile, out in light.tiles():
         values, mean = _read(flat, tile), np.empty(out.shape[1:], wide)

@@ -13,28 +13,20 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from spikekit.kernels.layout import empty_like_layout, is_channels_last
+from spikekit.check import wide_dtype
+from spikekit.kernels.layout import empty_like_layout, is_channels_last, new_tensor
 from spikekit.kernels.position_table import PositionTable, TableAxis
 
 _PIECE = 1 << 18  # numbers that are gathered at a time
 _TILE = 1 << 13  # positions that are searched at a time
 
 
-def _new(shape: tuple[int, ...], dtype: torch.dtype, numpy_new: Callable[..., np.ndarray] = np.empty) -> Tensor:
-    """From NumPy, which asks for huge pages."""
-    return torch.from_numpy(numpy_new(shape, f"i{dtype.itemsize}")).view(dtype)
-
-
 def _new_like_layout(values: Tensor, size: int, numpy_new: Callable[..., np.ndarray] = np.empty) -> Tensor:
-    return empty_like_layout(values, size, lambda shape: _new(shape, values.dtype, numpy_new))
+    return empty_like_layout(values, size, lambda shape: new_tensor(shape, values.dtype, numpy_new))
 
 
 def _array(values: Tensor) -> np.ndarray:
     return (values.view(torch.int16) if values.dtype is torch.bfloat16 else values).numpy()
-
-
-def _wide(*tensors: Tensor) -> torch.dtype:
-    return torch.float64 if torch.float64 in [tensor.dtype for tensor in tensors] else torch.float32
 
 
 def _pieces(length: int, width: int) -> Iterator[slice]:
@@ -48,7 +40,7 @@ def _rows(planes: Tensor, dtype: torch.dtype) -> Tensor:
     rows = planes.t()
     if rows.is_contiguous() and rows.dtype == dtype:
         return rows
-    result = _new(tuple(rows.shape), dtype)
+    result = new_tensor(tuple(rows.shape), dtype)
     for piece in _pieces(*rows.shape):
         result[piece].copy_(planes[:, piece].contiguous().t())  # torch transposes quickly what is contiguous
     return result
@@ -64,7 +56,7 @@ def _used_rows(planes: Tensor, index: np.ndarray, dtype: torch.dtype) -> tuple[T
     pixel = np.flatnonzero(used)
     place = np.empty(pixels, np.int32)
     place[pixel] = np.arange(len(pixel), dtype=np.int32)
-    rows = _new((len(pixel), channels), dtype)
+    rows = new_tensor((len(pixel), channels), dtype)
     for piece in _pieces(len(pixel), channels):
         rows[piece].copy_(planes.index_select(1, torch.from_numpy(pixel[piece])).t())
     return rows, place
@@ -78,7 +70,7 @@ def _bags(index: np.ndarray, place: np.ndarray | None, piece: slice) -> np.ndarr
 
 def weighted_gather(values: Tensor, index: Tensor, weight: Tensor) -> Tensor:
     """Rows are made of what is read only; the sums of a piece are transposed while they are in the cache."""
-    out, dtype = _new_like_layout(values, index.shape[2]), _wide(values, weight)
+    out, dtype = _new_like_layout(values, index.shape[2]), wide_dtype(values, weight)
     for planes, index_b, weight_b, out_b in zip(values.detach(), index.numpy(), weight.detach(), out, strict=True):
         rows, place = _used_rows(planes, index_b, dtype)
         for piece in _pieces(*out_b.t().shape):
@@ -90,7 +82,7 @@ def weighted_gather(values: Tensor, index: Tensor, weight: Tensor) -> Tensor:
 
 def weighted_scatter(grad: Tensor, index: Tensor, weight: Tensor, size: int) -> Tensor:
     """Sorted by pixel, what arrives at one is a bag: a gather again."""
-    out, dtype = _new_like_layout(grad, size, np.zeros), _wide(grad, weight)
+    out, dtype = _new_like_layout(grad, size, np.zeros), wide_dtype(grad, weight)
     for planes, index_b, weight_b, out_b in zip(grad.detach(), index.numpy(), weight.detach(), out, strict=True):
         pixel, order = torch.from_numpy(index_b.ravel().astype(np.int32)).sort(stable=True)
         first = np.flatnonzero(np.diff(pixel.numpy(), prepend=-1))
@@ -112,8 +104,8 @@ def weighted_scatter(grad: Tensor, index: Tensor, weight: Tensor, size: int) -> 
 
 def weighted_dot(values: Tensor, grad: Tensor, index: Tensor) -> Tensor:
     """Products of rows, a piece at a time."""
-    dtype = _wide(values, grad)
-    out = _new(tuple(index.shape), dtype)
+    dtype = wide_dtype(values, grad)
+    out = new_tensor(tuple(index.shape), dtype)
     for planes, grad_b, index_b, out_b in zip(values.detach(), grad.detach(), index.numpy(), out.numpy(), strict=True):
         rows, place = _used_rows(planes, index_b, dtype)
         for piece in _pieces(*grad_b.t().shape):
@@ -137,7 +129,7 @@ def nearest_four(flow: Tensor, products: list[tuple[Tensor, Tensor]]) -> tuple[T
     count, _, height, width = flow.shape
     plane = height * width
     steps = [tuple(_steps(table.numpy()) for table in product) for product in products]
-    index, weight = _new((count, 4, plane), torch.int64), _new((count, 4, plane), flow.dtype)
+    index, weight = new_tensor((count, 4, plane), torch.int64), new_tensor((count, 4, plane), flow.dtype)
     moved = flow.detach().flatten(2).numpy()
     pixel_x, pixel_y = np.tile(np.arange(1.0 * width), height), np.repeat(np.arange(1.0 * height), width)
     for images in _slices(count, max(_TILE // plane, 1)):
@@ -157,7 +149,10 @@ def nearest_in_table(flow: Tensor, table: PositionTable) -> tuple[Tensor, Tensor
     """Nearest pixels of rounded positions, and their weights, from a table."""
     count, _, height, width = flow.shape
     plane, neighbors = height * width, len(table.shift)
-    index, weight = _new((count, neighbors, plane), torch.int64), _new((count, neighbors, plane), flow.dtype)
+    index, weight = (
+        new_tensor((count, neighbors, plane), torch.int64),
+        new_tensor((count, neighbors, plane), flow.dtype),
+    )
     moved, shift, share = flow.detach().flatten(2).numpy(), table.shift.numpy(), table.weight.numpy()
     pixels = np.arange(plane, dtype=np.int32)
     pixel_x, pixel_y = pixels % width, pixels // width

@@ -15,22 +15,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from spikekit.kernels.gpu_parts import launch, my_pixels, store, wide_dtype
-from spikekit.kernels.gpu_warp import nearest_known, weighted_dot, weighted_gather, weighted_scatter
-
-__all__ = [
-    "integrate_fire",
-    "integrate_fire_grad",
-    "nearest_known",
-    "spike_interval",
-    "tfi",
-    "tfi_grad",
-    "tfp",
-    "tfp_grad",
-    "weighted_dot",
-    "weighted_gather",
-    "weighted_scatter",
-]
+from spikekit.check import wide_dtype
+from spikekit.kernels.gpu_parts import launch, my_pixels, store
+from spikekit.kernels.gpu_warp import nearest_known, weighted_dot, weighted_gather, weighted_scatter  # noqa: F401
 
 _BLOCK = 512  # pixels of a program: four a thread, so that a thread reads four bytes or more at a time
 _STAGES = tl.constexpr(4)  # frames on their way from memory while one is worked on

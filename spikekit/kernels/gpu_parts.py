@@ -8,7 +8,6 @@ from typing import Any
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
 
 def launch(kernel: Any, programs: int, *args: Any, **constants: Any) -> None:
@@ -17,11 +16,6 @@ def launch(kernel: Any, programs: int, *args: Any, **constants: Any) -> None:
     if programs:
         with torch.cuda.device(device) if device.type == "cuda" else nullcontext():
             kernel[(programs,)](*args, **constants, enable_fp_fusion=False)
-
-
-def wide_dtype(*tensors: Tensor) -> torch.dtype:
-    """The dtype to compute in: float64 where one of the tensors has it, else float32."""
-    return torch.float64 if torch.float64 in [tensor.dtype for tensor in tensors] else torch.float32
 
 
 @triton.jit

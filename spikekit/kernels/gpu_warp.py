@@ -11,7 +11,8 @@ import triton.language as tl
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from spikekit.kernels.gpu_parts import launch, my_pixels, store, wide_dtype
+from spikekit.check import wide_dtype
+from spikekit.kernels.gpu_parts import launch, my_pixels, store
 from spikekit.kernels.layout import empty_like_layout, is_channels_last
 
 _BLOCK = 128  # positions that a program searches, one a thread

@@ -1,10 +1,17 @@
-"""Memory layout of the result of a gather: that of its input."""
+"""Memory of results: where it comes from on the CPU, and its layout after a gather, that of the input."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
+import torch
 from torch import Tensor
+
+
+def new_tensor(shape: tuple[int, ...], dtype: torch.dtype, numpy_new: Callable[..., np.ndarray] = np.empty) -> Tensor:
+    """Return a tensor on the CPU from NumPy, which asks for huge pages."""
+    return torch.from_numpy(numpy_new(shape, f"i{dtype.itemsize}")).view(dtype)
 
 
 def is_channels_last(values: Tensor) -> bool:

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from kornia.color import CFA
 from torch import Tensor
 
-from spikekit.check import check_planes, check_positive, check_whole
+from spikekit.check import check_picture, check_positive, check_whole
 from spikekit.color.cfa import bayer_sites
 
 _CHUNK = 1 << 16  # positions sampled at a time: what they need stays in the cache
@@ -84,9 +84,7 @@ class Layer:
     mask: Tensor | None = None
 
     def __post_init__(self) -> None:
-        check_planes("picture", self.picture, 3, "(3, h, w)", floating=True)
-        if self.picture.ndim != 3 or self.picture.shape[0] != 3:
-            raise ValueError(f"picture: expected (3, h, w), got {tuple(self.picture.shape)}")
+        check_picture("picture", self.picture, "(3, h, w)")
         if self.picture.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"picture: expected float32 or float64, got {self.picture.dtype}")
         size = tuple(self.picture.shape[1:])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -16,70 +15,51 @@ class Interval:
     """Two neighbouring frames and what lies between them; nothing is computed before it is asked for.
 
     Args:
-        first: ``rgb`` (3, H, W), its sides multiples of ``2 * scale``.
+        film: the :class:`spikekit.Film` that it is a part of, whose settings count.
+        first: ``rgb`` (3, H, W), its sides multiples of ``2 * film.scale``.
         second: the next frame.
-        clocks: clocks from one to the other.
-        scale: how many pixels a sensor pixel is wide.
-        seen: gives the sensor's light of a picture.
-        interpolation: makes what lies between two pictures.
-        profile: looks at two frames.
-        plan: makes a plan of a profile.
-        fixed: the plan, where there is one already.
     """
 
-    def __init__(
-        self,
-        first: Tensor,
-        second: Tensor,
-        clocks: int,
-        scale: int,
-        seen: Callable[[Tensor], Tensor],
-        interpolation: Callable[[Tensor, Tensor], Any],
-        profile: Callable[[Tensor, Tensor], SceneProfile],
-        plan: Callable[[SceneProfile], Plan],
-        fixed: Plan | None = None,
-    ) -> None:
-        self.frames = first, second
-        self.clocks, self.scale = clocks, scale
-        self._seen, self._interpolation, self._look, self._decide = seen, interpolation, profile, plan
-        self._fixed = fixed
+    def __init__(self, film: Any, first: Tensor, second: Tensor) -> None:
+        self.film, self.frames = film, (first, second)
         self._betweens: dict[Region | None, Any] = {}
         self._latent: dict[int, Tensor] = {}
 
     @cached_property
     def profile(self) -> SceneProfile:
         """Change within the interval."""
-        return self._look(*self.frames)
+        return self.film._profile(*self.frames)
 
     @cached_property
     def plan(self) -> Plan:
         """Moments that are modelled."""
-        return self._fixed or self._decide(self.profile)
+        film = self.film
+        return film.fixed or self.profile.plan(spike_tolerance=film.spike_tolerance, step=film.step)
 
     @cached_property
     def _ends(self) -> tuple[Tensor, ...]:
-        return tuple(self._seen(frame) for frame in self.frames)
+        return tuple(map(self.film._seen, self.frames))
 
     def between(self, region: Region | None = None) -> Any:
         """Return what the interpolation makes of a region of the sensor; of all of it when not given."""
         if region not in self._betweens:
             ends = self.frames
             if region is not None:
-                top, left, height, width = (self.scale * pixels for pixels in region)
+                top, left, height, width = (self.film.scale * pixels for pixels in region)
                 ends = tuple(frame[:, top : top + height, left : left + width].contiguous() for frame in ends)
-            self._betweens[region] = self._interpolation(*ends)
+            self._betweens[region] = self.film.interpolation(*ends)
         return self._betweens[region]
 
     def light(self, phase: int) -> Tensor:
         """Return the light at a clock of the interval, 1 to ``clocks - 1``."""
-        steps, region = self.plan.latent + 1, self.plan.region
-        blended = torch.lerp(*self._ends, phase / self.clocks)
+        steps, region, clocks = self.plan.latent + 1, self.plan.region, self.film.clocks
+        blended = torch.lerp(*self._ends, phase / clocks)
         if steps == 1:
             return blended
-        before, rest = divmod(phase * steps, self.clocks)
+        before, rest = divmod(phase * steps, clocks)
         part = self._at(before, steps)
         if rest:
-            part = torch.lerp(part, self._at(before + 1, steps), rest / self.clocks)
+            part = torch.lerp(part, self._at(before + 1, steps), rest / clocks)
         if region is None:
             return part
         top, left, height, width = region
@@ -89,5 +69,5 @@ class Interval:
     def _at(self, number: int, steps: int) -> Tensor:
         """Return the light of latent frame ``number`` in the plan's region; 0 and ``steps`` are the ends."""
         if number not in self._latent:
-            self._latent[number] = self._seen(self.between(self.plan.region).at(number / steps))
+            self._latent[number] = self.film._seen(self.between(self.plan.region).at(number / steps))
         return self._latent[number]

@@ -12,7 +12,7 @@ from kornia.color import CFA
 from torch import Tensor
 
 from spikekit._renamed import renamed_argument
-from spikekit.check import check_planes, check_positive, check_whole
+from spikekit.check import check_picture, check_positive, check_whole
 from spikekit.color.cfa import bayer_pattern, bin_to_sensor
 from spikekit.flow.interpolate import Blend, FlowInterpolation, Still
 from spikekit.scenes.adaptive_sampling import Plan, SceneProfile, profile_interval
@@ -300,9 +300,7 @@ class Film:
 
     def _read(self, frame: int) -> Tensor:
         rgb = self.frames[frame]
-        check_planes(f"frames[{frame}]", rgb, 3, "(3, H, W)", floating=True)
-        if rgb.ndim != 3 or rgb.shape[0] != 3:
-            raise ValueError(f"frames[{frame}]: expected (3, H, W), got {tuple(rgb.shape)}")
+        check_picture(f"frames[{frame}]", rgb)
         return rgb
 
     def _view(self, frame: int) -> Tensor:
@@ -320,27 +318,14 @@ class Film:
         return self.alpha * bin_to_sensor(rgb, self.pattern, scale=self.scale)
 
     def _profile(self, first: Tensor, second: Tensor) -> SceneProfile:
-        return profile_interval(
-            first,
-            second,
-            scale=self.scale,
-            pattern=self.pattern,
-            alpha=self.alpha,
-            clocks=self.clocks,
-            spike_tolerance=self.spike_tolerance,
-            motion=self.motion,
-        )
-
-    def _plan(self, profile: SceneProfile) -> Plan:
-        return profile.plan(spike_tolerance=self.spike_tolerance, step=self.step)
+        names = "scale", "pattern", "alpha", "clocks", "spike_tolerance", "motion"
+        return profile_interval(first, second, **{name: getattr(self, name) for name in names})
 
     def _interval(self, index: int) -> Interval:
         if not 0 <= index < len(self.frames) - 1:
             raise ValueError(f"interval: expected 0 to {len(self.frames) - 2}, got {index}")
         if index not in self._intervals:
-            first, second = self._view(index), self._view(index + 1)
-            settings = self._seen, self.interpolation, self._profile, self._plan
-            _keep(self._intervals, index, Interval(first, second, self.clocks, self.scale, *settings, self.fixed))
+            _keep(self._intervals, index, Interval(self, self._view(index), self._view(index + 1)))
         return self._intervals[index]
 
 

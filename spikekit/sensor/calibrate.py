@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from spikekit.sensor.calibration import DEAD, HOT, Calibration, colors
@@ -137,8 +136,7 @@ def _lattices(size: tuple[int, int], pattern: str | None) -> list[tuple[slice, s
 
 def _median_around(plane: Tensor) -> Tensor:
     """Median over a window, without the pixel in its middle."""
-    half = _NEAR // 2
-    padded = F.pad(plane[None, None], (half, half, half, half), mode="replicate")
-    windows = F.unfold(padded, _NEAR)[0]
-    others = torch.cat([windows[: _NEAR**2 // 2], windows[_NEAR**2 // 2 + 1 :]])
-    return others.median(dim=0).values.reshape(plane.shape)
+    from scipy.ndimage import rank_filter
+
+    others = np.arange(_NEAR**2).reshape(_NEAR, _NEAR) != _NEAR**2 // 2
+    return torch.from_numpy(rank_filter(plane.numpy(), _NEAR**2 // 2 - 1, footprint=others, mode="nearest"))

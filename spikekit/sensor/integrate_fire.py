@@ -8,11 +8,11 @@ import torch
 from torch import Tensor, nn
 
 from spikekit.check import check_dtype, check_planes, check_positive
-from spikekit.kernels import batch_first, register
+from spikekit.kernels import operator
 
 
 # A custom operator, because torch.compile would unroll the loop over time and because the gradient does not need it.
-@torch.library.custom_op("spikekit::integrate_fire", mutates_args=())
+@operator(lambda light, threshold, charge, dtype: (torch.empty_like(light, dtype=dtype), torch.empty_like(charge)))
 def _integrate_fire(light: Tensor, threshold: float, charge: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     spikes = torch.empty_like(light, dtype=dtype)
     theta = charge.new_tensor(threshold)  # a tensor: CUDA would divide by a number through its inverse
@@ -28,21 +28,11 @@ def _integrate_fire(light: Tensor, threshold: float, charge: Tensor, dtype: torc
     return spikes, charge
 
 
-@_integrate_fire.register_fake
-def _(light: Tensor, threshold: float, charge: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    return torch.empty_like(light, dtype=dtype), torch.empty_like(charge)
-
-
-@torch.library.custom_op("spikekit::integrate_fire_grad", mutates_args=())
+@operator(lambda grad, light, threshold: torch.empty_like(grad))
 def _integrate_fire_grad(grad: Tensor, light: Tensor, threshold: float) -> Tensor:
     wide = torch.promote_types(light.dtype, torch.float32)
     light, theta = light.to(wide), light.new_tensor(threshold, dtype=wide)
     return torch.where((light >= 0) & (light <= theta), grad.to(wide) / theta, 0).to(grad.dtype)
-
-
-@_integrate_fire_grad.register_fake
-def _(grad: Tensor, light: Tensor, threshold: float) -> Tensor:
-    return torch.empty_like(grad)
 
 
 class _StraightThrough(torch.autograd.Function):
@@ -80,11 +70,6 @@ class _Linear(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
         return _Linear.apply(grad, *ctx.saved_tensors, ctx.threshold), None, None
-
-
-for _name, _op in {"integrate_fire": _integrate_fire, "integrate_fire_grad": _integrate_fire_grad}.items():
-    register(_op, _name)
-    batch_first(_op)
 
 
 def spike_integrate_fire(

@@ -16,22 +16,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from spikekit.check import wide_dtype
 from spikekit.kernels import cpu_warp, gpu_kernel, register_on_gpu
 from spikekit.kernels.layout import empty_like_layout, is_channels_last
 
 _FEW = 8  # channels: of fewer planes, a CPU gathers one after the other faster than rows of all
 
 
-def _wide(*tensors: Tensor) -> torch.dtype:
-    dtype = torch.float32
-    for tensor in tensors:
-        dtype = torch.promote_types(dtype, tensor.dtype)
-    return dtype
-
-
 def _gather(values: Tensor, index: Tensor, weight: Tensor) -> Tensor:
     """(B, C, P), (B, K, Q) and (B, K, Q) to (B, C, Q), in the dtype of ``values``."""
-    total = values.new_zeros(*values.shape[:2], index.shape[2], dtype=_wide(values, weight))
+    total = values.new_zeros(*values.shape[:2], index.shape[2], dtype=wide_dtype(values, weight))
     for index_k, weight_k in zip(index.split(1, dim=1), weight.split(1, dim=1), strict=True):
         total += values.gather(2, index_k.expand(-1, values.shape[1], -1)) * weight_k
     return empty_like_layout(values, index.shape[2]).copy_(total)
@@ -39,7 +33,7 @@ def _gather(values: Tensor, index: Tensor, weight: Tensor) -> Tensor:
 
 def _scatter(grad: Tensor, index: Tensor, weight: Tensor, size: int) -> Tensor:
     """(B, C, Q), (B, K, Q) and (B, K, Q) to (B, C, size), in the dtype of ``grad``."""
-    dtype = _wide(grad, weight)
+    dtype = wide_dtype(grad, weight)
     total = grad.new_zeros(*grad.shape[:2], size, dtype=dtype)
     for index_k, weight_k in zip(index.split(1, dim=1), weight.split(1, dim=1), strict=True):
         total.scatter_add_(2, index_k.expand(-1, grad.shape[1], -1), (grad * weight_k).to(dtype))
@@ -48,7 +42,7 @@ def _scatter(grad: Tensor, index: Tensor, weight: Tensor, size: int) -> Tensor:
 
 def _dot(values: Tensor, grad: Tensor, index: Tensor) -> Tensor:
     """(B, C, P), (B, C, Q) and (B, K, Q) to (B, K, Q), in float32 or wider."""
-    dtype = _wide(values, grad)
+    dtype = wide_dtype(values, grad)
     result = values.new_empty(index.shape, dtype=dtype)
     for k, index_k in enumerate(index.split(1, dim=1)):
         gathered = values.gather(2, index_k.expand(-1, values.shape[1], -1))
@@ -74,8 +68,10 @@ def fold_into_batch(op: Any, count: int) -> None:
     op.register_vmap(rule)
 
 
-def _operator(plain: Callable[..., Tensor], name: str) -> Any:
+def _operator(plain: Callable[..., Tensor], fake: Callable[..., Tensor]) -> Any:
+    name = f"weighted{plain.__name__}"
     op = torch.library.custom_op(f"spikekit::{name}", plain, mutates_args=())
+    op.register_fake(fake)
     rows = getattr(cpu_warp, name)
 
     @op.register_kernel("cpu")
@@ -91,24 +87,11 @@ def _operator(plain: Callable[..., Tensor], name: str) -> Any:
     return op
 
 
-weighted_gather = _operator(_gather, "weighted_gather")
-weighted_scatter = _operator(_scatter, "weighted_scatter")
-weighted_dot = _operator(_dot, "weighted_dot")
-
-
-@weighted_gather.register_fake
-def _(values: Tensor, index: Tensor, weight: Tensor) -> Tensor:
-    return empty_like_layout(values, index.shape[2])
-
-
-@weighted_scatter.register_fake
-def _(grad: Tensor, index: Tensor, weight: Tensor, size: int) -> Tensor:
-    return empty_like_layout(grad, size)
-
-
-@weighted_dot.register_fake
-def _(values: Tensor, grad: Tensor, index: Tensor) -> Tensor:
-    return values.new_empty(index.shape, dtype=_wide(values, grad))
+weighted_gather = _operator(_gather, lambda values, index, weight: empty_like_layout(values, index.shape[2]))
+weighted_scatter = _operator(_scatter, lambda grad, index, weight, size: empty_like_layout(grad, size))
+weighted_dot = _operator(
+    _dot, lambda values, grad, index: values.new_empty(index.shape, dtype=wide_dtype(values, grad))
+)
 
 
 class Gather(torch.autograd.Function):

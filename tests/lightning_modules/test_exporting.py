@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from lightning_modules import exporting
 from lightning_modules.__main__ import main
 from lightning_modules.exporting import export_network
 from lightning_modules.motion import ClassicalFlow, ZeroFlow
@@ -27,6 +28,21 @@ given = {"spikes": spikes, "flow": np.full((1, 2, 2, 16, 24), 0.5, np.float32)}
 np.save(out, session.run(["rgb"], {name: given[name] for name in names})[0])
 assert "torch" not in sys.modules
 """
+
+
+def test_a_program_that_differs_from_the_network_is_not_written(tmp_path, monkeypatch):
+    network = ClassicalDecoder("tfp", 2)
+    monkeypatch.setattr(torch.export, "export", lambda *_, **__: None)
+    monkeypatch.setattr(exporting, "_torch", lambda *_: b"a program")
+    for wrong in (2e-4, float("nan")):
+        run = lambda *inputs, wrong=wrong: network(*inputs) + wrong  # noqa: E731
+        monkeypatch.setattr(exporting, "exported", lambda *_, run=run: run)
+        with pytest.raises(ValueError, match=r"expected an export within 0\.0001 of the network, got (0\.0002|nan)"):
+            export_network(network, tmp_path / "a.pt2", "torch")
+    assert not list(tmp_path.iterdir())
+    monkeypatch.setattr(exporting, "exported", lambda *_: lambda *inputs: network(*inputs) + 5e-5)
+    assert "within 5e-05 of the network" in export_network(network, tmp_path / "a.pt2", "torch")
+    assert (tmp_path / "a.pt2").read_bytes() == b"a program"
 
 
 @pytest.mark.slow

@@ -1,32 +1,38 @@
-"""Every writer on a full disk: an error that names the file, what was there before, and nothing else."""
+"""Every file that lightning writes, on a full disk: an error that names it, what was there before, and nothing else."""
 
-import resource
 import warnings
-from contextlib import contextmanager
+from argparse import Namespace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+import yaml
 
+from lightning_modules import exporting
+from lightning_modules.__main__ import main
 from lightning_modules.charts import chart
+from lightning_modules.cli.command import Configuration
+from lightning_modules.cost.measure import Row as Measured
+from lightning_modules.cost.measure import Timed
 from lightning_modules.data.cache import ClipCache
+from lightning_modules.error_model import FILE, ErrorModel, write_error_model
+from lightning_modules.networks import ClassicalDecoder
 from lightning_modules.pretrained import Weights, write_weights
+from lightning_modules.sweep import cli as sweep_cli
+from lightning_modules.sweep import table as sweep_table
 from lightning_modules.sweep.state import write_json
+from lightning_modules.sweep.trials import Trial
+from lightning_modules.tasks.callbacks import TestReport
 from lightning_modules.tasks.checkpoint_io import Checkpoints
-from spikekit import write_picture, write_spikes
+from lightning_modules.trade import table as trade_table
+from lightning_modules.trade.settings import read_setting
+from spikekit import write_spikes
 
-SPIKES = (torch.rand(200, 64, 64) < 0.4).to(torch.uint8)
-
-
-@contextmanager
-def full(room):
-    """No file grows beyond so many bytes; Python ignores the signal, so that writing fails as on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (room, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+TRIAL = {
+    "model": {"class_path": "SuperResolution", "init_args": {"network": {"init_args": {"width": 4}}}},
+    "trainer": {"max_steps": 6},
+}
 
 
 def draw(path):
@@ -34,32 +40,105 @@ def draw(path):
         axes.plot([0, 1])
 
 
+def trials(path):
+    return [Trial((str(n),), None, path.parent / f"trial{n}", TRIAL, {"steps": 6}) for n in range(50)]
+
+
+def sweep_csv(path):
+    sweep_table.write_csv(sweep_table.collect(trials(path), {}), path)
+
+
+def sweep_md(path):
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("write_csv", "plot"):
+            patch.setattr(sweep_cli, name, lambda *_: None)
+        sweep_cli._write_tables(trials(path), {}, Namespace(output=path.parent))
+
+
+def trade_csv(path):
+    runner = SimpleNamespace(network=torch.nn.Linear(2, 3))
+    settings = [read_setting(f"{n}: --model.tile 8") for n in range(50)]
+    rows = [Measured(setting, runner, psnr=[20.0], ssim=[0.5], seconds=[1.0], macs=1.0) for setting in settings]
+    trade_table.write_csv(rows, ["command"] * 50, Timed(1, (8, 8), 2, "wall time"), path)
+
+
+def configuration(path):
+    parser = SimpleNamespace(dump=lambda *_, **__: "a: 1\n" * 999)
+    Configuration(parser, None).save_config(SimpleNamespace(default_root_dir=path.parent), None, "fit")
+
+
+def scores(path):
+    report = TestReport(path.parent)
+    report._rows = [[torch.zeros(3, 4, 4)]]
+    report._scores = {"TFI": [(1.0,) * len(report.columns())] * 999}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lightning_modules.tasks.callbacks.write_picture", lambda *_: None)
+        report.on_test_end(SimpleNamespace(is_global_zero=True, world_size=1, datamodule=None), None)
+
+
+def program(path):
+    network = ClassicalDecoder("tfp", 2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch.export, "export", lambda *_, **__: None)  # it takes half a minute
+        patch.setattr(exporting, "_torch", lambda *_: bytes(9999))
+        patch.setattr(exporting, "exported", lambda *_: network)
+        exporting.export_network(network, path, "torch")
+
+
 @pytest.mark.parametrize(
     ("name", "write"),
     [
         ("chart.png", draw),
-        ("a.png", lambda path: write_picture(path, torch.rand(3, 64, 64))),
-        ("a.dat", lambda path: write_spikes(path, SPIKES)),
-        ("a.npz", lambda path: write_spikes(path, SPIKES)),
         ("a.ckpt", lambda path: Checkpoints().save_checkpoint({"state_dict": {"a": torch.rand(9999)}}, path)),
         ("a.safetensors", lambda path: write_weights(Weights(path, {}, {}, {"a": torch.rand(9999)}), path)),
         ("a.json", lambda path: write_json(path, list(range(9999)))),
+        ("sweep.csv", sweep_csv),
+        ("sweep.md", sweep_md),
+        ("trade.csv", trade_csv),
+        ("config.yaml", configuration),
+        ("test.csv", scores),
+        ("a.pt2", program),
     ],
 )
-@pytest.mark.parametrize("room", [0, 2000])
-def test_what_was_there_stays(name, write, room, tmp_path):
-    (tmp_path / name).write_bytes(b"old")
-    with full(room), pytest.raises((OSError, ValueError), match=name):
-        write(tmp_path / name)
-    assert [path.name for path in tmp_path.iterdir()] == [name]
-    assert (tmp_path / name).read_bytes() == b"old"
-    write(tmp_path / name)
-    assert (tmp_path / name).stat().st_size > 2000
+def test_a_file_stays_whole(name, write, stays_whole):
+    stays_whole(name, write)
 
 
-def test_the_cache_goes_on_without(tmp_path):
+def test_constants_of_weights_stay_whole(full_disk, tmp_path):
+    for name in ("a", "b"):
+        before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+        for room in (0, 20):
+            with full_disk(room), pytest.raises(OSError, match=FILE):
+                write_error_model(tmp_path / f"{name}.safetensors", ErrorModel())
+            assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+        write_error_model(tmp_path / f"{name}.safetensors", ErrorModel())
+    assert [path.name for path in tmp_path.iterdir()] == [FILE]
+
+
+def test_a_trial_is_written_again_where_its_budget_is_missing(full_disk, tmp_path):
+    for room, config, left in ((0, TRIAL, []), (20, {"a": 1}, ["trial.yaml"])):
+        trial = Trial(("a",), None, tmp_path / "trial", config, {"steps": 10**100})
+        with full_disk(room), pytest.raises(OSError, match="too large"):
+            trial.write()
+        assert [path.name for path in trial.folder.iterdir()] == left
+    Trial(("a",), None, tmp_path / "trial", TRIAL, {"steps": 6}).write()
+    assert yaml.safe_load((tmp_path / "trial" / "trial.yaml").read_text()) == TRIAL
+
+
+def test_a_predicted_picture_is_there_whole_or_not_at_all(full_disk, tmp_path):
+    write_spikes(tmp_path / "clip.npz", torch.rand(41, 24, 32, generator=torch.Generator().manual_seed(0)) < 0.3)
+    words = ["predict", "--model.network", "ClassicalDecoder", "--model.network.scale", "4", "--data", "Recording"]
+    words += ["--data.path", str(tmp_path / "clip.npz"), "--trainer.accelerator", "cpu", "-o", str(tmp_path / "out")]
+    with full_disk(6000), pytest.raises(SystemExit, match=r"frame_000020.png: cannot be written \(File too large\)"):
+        main(words)
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [".predict.lock"]
+    main(words)
+    assert (tmp_path / "out" / "frame_000020.png").stat().st_size > 6000
+
+
+def test_the_cache_goes_on_without(full_disk, tmp_path):
     cache = ClipCache(tmp_path)
-    with full(2000), warnings.catch_warnings(record=True) as said:
+    with full_disk(2000), warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         cache.store("ab" * 32, {"a": np.zeros(9999)})
     assert "cannot be written" in str(said[0].message)

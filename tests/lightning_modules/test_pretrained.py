@@ -1,8 +1,10 @@
 """Weights in files, from Python and as they are typed."""
 
+import csv
 import json
 import os
 import pickle
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -19,7 +21,7 @@ from lightning_modules.cli.rehearsal import Rehearsal
 from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
 from lightning_modules.networks import CSCSR, ClassicalDecoder
 from lightning_modules.pretrained import load_weights, read_weights, write_weights
-from lightning_modules.shipped import FOLDER, shipped_weights
+from lightning_modules.shipped import FOLDER, list_pretrained, shipped_weights
 from lightning_modules.tasks.super_resolution import SuperResolution
 from spikekit import read_picture, write_picture, write_spikes
 
@@ -220,6 +222,39 @@ def test_every_file_of_weights_is_in_the_index_and_loads_by_every_name_it_had():
         read_weights("x4-q")
 
 
+def _rows_of_card(path):
+    """The tables of a card: rows by their first cell, each a dictionary by the heading."""
+    rows, heading = {}, []
+    for line in path.read_text().splitlines():
+        cells = [cell.strip(" *") for cell in line.strip("|").split("|")]
+        if line.startswith("| `lightning test"):
+            heading = cells
+        elif line.startswith("| "):
+            rows[cells[0]] = dict(zip(heading, cells, strict=False))
+    return rows
+
+
+@pytest.mark.parametrize("weights", list_pretrained(), ids=lambda weights: weights.name)
+def test_what_is_listed_is_what_cards_and_tables_say(weights):
+    card = weights.path.with_name(f"{weights.name}.md")
+    said = re.search(r"([\d.]+)\s+MMAC a sensor", card.read_text())
+    assert not said or float(said[1]) == pytest.approx(weights.macs / 1e6, abs=0.005)
+    if not weights.scale:
+        return
+    rows = _rows_of_card(card)
+    beginnings = {
+        "kodak": ("Kodak, 24 stills in motion", "Kodak, up to 3 in 20 clocks"),
+        "vid4": ("Vid4, foliage and walk only, 20 clocks a frame",),
+    }
+    for name, begin in beginnings.items():
+        (score,) = [row[weights.name] for first, row in rows.items() if first.startswith(begin)]
+        assert float(score) == getattr(weights, name)
+    with open(FOLDER / f"x{weights.scale}.csv", newline="") as file:
+        measured = {row["setting"]: row for row in csv.DictReader(file)}
+    if weights.name in measured:
+        assert float(measured[weights.name]["macs"]) == pytest.approx(weights.macs, rel=1e-5)
+
+
 def test_the_list_of_weights_says_what_the_networks_are(configs):
     import lightning_modules
 
@@ -238,6 +273,7 @@ def test_the_list_of_weights_says_what_the_networks_are(configs):
         assert weights.parameters == sum(value.numel() for value in found.tensors.values())
         assert weights.scale == found.settings.get("scale")
         if weights.scale:
+            assert min(weights.macs, weights.kodak, weights.vid4) > 0
             overlay = yaml.safe_load((configs / f"size/{weights.size}.yaml").read_text())
             assert overlay["model"]["network"]["init_args"].items() <= found.settings.items()
 

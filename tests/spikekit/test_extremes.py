@@ -13,7 +13,7 @@ import spikekit as sk
 from spikekit import extremes
 from spikekit.examples import EXAMPLES
 from spikekit.extremes import reference, sizes
-from spikekit.extremes.table import BITS, FLOATS, Cases, Measured, differ, rounded_once, short, state, ulps
+from spikekit.extremes.table import BITS, FLOATS, Cases, Measured, On, differ, rounded_once, short, state, ulps
 
 ROWS = [
     pytest.param(
@@ -197,7 +197,7 @@ def test_an_outcome_that_is_not_the_documented_one_fails():
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="peak memory is read from /proc")
 def test_memory_is_measured():
-    four_bytes = sizes._memory("stream.float().to(torch.uint8)", sizes._BITS, torch.uint8, torch.device("cpu"))
+    four_bytes = sizes._memory("stream.float().to(torch.uint8)", sizes._BITS, On(torch.uint8, torch.device("cpu")))
     assert 3.9 < four_bytes.error < 4.5
 
 

@@ -16,7 +16,8 @@ import spikekit
 from lightning_modules import list_pretrained
 from lightning_modules.__main__ import main
 from lightning_modules.checkpoint import read_checkpoint
-from lightning_modules.cli.arguments import behind_configurations, options
+from lightning_modules.cli.arguments import behind_configurations, given, options
+from lightning_modules.cli.command import Parser
 from lightning_modules.cli.command import run as run_command
 from lightning_modules.cli.errors import InputError
 from lightning_modules.cli.rehearsal import Rehearsal
@@ -143,7 +144,7 @@ def test_a_prediction_that_is_killed_leaves_whole_pictures(tmp_path):
         _killed([*words, "-o", out], lambda: any(out.glob(".*.part")) or any(out.glob("*.png")), moment)
         for path in out.glob("*.png"):
             assert read_picture(path).shape == (3, 160, 160)
-    assert any(out.iterdir())
+    assert any(path.name != ".predict.lock" for path in out.iterdir())
 
 
 @pytest.mark.slow
@@ -307,10 +308,12 @@ def test_version(capsys):
 
 def test_models_lists_the_weights_of_the_package(capsys):
     main(["models"])
-    head, _, *rows = capsys.readouterr().out.splitlines()
-    assert [cell.strip() for cell in head.strip("|").split("|")] == ["weights", "scale", "size", "parameters", "MB"]
-    assert [row.split()[1] for row in rows] == [weights.name for weights in list_pretrained()]
-    assert re.search(r"\| cscsr_tiny_x4 +\| x4 +\| tiny +\| 300,963 ", "\n".join(rows))
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 120
+    head, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|"))
+    assert head == ["weights", "scale", "size", "parameters", "MMAC/pixel", "Kodak", "Vid4", "MB"]
+    assert [row[0] for row in rows] == [weights.name for weights in list_pretrained()]
+    assert ["cscsr_tiny_x4", "x4", "tiny", "300,963", "0.36", "27.95", "23.51"] in [row[:-1] for row in rows]
 
 
 def test_no_network_is_said_in_one_line(decoder):
@@ -499,3 +502,31 @@ def test_fit_takes_a_former_overlay(configs, capsys):
     with pytest.raises(SystemExit):
         main(["fit", "-c", str(configs / "x4.yaml"), "-c", str(configs / "size/t.yaml"), "--print_config"])
     assert yaml.safe_load(capsys.readouterr().out)["model"]["init_args"]["network"]["init_args"]["stride"] == 6
+
+
+def test_what_is_said_of_an_object_is_read_without_the_parser(tmp_path):
+    (tmp_path / "my.yaml").write_text(
+        "model: {network: {class_path: CSCSR, init_args: {scale: 2}}}\n"
+        "data: {class_path: Recording, init_args: {path: a.dat, height: 6, camera: null}}\n"
+    )
+    args = ["predict", "-c", str(tmp_path / "my.yaml"), "--data.path", "b.dat", "--data.init_args.frame=20:40:5"]
+    said = {"path": "b.dat", "height": "6", "frame": "20:40:5"}
+    assert given(args, "data").items() >= said.items()
+    assert "camera" not in given(args, "data")
+    assert given(args, "model.network")["scale"] == "2"
+    assert given([*args, "--model.network.init_args.scale", "3"], "model.network")["scale"] == "3"
+
+
+def test_a_speed_is_chosen_before_the_parser_runs(tmp_path, monkeypatch):
+    write_spikes(tmp_path / "a.npz", torch.zeros(41, 6, 8, dtype=torch.uint8))
+    typed = []
+
+    def parse_args(self, args, *_, **__):
+        typed.append(args)
+        raise SystemExit
+
+    monkeypatch.setattr(Parser, "parse_args", parse_args)
+    with pytest.raises(SystemExit):
+        main(["predict", "--speed", "best", "--data", "Recording", "--data.path", str(tmp_path / "a.npz")])
+    assert len(typed) == 1
+    assert "cscsr_huge_x4" in " ".join(typed[0])

@@ -1,13 +1,18 @@
 """What every verb ends with: one line on stderr, 2 for wrong use and 1 for a file that is to blame; nothing written."""
 
 import shlex
+import subprocess
 import sys
 
 import pytest
+import torch
+from pytorch_lightning.utilities import rank_zero_only
 
 from lightning_modules.__main__ import main
+from lightning_modules.cli import folder_lock
 from lightning_modules.cli.errors import as_one_line
-from lightning_modules.cli.folder_lock import locked_folder
+from lightning_modules.cli.folder_lock import FolderError, locked_folder
+from spikekit import write_spikes
 
 OVERLAY = "model: {network: {init_args: {width: 4, representation_width: 4, features: 1, stages: 1, end_blocks: 1}}}"
 FILES = {
@@ -21,6 +26,14 @@ FILES = {
     "odd.dat": bytes(range(256)),
     "a.txt": b"text",
 }
+
+HOLDER = """
+import sys, time
+from lightning_modules.cli.folder_lock import locked_folder
+with locked_folder(sys.argv[1], "lightning predict", ".predict.lock"):
+    print("held", flush=True)
+    time.sleep(600)
+"""
 
 
 def _rows():
@@ -95,6 +108,69 @@ def test_two_trainings_in_one_folder(configs, tmp_path, monkeypatch):
     with locked_folder("out", "run"), pytest.raises(SystemExit, match="out: another run is at work here"):
         main(words.split())
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"lock"}
+
+
+@pytest.mark.parametrize("verb", ["test", "predict", "trade"])
+def test_two_runs_of_a_verb_in_one_folder(verb, configs, tmp_path, monkeypatch):
+    """One of them would go on with what the other writes; before anything is computed."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["lightning"])
+    words = f"{verb} -c {configs}/x4.yaml --data.val_clips 1" + " --setting a:" * (verb == "trade")
+    if verb == "predict":
+        write_spikes("a.npz", torch.zeros(41, 4, 4))
+        words = "predict --model.network ClassicalDecoder --model.network.scale 2 --data Recording --data.path a.npz"
+    held = "lock" if verb == "trade" else f".{verb}.lock"
+    for output, folder in (("out", "out"), *([("film.mp4", "film.mp4.frames")] if verb == "predict" else [])):
+        said = rf"^lightning: {folder}: another lightning {verb} is at work here; -o goes elsewhere$"
+        with locked_folder(folder, "run", held), pytest.raises(SystemExit, match=said):
+            main([*words.split(), "-o", output])
+        assert {path.name for path in (tmp_path / folder).iterdir()} == {held}
+
+
+def test_a_training_does_not_keep_predictions_out_nor_do_processes_of_one_run_each_other(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["lightning"])
+    write_spikes("a.npz", torch.zeros(41, 4, 4))
+    words = "predict --model.network ClassicalDecoder --model.network.scale 2 --data Recording --data.path a.npz -o out"
+    with locked_folder("out", "run"):
+        main(words.split())
+    monkeypatch.setattr(rank_zero_only, "rank", 1)
+    with locked_folder("out", "lightning predict", ".predict.lock"):
+        main(words.split())
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"lock", ".predict.lock", "frame_000020.png"}
+
+
+@pytest.mark.parametrize(("output", "folder"), [("out", "out"), ("film.gif", "film.gif.frames")])
+def test_the_lock_of_another_process_goes_with_it(output, folder, tmp_path, monkeypatch):
+    pytest.importorskip("av")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["lightning"])
+    write_spikes("a.npz", torch.zeros(41, 4, 4))
+    words = "predict --model.network ClassicalDecoder --model.network.scale 2 --data Recording --data.path a.npz -o"
+    with subprocess.Popen([sys.executable, "-c", HOLDER, folder], stdout=subprocess.PIPE) as other:
+        assert other.stdout.readline() == b"held\n"
+        with pytest.raises(SystemExit, match=f"^lightning: {folder}: another lightning predict is at work here"):
+            main([*words.split(), output])
+        other.kill()
+    main([*words.split(), output])
+    assert (tmp_path / ("out/frame_000020.png" if output == "out" else output)).is_file()
+
+
+def test_a_folder_that_cannot_be_locked(tmp_path, monkeypatch):
+    (tmp_path / "lock").mkdir()
+    with (
+        pytest.raises(FolderError, match=rf"^-o: {tmp_path}/lock cannot be written \("),
+        locked_folder(tmp_path, "run"),
+    ):
+        pass
+    with monkeypatch.context() as patch:
+
+        def refuse(*_):
+            raise NotImplementedError("no locks here")
+
+        patch.setattr(folder_lock.FileLock, "acquire", refuse)
+        with locked_folder(tmp_path, "run"):  # a file system without locks
+            pass
 
 
 def test_a_disk_that_refuses_is_failed_work():

@@ -47,6 +47,27 @@ def test_a_clip_is_what_the_network_reads(tmp_path, write_film):
     assert (clip["spikes"].float().sum(0) - 41 * light)[ground].abs().max() < 1.001
 
 
+@pytest.mark.parametrize("patch", [None, 8])
+def test_key_frames_of_a_film(tmp_path, write_film, patch):
+    write_film(tmp_path / "film", 11, (36, 48))
+    data = scenes(tmp_path, clips=1, key_frames=3, cache=str(tmp_path / "cache"))
+    for _ in ("fresh", "cached"):
+        clip = data.test_set[0] if patch is None else data.train_set[0]
+        side = (18, 24) if patch is None else (8, 8)
+        assert clip["spikes"].shape == (3, 41, *side)
+        assert clip["rgb"].shape == (3, 3, 2 * side[0], 2 * side[1])
+        assert clip.keys() == {"spikes", "rgb", "every"}
+        assert clip["every"] == 20
+        assert clip["spikes"][0, 20:].equal(clip["spikes"][1, :21])  # one stream, cut
+        for spikes, rgb in zip(clip["spikes"], clip["rgb"], strict=True):
+            light = 0.4 * bin_to_sensor(rgb, scale=2)
+            assert (spikes.float().mean(0) - light)[:4].abs().max() < 0.05  # where no disc comes by
+    truth = [read_picture(tmp_path / f"film/{n:08d}.png")[:, :36, :48] for n in (4, 5, 6)]
+    assert data.test_set[0]["rgb"].equal(torch.stack(truth))
+    with pytest.raises(ValueError, match="key_frames: expected an odd number, got 2"):
+        scenes(tmp_path, key_frames=2)
+
+
 def test_clips_are_spread_over_a_film(tmp_path, write_film):
     write_film(tmp_path / "film", 22)
     data = scenes(tmp_path, clips=5)
@@ -86,6 +107,19 @@ def test_patches_keep_the_phase_and_are_others_every_time(tmp_path, monkeypatch,
         assert torch.equal(patch["flow"], everything["flow"][:, :, top : top + 8, left : left + 8].half().float())
     assert len(corners) > 5
     assert len(whole) == 4  # every film has two clips, and every round has all of them
+
+
+def test_spikes_of_a_patch_reach_as_far_as_motion_is_estimated_on(tmp_path, reds):
+    """8 x 8 sensor pixels of a view of 16 x 24 have at most 4 around them."""
+    reds(tmp_path)
+    for flow_patch, side in ((8, 8), (11, 12), (48, 16)):
+        clip = scenes(tmp_path, flow_patch=flow_patch).train_set[0]
+        assert clip["spikes"].shape == (41, side, side)
+        assert clip["rgb"].shape == (3, 16, 16)
+        assert clip["flow"].shape == (2, 2, 8, 8)
+        light = 0.4 * bin_to_sensor(clip["rgb"], scale=2)
+        inner = clip["spikes"].float().mean(0)[side // 2 - 4 : side // 2 + 4, side // 2 - 4 : side // 2 + 4]
+        assert torch.corrcoef(torch.stack([inner.flatten(), light.flatten()]))[0, 1] > 0.8
 
 
 original_clip = ClipRecipe.clip
@@ -187,7 +221,7 @@ def test_training_goes_on_where_it_stands(tmp_path, reds):
     data = scenes(tmp_path, "fit", clips=2)
     sampler = data.train_dataloader().sampler
     assert list(sampler) == [0, 1, 2, 3]
-    data.trainer = types.SimpleNamespace(global_step=3, accumulate_grad_batches=1, world_size=1)
+    data.trainer = types.SimpleNamespace(global_step=3, accumulate_grad_batches=1, world_size=1, global_rank=0)
     assert list(sampler) == [6, 7, 8, 9]
 
 

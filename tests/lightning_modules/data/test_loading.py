@@ -5,11 +5,12 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 import torch
 
-from lightning_modules.data.loading import load_clips
+from lightning_modules.data.loading import FreshClips, OwnPart, load_clips
 
 # A clip is larger than a pipe: its worker waits for somebody to take it.
 LOAD = """
@@ -60,3 +61,30 @@ def test_workers_are_no_more_than_there_are_batches():
     loader = load_clips(Clips(), 2, 0)
     assert loader.num_workers == 0
     assert [batch["index"].tolist() for batch in loader] == [[0, 1], [2, 3], [4]]
+
+
+def of_process(rank, processes, step=0, accumulated=1):
+    trainer = SimpleNamespace(
+        global_rank=rank, world_size=processes, global_step=step, accumulate_grad_batches=accumulated
+    )
+    return SimpleNamespace(trainer=trainer)
+
+
+def test_processes_see_every_training_clip_once():
+    alone = [*FreshClips(of_process(0, 1), 4, 13)]
+    assert alone == [*range(12)]
+    shares = [[*FreshClips(of_process(rank, 2), 2, 13)] for rank in range(2)]
+    assert shares == [[0, 1, 4, 5, 8, 9], [2, 3, 6, 7, 10, 11]]
+    assert [len(FreshClips(of_process(rank, 2), 2, 13)) for rank in range(2)] == [6, 6]
+    later = [index for rank in range(2) for index in FreshClips(of_process(rank, 2, step=3, accumulated=2), 2, 13)]
+    assert sorted(later) == [*range(24, 36)]
+    assert [*FreshClips(SimpleNamespace(trainer=None), 4, 13)] == alone
+    with pytest.raises(ValueError, match="batch_size: 2 x 3 processes need 6 clips, got 5"):
+        FreshClips(of_process(0, 3), 2, 5)
+
+
+def test_processes_share_the_clips_of_a_test():
+    assert [[*OwnPart(of_process(rank, 2), 5)] for rank in range(2)] == [[0, 1], [2, 3, 4]]
+    assert [*OwnPart(SimpleNamespace(trainer=None), 3)] == [0, 1, 2]
+    with pytest.raises(ValueError, match="devices: expected at most 1, a clip for every process, got 2"):
+        OwnPart(of_process(1, 2), 1)

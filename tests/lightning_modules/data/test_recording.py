@@ -121,7 +121,7 @@ def test_a_dim_recording_is_shown_bright(tmp_path):
     words = ["predict", "--model.network", "ClassicalDecoder", "--model.network.method", "tfp"]
     words += ["--data", "Recording", "--data.path", str(tmp_path / "dim.npz"), "-o", str(tmp_path / "out")]
     main([*words, "--data.frame", "40:81:40"])
-    pictures = [read_picture(path) for path in sorted((tmp_path / "out").iterdir())]
+    pictures = [read_picture(path) for path in sorted((tmp_path / "out").glob("*.png"))]
     assert len(pictures) == 2
     assert all(picture.quantile(0.999) > 0.9 for picture in pictures)
     main([*words, "--data.frame", "40", "--data.white", "0.4"])
@@ -173,6 +173,28 @@ def test_processes_share_the_clips_in_parts_that_follow_each_other(tmp_path, spi
     found = [[batch["frame"].item() for batch in _Batches(clips, n, processes)] for n in range(processes)]
     assert [frame for part in found for frame in part] == clips.chosen
     assert max(map(len, found)) - min(map(len, found)) <= 1
+
+
+@pytest.mark.parametrize("processes", [1, 2, 3])
+@pytest.mark.parametrize("group", [1, 3])
+def test_groups_are_those_of_the_film_and_what_comes_before_is_seen_again(tmp_path, spikes, processes, group):
+    write_spikes(tmp_path / "clip.npz", spikes)
+    clips = RecordingClips(str(tmp_path / "clip.npz"), every=2, white=1.0)
+    clips.made = {30, 34, 36}
+    of_group = [clips.chosen[n : n + group] for n in range(0, len(clips), group)]
+    shown = []
+    for process in range(processes):
+        batches = list(_Batches(clips, process, processes, group, warm_up=4))
+        frames = [batch["frame"].tolist() for batch in batches]
+        assert all(part in of_group for part in frames)
+        assert len(batches) == len(_Batches(clips, process, processes, group, warm_up=4))
+        seen = [frame for part in frames for frame in part]
+        for batch in batches:
+            for frame, whether in zip(batch["frame"].tolist(), batch["shown"].tolist(), strict=True):
+                shown += [frame] * whether
+                before = [n for n in clips.chosen if n < frame][-4:]
+                assert not whether or set(before) <= set(seen[: seen.index(frame)])
+    assert shown == [frame for frame in clips.chosen if frame not in clips.made]
 
 
 def test_a_grey_recording_is_not_cropped_to_a_phase(tmp_path, spikes):

@@ -75,6 +75,41 @@ def test_clip_is_its_scene():
     assert (clip["spikes"].float().sum(0) - light).abs().max() < 1.001
 
 
+def test_spikes_reach_as_far_as_motion_is_estimated_on():
+    data = scenes(patch=6, flow_patch=12, scale=2)
+    clip, wide = data.train_set[3], scenes(patch=14, scale=2).train_set[3]
+    assert torch.equal(clip["spikes"], wide["spikes"])  # 4 more on every side, which keeps the Bayer phase
+    assert torch.equal(clip["rgb"], wide["rgb"][:, 8:20, 8:20])
+    assert torch.equal(clip["flow"], wide["flow"][..., 4:10, 4:10])
+    assert data.val_set[0]["spikes"].shape == (41, 8, 8)
+
+
+def test_key_frames_have_margins_and_a_cache_too(tmp_path):
+    options = {"scale": 2, "key_frames": 3, "every": 20}
+    wide = scenes(patch=14, **options).train_set[3]
+    for _ in range(2):
+        clip = scenes(patch=6, flow_patch=12, cache=str(tmp_path), **options).train_set[3]
+        assert clip.keys() == wide.keys() == {"spikes", "rgb", "every"}
+        assert torch.equal(clip["spikes"], wide["spikes"])
+        assert torch.equal(clip["spikes"][0, 20:], clip["spikes"][1, :21])
+        assert torch.equal(clip["rgb"], wide["rgb"][..., 8:20, 8:20])
+
+
+def test_a_cache_gives_the_same_clips_of_the_same_settings(tmp_path, monkeypatch):
+    options = {"patch": 6, "flow_patch": 12, "scale": 2, "cache": str(tmp_path)}
+    first = scenes(**options).train_set[3]
+    plain = scenes(**{**options, "cache": None}).train_set[3]
+    monkeypatch.setattr(StillClips, "_make", lambda self, index: pytest.fail("made again"))
+    kept = scenes(**options, train_clips=4).train_set[3]
+    for clip in (first, kept):
+        assert torch.equal(clip["spikes"], plain["spikes"])
+        assert torch.equal(clip["rgb"], plain["rgb"])
+        assert torch.equal(clip["flow"], plain["flow"].half().float())
+    for other in ({"alpha": 0.5}, {"flow_patch": 6}, {"seed": 1}):
+        with pytest.raises(pytest.fail.Exception, match="made again"):
+            scenes(**{**options, **other}).train_set[3]
+
+
 def test_mean_of_the_spikes_is_the_brightness():
     data = scenes(patch=16, motion=0.0, rotation=0.0, zoom=0.0)
     for i in range(6):
@@ -120,7 +155,7 @@ def test_fresh_clips_follow_the_steps():
     data = scenes()
     sampler = data.train_dataloader().sampler
     assert list(sampler) == list(range(8))
-    data.trainer = types.SimpleNamespace(global_step=7, accumulate_grad_batches=3, world_size=1)
+    data.trainer = types.SimpleNamespace(global_step=7, accumulate_grad_batches=3, world_size=1, global_rank=0)
     assert list(sampler) == list(range(42, 50))
 
 
@@ -213,6 +248,19 @@ def test_options_do_what_they_say():
     turned = scenes(motion=0.0, rotation=5.0, zoom=0.0, objects=0)
     assert turned.train_set[0]["flow"][0, :, 0, 0].norm() > 0
     assert scenes(frames=11, flow_times=(0, 10)).train_set[0]["spikes"].shape[0] == 11
+
+
+def test_key_frames_are_one_scene_that_moves_on():
+    clips = StillClips(embedded_pictures(), scale=2, patch=16, key_frames=3, every=10, motion=2.0, bend=0.5, objects=1)
+    clip, scene = clips[3], clips.scene(3)
+    assert scene.frames == 61
+    assert clip["spikes"].shape == (3, 41, 16, 16)
+    assert clip["every"] == 10
+    assert clip["spikes"][0, 10:].equal(clip["spikes"][1, :31])
+    for n, rgb in enumerate(clip["rgb"]):
+        assert rgb.equal(scene.rgb(20 + 10 * n))
+    single = StillClips(embedded_pictures(), scale=2, patch=16, motion=2.0, bend=0.5, objects=1).scene(3)
+    assert single.layers[0].motion.velocity == scene.layers[0].motion.velocity  # as fast as in a single clip
 
 
 def test_margins_are_wide_enough():

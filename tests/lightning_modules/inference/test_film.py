@@ -1,10 +1,15 @@
+import gc
+import os
+import resource
+
 import pytest
 import torch
 
 from lightning_modules.data.clips_around import clips_around
 from lightning_modules.inference.film import film
 from lightning_modules.inference.predict import predict
-from lightning_modules.networks import ClassicalDecoder
+from lightning_modules.motion import ClassicalFlow
+from lightning_modules.networks import CSCSR, ClassicalDecoder
 
 
 @pytest.fixture(name="spikes", scope="module")
@@ -68,3 +73,28 @@ def test_errors(spikes):
         film(network, [spikes], white=0)
     with pytest.raises(ValueError, match=r"chunks: expected \(T, H, W\), got \(1, 113, 8, 10\)"):
         next(film(network, [spikes[None]]))
+
+
+def test_memory_stays_flat_over_a_long_film():
+    """SPIKEKIT_FUZZ=N in the environment makes N pictures."""
+    count = int(os.environ.get("SPIKEKIT_FUZZ", "40"))
+    sizes = {"width": 4, "representation_width": 4, "features": 1, "stages": 1, "end_blocks": 1}
+    network = CSCSR(scale=2, motion=ClassicalFlow(), **sizes).eval()
+    generator = torch.Generator().manual_seed(0)
+    stream = ((torch.rand(3, 24, 32, generator=generator) < 0.3).to(torch.uint8) for _ in range(count + 32))
+
+    def held():
+        gc.collect()
+        tensors = sum(issubclass(type(one), torch.Tensor) for one in gc.get_objects())
+        return tensors, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
+
+    with torch.no_grad():
+        pictures = film(network, stream, every=3)
+        for _ in range(10):
+            next(pictures)
+        tensors, most = held()
+        for _ in range(count):
+            next(pictures)
+        now, peak = held()
+    assert now <= tensors
+    assert peak - most < 16 << 20

@@ -58,7 +58,7 @@ def _table(tmp_path, monkeypatch):
             times = {"ratio": ms and ms / 400, "ms": 400 if name == "all" else 1, "reference": "all"}
             writer.writerow(row | times | columns)
     monkeypatch.setattr(speed, "_FOLDER", tmp_path)
-    monkeypatch.setattr(speed, "pace", lambda scale: 1.0)
+    monkeypatch.setattr(speed, "pace", lambda *_: 1.0)
     return tmp_path
 
 
@@ -80,10 +80,22 @@ def test_speeds(table, name, expected):
         ("20MiB", (40, 50), "small tiles"),
         ("20MB", (40, 50), "tfp"),
         ("1GB", (40, 50), "all"),
+        ("2.5fps", (40, 50), "all"),
+        ("2.6 fps", (40, 50), "no motion"),
     ],
 )
 def test_budgets_grow_with_the_frame(table, budget, size, expected):
     assert choose(3, budget=budget, size=size).name == expected
+
+
+def test_films_have_a_table_of_their_own(table):
+    assert choose(3, "fastest", film=True) == choose(3, "fastest")  # as long as there is none
+    lines = (table / "x3.csv").read_text().splitlines()
+    (table / "x3_film.csv").write_text("\n".join(line for line in lines if not line.startswith("tfi")))
+    assert choose(3, "fastest", film=True).name == "tfp 5"
+    assert choose(3, "fastest").name == "tfi"
+    with pytest.raises(ValueError, match=r"expected one that was measured \(x3\), got 4"):
+        choose(4, "fastest", film=True)
 
 
 @pytest.mark.usefixtures("table")
@@ -107,7 +119,7 @@ def test_memory_of_a_tile_goes_by_the_halo_of_the_weights(monkeypatch):
 
 @pytest.mark.parametrize(("here", "expected"), [(2.0, "no motion"), (0.1, "all"), (50.0, "tfi")])
 def test_a_budget_of_time_is_one_of_this_machine(table, monkeypatch, here, expected):
-    monkeypatch.setattr(speed, "pace", lambda scale: here)
+    monkeypatch.setattr(speed, "pace", lambda *_: here)
     choice = choose(3, budget="400ms", size=(40, 50))
     assert choice.name == expected
     assert choice.ms == here * {"no motion": 200, "all": 400, "tfi": 4}[expected]
@@ -261,7 +273,7 @@ def test_help_says_the_figures_that_speeds_are_chosen_by(capsys):
 
 
 def test_tables_of_the_package(monkeypatch):
-    monkeypatch.setattr(speed, "pace", lambda scale: 1.0)
+    monkeypatch.setattr(speed, "pace", lambda *_: 1.0)
     for scale in (2, 3, 4):
         found = choices(scale, (250, 400))
         picked = [choose(scale, name) for name in SPEEDS]

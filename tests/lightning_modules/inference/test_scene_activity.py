@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lightning_modules.error_model import ErrorModel
-from lightning_modules.inference.scene_activity import CELL, look, required
+from lightning_modules.inference.scene_activity import CELL, look, required, scene_activity
 from spikekit import spike_integrate_fire
 from spikekit.scenes.analytic import Layer, Motion, Scene
 from spikekit.sensor.noise import SensorNoise
@@ -81,6 +81,15 @@ def test_change_is_counted_in_parts_of_a_white_pixel():
         spikes, _ = spike_integrate_fire(ramp, charge=charge)
         still = seen(spikes[None], alpha).still
         assert (still / (0.05 * 0.1**2 * CELL**2)).mean().item() == pytest.approx(1, abs=0.2)
+
+
+def test_black_says_little_of_what_changes_beside_it():
+    """Half of every cell is black, which has no noise, and the other half grows by a tenth of white."""
+    ramp = 0.4 * (0.4 + torch.linspace(0, 0.1, 41)[:, None, None]).expand(41, 64, 64).clone()
+    ramp.unflatten(-1, (4, 16))[..., :8] = 0
+    charge = torch.rand(64, 64, generator=torch.Generator().manual_seed(0))
+    change = scene_activity(spike_integrate_fire(ramp, charge=charge)[0][None], "RGGB", 0.4).change
+    assert (change / (0.1**2 * CELL**2)).mean().item() == pytest.approx(0.863, abs=0.01)
 
 
 def test_noise_of_a_real_sensor_asks_for_more_never_for_less():

@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from lightning_modules.error_model import ErrorModel
+from lightning_modules.inference.predict import predict
 from lightning_modules.inference.tiles import AROUND, forward_in_tiles
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks import CSCSR, ClassicalDecoder
@@ -240,6 +241,17 @@ def test_a_network_that_sees_everything_is_not_run_in_tiles(tolerance):
     calls.clear()
     assert forward_in_tiles(network, spikes, 64, tolerance).equal(expected)
     assert [size for size, _ in calls] == [(64, 192)]
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 1e-6])
+def test_how_far_a_picture_is_is_told_tile_by_tile_and_view_by_view(tolerance):
+    shares = []
+    how = {"done": shares.append, "tile": 32, "psnr_tolerance": tolerance}
+    predict(ClassicalDecoder(scale=2), clip([Layer(coarse(32, 64))], 32, 64), self_ensemble=2, **how)
+    assert list(dict.fromkeys(shares)) == [0.25, 0.5, 0.75, 1.0]
+    shares.clear()
+    predict(ClassicalDecoder(scale=2), clip([Layer(coarse(8, 8))], 8, 8), self_ensemble=4, **how)
+    assert list(dict.fromkeys(shares)) == [0.25, 0.5, 0.75, 1.0]
 
 
 @pytest.mark.parametrize("tolerance", [-0.1, float("nan"), float("inf")])

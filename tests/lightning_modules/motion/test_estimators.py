@@ -70,6 +70,12 @@ def test_any_size(size):
             assert flow.isfinite().all()
 
 
+def test_zero_flow_has_a_plane_for_every_site():
+    for flow in ZeroFlow().channel_flows(torch.zeros(3, 41, 5, 8, dtype=torch.uint8), TIMES, "RGGB"):
+        assert flow.shape == (4, 3, 2, 3, 4)
+        assert flow.dtype == torch.float32
+
+
 @pytest.mark.parametrize(
     "wrong", [{"attachment": 0.0}, {"attachment": float("nan")}, {"warps": 0}, {"warps": 1.5}, {"warps": True}]
 )

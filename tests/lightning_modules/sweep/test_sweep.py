@@ -414,6 +414,34 @@ def test_two_sweeps_in_one_folder_are_refused(typed, tmp_path):
         main([*typed, "-o", str(tmp_path)])
 
 
+def test_a_sweep_fails_where_trials_do(typed, tmp_path, monkeypatch, capsys):
+    for failed in ({}, {tmp_path / "tiny": "no such thing"}):
+        monkeypatch.setattr(cli, "_run", lambda *_, failed=failed: failed)
+        if failed:
+            with pytest.raises(SystemExit, match=r"^lightning: sweep: 1 of 1 trials failed; the same"):
+                main([*typed, "-o", str(tmp_path)])
+        else:
+            main([*typed, "-o", str(tmp_path)])
+
+
+def test_a_result_is_of_the_checkpoint_and_of_the_table_of_its_test(tmp_path):
+    optimizer = {"lr": 0.05, "initial_lr": 0.1, "weight_decay": 0.2}
+    network = {"class": "CSCSR", "scale": 4}
+    state = {"state_dict": {}, "network": network, "global_step": 6, "pytorch-lightning_version": "2.6.0"}
+    torch.save({**state, "optimizer_states": [{"param_groups": [optimizer]}]}, tmp_path / "last.ckpt")
+    (tmp_path / "test.csv").write_text("method,clip,psnr\nTFI,0,1.5\nTFI,mean,2.5\n")
+    report = SimpleNamespace(seconds=3.0, steps=6, parameters=100)
+    assert worker._result(tmp_path, tmp_path / "last.ckpt", report) == {
+        "metrics": {"TFI": {"psnr": 2.5}},
+        "method": "CSCSR",
+        "steps": 6,
+        "seconds_per_step": 0.5,
+        "parameters": 100,
+        "network": network,
+        "optimizer": {"lr": 0.1, "weight_decay": 0.2},
+    }
+
+
 def test_trials_end_as_their_processes_do(tmp_path, monkeypatch):
     ends = {
         "fine": ("pass", None),

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -12,8 +13,12 @@ import torch
 from PIL import Image
 
 from lightning_modules.__main__ import main
+from lightning_modules.cli import parts
+from lightning_modules.inference.film import film
+from lightning_modules.networks import RecurrentCSCSR
+from lightning_modules.pretrained import Weights, settings_of, write_weights
 from lightning_modules.tasks import predictions
-from spikekit import read_picture, read_video, write_spikes
+from spikekit import read_picture, read_spikes, read_video, write_spikes
 from spikekit.io import video_output
 
 pytest.importorskip("av")
@@ -135,6 +140,47 @@ def command(words, *more, **how):
     return subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, **how)
 
 
+@pytest.fixture(name="carries_on")
+def _carries_on(words, tmp_path):
+    """The same by a network whose pictures depend on their neighbours."""
+    torch.manual_seed(0)
+    network = RecurrentCSCSR(scale=2, width=8, representation_width=8, features=1, stages=1, end_blocks=1)
+    for weight in (network.fusion.share.weight, network.fusion.rest.weight):
+        torch.nn.init.normal_(weight, std=0.05)
+    weights = Weights(tmp_path, settings_of(network), {}, network.state_dict())
+    write_weights(weights, tmp_path / "film.safetensors")
+    data = words[words.index("--data") : -1]
+    return ["predict", "--model.weights", str(tmp_path / "film.safetensors"), *data, "-o"]
+
+
+@pytest.mark.parametrize("future", [0, 3])
+def test_a_network_carries_on_through_a_film_and_where_it_was_stopped(carries_on, tmp_path, monkeypatch, future):
+    words = [*carries_on, str(tmp_path / "out"), "--model.future", str(future), "--data.white", "0.3"]
+    main(words)
+    unbroken = pictures(tmp_path / "out")
+    network = RecurrentCSCSR.from_pretrained(tmp_path / "film.safetensors")
+    shown = list(film(network, [read_spikes(tmp_path / "clip.npz")], 10, future=future, white=0.3))
+    assert sorted(unbroken) == [f"frame_{frame.clock:06d}.png" for frame in shown]
+    for name, frame in zip(sorted(unbroken), shown, strict=True):
+        torch.testing.assert_close(read_picture(tmp_path / "out" / name), frame.rgb, rtol=0, atol=0.51 / 255)
+    (tmp_path / "out" / "frame_000040.png").unlink()
+    (tmp_path / "out" / "frame_000070.png").unlink()
+    stop_after(monkeypatch, 2)
+    main(words)
+    assert pictures(tmp_path / "out") == unbroken
+    monkeypatch.undo()
+    main([*carries_on, str(tmp_path / "alone"), "--data.frame", "40", "--data.white", "0.3"])
+    assert pictures(tmp_path / "alone")["frame_000040.png"] != unbroken["frame_000040.png"]
+
+
+@pytest.mark.slow
+def test_a_network_that_carries_on_is_the_same_in_two_processes(carries_on, tmp_path):
+    for name, devices in (("one", 1), ("two", 2)):
+        with command(carries_on, tmp_path / name, "--model.future", 1, "--trainer.devices", devices) as process:
+            assert process.wait() == 0, process.stderr.read()
+    assert pictures(tmp_path / "one") == pictures(tmp_path / "two")
+
+
 @pytest.mark.slow
 def test_a_killed_film_goes_on(words, tmp_path):
     words = [*words, tmp_path / "film.mp4", "--data.every", 1]
@@ -166,9 +212,41 @@ def test_two_processes_make_what_one_makes(words, tmp_path):
     assert len(read_video(tmp_path / "film.mp4")) == 6
 
 
+def test_parts_make_what_one_makes(words, tmp_path):
+    main([*words, str(tmp_path / "one")])
+    for part in ("3/4", "1/4", "4/4", "2/4"):
+        before = len(pictures(tmp_path / "film.mp4.frames"))
+        main([*words, str(tmp_path / "film.mp4"), "--part", part])
+        assert len(pictures(tmp_path / "film.mp4.frames")) == before + (2 if part in ("2/4", "4/4") else 1)
+    assert pictures(tmp_path / "one") == pictures(tmp_path / "film.mp4.frames")
+    main([*words, str(tmp_path / "film.mp4")])
+    assert len(read_video(tmp_path / "film.mp4")) == 6
+    with pytest.raises(SystemExit, match="--part: expected at most 4 of 4, got 5"):
+        main([*words, str(tmp_path / "film.mp4"), "--part", "5/4"])
+
+
+@pytest.mark.slow
+def test_ray_makes_what_one_process_makes(words, tmp_path, monkeypatch):
+    pytest.importorskip("ray", reason="Ray is an extra")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    words = [*words[:-1], "--data.every", "20", "-o"]
+    main([*words, str(tmp_path / "one.mp4")])
+    main([*words, str(tmp_path / "many.mp4"), "--engine", "ray", "--jobs", "2"])
+    assert len(read_video(tmp_path / "many.mp4")) == 3
+    assert (tmp_path / "many.mp4").read_bytes() == (tmp_path / "one.mp4").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["clip.npz", "many.mp4", "one.mp4"]
+
+
+def test_ray_is_said_to_be_missing(words, tmp_path, monkeypatch):
+    monkeypatch.setattr(parts, "find_spec", lambda _: None)
+    with pytest.raises(SystemExit, match="predict: --engine ray: Ray is not installed"):
+        main([*words, str(tmp_path / "out"), "--engine", "ray"])
+
+
 _PEAK = """
 import resource, sys
 from lightning_modules.__main__ import main
+from lightning_modules.cli import parts
 main(sys.argv[1:])
 print("peak", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
@@ -186,3 +264,18 @@ def test_memory_does_not_grow_with_the_recording(words, tmp_path):
         done = subprocess.run([*map(str, run)], capture_output=True, text=True, check=True)
         peaks.append(int(done.stdout.split("peak ")[1]) / 1024)
     assert peaks[1] < peaks[0] + 60  # MiB; the 2000 frames are 190 MiB
+
+
+def test_progress_of_pictures_and_of_tiles_on_a_terminal(words, tmp_path, monkeypatch, capsys):
+    words = [*words, str(tmp_path), "--model.tile", "8", "--model.self_ensemble", "2", "--data.frame", "20:41:20"]
+    main(words)
+    assert capsys.readouterr().err == ""  # that of the tests is no terminal
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    monkeypatch.setattr("spikekit.progress.AFTER", 0)
+    for path in tmp_path.glob("*.png"):
+        path.unlink()
+    main(words)
+    shown = capsys.readouterr().err
+    assert re.search(r"pictures: .* 0/2 .*picture", shown)
+    assert shown.count("this picture:   0%") >= 2
+    assert " left" in shown

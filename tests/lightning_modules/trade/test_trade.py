@@ -11,24 +11,28 @@ from pathlib import Path
 import pytest
 import pytorch_lightning
 import torch
+from pytorch_lightning import LightningDataModule
 
 from lightning_modules.__main__ import main
 from lightning_modules.cli.arguments import arguments_preset
-from lightning_modules.cli.errors import InputError
+from lightning_modules.cli.errors import InputError, UsageError
 from lightning_modules.cost.energy import energy_meter, energy_per_call
 from lightning_modules.cost.measure import Row, Timed, running, time_in_turns
 from lightning_modules.cost.runner import Runner, make_runner
+from lightning_modules.data import FilmScenes
 from lightning_modules.inference import presets
 from lightning_modules.inference.presets import Preset
+from lightning_modules.metrics.flicker import film_flicker
 from lightning_modules.motion import Spike2Flow
 from lightning_modules.networks import CSCSR, TSCNN
 from lightning_modules.pretrained import settings_of
 from lightning_modules.trade import cli, energy, measure
+from lightning_modules.trade.films import film_scenes
 from lightning_modules.trade.pareto import pareto_front
 from lightning_modules.trade.plot import plot
 from lightning_modules.trade.settings import Setting, read_setting, usual_settings
 from lightning_modules.trade.table import figures, front, markdown, write_csv
-from spikekit import read_picture
+from spikekit import flow_warp, psnr, read_picture
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 WIDTHS = dict.fromkeys(("width", "representation_width", "features", "stages", "blocks", "end_blocks"), 2)
@@ -133,6 +137,61 @@ def test_scores_are_those_of_lightning_test(traded, shared, checkpoint, tmp_path
             assert float(rows[ours]["psnr"]) == pytest.approx(float(means[theirs]["psnr"]), abs=1e-4)
             assert float(rows[ours]["ssim"]) == pytest.approx(float(means[theirs]["ssim"]), abs=1e-4)
     assert len({rows[name]["psnr"] for name in ("as it is", "trained", "TFI")}) == 3
+
+
+@pytest.mark.slow
+def test_films(shared, base, tmp_path):
+    """Pictures, errors and work are those of single clips, which these networks see in a film as well."""
+    settings = ["--setting", "as it is:", "--setting", f"TFI: {TFI}"]
+    more = ["--data.val_clips", "1", "--rounds", "1", "--film", "10"]
+    main(["trade", *shared, *settings, *more, "-o", str(tmp_path)])
+    rows, text = rows_of(tmp_path), (tmp_path / "trade.md").read_text()
+    assert "5 pictures each, 10 clocks apart" in text
+    assert [(row["latency"], row["every"], row["failed"]) for row in rows.values()] == [("20", "10", "")] * 2
+    scene = next(film_scenes(base.data, 41, 10))
+    clips = scene.spikes[0].unfold(0, 41, 10).movedim(-1, 1)[1:4]
+    rgb = torch.cat([base(clip[None]) for clip in clips])
+    assert float(rows["as it is"]["psnr"]) == pytest.approx(psnr(rgb, scene.rgb).mean().item(), abs=1e-4)
+    pairs = [film_flicker(*(part[None] for part in (rgb[1], rgb[n], scene.rgb[1], scene.rgb[n], scene.flow[n // 2])))
+             for n in (0, 2)]  # fmt: skip
+    assert float(rows["as it is"]["flicker"]) == pytest.approx(torch.cat(pairs).mean().item(), abs=1e-4)
+    assert "--film 10" in rows["TFI"]["command"]
+    assert f"| {float(rows['TFI']['flicker']):.3f} " in text
+
+
+def test_the_truth_of_a_film_follows_its_motion(base):
+    scene = next(film_scenes(base.data, 41, 20))
+    assert scene.spikes.shape == (1, 121, 12, 12)
+    still = [(flow_warp(scene.rgb[n][None], torch.zeros(1, 2, 48, 48)) - scene.rgb[1]).abs().mean() for n in (0, 2)]
+    moved = [
+        (flow_warp(scene.rgb[n][None], scene.flow[n // 2][None]) - scene.rgb[1])[..., 16:32, 16:32] for n in (0, 2)
+    ]
+    assert max(part.abs().mean() for part in moved) < 0.5 * min(still)
+
+
+def test_what_flickers():
+    truth, flow = torch.rand(3, 3, 16, 16, generator=torch.Generator().manual_seed(0)), torch.zeros(3, 2, 16, 16)
+    flow[:, 0] = 2.0
+    then = truth.roll(2, dims=-1)
+    error = torch.rand(3, 3, 16, 16)
+    goes_along, comes = error.roll(2, dims=-1), torch.full_like(error, 4 / 255)
+    assert (film_flicker(truth + error, then + goes_along, truth, then, flow) < 1e-3).all()
+    found = film_flicker(truth, then + comes, truth, then, flow)
+    torch.testing.assert_close(found, torch.full((3,), 4.0), rtol=0, atol=1e-3)
+    outside = torch.zeros_like(error)
+    outside[..., -2:] = 1.0  # from where the flow ends beyond the edge
+    assert (film_flicker(truth + outside, then, truth, then, flow) < 1e-3).all()
+
+
+def test_films_need_scenes_that_go_on(base, tmp_path, write_film):
+    write_film(tmp_path / "film", 9)
+    data = FilmScenes(str(tmp_path), scale=2)
+    data.setup("test")
+    with pytest.raises(UsageError, match="--film: expected a multiple of the 20 clocks of a source frame, got 10"):
+        next(film_scenes(data, 41, 10))
+    assert next(film_scenes(data, 41, 20)).rgb.shape == (3, 3, 32, 48)
+    with pytest.raises(UsageError, match="--film: expected still pictures in motion or films at full size, got"):
+        next(film_scenes(LightningDataModule(), 41, 20))
 
 
 @pytest.mark.slow
@@ -356,6 +415,13 @@ def test_what_the_machine_lacks_is_a_row(shared, base):
     for args in (["--trainer.accelerator", "gpu"], ["--trainer.precision", "16-mixed"]):
         with pytest.raises(CannotRunError, match=r"gpu|16-mixed: not on this device"):
             make_runner(shared, args, base)
+
+
+def test_a_runner_has_the_weights_of_its_checkpoint(shared, base, checkpoint):
+    network = Runner([*shared, "--ckpt_path", str(checkpoint)]).network
+    stored = torch.load(checkpoint, weights_only=True)["state_dict"]
+    assert all(value.equal(stored[f"network.{name}"]) for name, value in network.state_dict().items())
+    assert not all(value.equal(stored[f"network.{name}"]) for name, value in base.network.state_dict().items())
 
 
 def test_a_network_of_fewer_frames_sees_the_middle_of_the_clip(shared, base):

@@ -111,7 +111,7 @@ def case(*others, clock=None, seconds=1.0):
         clock.seconds += seconds
         return torch.arange(4)
 
-    return Case("what it does", ours, 8_000_000, 4, 4, others), clock
+    return Case("what it does", ours, (), others, pixels=8_000_000, read=4, written=4), clock
 
 
 def measured(*others, **options):

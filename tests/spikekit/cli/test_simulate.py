@@ -16,12 +16,13 @@ import pytest
 import torch
 from skimage import io
 
-from spikekit import read_picture, read_spikes, tfp, write_picture
+from spikekit import Calibration, read_picture, read_spikes, tfp, write_calibration, write_picture
 from spikekit.cli.command import main
 from spikekit.cli.simulation import Settings, build
 from spikekit.io.sidecar import find_sidecar, published, read_sidecar
 from spikekit.scenes.adaptive_sampling import Plan
 from spikekit.scenes.frame_sequence import Film
+from spikekit.sensor.calibration import DEAD, HOT
 
 COMMAND = [sys.executable, "-c", "from spikekit.cli.command import main; raise SystemExit(main())"]
 IGNORING = "import signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN); "
@@ -541,8 +542,45 @@ def test_another_ending(film, fails):
     assert "expected a stream that ends in .dat or .npz, got a.png" in fails(2, film, "-o", "a.png", "--scale", 2)
 
 
+def calibrated(path, width=18, gain=0.5):
+    """A sensor whose left half sees half of the light, with a dead pixel and a hot one."""
+    gains, defects = torch.ones(16, width), torch.zeros(16, width, dtype=torch.uint8)
+    gains[:, : width // 2] = gain
+    defects[3, 5], defects[4, 6] = DEAD, HOT
+    write_calibration(path, Calibration(gains, torch.zeros(16, width), defects))
+
+
+def test_the_pixels_of_a_sensor_that_was_measured(film, capsys, fails):
+    Path("cameras").mkdir()
+    calibrated("cameras/one.safetensors")
+    words = [film, "--frames", 400, "--frame", 2, "--clocks", 200, "--alpha", 0.8, *QUICK]
+    sensor = ["--calibration", "cameras/one.safetensors"]
+    simulate(*words, "-o", "plain.dat")
+    simulate(*words, *sensor, "--photons", 1e6, "-o", "out/real.dat")
+    assert "pixels as cameras/one.safetensors has them" in capsys.readouterr().out
+    plain, real = (read_spikes(path, 16, 18).float().mean(0) for path in ("plain.dat", "out/real.dat"))
+    assert real[3, 5] == 0
+    assert real[4, 6] == 1
+    works = torch.ones(16, 18, dtype=bool)
+    works[3, 5] = works[4, 6] = False
+    expected = torch.where(torch.arange(18) < 9, plain / 2, plain)
+    assert (real - expected)[works].abs().max() < 0.02
+    assert read_sidecar(Path("out/real.json")).settings["calibration"] == "../cameras/one.safetensors"
+    simulate("out/real.json", "-o", "again.dat")
+    assert Path("again.dat").read_bytes() == Path("out/real.dat").read_bytes()
+    capsys.readouterr()
+    drawn = fails(2, *words, *sensor, "-o", "a.dat", "--dark-current", 0.1)
+    assert "--dark-current: expected 0, as the calibration has it" in drawn
+    calibrated("cameras/one.safetensors", gain=0.6)
+    assert "one.safetensors: changed since the side-car was written" in fails(1, "out/real.json", "-o", "a.dat")
+    calibrated("cameras/one.safetensors", width=20)
+    said = "one.safetensors: expected 16 x 18 pixels as the film gives them, got 16 x 20"
+    assert said in fails(1, *words, *sensor, "-o", "a.dat")
+
+
 def test_progress_on_a_terminal(film, monkeypatch, capsys):
     monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    monkeypatch.setattr("spikekit.progress.AFTER", 0)
     simulate(film, "-o", "a.dat", "--all", *QUICK)
     err = capsys.readouterr().err
     assert re.search(r"frames read: .* 0/5 ", err)

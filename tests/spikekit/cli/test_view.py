@@ -125,7 +125,7 @@ def test_a_page_of_its_own(still):
     view("a.dat", "-o", "a.html")
     page = Path("a.html").read_text()
     assert "http" not in page
-    pictures = re.findall(r'<img (hidden )?src="data:image/png;base64,([^"]+)"', page)
+    pictures = re.findall(r'<img (hidden )?src="data:image/(?:png|jpeg);base64,([^"]+)"', page)
     sizes = {Image.open(io.BytesIO(base64.b64decode(data))).size for _, data in pictures}
     assert (480, 320) in sizes
     sliding = sum(bool(hidden) for hidden, _ in pictures)
@@ -135,7 +135,23 @@ def test_a_page_of_its_own(still):
     assert 'max="21"' in page
     assert "img:not([hidden]){display:block}" in page  # or all would be seen at once
     assert "length = 20" in page
-    assert "41 frames of 32 x 48, alpha 0.5 is white" in page
+    assert "41 frames of 32 x 48, alpha 0.5 is white</p>\n" in page
+    assert "play.onclick" in page
+
+
+def test_a_large_recording_makes_a_page_of_some_megabytes(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    spikes = torch.rand(104, 500, 500, generator=torch.Generator().manual_seed(0)) < 0.03
+    write_spikes("a.dat", spikes)
+    view("a.dat", "--height", 500, "--width", 500, "-o", "a.html")
+    assert Path("a.html").stat().st_size < 11e6  # pure noise, the worst there is; lossless it takes half as much again
+    page = Path("a.html").read_text()
+    assert "60 of 64 windows, shrunk to at most 480 pixels" in page
+    said = "3.0% of the bits are set, 1.2 spikes of a pixel in 41 frames: --window 104 shows less noise"
+    assert said in page
+    assert said in capsys.readouterr().out
+    view("a.dat", "--height", 500, "--width", 500, "-o", "a.png", "--window", 41)
+    assert "--window" not in capsys.readouterr().out
 
 
 def test_a_name_cannot_break_the_page(still):

@@ -1,20 +1,24 @@
 """The overlays of the baselines, as their users type them: trained, tested, exported, read again, and run."""
 
 import csv
+import re
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
+from torch.utils.flop_counter import FlopCounterMode
 
 from lightning_modules import networks
 from lightning_modules.__main__ import main
+from lightning_modules.data import StillScenes
 from lightning_modules.pretrained import read_weights
 from lightning_modules.sweep.paper import TABLE_2, method_of
 from spikekit import read_picture, write_spikes
 
 CONFIGS = Path(__file__).parents[4] / "configs"
 OVERLAYS = sorted((CONFIGS / "baseline").glob("*.yaml"))
+SMALL = sorted((CONFIGS / "baseline/small").glob("*.yaml"))
 
 TINY = {
     "BasicVSR": {"width": 4, "blocks": 1, "neighbors": 1},
@@ -30,7 +34,7 @@ def network(overlay):
     return yaml.safe_load(overlay.read_text())["model"]["network"]
 
 
-@pytest.mark.parametrize("overlay", OVERLAYS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("overlay", OVERLAYS + SMALL, ids=lambda path: f"{path.parent.name}-{path.stem}")
 def test_what_an_overlay_says_is_all_that_its_network_has_in_common_with_cscsr(overlay):
     """It is laid over a configuration of CSCSR, whose settings of the same name would stay."""
     said = network(overlay)
@@ -42,6 +46,16 @@ def test_what_an_overlay_says_is_all_that_its_network_has_in_common_with_cscsr(o
             assert method_of({"class": kind.__name__, **made.settings}) in TABLE_2[scale]
         stays = below.keys() & made.settings.keys() - said["init_args"].keys()
         assert stays <= {"scale", "frames", "pattern", "alpha"}
+
+
+@pytest.mark.parametrize("overlay", SMALL, ids=lambda path: path.stem)
+def test_small_ones_do_as_much_work_as_they_say(overlay):
+    said = network(overlay)
+    made = getattr(networks, said["class_path"])(scale=4, **said["init_args"])
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        made(torch.zeros(1, 41, 16, 16), static=True)
+    expected = float(re.search(r"([\d.]+) MMAC a sensor pixel", overlay.read_text())[1])
+    assert counter.get_total_flops() / 2 / 16**2 / 1e6 == pytest.approx(expected, abs=0.05)
 
 
 def test_every_method_of_the_paper_has_an_overlay():
@@ -81,10 +95,22 @@ def test_from_training_to_a_picture(overlay, tmp_path):
     torch.testing.assert_close(read_picture(picture), expected, rtol=0, atol=0.51 / 255)
 
 
-def test_flow_between_other_frames_is_refused(tmp_path):
-    """The data's is linked to CSCSR's window; of 41 frames it is that of all networks."""
-    args = ["-c", str(CONFIGS / "x2.yaml"), "-c", str(CONFIGS / "baseline/vidarsr.yaml"), "-o", str(tmp_path)]
-    with pytest.raises(
-        SystemExit, match=r"data\.flow_times: expected \(7, 53\), between which the flow of VidarSR runs"
-    ):
-        main(["test", *args, "--model.network.frames=61"])
+@pytest.mark.parametrize(
+    ("config", "settings", "expected"),
+    [
+        ("baseline/vidarsr.yaml", ["network.frames=61"], "'frames': 61,.*'flow_times': (7, 53)"),
+        ("baseline/swinir.yaml", ["network.frames=21"], "'frames': 21,.*'flow_times': (2, 18)"),
+        ("baseline/small/spikesrnet.yaml", ["network.frames=27"], "'frames': 27,.*'flow_times': (3, 23)"),
+        ("size/tiny.yaml", ["network.frames=23"], "'frames': 23,.*'flow_times': (5, 17)"),
+        ("flow.yaml", ["window=21"], "'frames': 41,.*'flow_times': (10, 30)"),
+    ],
+)
+def test_clips_have_the_frames_and_the_flow_that_the_network_takes(config, settings, expected, tmp_path, monkeypatch):
+    def stop(self, stage):
+        raise ValueError(self.options)
+
+    monkeypatch.setattr(StillScenes, "setup", stop)
+    below = [] if config == "flow.yaml" else ["-c", str(CONFIGS / "x2.yaml")]
+    settings = [f"--model.{setting}" for setting in settings]
+    with pytest.raises(SystemExit, match=expected.replace("(", r"\(").replace(")", r"\)")):
+        main(["test", *below, "-c", str(CONFIGS / config), *settings, "-o", str(tmp_path)])

@@ -1,0 +1,63 @@
+"""``python -m lightning_modules.cost.exported``: what exported networks take beside the network itself."""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from lightning_modules.exporting import FORMATS, OPSET, export_network, exported
+from lightning_modules.networks import CSCSR
+from spikekit.arguments import whole
+from spikekit.bench import cpu_name
+from spikekit.tables import table
+from spikekit.timing import cpu_timer, interleave, ratio
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Print size, difference and time of every format, as ratios to the network, in turns in one process and thread."""
+    parser = argparse.ArgumentParser(prog="python -m lightning_modules.cost.exported", description=main.__doc__)
+    parser.add_argument("weights", nargs="+", help="names that lightning models lists")
+    parser.add_argument("--side", type=whole(16), default=96, help="of the clip, in sensor pixels; 96")
+    parser.add_argument("--rounds", type=whole(1), default=5, help="timings of each; 5")
+    parser.add_argument("--formats", nargs="+", choices=FORMATS, default=list(FORMATS), help="torch onnx")
+    asked = parser.parse_args(args)
+    torch.set_num_threads(1)
+    rows = [row for name in asked.weights for row in _rows(name, asked.formats, asked.side, asked.rounds)]
+    heading = ["weights", "format", "MiB", "export (s)", "largest difference", "time, network = 1", "ms"]
+    print(table(heading, rows))  # noqa: T201
+    print(f"{asked.side} x {asked.side} sensor pixels, seed 0, {asked.rounds} rounds, one thread of {cpu_name()}")  # noqa: T201
+    print(f"torch {torch.__version__}, ONNX opset {OPSET}")  # noqa: T201
+
+
+@torch.no_grad()
+def _rows(name: str, formats: Sequence[str], side: int, rounds: int) -> list[list[str]]:
+    network = CSCSR.from_pretrained(name)
+    generator = torch.Generator().manual_seed(0)
+    spikes = (torch.rand(1, network.frames, side, side, generator=generator) < 0.3).float()
+    flow = torch.randn(1, 2, 2, side, side, generator=generator)
+    runs, cells = {"network": lambda: network(spikes, flow)}, {}
+    with tempfile.TemporaryDirectory() as folder:
+        for kind in formats:
+            path, begin = Path(folder, f"network{FORMATS[kind]}"), time.process_time()
+            export_network(network, path, kind)
+            took, data = time.process_time() - begin, path.read_bytes()
+            run = exported(data, kind, threads=1)
+            worst = (run(spikes, flow) - network(spikes, flow)).abs().max().item()
+            cells[kind] = [f"{len(data) / 2**20:.1f}", f"{took:.0f}", f"{worst:.1g}"]
+            runs[kind] = lambda run=run: run(spikes, flow)
+        times = interleave(runs, rounds, cpu_timer(time.process_time))
+    found = [[name, "network", "", "", "", "1", f"{1e3 * min(times['network']):.0f}"]]
+    for kind in formats:
+        compared = ratio(times[kind], times["network"])
+        said = f"{compared.median:.2f} ({compared.least:.2f} .. {compared.most:.2f})"
+        found.append([name, kind, *cells[kind], said, f"{1e3 * min(times[kind]):.0f}"])
+    return found
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,34 @@
+"""The margin around a training patch, where spikes are there for the estimate of motion alone."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+
+def flow_margin(patch: int, flow_patch: int) -> int:
+    """Return how far spikes reach beyond a patch so that motion is estimated on enough of the scene.
+
+    Args:
+        patch: side of the patch in sensor pixels.
+        flow_patch: smallest side of what motion is estimated on.
+
+    Returns:
+        An even number, which keeps the Bayer phase.
+
+    Example:
+        >>> flow_margin(24, 48), flow_margin(26, 48), flow_margin(96, 48)
+        (12, 12, 0)
+    """
+    return 2 * max(0, -((patch - flow_patch) // 4))
+
+
+def trim(planes: Tensor, margin: int) -> Tensor:
+    """Cut off a margin: (*, H, W) to (*, H - 2 margin, W - 2 margin).
+
+    Example:
+        >>> import torch
+        >>> trim(torch.arange(16).reshape(4, 4), 1).tolist()
+        [[5, 6], [9, 10]]
+    """
+    height, width = planes.shape[-2:]
+    return planes[..., margin : height - margin, margin : width - margin]

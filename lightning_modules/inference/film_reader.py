@@ -1,0 +1,113 @@
+"""Films by a network that carries what it knows from one key frame to the next."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lightning_modules.inference.tiles import TILE, Box, reach, tiled
+from lightning_modules.networks import Network, RecurrentCSCSR
+from lightning_modules.networks.recurrent_cscsr import read_group
+
+
+class _Known(NamedTuple):
+    clock: int
+    state: Tensor
+
+
+class FilmReader:
+    r"""Makes the pictures of a film, group by group, and keeps the state of the last key frame in between.
+
+    Convention:
+        A key frame's neighbour helps if it is at most a clip's length away; further away nothing is known of the
+        motion. So a reader may be given the groups of another part of the film at any time.
+
+    Args:
+        network: a network for films.
+        tile: side of the tiles in sensor pixels, 0 for none.
+
+    Example:
+        >>> network = RecurrentCSCSR(scale=2, width=8, representation_width=8, features=1, stages=1, end_blocks=1)
+        >>> reader = FilmReader(network)
+        >>> reader(torch.zeros(2, 41, 12, 10), [20, 40]).shape
+        torch.Size([2, 3, 24, 20])
+    """
+
+    def __init__(self, network: RecurrentCSCSR, tile: int = TILE) -> None:
+        self.network, self.tile = network, tile
+        self._last: _Known | None = None
+
+    @torch.no_grad()
+    def __call__(
+        self, spikes: Tensor, clocks: Sequence[int], flow: Tensor | None = None, static: bool = False
+    ) -> Tensor:
+        """Return the pictures of key frames that follow each other.
+
+        A single one knows the key frame before; of more, which are read from their end first, all but the last know
+        the one behind them as well.
+
+        Args:
+            spikes: (G, N, H, W), the clips of a group.
+            clocks: number of the key frame of each, increasing.
+            flow: (G, 2, 2, H, W), as the network takes it; when not given, the network's own estimate.
+            static: nothing moves, instead of a flow.
+
+        Returns:
+            rgb (G, 3, s H, s W), not clamped.
+
+        Raises:
+            ValueError: as many clocks as clips, increasing ones, were expected.
+        """
+        if len(clocks) != len(spikes) or any(after <= before for before, after in pairwise(clocks)):
+            raise ValueError(f"clocks: expected {len(spikes)} increasing ones, got {list(clocks)}")
+        network, whole = self.network, Box(0, 0, *spikes.shape[-2:])
+        clips = spikes.split(1)
+        given = [None] * len(clips) if flow is None else flow.split(1)
+        flows = [network.resolve_flow(clip, way, static) for clip, way in zip(clips, given, strict=True)]
+        features = [self._features(clip, way, whole) for clip, way in zip(clips, flows, strict=True)]
+
+        def meet(n: int, *around: _Known | None) -> _Known:
+            neighbors = []
+            for known in around:
+                away = known.clock - clocks[n] if known else math.inf
+                if abs(away) <= network.frames:
+                    neighbors.append((known.state, None if flows[n] is None else network.flow_to(flows[n], away)))
+            return _Known(clocks[n], self._advance(features[n], neighbors, whole))
+
+        _, states = read_group(range(len(clips)), meet, self._last)
+        self._last = states[-1]
+        return torch.cat([network.picture(known.state) for known in states])
+
+    def _features(self, spikes: Tensor, flow: Tensor | None, whole: Box) -> Tensor:
+        def run(outer: Box) -> Tensor:
+            return self.network.features(outer.of(spikes), None if flow is None else outer.of(flow))
+
+        return tiled(run, whole, self.tile, lambda box: reach(flow, box, whole, self.network.halo))
+
+    def _advance(self, features: Tensor, neighbors: list[tuple[Tensor, Tensor | None]], whole: Box) -> Tensor:
+        def moved(outer: Box, state: Tensor, way: Tensor | None) -> Tensor:
+            near = outer.grown(reach(way, outer, whole, 2), whole)
+            return outer.of(self.network.moved(near.of(state), None if way is None else near.of(way)), near[:2])
+
+        def run(outer: Box) -> Tensor:
+            return self.network.advance(outer.of(features), [moved(outer, *neighbor) for neighbor in neighbors])
+
+        return tiled(run, whole, self.tile, lambda _: self.network.halo)
+
+
+def check_future(network: Network, future: int) -> int:
+    """Return how many key frames a picture may wait for.
+
+    Raises:
+        ValueError: less than 0, or any for a network that takes every clip by itself.
+    """
+    if future < 0 or (future and not isinstance(network, RecurrentCSCSR)):
+        kind = type(network).__name__
+        most = "0 or more" if isinstance(network, RecurrentCSCSR) else f"0, as {kind} takes every clip by itself"
+        raise ValueError(f"future: expected {most}, got {future}")
+    return future

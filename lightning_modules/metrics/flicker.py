@@ -1,0 +1,45 @@
+"""Metric of films: flicker."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from spikekit import flow_warp
+
+
+def film_flicker(rgb: Tensor, then: Tensor, truth: Tensor, truth_then: Tensor, flow: Tensor) -> Tensor:
+    r"""Error of the difference of two pictures of a film, the later warped onto the earlier by the true flow.
+
+    .. math:: d = \sqrt{\operatorname{mean} \bigl( (W(\hat I_{then}) - \hat I) - (W(I_{then}) - I) \bigr)^2}
+
+    An error that moves with the scene, such as blur that stays the same, is none; one that comes and goes is. Pixels
+    whose flow ends outside of the picture do not count.
+
+    Args:
+        rgb: pictures, :math:`(B, 3, H, W)`, in [0, 1].
+        then: the next ones, or those before.
+        truth: of ``rgb``.
+        truth_then: of ``then``.
+        flow: the true one from ``rgb`` to ``then``, :math:`(B, 2, H, W)`, in pixels of the pictures.
+
+    Returns:
+        Steps of 8 bits, root mean square, :math:`(B)`; less is better; NaN where all flow ends outside.
+
+    Example:
+        >>> truth, flow = torch.rand(1, 3, 8, 8), torch.zeros(1, 2, 8, 8)
+        >>> film_flicker(truth + 0.1, truth + 0.1, truth, truth, flow).round(decimals=3).item()
+        0.0
+        >>> film_flicker(truth, truth + 1 / 255, truth, truth, flow).round(decimals=3).item()
+        1.0
+
+    Reference:
+        Lai et al., Learning Blind Video Temporal Consistency, ECCV 2018.
+    """
+    height, width = flow.shape[-2:]
+    ends = flow + torch.stack(
+        torch.meshgrid(torch.arange(width).to(flow), torch.arange(height).to(flow), indexing="xy")
+    )
+    inside = ((ends >= 0) & (ends <= ends.new_tensor([width - 1, height - 1])[:, None, None])).all(dim=1)
+    error = (flow_warp(then - truth_then, flow) - (rgb - truth)).square().mean(dim=1)
+    return 255 * ((error * inside).sum(dim=(1, 2)) / inside.sum(dim=(1, 2))).sqrt()

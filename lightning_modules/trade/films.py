@@ -1,0 +1,174 @@
+"""Films in a trade: what a picture costs and is worth as one of several, made one after the other."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from pytorch_lightning import LightningDataModule
+from torch import Tensor
+from tqdm import tqdm
+
+from lightning_modules.cli.errors import UsageError
+from lightning_modules.cost.measure import Row, Timed, attempt, measure_costs, running
+from lightning_modules.cost.runner import Runner
+from lightning_modules.data import FilmScenes, StillScenes
+from lightning_modules.data.films import FilmClips
+from lightning_modules.metrics.flicker import film_flicker
+from lightning_modules.metrics.image import measures
+from spikekit import Scene
+from spikekit.scenes.frame_sequence import FilmClip
+
+#: pictures of a film; those between the first and the last count, which all have a neighbour on either side
+PICTURES = 5
+
+_COUNTED = slice(1, PICTURES - 1)
+
+
+class FilmRunner:
+    """A setting that makes films.
+
+    Args:
+        runner: it.
+        every: clocks between two pictures.
+
+    Attributes:
+        latency: clocks that had come after a picture's own when it was made, in the last film at most.
+    """
+
+    def __init__(self, runner: Runner, every: int) -> None:
+        self.runner, self.every = runner, every
+        self.network, self.device = runner.network, runner.device
+        self.latency = 0
+
+    def __call__(self, spikes: Tensor) -> Tensor:
+        """Return the pictures of a film, (PICTURES, 3, s H, s W), in [0, 1].
+
+        Args:
+            spikes: (1, T, H, W), on the device; of more clocks than the network needs, those in the middle.
+        """
+        length = film_length(self.network.frames, self.every)
+        first = (spikes.shape[1] - length) // 2
+        came = 0
+
+        def clocks() -> Iterator[Tensor]:
+            nonlocal came
+            for clock in range(first, first + length):
+                came = clock - first
+                yield spikes[0, clock : clock + 1]
+
+        pictures, self.latency = [], 0
+        for picture in self.runner.film(clocks(), self.every):
+            pictures.append(picture.rgb)
+            self.latency = max(self.latency, came - picture.clock)
+        return torch.stack(pictures)
+
+
+class FilmScene(NamedTuple):
+    """A film with its truth.
+
+    Args:
+        spikes: (1, T, H, W).
+        rgb: of the pictures that count, (3, 3, s H, s W).
+        flow: from the one in the middle to the one before it and to the one behind it, (2, 2, s H, s W), in pixels of
+            the pictures.
+    """
+
+    spikes: Tensor
+    rgb: Tensor
+    flow: Tensor
+
+
+def film_length(frames: int, every: int) -> int:
+    """Return how many clocks a film takes.
+
+    Args:
+        frames: those of a clip.
+        every: clocks between two pictures.
+    """
+    return frames + (PICTURES - 1) * every
+
+
+def film_scenes(data: LightningDataModule, frames: int, every: int) -> Iterator[FilmScene]:
+    """Yield the test scenes of data as films, moving as fast as the clips do.
+
+    Args:
+        data: scenes that are set up for a test.
+        frames: those of a clip.
+        every: clocks between two pictures.
+
+    Raises:
+        UsageError: data of another kind, or without truth at so many clocks.
+        ValueError: a source film that is too short.
+    """
+    length = film_length(frames, every)
+    if isinstance(data, StillScenes):
+        stills = copy.copy(data.val_set)
+        stills.key_frames, stills.every, stills.clocks = PICTURES, every, length
+        for n in range(len(stills)):
+            scene = stills.scene(n)
+            yield _film_scene(stills.spikes(n, scene), scene, every, stills.scale)
+    elif isinstance(data, FilmScenes) and all(source.truth is None for source in data.found.test):
+        recipe = replace(data.test_set.recipe, frames=length, key_frames=1, flow_times=())
+        if every % recipe.clocks:
+            raise UsageError(
+                f"--film: expected a multiple of the {recipe.clocks} clocks of a source frame, got {every}"
+            )
+        clips = FilmClips(data.found.test, recipe, data.clips or data.found.clips, cache=data.test_set.cache)
+        for n in range(len(clips)):
+            yield _film_scene(clips[n]["spikes"], recipe.view(*clips.place(n)), every, recipe.scale)
+    else:
+        raise UsageError(f"--film: expected still pictures in motion or films at full size, got {type(data).__name__}")
+
+
+def _film_scene(spikes: Tensor, view: Scene | FilmClip, every: int, scale: int) -> FilmScene:
+    before, after = view.middle - every, view.middle + every
+    rgb = torch.stack([view.rgb(clock) for clock in (before, view.middle, after)])
+    flow = torch.stack([view.flow(clock, scale=scale) for clock in (before, after)])
+    flow = scale * F.interpolate(flow, rgb.shape[-2:], mode="bilinear", align_corners=False)
+    return FilmScene(spikes[None], rgb, flow)
+
+
+def measure_films(rows: Sequence[Row], data: LightningDataModule, frames: int, every: int, rounds: int) -> Timed:
+    """Measure settings as :func:`lightning_modules.cost.measure.measure` does, on films.
+
+    Args:
+        rows: of settings that can run; their runners become those of films.
+        data: scenes that are set up for a test.
+        frames: those of the longest clip.
+        every: clocks between two pictures.
+        rounds: how often a setting is timed.
+
+    Raises:
+        UsageError: data that make no such films.
+        ValueError: likewise.
+    """
+    for row in running(rows):
+        row.runner = FilmRunner(row.runner, every)
+    kept: list[Tensor] = []
+    for scene in tqdm(film_scenes(data, frames, every), "films", disable=None, leave=False):
+        if len(kept) < rounds and (not kept or scene.spikes.shape == kept[0].shape):
+            kept.append(scene.spikes)
+        for row in running(rows):
+            attempt(row, lambda row=row, scene=scene: _score(row, scene))
+    timed = measure_costs(rows, kept, rounds)
+    for row in running(rows):
+        row.seconds = [seconds / PICTURES for seconds in row.seconds]
+        row.macs /= PICTURES
+        row.joules = row.joules and row.joules / PICTURES
+    return replace(timed, every=every)
+
+
+def _score(row: Row, scene: FilmScene) -> None:
+    rgb = row.runner(scene.spikes.to(row.runner.device))[_COUNTED]
+    truth = scene.rgb.to(rgb)
+    for measure in measures():
+        getattr(row, measure.name).extend(measure.of(rgb, truth).tolist())
+    middle, ends = slice(1, 2), slice(0, 3, 2)
+    pair = rgb[middle].expand(2, -1, -1, -1), rgb[ends], truth[middle].expand(2, -1, -1, -1), truth[ends]
+    row.flicker.extend(film_flicker(*pair, scene.flow.to(rgb)).tolist())
+    row.latency = row.runner.latency

@@ -1,0 +1,53 @@
+"""What goes wrong with a file, said in one line that names it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from spikekit.arguments import one_line
+
+
+@contextmanager
+def reading(path: str | Path, kind: type[ValueError], what: str = "", otherwise: str = "{}") -> Iterator[None]:
+    """Turn whatever goes wrong with the bytes of a file into one line.
+
+    Args:
+        path: the file.
+        kind: of the error that is raised; one of this kind passes as it is.
+        what: of the file was read, such as ``"frame 3: "``.
+        otherwise: how to say what neither the system nor the memory is to blame for.
+
+    Example:
+        >>> with reading("clip.npz", ValueError, otherwise="damaged ({})"):
+        ...     raise KeyError("spk")
+        Traceback (most recent call last):
+        ValueError: clip.npz: damaged ('spk')
+    """
+    try:
+        yield
+    except kind:
+        raise
+    except MemoryError as error:  # also what PyAV says of damaged sizes
+        raise kind(f"{path}: {what}takes more memory than there is") from error
+    except OSError as error:
+        raise kind(f"{path}: {what}cannot be read ({error.strerror or error})") from error
+    except Exception as error:
+        said = one_line(error).removeprefix(f"{path}: ")[:300]
+        raise kind(f"{path}: {what}{otherwise.format(said)}") from error
+
+
+@contextmanager
+def writing(path: str | Path, kind: type[ValueError] = ValueError, wrong: type[Exception] = OSError) -> Iterator[None]:
+    """Turn what keeps a file from being written into one line.
+
+    Args:
+        path: the file.
+        kind: of the error that is raised.
+        wrong: what is turned into it.
+    """
+    try:
+        yield
+    except wrong as error:
+        raise kind(f"{path}: cannot be written ({one_line(error)})") from error

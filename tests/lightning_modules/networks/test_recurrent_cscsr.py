@@ -1,0 +1,187 @@
+import pytest
+import torch
+import yaml
+from torch.utils.flop_counter import FlopCounterMode
+
+from lightning_modules.inference.film import film
+from lightning_modules.inference.film_reader import FilmReader
+from lightning_modules.networks import CSCSR, ClassicalDecoder, RecurrentCSCSR
+from lightning_modules.networks.recurrent_cscsr import read_group
+from spikekit import flow_warp
+
+TINY = {"scale": 2, "width": 8, "representation_width": 8, "features": 1, "stages": 1, "end_blocks": 1, "skip": True}
+CLOCKS = [20, 40, 60, 80, 100]
+
+
+@pytest.fixture(name="network")
+def _network():
+    """A network whose neighbours matter, as if it had been trained."""
+    torch.manual_seed(0)
+    network = RecurrentCSCSR(**TINY).eval()
+    torch.nn.init.normal_(network.fusion.share.weight, std=0.05)
+    torch.nn.init.normal_(network.fusion.rest.weight, std=0.02)
+    torch.nn.init.normal_(network.reconstruction.rgb.weight, std=0.05)
+    return network
+
+
+@pytest.fixture(name="clips")
+def _clips():
+    """Clips (5, 41, H, W) around every 20th clock, and their flows."""
+    generator = torch.Generator().manual_seed(1)
+    stream = torch.rand(121, 22, 26, generator=generator) < 0.3
+    flow = torch.randn(5, 2, 2, 1, 1, generator=generator).expand(-1, -1, -1, 22, 26)
+    return torch.stack([stream[clock - 20 : clock + 21] for clock in CLOCKS]), flow
+
+
+def test_untrained_it_is_the_network_that_it_began_as(clips):
+    single = CSCSR(**TINY, resolution="sensor").eval()
+    network = RecurrentCSCSR(**single.settings).eval()
+    assert all(name.startswith("fusion.") for name in network.load_state_dict(single.state_dict(), strict=False)[0])
+    torch.nn.init.normal_(single.reconstruction.rgb.weight, std=0.05)
+    network.reconstruction.load_state_dict(single.reconstruction.state_dict())
+    spikes, flow = clips
+    torch.testing.assert_close(network(spikes[:1], flow[:1]), single(spikes[:1], flow[:1]))
+    pictures = network(spikes[None], flow[None], future=4)[0]
+    torch.testing.assert_close(pictures, single(spikes, flow))
+
+
+def test_the_first_key_frame_is_that_of_a_single_clip_and_the_others_are_not(network, clips):
+    spikes, flow = clips
+    pictures, single = network(spikes[None], flow[None])[0], network(spikes, flow)
+    torch.testing.assert_close(pictures[0], single[0])
+    assert ((pictures[1:] - single[1:]).abs().amax(dim=(1, 2, 3)) > 1e-3).all()
+
+
+@pytest.mark.parametrize("future", [0, 1, 2, 4])
+def test_a_picture_depends_on_all_before_and_on_those_of_its_group(network, clips, future):
+    spikes, flow = clips
+    known = spikes[None].float().requires_grad_()
+    rgb = network(known, flow[None], future=future)
+    for n, picture in enumerate(rgb[0]):
+        seen = torch.autograd.grad(picture.sum(), known, retain_graph=True)[0][0].abs().amax(dim=(1, 2, 3)) > 0
+        last = min((n // (future + 1) + 1) * (future + 1), 5)
+        assert seen.tolist() == [m < last for m in range(5)]
+
+
+def test_a_film_read_from_its_end_is_its_mirror_image(network, clips):
+    spikes, flow = clips
+    earlier, final = network.film(spikes[None], flow[None], future=4)
+    torch.testing.assert_close(earlier[0, 4], network(spikes[4:], flow[4:])[0])
+    assert (final[0, 4] - earlier[0, 4]).abs().max() > 1e-3
+    # a scene at rest knows no direction: what is read first is the film backwards, read once
+    turned = network(spikes.flip(0)[None], static=True)
+    torch.testing.assert_close(network.film(spikes[None], static=True, future=4)[0].flip(1), turned)
+
+
+@pytest.mark.parametrize("tile", [0, 16])
+@pytest.mark.parametrize("future", [0, 1, 4])
+def test_a_reader_gives_the_same_group_by_group_and_tile_by_tile(network, clips, future, tile):
+    spikes, flow = clips
+    reader = FilmReader(network, tile)
+    found = [
+        reader(spikes[n : n + future + 1], CLOCKS[n : n + future + 1], flow[n : n + future + 1])
+        for n in range(0, 5, future + 1)
+    ]
+    torch.testing.assert_close(torch.cat(found), network(spikes[None], flow[None], future=future)[0], rtol=0, atol=1e-4)
+
+
+def test_a_state_moves_with_the_scene(network):
+    network = RecurrentCSCSR(**{**TINY, "scale": 4})
+    state = torch.rand(1, 48 + 32, 10, 12)
+    flow = torch.zeros(1, 2, 10, 12)
+    torch.testing.assert_close(network.moved(state, flow), state)
+    flow[:, 0], flow[:, 1] = 0.75, -0.5  # three and two pixels of the picture
+    moved = network.moved(state, flow)
+    torch.testing.assert_close(moved[:, 48:], flow_warp(state[:, 48:], flow))
+    inside = network.picture(moved)[..., 8:-8, 8:-8]
+    torch.testing.assert_close(inside, network.picture(state)[..., 6:-10, 11:-5])
+
+
+def test_the_way_to_a_neighbour_goes_on_as_the_clip_moves(network):
+    flow = torch.tensor([[[3.0, -6.0], [1.5, 15.0]]])[..., None, None]
+    assert network.flow_to(flow, -5).flatten().tolist() == [1, -2]
+    assert network.flow_to(flow, 20).flatten().tolist() == [2, 20]
+
+
+def test_what_is_too_far_away_is_not_asked(network, clips):
+    spikes, flow = clips
+    reader = FilmReader(network)
+    single = network(spikes[1:2], flow[1:2])
+    reader(spikes[:1], [20], flow[:1])
+    assert (reader(spikes[1:2], [61], flow[1:2]) - single).abs().max() > 1e-3
+    torch.testing.assert_close(reader(spikes[1:2], [61 + 42], flow[1:2]), single)
+
+
+@pytest.mark.parametrize(("future", "mmac"), [(None, 2.66), (0, 2.99), (4, 3.39)])
+def test_parameters_and_work_of_size_large_film(configs, future, mmac):
+    model = yaml.safe_load((configs / "size/large_film.yaml").read_text())["model"]
+    network = RecurrentCSCSR(4, **model["network"]["init_args"])
+    assert sum(weight.numel() for weight in network.parameters()) == 2_635_654
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        if future is None:
+            network(torch.zeros(1, 41, 8, 8), torch.zeros(1, 2, 2, 8, 8))
+        else:
+            network(torch.zeros(1, 10, 41, 8, 8), torch.zeros(1, 10, 2, 2, 8, 8), future=future)
+    pictures = 1 if future is None else 10
+    assert counter.get_total_flops() / 2 / 64 / 1e6 / pictures == pytest.approx(mmac, rel=0.005)
+
+
+def test_groups_are_read_from_their_end_first():
+    def meet(n, before, after):
+        return f"({before or ''}{n}{after or ''})"
+
+    assert read_group("a", meet) == (["(a)"], ["(a)"])
+    assert read_group("b", meet, "A") == (["(Ab)"], ["(Ab)"])
+    assert read_group("bc", meet, "A") == (["(b(c))", "(c)"], ["(Ab(c))", "((Ab(c))c)"])
+
+
+@pytest.mark.parametrize("future", [0, 1, 3])
+def test_the_film_of_a_stream(network, clips, future):
+    torch.manual_seed(3)
+    stream = (torch.rand(113, 12, 14) < 0.3).to(torch.uint8)
+    shown = list(film(network, stream.split(7), 20, white=0.4, future=future, static=True))
+    clocks = [20, 40, 60, 80]
+    assert [frame.clock for frame in shown] == clocks
+    spikes = torch.stack([stream[clock - 20 : clock + 21] for clock in clocks])
+    expected = network(spikes[None], static=True, future=future)[0].clamp(0, 1)
+    torch.testing.assert_close(torch.stack([frame.rgb for frame in shown]), expected)
+
+
+def test_a_picture_waits_for_its_group(network):
+    come = []
+
+    def camera():
+        for n in range(200):
+            come.append(n)
+            yield torch.zeros(1, 8, 8)
+
+    for clock, _ in film(network, camera(), 20, future=2, static=True, white=0.4):
+        last = 20 + (clock // 20 - 1) // 3 * 60 + 40
+        assert come[-1] == last + 20
+        if clock == 120:
+            break
+
+
+def test_gradients_reach_the_first_key_frame_and_all_weights(network, clips):
+    spikes, flow = clips
+    sum(rgb.sum() for rgb in network.film(spikes[None].float(), flow[None], future=4)).backward()
+    assert all(weight.grad is not None and weight.grad.isfinite().all() for weight in network.parameters())
+    assert network.fusion.neighbor.weight.grad.abs().max() > 0
+
+
+def test_errors(network, clips):
+    with pytest.raises(ValueError, match=r"resolution: expected correlated and sensor, .* got correlated and output"):
+        RecurrentCSCSR(resolution="output")
+    with pytest.raises(ValueError, match=r"correlated and sensor.* got early"):
+        RecurrentCSCSR(reconstruction="early")
+    spikes, flow = clips
+    with pytest.raises(ValueError, match="every: expected a whole number >= 1, got 0"):
+        network(spikes[None], flow[None], every=0)
+    with pytest.raises(ValueError, match=r"clocks: expected 2 increasing ones, got \[40, 20\]"):
+        FilmReader(network)(spikes[:2], [40, 20])
+    with pytest.raises(ValueError, match="future: expected 0 or more, got -1"):
+        film(network, [], future=-1)
+    with pytest.raises(ValueError, match="future: expected 0, as ClassicalDecoder takes every clip by itself, got 1"):
+        film(ClassicalDecoder(), [], future=1)
+    with pytest.raises(ValueError, match=r"how: expected tile or static with RecurrentCSCSR, got .*self_ensemble"):
+        film(network, [], self_ensemble=2)

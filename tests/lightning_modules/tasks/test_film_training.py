@@ -1,0 +1,106 @@
+"""Training and testing on several key frames of a scene, as users type it."""
+
+import csv
+
+import pytest
+import torch
+
+from lightning_modules.__main__ import main
+from lightning_modules.networks import CSCSR, ClassicalDecoder, RecurrentCSCSR
+from lightning_modules.pretrained import Weights, read_weights, settings_of, write_weights
+from lightning_modules.tasks.super_resolution import SuperResolution
+
+TINY = {"scale": 2, "width": 8, "representation_width": 8, "features": 1, "stages": 1, "end_blocks": 1}
+DATA = [
+    "--data.key_frames=5",
+    "--data.every=10",
+    "--data.patch=16",
+    "--data.val_patch=16",
+    "--data.train_clips=4",
+    "--data.batch_size=2",
+    "--data.val_clips=2",
+    "--data.workers=0",
+    "--trainer.accelerator=cpu",
+]
+
+
+@pytest.fixture(name="trained", scope="module")
+def _trained(tmp_path_factory, configs_of_module):
+    """The weights that a training of four steps began with, and what it made of them."""
+    folder = tmp_path_factory.mktemp("film")
+    torch.manual_seed(0)
+    network = RecurrentCSCSR(**TINY)
+    write_weights(Weights(folder, settings_of(network), {}, network.state_dict()), folder / "start.safetensors")
+    words = ["-c", str(configs_of_module / "x2.yaml"), "--data=StillScenes", *DATA]
+    model = ["--model.flow=estimated", "--model.future=4", "--model.frozen=[representation,refinement,reconstruction]"]
+    start = ["--model.weights", str(folder / "start.safetensors"), "--trainer.max_steps=4"]
+    main(["fit", *words, *model, *start, "-o", str(folder / "run")])
+    return words, folder
+
+
+@pytest.fixture(name="configs_of_module", scope="module")
+def _configs(request):
+    return request.config.rootpath / "configs"
+
+
+def test_what_is_frozen_stays_and_the_rest_learns(trained):
+    _, folder = trained
+    before = read_weights(folder / "start.safetensors").tensors
+    after = read_weights(folder / "run" / "checkpoints" / "last.ckpt").tensors
+    changed = {name for name in before if not before[name].equal(after[name])}
+    assert changed == {name for name in before if name.startswith("fusion.")}
+
+
+def test_a_film_is_judged_beside_its_clips(trained, capsys):
+    words, folder = trained
+    last = str(folder / "run" / "checkpoints" / "last.ckpt")
+    main(["test", *words, "--model.weights", last, "--model.future=4", "-o", str(folder / "test")])
+    assert "RecurrentCSCSR, film" in capsys.readouterr().out
+    with open(folder / "test" / "test.csv", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["clip"] != "mean"]
+    assert [row["method"] for row in rows[::2]] == [
+        "TFI",
+        "TFP",
+        "RecurrentCSCSR, single clips",
+        "RecurrentCSCSR, film",
+    ]
+    assert rows[4]["psnr"] != rows[6]["psnr"]
+
+
+def batch(count=5):
+    spikes = (torch.rand(2, count, 41, 12, 12) < 0.3).to(torch.uint8)
+    return {"spikes": spikes, "rgb": torch.rand(2, count, 3, 24, 24), "every": torch.full((2,), 20)}
+
+
+def test_the_loss_is_that_of_a_film_read_twice():
+    torch.manual_seed(0)
+    module = SuperResolution(RecurrentCSCSR(**TINY), flow="estimated", future=4)
+    for weight in module.network.fusion.parameters():
+        torch.nn.init.normal_(weight, std=0.05)
+    module.log = lambda *_, **__: None
+    clips = batch()
+    read = module.network.film(clips["spikes"], future=4)
+    expected = sum((rgb - clips["rgb"]).abs().mean() for rgb in read) / 2
+    torch.testing.assert_close(module.training_step(clips, 0), expected)
+    assert not torch.allclose(read[0], read[1])
+
+
+def test_a_network_without_a_state_takes_every_key_frame_by_itself():
+    torch.manual_seed(0)
+    module = SuperResolution(CSCSR(**TINY), flow="estimated").eval()
+    module.log = lambda *_, **__: None
+    clips = batch(count=3)
+    shown = module.validation_step(clips, 0)
+    torch.testing.assert_close(shown, module(clips["spikes"][:, 1]))
+    assert module.test_step(clips, 0).keys() == {"TFI", "TFP", "CSCSR, single clips"}
+
+
+def test_errors():
+    with pytest.raises(ValueError, match="future: expected 0, as ClassicalDecoder takes every clip by itself, got 2"):
+        SuperResolution(ClassicalDecoder(), future=2)
+    with pytest.raises(
+        ValueError, match=r"self_ensemble: expected 0 and 1 for a network that makes films, got 0.0 and 2"
+    ):
+        SuperResolution(RecurrentCSCSR(**TINY), self_ensemble=2)
+    with pytest.raises(ValueError, match=r"frozen: expected parts of the network, such as motion, .* got nothing"):
+        SuperResolution(RecurrentCSCSR(**TINY), frozen=["nothing"])
