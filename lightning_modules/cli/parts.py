@@ -1,15 +1,21 @@
-"""Parts of a recording, each made by a process of its own on a Ray cluster; this module is such a process."""
+"""Parts of a recording, each made by a process of its own on a Ray cluster."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
 from lightning_modules.cli.arguments import options
 from lightning_modules.cli.errors import InputError, UsageError
-from lightning_modules.sweep.engines import end_with_parent, run_commands_on_ray
+from lightning_modules.processes import run_commands_on_ray
+
+_PROCESS = """\
+from lightning_modules.processes import end_with_parent
+end_with_parent()
+from lightning_modules.__main__ import main
+main()
+"""
 
 
 def make_parts(typed: Sequence[str], folder: Path, precision: str, jobs: int | None) -> None:
@@ -34,7 +40,7 @@ def make_parts(typed: Sequence[str], folder: Path, precision: str, jobs: int | N
 
     def commands(count: int) -> dict[Path, list[str]]:
         logs.extend(folder.absolute() / f"part_{n}_of_{count}.log" for n in range(1, count + 1))
-        words = ["-m", "lightning_modules.cli.parts", *typed, *quiet]
+        words = ["-c", _PROCESS, *typed, *quiet]
         return {log: [*words, "--part", f"{n}/{count}"] for n, log in enumerate(logs, 1)}
 
     for ended in run_commands_on_ray(commands, jobs):
@@ -44,11 +50,3 @@ def make_parts(typed: Sequence[str], folder: Path, precision: str, jobs: int | N
             print(f"{log.stem.replace('_', ' ')} is made", flush=True)
     for log in logs:
         log.unlink(missing_ok=True)
-
-
-if __name__ == "__main__":
-    from lightning_modules.__main__ import main
-
-    end_with_parent()
-    arguments, sys.argv = sys.argv[1:], sys.argv[:1]
-    main(arguments)

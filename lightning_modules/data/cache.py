@@ -142,7 +142,7 @@ def pack_clip(clip: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
     becomes numbers of 8 (16) bits and a table.
 
     Args:
-        clip: ``spikes`` (N, H, W) of zeros and ones, ``rgb`` (*, 3, s H, s W), perhaps ``flow`` (times, 2, H, W).
+        clip: ``spikes`` (N, H, W) of zeros and ones, ``rgb`` (..., 3, s H, s W), perhaps ``flow`` (times, 2, H, W).
 
     Returns:
         Arrays for :func:`unpack_clip`.
@@ -173,7 +173,7 @@ def unpack_clip(packed: Mapping[str, np.ndarray], part: tuple[int, int, int, int
         scale: pixels of the picture for a sensor pixel.
 
     Returns:
-        ``spikes`` uint8 (N, H, W), ``rgb`` (*, 3, s H, s W), and ``flow`` (times, 2, H, W) float32 where there is any.
+        ``spikes`` uint8 (N, H, W), ``rgb`` (..., 3, s H, s W), and ``flow`` (times, 2, H, W) float32 where there is any.
 
     Example:
         >>> clip = {"spikes": torch.rand(41, 6, 10).round(), "rgb": torch.rand(3, 12, 20)}

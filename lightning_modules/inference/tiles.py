@@ -83,7 +83,7 @@ def tiled(
     """Put planes together of what is computed of tiles.
 
     Args:
-        run: makes planes (*, s h, s w) of a box of h x w sensor pixels.
+        run: makes planes (..., s h, s w) of a box of h x w sensor pixels.
         whole: box of all planes.
         tile: side of a tile in sensor pixels, 0 for a single one.
         around: how much around a box is to be seen.
@@ -91,7 +91,7 @@ def tiled(
         done: called after every tile, with the share of them that is done.
 
     Returns:
-        (*, s H, s W).
+        (..., s H, s W).
     """
     height, width = whole.bottom - whole.top, whole.right - whole.left
     if not tile or max(height, width) <= tile:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
 
@@ -61,7 +62,7 @@ class Network(nn.Module):
 
     @classmethod
     def from_pretrained(cls, weights: str | Path, motion: MotionEstimator | None = None, **arguments: Any) -> Self:
-        """Build the network that weights are of, and load them.
+        """Build the network that weights are of, this class or one that derives from it, and load them.
 
         Args:
             weights: the name of weights that come with the package, such as ``"cscsr_small_x4"``; a file of
@@ -78,20 +79,21 @@ class Network(nn.Module):
             ValueError: a file that is damaged, or of another kind of network; an estimator for one that takes no flow.
         """
         found = read_weights(weights)
-        kind = found.settings.get("class")
-        if kind != cls.__name__:
-            raise ValueError(f"{weights}: expected weights of {cls.__name__}, got those of {kind}")
-        check_weights(found, {cls.__name__: cls, **ESTIMATORS})
+        named = found.settings.get("class")
+        kind = next((kind for kind in _family(cls) if kind.__name__ == named), None)
+        if kind is None:
+            raise ValueError(f"{weights}: expected weights of {cls.__name__}, got those of {named}")
+        check_weights(found, {named: kind, **ESTIMATORS})
         settings = {name: value for name, value in found.settings.items() if name != "class"}
         own = motion is not None
-        if own and not cls.takes_flow:
-            raise ValueError(f"motion: {cls.__name__} takes no flow, expected none, got {type(motion).__name__}")
+        if own and not kind.takes_flow:
+            raise ValueError(f"motion: {named} takes no flow, expected none, got {type(motion).__name__}")
         try:
             if found.motion and not own:
                 estimator, built_with = own_class(found.motion, weights, ESTIMATORS)
                 motion = estimator(**built_with)
-            flow = {"motion": motion} if cls.takes_flow else {}
-            network = cls(**{**settings, **arguments}, **flow)
+            flow = {"motion": motion} if kind.takes_flow else {}
+            network = kind(**{**settings, **arguments}, **flow)
         except TypeError as error:
             raise ValueError(f"{weights}: written by another version of this package ({error})") from error
         load_weights(network, found, keep_motion=own)
@@ -150,3 +152,9 @@ class Network(nn.Module):
             got = tuple(flow.shape) if isinstance(flow, Tensor) else f"{flow!r}; static=True says that nothing moves"
             raise ValueError(f"flow: expected {' or '.join(map(str, shapes))}, got {got}")
         return flow
+
+
+def _family(kind: type[Network]) -> Iterator[type[Network]]:
+    yield kind
+    for child in kind.__subclasses__():
+        yield from _family(child)

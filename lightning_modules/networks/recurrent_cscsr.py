@@ -163,7 +163,7 @@ class RecurrentCSCSR(CSCSR):
     ) -> list[Tensor]:
         """Return the pictures of a film, as they are after every time that it was read.
 
-        It is read in groups of ``future + 1`` key frames, see :func:`read_group`.
+        It is read in groups of ``future + 1`` key frames, see :func:`lightning_modules.networks.recurrent_cscsr.read_group`.
 
         Args:
             spikes: (B, K, N, H, W).
@@ -207,7 +207,7 @@ class RecurrentCSCSR(CSCSR):
             flow: (B, 2, 2, H, W), or None where nothing moves.
 
         Returns:
-            (B, 3 s^2 + width, H, W): the picture, as channels, and the features that it was made of.
+            The picture, as channels, and the features that it was made of, (B, 3 s^2 + width, H, W).
         """
         spikes = spikes.to(self.reconstruction.rgb.weight.dtype)
         features = self.reconstruction.features(self._colors(spikes, flow))
@@ -247,7 +247,7 @@ class RecurrentCSCSR(CSCSR):
             clocks: later.
 
         Returns:
-            (B, 2, H, W): the motion is taken to go on as it is.
+            The motion, taken to go on as it is, (B, 2, H, W).
         """
         first, middle, last = self.flow_times
         return flow[:, 1] * (clocks / (last - middle)) if clocks > 0 else flow[:, 0] * (-clocks / (middle - first))

@@ -87,7 +87,7 @@ class Learner(LightningModule):
         Args:
             name: of the figure.
             values: of a batch, one a clip.
-            how: others of :meth:`log`.
+            how: other arguments of Lightning's ``log``.
         """
         processes = torch.distributed.get_world_size() if torch.distributed.is_initialized() else 1
         # Lightning divides the number of clips by that of processes, and rounds down

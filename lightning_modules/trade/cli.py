@@ -89,7 +89,9 @@ def trade(args: Sequence[str]) -> None:
         base = Runner(shared)
     except CannotRunError as error:
         raise InputError(f"trade: {error}") from error
-    settings = given or usual_settings(base.network.scale, own := _own_weights(base), base.network if own else None)
+    own = _own_weights(base)
+    usual = usual_settings(base.network.scale, own, base.network if own else None, film=asked.film is not None)
+    settings = given or usual
     names = [setting.name for setting in settings]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:

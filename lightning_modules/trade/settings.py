@@ -45,7 +45,7 @@ def read_setting(text: str) -> Setting:
 _REFERENCE = "cscsr_base_x{scale}"
 
 #: what is tried on every network: behind its name, and what it changes
-_EFFORT = [("no motion", {"motion": "ZeroFlow"}), ("self-ensemble of 2", {"self_ensemble": 2})]
+_NO_MOTION, _TWO_VIEWS = ("no motion", {"motion": "ZeroFlow"}), ("self-ensemble of 2", {"self_ensemble": 2})
 
 #: what is tried on the largest, besides: a larger network is worth more than more views of a smaller one
 _MOST = [(f"self-ensemble of {views}", {"self_ensemble": views}) for views in (4, 8)]
@@ -66,7 +66,9 @@ _SPIKE2FLOW = {"motion": "Spike2Flow", "motion_weights": "spike2flow"}
 _LEARNED = [("Spike2Flow", _SPIKE2FLOW), ("Spike2Flow, once", {**_SPIKE2FLOW, "motion_iterations": 1})]
 
 
-def usual_settings(scale: int, own: Sequence[str] = (), network: Network | None = None) -> list[Setting]:
+def usual_settings(
+    scale: int, own: Sequence[str] = (), network: Network | None = None, film: bool = False
+) -> list[Setting]:
     """Return what is measured where nothing else is asked for.
 
     The networks whose weights come with the package, as they are, the reference first and then by size; then the same
@@ -78,10 +80,12 @@ def usual_settings(scale: int, own: Sequence[str] = (), network: Network | None 
         own: arguments that give weights to the network of all settings, such as ``--ckpt_path``: that network then
             stands in the place of those in the package.
         network: that network, of which only what it has arguments for is changed.
+        film: pictures of films are measured: those of all networks, for films or not, as they are and without motion.
     """
     shipped = shipped_weights()
-    # those for longer clips would need other scenes than the rest
-    names = [name for name in shipped if name.endswith(f"_x{scale}") and "_long_" not in name]
+    # those for longer clips would need other scenes than the rest; those for films are the same as others on one clip
+    left_out = ("_long_",) if film else ("_long_", "_film_")
+    names = [name for name in shipped if name.endswith(f"_x{scale}") and not any(part in name for part in left_out)]
     names.sort(key=lambda name: (name != _REFERENCE.format(scale=scale), shipped[name].stat().st_size, name))
     largest = max(names, key=lambda name: shipped[name].stat().st_size, default=None)
     networks = {name: Preset(name) for name in names}
@@ -95,12 +99,8 @@ def usual_settings(scale: int, own: Sequence[str] = (), network: Network | None 
             lacking |= {"tile", "psnr_tolerance"}
     presets = dict(networks)
     for place, (weights, preset) in enumerate(networks.items()):
-        for name, changes in [
-            *(learned if place == 0 else []),
-            *_EFFORT,
-            *(_MOST if weights == largest else []),
-            *(_VARIANTS if place == 0 else []),
-        ]:
+        more = [_TWO_VIEWS, *(_MOST if weights == largest else []), *([*learned, *_VARIANTS] if place == 0 else [])]
+        for name, changes in [_NO_MOTION, *([] if film else more)]:
             if not lacking & changes.keys():
                 presets[f"{weights}, {name}"] = replace(preset, **changes)
     decoders = {

@@ -203,9 +203,10 @@ def test_shipped_weights_are_what_their_names_and_cards_say():
         if name == "spike2flow":
             Spike2Flow(weights=name)
             continue
-        assert found.settings["class"] == "CSCSR"
+        assert found.settings["class"] == ("RecurrentCSCSR" if "_film_" in name else "CSCSR")
         assert name.endswith(f"_x{found.settings['scale']}")
-        built = {"class": "CSCSR", **CSCSR.from_pretrained(name).settings}
+        network = CSCSR.from_pretrained(name)
+        built = {"class": type(network).__name__, **network.settings}
         assert {key: built[key] for key in found.settings} == found.settings
 
 
@@ -267,6 +268,7 @@ def test_the_list_of_weights_says_what_the_networks_are(configs):
         "large",
         "huge",
         "huge_long",
+        "large_film",
     ]
     for weights in listed:
         found = read_weights(weights.name)

@@ -2,9 +2,13 @@
 
 import os
 import signal
+import subprocess
+import sys
 import time
 import warnings
-from multiprocessing import get_context
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from inspect import getsource
 
 import numpy as np
 import pytest
@@ -82,34 +86,65 @@ def _write(folder, rounds, size):
         cache.store(clip_key(n=n % 3), arrays(seed=n % 3, size=size))
 
 
-def _wait_for_a_new_file(folder, writer):
+# Forks a writer for every line that it reads. Pytest's own process has threads, and what is forked from it may hang.
+WRITERS = f"""
+import os, sys
+import numpy as np
+from lightning_modules.data.cache import ClipCache, clip_key
+
+{getsource(arrays)}
+{getsource(_write)}
+for line in sys.stdin:
+    writer = os.fork()
+    if not writer:
+        _write(sys.argv[1], int(line), 200_000)
+        os._exit(0)
+    print(writer, flush=True)
+    print(os.waitpid(writer, 0)[1], flush=True)
+"""
+
+
+@contextmanager
+def writers(folder):
+    command = [sys.executable, "-c", WRITERS, str(folder)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        yield process
+        process.stdin.close()
+
+
+def begin(process, rounds):
+    """Let a writer write so often, and return its number."""
+    print(rounds, file=process.stdin, flush=True)
+    return int(process.stdout.readline())
+
+
+def _wait_for_a_new_file(folder, before):
     """However busy the machine is."""
-    before = set(folder.rglob("*"))
-    while not set(folder.rglob("*")) - before:
-        assert writer.is_alive()
+    for _ in range(60_000):
+        if set(folder.rglob("*")) - before:
+            return
         time.sleep(0.001)
-
-
-FORK = get_context("fork")  # a new interpreter would take seconds to come to the point
+    pytest.fail("nothing was written within a minute")
 
 
 def test_killed_writers_leave_nothing_that_is_believed(tmp_path):
     rng, unfinished = np.random.default_rng(0), 0
     expected = [arrays(seed=n, size=200_000) for n in range(3)]
-    for _ in range(25):
-        writer = FORK.Process(target=_write, args=(tmp_path, 10**6, 200_000))
-        writer.start()
-        _wait_for_a_new_file(tmp_path, writer)
-        time.sleep(rng.choice([0, 0.001, 0.01, 0.05]))
-        os.kill(writer.pid, signal.SIGKILL)
-        writer.join()
-        unfinished = max(unfinished, len(list(tmp_path.rglob("*.part"))))
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")  # nothing has even to be recognised as damaged
-            cache = ClipCache(tmp_path)
-            for n in range(3):
-                clip = cache.load(clip_key(n=n))
-                assert clip is None or same(clip, expected[n])
+    with writers(tmp_path) as process:
+        for _ in range(25):
+            before = set(tmp_path.rglob("*"))
+            writer = begin(process, 10**6)
+            _wait_for_a_new_file(tmp_path, before)
+            time.sleep(rng.choice([0, 0.001, 0.01, 0.05]))
+            os.kill(writer, signal.SIGKILL)
+            assert process.stdout.readline() == f"{int(signal.SIGKILL)}\n"
+            unfinished = max(unfinished, len(list(tmp_path.rglob("*.part"))))
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")  # nothing has even to be recognised as damaged
+                cache = ClipCache(tmp_path)
+                for n in range(3):
+                    clip = cache.load(clip_key(n=n))
+                    assert clip is None or same(clip, expected[n])
     assert unfinished  # some were killed in the middle
     for part in tmp_path.rglob("*.part"):  # made again, which removes them
         number = next(n for n in range(10**6) if part.name.startswith(f".{cache._path(clip_key(n=n)).name}."))
@@ -118,19 +153,18 @@ def test_killed_writers_leave_nothing_that_is_believed(tmp_path):
 
 
 def test_two_writers_and_a_reader(tmp_path):
-    writers = [FORK.Process(target=_write, args=(tmp_path, 30, 200_000)) for _ in range(2)]
-    cache, read = ClipCache(tmp_path), 0
-    for writer in writers:
-        writer.start()
-    expected = [arrays(seed=n, size=200_000) for n in range(3)]
-    with warnings.catch_warnings():
+    cache, expected = ClipCache(tmp_path), [arrays(seed=n, size=200_000) for n in range(3)]
+    with writers(tmp_path) as one, writers(tmp_path) as other, ThreadPoolExecutor() as pool, warnings.catch_warnings():
         warnings.simplefilter("error")
-        while any(writer.is_alive() for writer in writers) or read < 3:
+        for process in (one, other):
+            begin(process, 30)
+        ended = [pool.submit(process.stdout.readline) for process in (one, other)]
+        while not all(writer.done() for writer in ended):
             for n in range(3):
                 clip = cache.load(clip_key(n=n))
                 assert clip is None or same(clip, expected[n])
-                read += clip is not None
-    assert [writer.exitcode for writer in writers] == [0, 0]
+        assert [writer.result() for writer in ended] == ["0\n", "0\n"]
+    assert all(same(cache.load(clip_key(n=n)), expected[n]) for n in range(3))
     assert len(files(tmp_path)) == 3
 
 

@@ -14,7 +14,7 @@ from lightning_modules.cli.rehearsal import Rehearsal
 from lightning_modules.inference import presets as speed
 from lightning_modules.inference.presets import SPEEDS, Choice, Preset, choices, choose, pace
 from lightning_modules.motion import ZeroFlow
-from lightning_modules.networks import CSCSR, ClassicalDecoder
+from lightning_modules.networks import CSCSR, ClassicalDecoder, RecurrentCSCSR
 from lightning_modules.tasks.super_resolution import SuperResolution
 from spikekit import read_picture, write_spikes
 
@@ -96,6 +96,12 @@ def test_films_have_a_table_of_their_own(table):
     assert choose(3, "fastest").name == "tfi"
     with pytest.raises(ValueError, match=r"expected one that was measured \(x3\), got 4"):
         choose(4, "fastest", film=True)
+
+
+def test_a_film_is_made_by_a_network_for_films():
+    film, picture = (choose(4, "balanced", film=film).preset for film in (True, False))
+    assert [film.weights, picture.weights] == ["cscsr_large_film_x4", "cscsr_large_x4"]
+    assert isinstance(film.build(), RecurrentCSCSR)
 
 
 @pytest.mark.usefixtures("table")
