@@ -173,7 +173,7 @@ def unpack_clip(packed: Mapping[str, np.ndarray], part: tuple[int, int, int, int
         scale: pixels of the picture for a sensor pixel.
 
     Returns:
-        ``spikes`` uint8 (N, H, W), ``rgb`` (..., 3, s H, s W), and ``flow`` (times, 2, H, W) float32 where there is any.
+        ``spikes`` uint8 (N, H, W), ``rgb`` (..., 3, s H, s W), and ``flow`` (times, 2, H, W) float32, if any.
 
     Example:
         >>> clip = {"spikes": torch.rand(41, 6, 10).round(), "rgb": torch.rand(3, 12, 20)}

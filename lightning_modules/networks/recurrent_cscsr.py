@@ -163,7 +163,8 @@ class RecurrentCSCSR(CSCSR):
     ) -> list[Tensor]:
         """Return the pictures of a film, as they are after every time that it was read.
 
-        It is read in groups of ``future + 1`` key frames, see :func:`lightning_modules.networks.recurrent_cscsr.read_group`.
+        It is read in groups of ``future + 1`` key frames, see
+        :func:`~lightning_modules.networks.recurrent_cscsr.read_group`.
 
         Args:
             spikes: (B, K, N, H, W).
