@@ -13,15 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytorch_lightning as pl
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import Dataset
 
 from lightning_modules.data.cache import ClipCache, clip_key, file_digest, pack_clip, unpack_clip
 from lightning_modules.data.layouts import EXPECTED, Collection, FilmFiles, find_films
-from lightning_modules.data.loading import FreshClips, OwnPart, default_workers, load_clips
+from lightning_modules.data.loading import ClipScenes, cut_key_frames
 from lightning_modules.data.margin import flow_margin, trim
 from lightning_modules.data.pictures import split_pictures
 from spikekit import bayer_pattern
@@ -166,10 +165,7 @@ class ClipRecipe:
 
     def cut(self, clip: dict[str, Tensor]) -> dict[str, Tensor]:
         """Cut what :meth:`clip` returned into the clips of its key frames, (K, N, H, W), ``every`` clocks apart."""
-        if self.key_frames == 1:
-            return clip
-        spikes = clip["spikes"].unfold(0, self.frames, self.clocks).movedim(-1, 1).contiguous()
-        return {**clip, "spikes": spikes, "every": torch.tensor(self.clocks)}
+        return cut_key_frames(clip, self.key_frames, self.frames, self.clocks)
 
     def _flow(self, clip: FilmClip, time: int) -> Tensor:
         try:
@@ -288,12 +284,10 @@ class FilmClips(Dataset):
         return self._clip(*place, np.random.default_rng([self.recipe.seed, index, 1]))
 
     def _clip(self, film: FilmFiles, middle: int, rng: np.random.Generator | None) -> dict[str, Tensor]:
-        key = self.cache and self.recipe.key(film, middle)
-        packed = self.cache and self.cache.load(key)
-        if packed is None:
+        if self.cache is None:
             packed = pack_clip(self.recipe.clip(film, middle))
-            if self.cache is not None:
-                self.cache.store(key, packed)
+        else:
+            packed = self.cache.packed(self.recipe.key(film, middle), lambda: self.recipe.clip(film, middle))
         scale = self.recipe.scale
         height, width = (length // scale for length in packed["rgb"].shape[-2:])
         part, margin = (0, 0, height, width), 0
@@ -312,7 +306,7 @@ class FilmClips(Dataset):
         return self.recipe.cut({name: trim(planes, inner.get(name, 0)) for name, planes in clip.items()})
 
 
-class FilmScenes(pl.LightningDataModule):
+class FilmScenes(ClipScenes):
     """Clips of films, seen by a simulated camera: REDS, Vid4, Vimeo-90K, or any folder of frame folders.
 
     What lies in ``root`` says which data set it is. Of the 120-fps REDS, 240 scenes train and 30 validate and test, 5
@@ -370,10 +364,9 @@ class FilmScenes(pl.LightningDataModule):
         workers: int | None = None,
         seed: int = 0,
     ) -> None:
-        super().__init__()
+        super().__init__(batch_size, 1, workers)
         self.root, self.patch, self.clips, self.cache, self.flow_patch = root, patch, clips, cache, flow_patch
-        self.batch_size, self.seed = batch_size, seed
-        self.workers = default_workers() if workers is None else workers
+        self.seed = seed
         self.options = {
             "scale": scale,
             "frames": frames,
@@ -440,13 +433,3 @@ class FilmScenes(pl.LightningDataModule):
     def test_names(self) -> list[str]:
         """Film and frame of every test clip."""
         return self.test_set.names
-
-    def train_dataloader(self) -> DataLoader:  # noqa: D102
-        clips = FreshClips(self, self.batch_size, self.train_clips)
-        return load_clips(self.train_set, self.batch_size, self.workers, sampler=clips, drop_last=True)
-
-    def val_dataloader(self) -> DataLoader:  # noqa: D102
-        return load_clips(self.val_set, 1, self.workers, sampler=OwnPart(self, len(self.val_set)))
-
-    def test_dataloader(self) -> DataLoader:  # noqa: D102
-        return load_clips(self.test_set, 1, self.workers, sampler=OwnPart(self, len(self.test_set)))

@@ -8,14 +8,13 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import pytorch_lightning as pl
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import Dataset
 
-from lightning_modules.data.cache import ClipCache, clip_key, file_digest, pack_clip, unpack_clip
-from lightning_modules.data.loading import FreshClips, OwnPart, default_workers, load_clips
+from lightning_modules.data.cache import ClipCache, clip_key, file_digest, unpack_clip
+from lightning_modules.data.loading import ClipScenes, cut_key_frames
 from lightning_modules.data.margin import flow_margin, trim
 from lightning_modules.data.pictures import cached_picture, embedded_pictures, folder_pictures, split_pictures
 from lightning_modules.data.textures import outline_mask, texture
@@ -115,11 +114,7 @@ class StillClips(Dataset):
         """
         if self.cache is None:
             return self._cut(self._make(index))
-        key = clip_key(source=self._source, index=index)
-        packed = self.cache.load(key)
-        if packed is None:
-            packed = pack_clip(self._make(index))
-            self.cache.store(key, packed)
+        packed = self.cache.packed(clip_key(source=self._source, index=index), lambda: self._make(index))
         side = self.patch + 2 * self.margin
         return self._cut(unpack_clip(packed, (0, 0, side, side), self.scale))
 
@@ -143,11 +138,7 @@ class StillClips(Dataset):
         return {"spikes": spikes, "rgb": rgb[0], "flow": trim(flow, self.margin)}
 
     def _cut(self, clip: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Cut the spikes of several key frames into their clips."""
-        if self.key_frames == 1:
-            return clip
-        spikes = clip["spikes"].unfold(0, self.frames, self.every).movedim(-1, 1).contiguous()
-        return {**clip, "spikes": spikes, "every": torch.tensor(self.every)}
+        return cut_key_frames(clip, self.key_frames, self.frames, self.every)
 
     def spikes(self, index: int, scene: Scene) -> Tensor:
         """Return what the sensor makes of the scene of a clip, uint8 (clocks, H, W)."""
@@ -271,7 +262,7 @@ def _augment(picture: Tensor, rng: np.random.Generator) -> Tensor:
     return picture.contiguous()
 
 
-class StillScenes(pl.LightningDataModule):
+class StillScenes(ClipScenes):
     """Clips of still pictures in motion, made while training runs.
 
     Args:
@@ -339,12 +330,10 @@ class StillScenes(pl.LightningDataModule):
         workers: int | None = None,
         seed: int = 0,
     ) -> None:
-        super().__init__()
+        super().__init__(batch_size, batch_size, workers)
         self.root, self.val_root = root, val_root
         self.patch, self.val_patch, self.flow_patch, self.cache = patch, val_patch, flow_patch, cache
-        self.train_clips, self.val_clips = train_clips, val_clips
-        self.batch_size, self.seed = batch_size, seed
-        self.workers = default_workers() if workers is None else workers
+        self.train_clips, self.val_clips, self.seed = train_clips, val_clips, seed
         self.options = {
             "scale": scale,
             "frames": frames,
@@ -374,13 +363,11 @@ class StillScenes(pl.LightningDataModule):
         if self.batch_size < 1 or self.train_clips < self.batch_size:
             raise ValueError(f"train_clips: expected at least batch_size = {self.batch_size}, got {self.train_clips}")
         train, val = self._pictures()
-        embedded = self.root is None
-        options = self.options
-        more = {"flow_patch": self.flow_patch, "cache": ClipCache(self.cache) if self.cache else None}
-        self.train_set = StillClips(
-            train, **options, patch=self.patch, length=self.train_clips, textures=embedded, **more
-        )
-        self.val_set = StillClips(val, **options, patch=self.val_patch, length=self.val_clips, augment=False)
+        train_only = {"textures": self.root is None, "flow_patch": self.flow_patch}
+        train_only["cache"] = ClipCache(self.cache) if self.cache else None
+        self.train_set = StillClips(train, **self.options, patch=self.patch, length=self.train_clips, **train_only)
+        self.val_set = StillClips(val, **self.options, patch=self.val_patch, length=self.val_clips, augment=False)
+        self.test_set = self.val_set
 
     def _pictures(self) -> tuple[list[Path], list[Path]]:
         if self.root is None:
@@ -390,13 +377,3 @@ class StillScenes(pl.LightningDataModule):
         else:
             train, val = folder_pictures(self.root), []
         return train, val if self.val_root is None else folder_pictures(self.val_root)
-
-    def train_dataloader(self) -> DataLoader:  # noqa: D102
-        clips = FreshClips(self, self.batch_size, self.train_clips)
-        return load_clips(self.train_set, self.batch_size, self.workers, sampler=clips, drop_last=True)
-
-    def val_dataloader(self) -> DataLoader:  # noqa: D102
-        return load_clips(self.val_set, self.batch_size, self.workers, sampler=OwnPart(self, len(self.val_set)))
-
-    def test_dataloader(self) -> DataLoader:  # noqa: D102
-        return load_clips(self.val_set, self.batch_size, self.workers, sampler=OwnPart(self, len(self.val_set)))
