@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from lightning_modules.data.loading import ClipScenes, cut_key_frames
 from lightning_modules.data.margin import flow_margin, trim
 from lightning_modules.data.pictures import cached_picture, embedded_pictures, folder_pictures, split_pictures
 from lightning_modules.data.textures import outline_mask, texture
+from lightning_modules.signatures import takes
 from spikekit import bayer_pattern
 from spikekit.check import check_positive, check_whole
 from spikekit.scenes import analytic
@@ -38,23 +40,24 @@ class StillClips(Dataset):
 
     Args:
         pictures: files to make scenes of.
-        scale: how many view pixels a sensor pixel is wide.
+        scale: super-resolution factor: how many view pixels a sensor pixel is wide.
         patch: side of the clip in sensor pixels.
-        frames: clocks of a clip; the truth is the view at clock ``frames // 2``.
-        pattern: Bayer phase of the sensor.
-        alpha: light of a white pixel per clock, the threshold being 1.
-        motion: largest displacement of the middle of the background from the middle of the clip to its first or last
-            frame, in sensor pixels; an object moves by up to as much again relative to the background.
-        bend: what acceleration adds to that displacement at most, in sensor pixels, of every layer by itself.
-        rotation: largest turn in the same time, in degrees.
-        zoom: largest growth or shrinkage in the same time; 0.01 is one per cent.
-        objects: most objects in front of the background.
-        brightness: darkest and brightest exposure; a clip's pictures, so its truth and its light, are multiplied by one
-            number between.
-        photons: photons that make one threshold, for photon noise; ``None`` for none.
-        flow_times: clocks to which the flow from the middle is given.
-        key_frames: clips that follow each other, for a network that makes films; what moves, goes on as it does.
-        every: clocks from the middle of one to the middle of the next.
+        frames: spike frames of a clip. The truth is the view at frame ``frames // 2``.
+        pattern: Bayer phase of the sensor: RGGB, BGGR, GRBG or GBRG.
+        alpha: light of a white pixel per clock; a threshold of charge is 1.
+        motion: largest displacement of the background, at its centre, from the middle frame to the first or last one,
+            in sensor pixels. An object moves by up to as much again relative to the background.
+        bend: what acceleration adds to that displacement at most, in sensor pixels, for the background and for each
+            object: paths are parabolas instead of straight lines.
+        rotation: largest turn of the background and of each object in that time, in degrees.
+        zoom: largest growth or shrinkage of the background and of each object in that time; 0.01 is one per cent.
+        objects: most objects that move in front of the background.
+        brightness: darkest and brightest exposure. Truth and light of a clip are both multiplied by one number between.
+        photons: photons that make one threshold, for photon noise; null for none.
+        flow_times: frames to which the flow from the middle frame is given; with 41 frames and a window of 11, 5 and 35
+            are the centres of the first and of the last window.
+        key_frames: clips that follow each other, of one scene, for a network that makes films.
+        every: frames from the middle of one to the middle of the next.
         seed: where chance begins.
         augment: mirror, turn and recolour the pictures. Without it the pictures take their turns, one an index.
         textures: take some of the pictures from :func:`lightning_modules.data.textures.texture`.
@@ -265,30 +268,15 @@ def _augment(picture: Tensor, rng: np.random.Generator) -> Tensor:
 class StillScenes(ClipScenes):
     """Clips of still pictures in motion, made while training runs.
 
+    Besides its own arguments it has those of :class:`StillClips` that say how a clip is made.
+
     Args:
         root: folder of training pictures, read with all folders in it. Without it, the photographs inside
             scikit-image's wheel and procedural textures: no files are needed.
         val_root: folder of validation pictures. Without it, one picture in twenty of ``root`` is kept for validation
             (at least four, if there are as many again); without both, four held-out photographs of scikit-image.
-        scale: super-resolution factor.
         patch: side of a training clip in sensor pixels.
         val_patch: side of a validation or test clip in sensor pixels.
-        frames: spike frames of a clip. The truth is the view at frame ``frames // 2``.
-        pattern: Bayer phase of the sensor: RGGB, BGGR, GRBG or GBRG.
-        alpha: light of a white pixel per clock; a threshold of charge is 1.
-        motion: largest displacement of the background, at its centre, from the middle frame to the first or last one,
-            in sensor pixels. An object moves by up to as much again relative to the background.
-        bend: what acceleration adds to that displacement at most, in sensor pixels, for the background and for each
-            object: paths are parabolas instead of straight lines.
-        rotation: largest turn of the background and of each object in that time, in degrees.
-        zoom: largest growth or shrinkage of the background and of each object in that time; 0.01 is one per cent.
-        objects: most objects that move in front of the background.
-        brightness: darkest and brightest exposure. Truth and light of a clip are both multiplied by one number between.
-        photons: photons that make one threshold, for photon noise; null for none.
-        flow_times: frames to which the flow from the middle frame is given; with 41 frames and a window of 11, 5 and 35
-            are the centres of the first and of the last window.
-        key_frames: clips that follow each other, of one scene, for a network that makes films.
-        every: frames from the middle of one to the middle of the next.
         flow_patch: smallest side, in sensor pixels, of the part of a scene that motion is estimated on in training: on
             less the estimate is poor. Spikes of training clips reach so far beyond their patch. ``lightning`` says 48
             where ``model.flow`` is estimated, else 0.
@@ -302,26 +290,14 @@ class StillScenes(ClipScenes):
         seed: where chance begins. The same seed gives the same clips, whatever the number of workers.
     """
 
+    @takes(StillClips, "pictures", "augment", "textures", "length")
     def __init__(
         self,
         root: str | None = None,
         val_root: str | None = None,
-        scale: int = 4,
+        *,
         patch: int = 96,
         val_patch: int = 96,
-        frames: int = 41,
-        pattern: str = "RGGB",
-        alpha: float = 0.4,
-        motion: float = 3.0,
-        bend: float = 0.0,
-        rotation: float = 1.0,
-        zoom: float = 0.01,
-        objects: int = 2,
-        brightness: tuple[float, float] = (0.5, 1.0),
-        photons: float | None = None,
-        flow_times: tuple[int, int] = (5, 35),
-        key_frames: int = 1,
-        every: int = 20,
         flow_patch: int = 0,
         cache: str | None = None,
         train_clips: int = 1200,
@@ -329,28 +305,13 @@ class StillScenes(ClipScenes):
         batch_size: int = 4,
         workers: int | None = None,
         seed: int = 0,
+        **options: Any,
     ) -> None:
         super().__init__(batch_size, batch_size, workers)
         self.root, self.val_root = root, val_root
         self.patch, self.val_patch, self.flow_patch, self.cache = patch, val_patch, flow_patch, cache
         self.train_clips, self.val_clips, self.seed = train_clips, val_clips, seed
-        self.options = {
-            "scale": scale,
-            "frames": frames,
-            "pattern": pattern,
-            "alpha": alpha,
-            "motion": motion,
-            "bend": bend,
-            "rotation": rotation,
-            "zoom": zoom,
-            "objects": objects,
-            "brightness": brightness,
-            "photons": photons,
-            "flow_times": flow_times,
-            "key_frames": key_frames,
-            "every": every,
-            "seed": seed,
-        }
+        self.options = {**options, "seed": seed}
 
     def setup(self, stage: str | None = None) -> None:
         """Find the pictures.
