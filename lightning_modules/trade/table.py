@@ -145,36 +145,25 @@ def write_csv(rows: Sequence[Row], commands: Sequence[str], timed: Timed, path: 
     height, width = timed.size
     best, reference = front(rows), running(rows)[0].setting.name
     figured = _FIGURES if timed.every is not None else [name for name in _FIGURES if name not in _OF_FILMS]
-    columns = [
-        "setting",
-        *Preset.columns(),
-        *figured,
-        *["every"] * (timed.every is not None),
-        "reference",
-        "height",
-        "width",
-        "front",
-        "command",
-        "failed",
+    lines = [
+        {
+            "setting": row.setting.name,
+            **(row.setting.preset or Preset()).write(),
+            **{name: _text(values.get(name), ".10g") for name in figured},
+            **({} if timed.every is None else {"every": timed.every}),
+            "reference": reference,
+            "height": height,
+            "width": width,
+            "front": int(n in best) if values else "",
+            "command": command,
+            "failed": row.reason,
+        }
+        for n, (row, values, command) in enumerate(zip(rows, figures(rows), commands, strict=True))
     ]
     with whole_file(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, columns)
+        writer = csv.DictWriter(file, list(lines[0]))
         writer.writeheader()
-        for n, (row, values, command) in enumerate(zip(rows, figures(rows), commands, strict=True)):
-            writer.writerow(
-                {
-                    "setting": row.setting.name,
-                    **(row.setting.preset or Preset()).write(),
-                    **{name: _text(values.get(name), ".10g") for name in figured},
-                    **({} if timed.every is None else {"every": timed.every}),
-                    "reference": reference,
-                    "height": height,
-                    "width": width,
-                    "front": int(n in best) if values else "",
-                    "command": command,
-                    "failed": row.reason,
-                }
-            )
+        writer.writerows(lines)
 
 
 def _text(value: float | None, form: str) -> str:
