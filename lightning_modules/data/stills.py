@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ _CODE = [Path(__file__).with_name(f"{name}.py") for name in ("stills", "textures
 _TEXTURES = 0.3  # share of procedural pictures among embedded ones
 
 
+@dataclass(eq=False, repr=False)
 class StillClips(Dataset):
     """Clips of random scenes; which one, only the seed and the index say, in whatever process and order.
 
@@ -70,39 +72,33 @@ class StillClips(Dataset):
         ValueError: an argument that makes no sense; the message names it.
     """
 
-    def __init__(
-        self,
-        pictures: Sequence[Path],
-        *,
-        scale: int = 4,
-        patch: int = 96,
-        frames: int = 41,
-        pattern: str = "RGGB",
-        alpha: float = 0.4,
-        motion: float = 3.0,
-        bend: float = 0.0,
-        rotation: float = 1.0,
-        zoom: float = 0.01,
-        objects: int = 2,
-        brightness: tuple[float, float] = (0.5, 1.0),
-        photons: float | None = None,
-        flow_times: tuple[int, int] = (5, 35),
-        key_frames: int = 1,
-        every: int = 20,
-        seed: int = 0,
-        augment: bool = True,
-        textures: bool = False,
-        length: int = 1200,
-        flow_patch: int = 0,
-        cache: ClipCache | None = None,
-    ) -> None:
-        self.pictures = list(pictures)
-        self.scale, self.patch, self.frames, self.pattern, self.alpha = scale, patch, frames, pattern, alpha
-        self.motion, self.bend, self.rotation, self.zoom, self.objects = motion, bend, rotation, zoom, objects
-        self.brightness, self.photons, self.flow_times = tuple(brightness), photons, tuple(flow_times)
-        self.key_frames, self.every = key_frames, every
-        self.seed, self.augment, self.textures, self.length = seed, augment, textures, length
-        self.margin, self.cache = flow_margin(patch, flow_patch), cache
+    pictures: Sequence[Path]
+    _: KW_ONLY
+    scale: int = 4
+    patch: int = 96
+    frames: int = 41
+    pattern: str = "RGGB"
+    alpha: float = 0.4
+    motion: float = 3.0
+    bend: float = 0.0
+    rotation: float = 1.0
+    zoom: float = 0.01
+    objects: int = 2
+    brightness: tuple[float, float] = (0.5, 1.0)
+    photons: float | None = None
+    flow_times: tuple[int, int] = (5, 35)
+    key_frames: int = 1
+    every: int = 20
+    seed: int = 0
+    augment: bool = True
+    textures: bool = False
+    length: int = 1200
+    flow_patch: int = 0
+    cache: ClipCache | None = None
+
+    def __post_init__(self) -> None:
+        self.pictures, self.brightness = list(self.pictures), tuple(self.brightness)
+        self.flow_times, self.margin = tuple(self.flow_times), flow_margin(self.patch, self.flow_patch)
         _check(self)
         self.clocks = self.frames + (self.key_frames - 1) * self.every
 

@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from spikekit.arguments import UsageError, positive, whole
+from spikekit.arguments import UsageError, ending_in, positive, whole
 from spikekit.cli.simulation import Settings, Source, is_own, simulate
 from spikekit.color.cfa import PATTERNS
 from spikekit.io.calibration import read_calibration
@@ -109,7 +109,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         to.add_argument(f"--{name}", type=kind, metavar=metavar, help=f"{said}; {getattr(Settings, name)} if not given")
 
     add("input", type=Path, metavar="INPUT", help="a folder of pictures, a video file, a picture, or a side-car")
-    add("-o", "--output", required=True, type=_stream, metavar="OUT.dat", help="the stream to write, .dat or .npz")
+    stream = ending_in(".dat", ".npz", said="a stream that ends in .dat or .npz")
+    add("-o", "--output", required=True, type=stream, metavar="OUT.dat", help="the stream to write, .dat or .npz")
     add("--scale", type=whole(1), metavar="S", help="pixels of a frame that a sensor pixel is wide")
     said = f"Bayer phase of the sensor; {Settings.pattern} if not given"
     add("--pattern", type=str.upper, choices=PATTERNS, help=said)
@@ -161,10 +162,3 @@ def _plan(text: str) -> str | int:
     if text.isascii() and text.isdigit():
         return int(text)
     raise argparse.ArgumentTypeError(f"expected scene, everything or a number of latent frames, got {text}")
-
-
-def _stream(text: str) -> Path:
-    path = Path(text)
-    if path.suffix.lower() not in (".dat", ".npz"):
-        raise argparse.ArgumentTypeError(f"expected a stream that ends in .dat or .npz, got {text}")
-    return path
