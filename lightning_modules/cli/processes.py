@@ -1,0 +1,162 @@
+"""Python in processes of its own, on this machine or on a Ray cluster, such as those that make parts of a recording."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from lightning_modules.cli.errors import InputError, UsageError
+from spikekit.arguments import one_line
+
+_A_MOMENT = 0.2  # seconds
+
+
+def make_parts(typed: Sequence[str], folder: Path, precision: str, jobs: int | None) -> None:
+    """Make all pictures of a recording, in as many parts as are made at once.
+
+    Args:
+        typed: verb and arguments of ``lightning predict``.
+        folder: of the pictures, under the same path for all nodes.
+        precision: the same for all of them, whatever each would choose.
+        jobs: parts at once; as many as there are GPUs, or else nodes, if ``None``.
+
+    Raises:
+        UsageError: a ``--budget``, which every node would measure for itself.
+        InputError: Ray is not installed, or a part failed.
+    """
+    from lightning_modules.cli.arguments import options  # takes torch, which the cluster runs this module without
+
+    if any(option == "--budget" for _, option, _ in options(typed)):
+        raise UsageError("--engine ray: expected --speed or --model.weights, got --budget, which differs by node")
+    if find_spec("ray") is None:
+        raise InputError("predict: --engine ray: Ray is not installed; pip install '.[ray]' in a clone brings it")
+    quiet = ["--engine", "local", "--trainer.enable_progress_bar", "false", "--trainer.precision", precision]
+    logs: list[Path] = []
+
+    def commands(count: int) -> dict[Path, list[str]]:
+        logs.extend(folder.absolute() / f"part_{n}_of_{count}.log" for n in range(1, count + 1))
+        words = ["-m", "lightning_modules.recording_part", *typed, *quiet]
+        return {log: [*words, "--part", f"{n}/{count}"] for n, log in enumerate(logs, 1)}
+
+    for ended in run_commands_on_ray(commands, jobs):
+        for log, reason in ended.items():
+            if reason is not None:
+                raise InputError(f"{log}: {reason}")
+            print(f"{log.stem.replace('_', ' ')} is made", flush=True)
+    for log in logs:
+        log.unlink(missing_ok=True)
+
+
+def run_commands_on_ray(
+    commands: Callable[[int], dict[Path, Sequence[str]]], jobs: int | None
+) -> Iterator[dict[Path, str | None]]:
+    """Run Python on the Ray cluster that ``RAY_ADDRESS`` names or that runs here, else on a Ray of this machine's own.
+
+    It says again and again which commands ended, and with what reason, ``None`` where nothing went wrong.
+
+    Args:
+        commands: given how many run at once, the arguments of Python by the file that a command's output goes to.
+        jobs: commands at once; as many as there are GPUs, or else nodes, if ``None``.
+    """
+    import ray
+
+    try:
+        ray.init(log_to_driver=False, include_dashboard=False, logging_level="ERROR")
+    except Exception as error:  # Ray raises its plainest kind where a machine is too busy to start it
+        raise InputError(f"--engine ray: {one_line(error)}") from error
+    try:
+        nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        share = _share(nodes, jobs)
+        at_once = jobs or int(sum(node.get("GPU", 0) for node in nodes)) or len(nodes)
+        task = ray.remote(max_retries=0, **share)(_run_to_end)
+        running = {task.remote(log, words, os.getcwd()): log for log, words in commands(at_once).items()}
+        while running:
+            done, _ = ray.wait(list(running), timeout=_A_MOMENT)
+            yield {running.pop(reference): _outcome(ray, reference) for reference in done}
+    finally:
+        ray.shutdown()
+
+
+def _share(nodes: Sequence[dict[str, float]], jobs: int | None) -> dict[str, Any]:
+    """Return what a trial takes of a cluster.
+
+    Example:
+        >>> _share([{"CPU": 16, "GPU": 2}, {"CPU": 8, "GPU": 2}], None)
+        {'num_cpus': 4, 'num_gpus': 1.0}
+        >>> _share([{"CPU": 8}], 4)
+        {'num_cpus': 2}
+    """
+    gpus = sum(node.get("GPU", 0) for node in nodes)
+    if gpus:
+        gpu = gpus / max(jobs or gpus, 1)
+        gpu = min(1.0, gpu)
+        cpus = min(node.get("CPU", 0) / node["GPU"] for node in nodes if node.get("GPU")) * gpu
+        return {"num_cpus": int(cpus), "num_gpus": gpu}
+    a_node = -(-(jobs or len(nodes)) // len(nodes))
+    return {"num_cpus": max(1, int(min(node.get("CPU", 1) for node in nodes) // a_node))}
+
+
+def _run_to_end(log: Path, words: Sequence[str], there: str) -> str | None:
+    os.chdir(there)
+    process = start(log, words, {})
+    try:
+        return reason(log, process.wait())
+    finally:
+        stop(process)
+
+
+def _outcome(ray: Any, reference: Any) -> str | None:
+    try:
+        return ray.get(reference)
+    except ray.exceptions.RayError as error:
+        return f"Ray: {str(error).strip().splitlines()[0]}"
+
+
+def start(log: Path, words: Sequence[str], environment: dict[str, str]) -> subprocess.Popen:
+    """Start Python, with what it prints at the end of a file, and more in its environment."""
+    # Threads that spin while they wait hold up the workers that make clips.
+    environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ, **environment}
+    with open(log, "ab") as file:
+        return subprocess.Popen(
+            [sys.executable, *words],
+            stdin=subprocess.PIPE,
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            env=environment,
+        )
+
+
+def stop(process: subprocess.Popen) -> None:
+    """Have a process that was started here end, see :func:`end_with_parent`, and wait for it."""
+    process.stdin.close()
+    process.wait()
+
+
+def end_with_parent() -> None:
+    """Stop where the one that started this process does, even when it is killed: our standard input then closes."""
+
+    def wait() -> None:
+        while os.read(0, 1):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def reason(log: Path, status: int) -> str | None:
+    """Return why a process ended with a status, or None where nothing went wrong."""
+    if status == 0:
+        return None
+    if status < 0:
+        name = signal.Signals(-status).name
+        return f"killed by {name}" + (", perhaps for want of memory" if name == "SIGKILL" else "")
+    lines = log.read_text(errors="replace").split("\n")
+    last = next((line.strip() for line in reversed(lines) if line.strip()), f"status {status}")
+    return last.removeprefix("lightning: ")
