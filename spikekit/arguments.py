@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable
+from pathlib import Path
 
 #: what names frames: N, A:B or A:B:STEP
 FRAMES = r"\d+|\d*:\d*(:0*[1-9]\d*)?"
@@ -66,6 +67,18 @@ def positive(text: str) -> float:
     if not 0 < number < float("inf"):
         raise argparse.ArgumentTypeError(f"expected a number above 0, got {text}")
     return number
+
+
+def ending_in(*endings: str, said: str) -> Callable[[str], Path]:
+    """Return the type of an argument that names a file with one of some endings, ``said`` to be expected if not."""
+
+    def read(text: str) -> Path:
+        path = Path(text)
+        if path.suffix.lower() not in endings:
+            raise argparse.ArgumentTypeError(f"expected {said}, got {text}")
+        return path
+
+    return read
 
 
 def one_line(error: BaseException) -> str:

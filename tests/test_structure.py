@@ -118,7 +118,7 @@ UNWHOLE = {
     "spikekit.io.video_output": 1,  # FFmpeg, under the name of a whole file's part
     "spikekit.timing": 1,  # a switch of Linux in /proc
     "spikekit.bench.plain": 1,  # in a temporary folder
-    "lightning_modules.processes": 1,  # a log, which grows
+    "lightning_modules.cli.processes": 1,  # a log, which grows
 }
 
 

@@ -27,8 +27,8 @@ from lightning_modules.cli import prediction
 from lightning_modules.cli.arguments import classes_first, flatten, options, whole_counts, with_network_of_weights
 from lightning_modules.cli.errors import InputError, UsageError
 from lightning_modules.cli.folder_lock import FolderError, locked_folder, make_folder
-from lightning_modules.cli.parts import make_parts
 from lightning_modules.cli.prediction import NO_RECORDING
+from lightning_modules.cli.processes import make_parts
 from lightning_modules.cli.reasons import reason, suggestion, unknown
 from lightning_modules.cli.renamed_overlays import with_current_overlays
 from lightning_modules.data import FilmScenes, Recording, StillScenes

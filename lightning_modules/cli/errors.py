@@ -48,11 +48,10 @@ def _of_users() -> tuple[type[Exception], ...]:
 
     from lightning_modules.cli.folder_lock import FolderError
     from lightning_modules.pretrained import CheckpointMismatchError
-    from lightning_modules.processes import EngineError
     from spikekit import SpikeFileError, VideoError
     from spikekit.io import PictureError
 
-    ours = InputError, SpikeFileError, PictureError, VideoError, CheckpointMismatchError, FolderError, EngineError
+    ours = InputError, SpikeFileError, PictureError, VideoError, CheckpointMismatchError, FolderError
     return *ours, MisconfigurationException  # of Lightning, such as a device that is not there
 
 

@@ -6,7 +6,7 @@ import hashlib
 import io
 import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -87,6 +87,14 @@ class ClipCache:
                 file.write(stored)
         except OSError as error:
             self._warn(f"{path}: cannot be written ({error.strerror or error}), goes on without")
+
+    def packed(self, key: str, make: Callable[[], Mapping[str, Tensor]]) -> dict[str, np.ndarray]:
+        """Return a clip that is here, or make it and keep it, as :func:`pack_clip` does."""
+        packed = self.load(key)
+        if packed is None:
+            packed = pack_clip(make())
+            self.store(key, packed)
+        return packed
 
     def _path(self, key: str) -> Path:
         return self.folder / key[:2] / f"{key[2:]}.clip"

@@ -8,22 +8,22 @@ import pickle
 import zlib
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytorch_lightning as pl
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import Dataset
 
 from lightning_modules.data.cache import ClipCache, clip_key, file_digest, pack_clip, unpack_clip
 from lightning_modules.data.layouts import EXPECTED, Collection, FilmFiles, find_films
-from lightning_modules.data.loading import FreshClips, OwnPart, default_workers, load_clips
+from lightning_modules.data.loading import ClipScenes, cut_key_frames
 from lightning_modules.data.margin import flow_margin, trim
 from lightning_modules.data.pictures import split_pictures
+from lightning_modules.signatures import takes
 from spikekit import bayer_pattern
 from spikekit.check import check_positive, check_whole
 from spikekit.flow.interpolate import FlowInterpolation
@@ -38,15 +38,16 @@ class ClipRecipe:
 
     Args:
         scale: super-resolution factor.
-        frames: spike frames of a clip; the truth is the source frame at ``frames // 2``.
-        pattern: Bayer phase of the sensor.
-        alpha: light of a white pixel per clock, the threshold being 1.
-        clocks: clocks from one source frame to the next.
+        frames: spike frames of a clip. The truth is the source frame at frame ``frames // 2``.
+        pattern: Bayer phase of the sensor: RGGB, BGGR, GRBG or GBRG.
+        alpha: light of a white pixel per clock; a threshold of charge is 1.
+        clocks: spike frames from one source frame to the next.
         key_frames: clips that follow each other, around so many source frames, an odd number; their truth is all of
             these frames, and there is no flow.
         flow_times: spike frames to which the flow from the middle is given; empty for no flow.
-        interpolation: what makes latent frames.
-        noise: what the sensor adds.
+        interpolation: what makes frames between two source frames, by its class path; motion-compensated, without
+            weights, when null.
+        noise: what the sensor adds, such as ``{photons: 1000}``; nothing when null.
         seed: where chance begins.
 
     Raises:
@@ -60,12 +61,14 @@ class ClipRecipe:
     clocks: int = 20
     key_frames: int = 1
     flow_times: tuple[int, ...] = (5, 35)
-    interpolation: Callable[[Tensor, Tensor], Any] = field(default_factory=FlowInterpolation)
-    noise: SensorNoise = field(default_factory=SensorNoise)
+    interpolation: Callable[[Tensor, Tensor], Any] | None = None
+    noise: SensorNoise | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "scale", check_whole("scale", self.scale))  # frozen
+        own = {"interpolation": self.interpolation or FlowInterpolation(), "noise": self.noise or SensorNoise()}
+        for name, value in {"scale": check_whole("scale", self.scale), **own}.items():
+            object.__setattr__(self, name, value)  # frozen
         check_positive("alpha", self.alpha)
         check_whole("frames", self.frames)
         check_whole("clocks", self.clocks)
@@ -166,10 +169,7 @@ class ClipRecipe:
 
     def cut(self, clip: dict[str, Tensor]) -> dict[str, Tensor]:
         """Cut what :meth:`clip` returned into the clips of its key frames, (K, N, H, W), ``every`` clocks apart."""
-        if self.key_frames == 1:
-            return clip
-        spikes = clip["spikes"].unfold(0, self.frames, self.clocks).movedim(-1, 1).contiguous()
-        return {**clip, "spikes": spikes, "every": torch.tensor(self.clocks)}
+        return cut_key_frames(clip, self.key_frames, self.frames, self.clocks)
 
     def _flow(self, clip: FilmClip, time: int) -> Tensor:
         try:
@@ -288,12 +288,10 @@ class FilmClips(Dataset):
         return self._clip(*place, np.random.default_rng([self.recipe.seed, index, 1]))
 
     def _clip(self, film: FilmFiles, middle: int, rng: np.random.Generator | None) -> dict[str, Tensor]:
-        key = self.cache and self.recipe.key(film, middle)
-        packed = self.cache and self.cache.load(key)
-        if packed is None:
+        if self.cache is None:
             packed = pack_clip(self.recipe.clip(film, middle))
-            if self.cache is not None:
-                self.cache.store(key, packed)
+        else:
+            packed = self.cache.packed(self.recipe.key(film, middle), lambda: self.recipe.clip(film, middle))
         scale = self.recipe.scale
         height, width = (length // scale for length in packed["rgb"].shape[-2:])
         part, margin = (0, 0, height, width), 0
@@ -312,7 +310,7 @@ class FilmClips(Dataset):
         return self.recipe.cut({name: trim(planes, inner.get(name, 0)) for name, planes in clip.items()})
 
 
-class FilmScenes(pl.LightningDataModule):
+class FilmScenes(ClipScenes):
     """Clips of films, seen by a simulated camera: REDS, Vid4, Vimeo-90K, or any folder of frame folders.
 
     What lies in ``root`` says which data set it is. Of the 120-fps REDS, 240 scenes train and 30 validate and test, 5
@@ -323,23 +321,15 @@ class FilmScenes(pl.LightningDataModule):
     Training takes patches, everything else whole views, cut at the bottom and at the right to multiples of twice the
     scale. The whole view is simulated also for a patch, which takes seconds where frames are large: give a ``cache``.
 
+    Besides its own arguments it has those of :class:`~lightning_modules.data.films.ClipRecipe`.
+
     Args:
         root: folder of the data set, with what its archives hold.
-        scale: super-resolution factor.
         patch: side of a training clip in sensor pixels.
-        frames: spike frames of a clip. The truth is the source frame at frame ``frames // 2``.
-        pattern: Bayer phase of the sensor: RGGB, BGGR, GRBG or GBRG.
-        alpha: light of a white pixel per clock; a threshold of charge is 1.
-        clocks: spike frames from one source frame to the next.
-        key_frames: clips that follow each other, around so many source frames, for a network that makes films; an odd
-            number.
         clips: clips of a film, spread over it. Null for 5 of REDS and of other films, 1 of Vid4 and Vimeo-90K.
         flow: give the interpolation's flow from the middle to ``flow_times``. False for an interpolation that has
             none; training then uses the network's own estimator.
         flow_times: frames to which the flow is given.
-        interpolation: what makes frames between two source frames, by its class path; motion-compensated, without
-            weights, when null.
-        noise: what the sensor adds, such as ``{photons: 1000}``; nothing when null.
         flow_patch: smallest side, in sensor pixels, of what motion is estimated on in training, see
             :class:`StillScenes`.
         cache: folder where simulated clips are kept, found again by the content of their frames, by all settings and
@@ -349,45 +339,26 @@ class FilmScenes(pl.LightningDataModule):
         seed: where chance begins. The same seed gives the same clips, whatever the number of workers.
     """
 
+    @takes(ClipRecipe)
     def __init__(
         self,
         root: str,
-        scale: int = 4,
+        *,
         patch: int = 96,
-        frames: int = 41,
-        pattern: str = "RGGB",
-        alpha: float = 0.4,
-        clocks: int = 20,
-        key_frames: int = 1,
         clips: int | None = None,
         flow: bool = True,
         flow_times: tuple[int, int] = (5, 35),
-        interpolation: Callable[[Tensor, Tensor], Any] | None = None,
-        noise: SensorNoise | None = None,
         flow_patch: int = 0,
         cache: str | None = None,
         batch_size: int = 4,
         workers: int | None = None,
         seed: int = 0,
+        **options: Any,
     ) -> None:
-        super().__init__()
+        super().__init__(batch_size, 1, workers)
         self.root, self.patch, self.clips, self.cache, self.flow_patch = root, patch, clips, cache, flow_patch
-        self.batch_size, self.seed = batch_size, seed
-        self.workers = default_workers() if workers is None else workers
-        self.options = {
-            "scale": scale,
-            "frames": frames,
-            "pattern": pattern,
-            "alpha": alpha,
-            "clocks": clocks,
-            "key_frames": key_frames,
-            "flow_times": tuple(flow_times) if flow else (),
-            "seed": seed,
-        }
-        if interpolation is not None:
-            self.options["interpolation"] = interpolation
-        if noise is not None:
-            self.options["noise"] = noise
+        self.seed = seed
+        self.options = {**options, "flow_times": tuple(flow_times) if flow else (), "seed": seed}
         self.found: Collection | None = None
 
     def setup(self, stage: str | None = None) -> None:
@@ -440,13 +411,3 @@ class FilmScenes(pl.LightningDataModule):
     def test_names(self) -> list[str]:
         """Film and frame of every test clip."""
         return self.test_set.names
-
-    def train_dataloader(self) -> DataLoader:  # noqa: D102
-        clips = FreshClips(self, self.batch_size, self.train_clips)
-        return load_clips(self.train_set, self.batch_size, self.workers, sampler=clips, drop_last=True)
-
-    def val_dataloader(self) -> DataLoader:  # noqa: D102
-        return load_clips(self.val_set, 1, self.workers, sampler=OwnPart(self, len(self.val_set)))
-
-    def test_dataloader(self) -> DataLoader:  # noqa: D102
-        return load_clips(self.test_set, 1, self.workers, sampler=OwnPart(self, len(self.test_set)))

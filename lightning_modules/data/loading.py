@@ -85,6 +85,47 @@ def _process(data: LightningDataModule) -> tuple[int, int]:
     return (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
 
 
+class ClipScenes(LightningDataModule):
+    """Loads clips that are made while training runs: ``train_set``, ``val_set`` and ``test_set`` of ``setup``.
+
+    Args:
+        batch_size: training clips in a batch.
+        val_batch_size: clips in a batch of validation and test.
+        workers: processes that make clips; None for :func:`default_workers`.
+
+    Attributes:
+        train_clips: training clips in an epoch.
+    """
+
+    train_clips: int
+
+    def __init__(self, batch_size: int, val_batch_size: int, workers: int | None) -> None:
+        super().__init__()
+        self.batch_size, self.val_batch_size = batch_size, val_batch_size
+        self.workers = default_workers() if workers is None else workers
+
+    def train_dataloader(self) -> DataLoader:  # noqa: D102
+        clips = FreshClips(self, self.batch_size, self.train_clips)
+        return load_clips(self.train_set, self.batch_size, self.workers, sampler=clips, drop_last=True)
+
+    def val_dataloader(self) -> DataLoader:  # noqa: D102
+        return self._every_clip(self.val_set)
+
+    def test_dataloader(self) -> DataLoader:  # noqa: D102
+        return self._every_clip(self.test_set)
+
+    def _every_clip(self, clips: Dataset) -> DataLoader:
+        return load_clips(clips, self.val_batch_size, self.workers, sampler=OwnPart(self, len(clips)))
+
+
+def cut_key_frames(clip: dict[str, Tensor], key_frames: int, frames: int, every: int) -> dict[str, Tensor]:
+    """Cut the spikes (T, H, W) of several key frames into a clip of each, (K, N, H, W), ``every`` clocks apart."""
+    if key_frames == 1:
+        return clip
+    spikes = clip["spikes"].unfold(0, frames, every).movedim(-1, 1).contiguous()
+    return {**clip, "spikes": spikes, "every": torch.tensor(every)}
+
+
 def load_clips(clips: Dataset, batch_size: int, workers: int, **options: object) -> DataLoader:
     """Return a loader of clips, which are dictionaries of tensors.
 

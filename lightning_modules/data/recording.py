@@ -6,6 +6,7 @@ from argparse import Namespace
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import cached_property
+from inspect import signature
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from torch import Tensor
 from torch.utils.data import Dataset, default_collate
 
 from lightning_modules.data.clips_around import clips_around
+from lightning_modules.signatures import takes
 from spikekit import bayer_sites
 from spikekit.arguments import frames_of
 from spikekit.io.recording import open_recording, white_rate
@@ -30,19 +32,22 @@ class RecordingClips(Dataset[dict[str, Any]]):
 
     Args:
         path: a ``.dat`` or ``.npz`` file, see :func:`spikekit.read_spikes`.
-        height: rows; needed for a ``.dat`` without side-car or camera.
+        height: rows; needed for a ``.dat`` without side-car or camera, as it has no header.
         width: columns; likewise.
         flip: turn the stored frames upside down, as real cameras need.
-        pattern: Bayer phase after the flip; that of the side-car or the camera, or else RGGB, when not given. "grey"
-            for a camera without colours.
-        frames: spike frames N of a clip.
-        every: frames between two clips.
-        crop_to: Bayer phase that a network wants; up to one row and column are cut off so that clips begin with it.
-        camera: what recorded it, see :func:`spikekit.camera`.
-        frame: N, or A:B or A:B:STEP: the frames in the middle of the clips, from A to B - 1, ``every`` apart where
-            STEP is left out; all that a whole clip is around when not given.
-        white: spikes a frame of a pixel that is shown white; see :class:`Recording`.
-        calibration: of the pixels; see :class:`Recording`.
+        pattern: Bayer phase after the flip, one of RGGB, BGGR, GRBG, GBRG; that of the side-car or the camera, or else
+            RGGB, when not given. "grey" for a camera without colours, whose pictures are grey then.
+        frames: spike frames N of a clip, as the network was trained.
+        every: frames between two clips, or two reconstructed pictures; 20 is a millisecond at 20 kHz.
+        crop_to: Bayer phase that the network was trained with; clips begin with it, a row and a column less at most.
+        camera: what recorded it: m1k40, m1k40-bayer, uhsr, vidar, or a .json file of the same form; gives the size, the
+            flip, the Bayer phase, what to crop, and the gamma of the pictures.
+        frame: which frames are in the middle of clips and reconstructed: N, or from A to B - 1 as A:B or A:B:STEP,
+            ``every`` apart where STEP is left out; all when not given.
+        white: spikes a frame of a pixel that is shown white; less makes pictures brighter. When not given, that of the
+            side-car, or else what 99.9 % of the pixels of the recording do not exceed, the same in all its pictures.
+        calibration: what spikekit calibrate measured of the pixels; the spikes are made those of an ideal sensor by it.
+            When not given, the recording's own, NAME.calibration.safetensors beside it; "none" for none.
 
     Attributes:
         size: (H, W) of a clip.
@@ -178,56 +183,13 @@ class Recording(LightningDataModule):
 
     What a side-car beside the recording knows, or ``camera``, need not be said: size, Bayer phase and gain.
 
-    Args:
-        path: a ``.dat`` or ``.npz`` file.
-        height: rows; needed for a ``.dat`` without side-car or camera, as it has no header.
-        width: columns; likewise.
-        flip: turn the stored frames upside down, as real cameras need.
-        pattern: Bayer phase after the flip, one of RGGB, BGGR, GRBG, GBRG; that of the side-car or the camera, or else
-            RGGB, when not given. "grey" for a camera without colours, whose pictures are grey then.
-        every: frames between two reconstructed pictures; 20 is a millisecond at 20 kHz.
-        frames: spike frames of a clip, as the network was trained.
-        crop_to: Bayer phase that the network was trained with; clips begin with it, a row and a column less at most.
-        camera: what recorded it: m1k40, m1k40-bayer, uhsr, vidar, or a .json file of the same form; gives the size, the
-            flip, the Bayer phase, what to crop, and the gamma of the pictures.
-        frame: which frames to reconstruct: N, or from A to B - 1 as A:B or A:B:STEP, ``every`` apart where STEP is left
-            out; all when not given.
-        white: spikes a frame of a pixel that is shown white; less makes pictures brighter. When not given, that of the
-            side-car, or else what 99.9 % of the pixels of the recording do not exceed, the same in all its pictures.
-        calibration: what spikekit calibrate measured of the pixels; the spikes are made those of an ideal sensor by it.
-            When not given, the recording's own, NAME.calibration.safetensors beside it; "none" for none.
+    Its arguments are those of :class:`RecordingClips`.
     """
 
-    def __init__(
-        self,
-        path: str,
-        height: int | None = None,
-        width: int | None = None,
-        flip: bool = False,
-        pattern: str | None = None,
-        every: int = 20,
-        frames: int = 41,
-        crop_to: str = "RGGB",
-        camera: str | None = None,
-        frame: str | None = None,
-        white: float | None = None,
-        calibration: str | None = None,
-    ) -> None:
+    @takes(RecordingClips)
+    def __init__(self, *args: Any, **settings: Any) -> None:
         super().__init__()
-        self.path = path
-        self.how = {
-            "height": height,
-            "width": width,
-            "flip": flip,
-            "pattern": pattern,
-            "frames": frames,
-            "every": every,
-            "crop_to": crop_to,
-            "camera": camera,
-            "frame": frame,
-            "white": white,
-            "calibration": calibration,
-        }
+        self.how = signature(RecordingClips).bind(*args, **settings)
 
     def setup(self, stage: str | None = None) -> None:
         """Open the recording.
@@ -236,7 +198,7 @@ class Recording(LightningDataModule):
             spikekit.SpikeFileError: the file cannot be read.
             ValueError: the recording is shorter than a clip, or an argument is out of range.
         """
-        self.clips = RecordingClips(self.path, **self.how)
+        self.clips = RecordingClips(*self.how.args, **self.how.kwargs)
 
     def show(self, rgb: Tensor) -> Tensor:
         """Return light (3, H, W) in [0, 1], white being 1, as the camera shows it."""

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pytorch_lightning as pl
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import Dataset
 
-from lightning_modules.data.cache import ClipCache, clip_key, file_digest, pack_clip, unpack_clip
-from lightning_modules.data.loading import FreshClips, OwnPart, default_workers, load_clips
+from lightning_modules.data.cache import ClipCache, clip_key, file_digest, unpack_clip
+from lightning_modules.data.loading import ClipScenes, cut_key_frames
 from lightning_modules.data.margin import flow_margin, trim
 from lightning_modules.data.pictures import cached_picture, embedded_pictures, folder_pictures, split_pictures
 from lightning_modules.data.textures import outline_mask, texture
+from lightning_modules.signatures import takes
 from spikekit import bayer_pattern
 from spikekit.check import check_positive, check_whole
 from spikekit.scenes import analytic
@@ -34,28 +36,30 @@ _CODE = [Path(__file__).with_name(f"{name}.py") for name in ("stills", "textures
 _TEXTURES = 0.3  # share of procedural pictures among embedded ones
 
 
+@dataclass(eq=False, repr=False)
 class StillClips(Dataset):
     """Clips of random scenes; which one, only the seed and the index say, in whatever process and order.
 
     Args:
         pictures: files to make scenes of.
-        scale: how many view pixels a sensor pixel is wide.
+        scale: super-resolution factor: how many view pixels a sensor pixel is wide.
         patch: side of the clip in sensor pixels.
-        frames: clocks of a clip; the truth is the view at clock ``frames // 2``.
-        pattern: Bayer phase of the sensor.
-        alpha: light of a white pixel per clock, the threshold being 1.
-        motion: largest displacement of the middle of the background from the middle of the clip to its first or last
-            frame, in sensor pixels; an object moves by up to as much again relative to the background.
-        bend: what acceleration adds to that displacement at most, in sensor pixels, of every layer by itself.
-        rotation: largest turn in the same time, in degrees.
-        zoom: largest growth or shrinkage in the same time; 0.01 is one per cent.
-        objects: most objects in front of the background.
-        brightness: darkest and brightest exposure; a clip's pictures, so its truth and its light, are multiplied by one
-            number between.
-        photons: photons that make one threshold, for photon noise; ``None`` for none.
-        flow_times: clocks to which the flow from the middle is given.
-        key_frames: clips that follow each other, for a network that makes films; what moves, goes on as it does.
-        every: clocks from the middle of one to the middle of the next.
+        frames: spike frames of a clip. The truth is the view at frame ``frames // 2``.
+        pattern: Bayer phase of the sensor: RGGB, BGGR, GRBG or GBRG.
+        alpha: light of a white pixel per clock; a threshold of charge is 1.
+        motion: largest displacement of the background, at its centre, from the middle frame to the first or last one,
+            in sensor pixels. An object moves by up to as much again relative to the background.
+        bend: what acceleration adds to that displacement at most, in sensor pixels, for the background and for each
+            object: paths are parabolas instead of straight lines.
+        rotation: largest turn of the background and of each object in that time, in degrees.
+        zoom: largest growth or shrinkage of the background and of each object in that time; 0.01 is one per cent.
+        objects: most objects that move in front of the background.
+        brightness: darkest and brightest exposure. Truth and light of a clip are both multiplied by one number between.
+        photons: photons that make one threshold, for photon noise; null for none.
+        flow_times: frames to which the flow from the middle frame is given; with 41 frames and a window of 11, 5 and 35
+            are the centres of the first and of the last window.
+        key_frames: clips that follow each other, of one scene, for a network that makes films.
+        every: frames from the middle of one to the middle of the next.
         seed: where chance begins.
         augment: mirror, turn and recolour the pictures. Without it the pictures take their turns, one an index.
         textures: take some of the pictures from :func:`lightning_modules.data.textures.texture`.
@@ -68,39 +72,33 @@ class StillClips(Dataset):
         ValueError: an argument that makes no sense; the message names it.
     """
 
-    def __init__(
-        self,
-        pictures: Sequence[Path],
-        *,
-        scale: int = 4,
-        patch: int = 96,
-        frames: int = 41,
-        pattern: str = "RGGB",
-        alpha: float = 0.4,
-        motion: float = 3.0,
-        bend: float = 0.0,
-        rotation: float = 1.0,
-        zoom: float = 0.01,
-        objects: int = 2,
-        brightness: tuple[float, float] = (0.5, 1.0),
-        photons: float | None = None,
-        flow_times: tuple[int, int] = (5, 35),
-        key_frames: int = 1,
-        every: int = 20,
-        seed: int = 0,
-        augment: bool = True,
-        textures: bool = False,
-        length: int = 1200,
-        flow_patch: int = 0,
-        cache: ClipCache | None = None,
-    ) -> None:
-        self.pictures = list(pictures)
-        self.scale, self.patch, self.frames, self.pattern, self.alpha = scale, patch, frames, pattern, alpha
-        self.motion, self.bend, self.rotation, self.zoom, self.objects = motion, bend, rotation, zoom, objects
-        self.brightness, self.photons, self.flow_times = tuple(brightness), photons, tuple(flow_times)
-        self.key_frames, self.every = key_frames, every
-        self.seed, self.augment, self.textures, self.length = seed, augment, textures, length
-        self.margin, self.cache = flow_margin(patch, flow_patch), cache
+    pictures: Sequence[Path]
+    _: KW_ONLY
+    scale: int = 4
+    patch: int = 96
+    frames: int = 41
+    pattern: str = "RGGB"
+    alpha: float = 0.4
+    motion: float = 3.0
+    bend: float = 0.0
+    rotation: float = 1.0
+    zoom: float = 0.01
+    objects: int = 2
+    brightness: tuple[float, float] = (0.5, 1.0)
+    photons: float | None = None
+    flow_times: tuple[int, int] = (5, 35)
+    key_frames: int = 1
+    every: int = 20
+    seed: int = 0
+    augment: bool = True
+    textures: bool = False
+    length: int = 1200
+    flow_patch: int = 0
+    cache: ClipCache | None = None
+
+    def __post_init__(self) -> None:
+        self.pictures, self.brightness = list(self.pictures), tuple(self.brightness)
+        self.flow_times, self.margin = tuple(self.flow_times), flow_margin(self.patch, self.flow_patch)
         _check(self)
         self.clocks = self.frames + (self.key_frames - 1) * self.every
 
@@ -115,11 +113,7 @@ class StillClips(Dataset):
         """
         if self.cache is None:
             return self._cut(self._make(index))
-        key = clip_key(source=self._source, index=index)
-        packed = self.cache.load(key)
-        if packed is None:
-            packed = pack_clip(self._make(index))
-            self.cache.store(key, packed)
+        packed = self.cache.packed(clip_key(source=self._source, index=index), lambda: self._make(index))
         side = self.patch + 2 * self.margin
         return self._cut(unpack_clip(packed, (0, 0, side, side), self.scale))
 
@@ -143,11 +137,7 @@ class StillClips(Dataset):
         return {"spikes": spikes, "rgb": rgb[0], "flow": trim(flow, self.margin)}
 
     def _cut(self, clip: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Cut the spikes of several key frames into their clips."""
-        if self.key_frames == 1:
-            return clip
-        spikes = clip["spikes"].unfold(0, self.frames, self.every).movedim(-1, 1).contiguous()
-        return {**clip, "spikes": spikes, "every": torch.tensor(self.every)}
+        return cut_key_frames(clip, self.key_frames, self.frames, self.every)
 
     def spikes(self, index: int, scene: Scene) -> Tensor:
         """Return what the sensor makes of the scene of a clip, uint8 (clocks, H, W)."""
@@ -271,33 +261,18 @@ def _augment(picture: Tensor, rng: np.random.Generator) -> Tensor:
     return picture.contiguous()
 
 
-class StillScenes(pl.LightningDataModule):
+class StillScenes(ClipScenes):
     """Clips of still pictures in motion, made while training runs.
+
+    Besides its own arguments it has those of :class:`StillClips` that say how a clip is made.
 
     Args:
         root: folder of training pictures, read with all folders in it. Without it, the photographs inside
             scikit-image's wheel and procedural textures: no files are needed.
         val_root: folder of validation pictures. Without it, one picture in twenty of ``root`` is kept for validation
             (at least four, if there are as many again); without both, four held-out photographs of scikit-image.
-        scale: super-resolution factor.
         patch: side of a training clip in sensor pixels.
         val_patch: side of a validation or test clip in sensor pixels.
-        frames: spike frames of a clip. The truth is the view at frame ``frames // 2``.
-        pattern: Bayer phase of the sensor: RGGB, BGGR, GRBG or GBRG.
-        alpha: light of a white pixel per clock; a threshold of charge is 1.
-        motion: largest displacement of the background, at its centre, from the middle frame to the first or last one,
-            in sensor pixels. An object moves by up to as much again relative to the background.
-        bend: what acceleration adds to that displacement at most, in sensor pixels, for the background and for each
-            object: paths are parabolas instead of straight lines.
-        rotation: largest turn of the background and of each object in that time, in degrees.
-        zoom: largest growth or shrinkage of the background and of each object in that time; 0.01 is one per cent.
-        objects: most objects that move in front of the background.
-        brightness: darkest and brightest exposure. Truth and light of a clip are both multiplied by one number between.
-        photons: photons that make one threshold, for photon noise; null for none.
-        flow_times: frames to which the flow from the middle frame is given; with 41 frames and a window of 11, 5 and 35
-            are the centres of the first and of the last window.
-        key_frames: clips that follow each other, of one scene, for a network that makes films.
-        every: frames from the middle of one to the middle of the next.
         flow_patch: smallest side, in sensor pixels, of the part of a scene that motion is estimated on in training: on
             less the estimate is poor. Spikes of training clips reach so far beyond their patch. ``lightning`` says 48
             where ``model.flow`` is estimated, else 0.
@@ -311,26 +286,14 @@ class StillScenes(pl.LightningDataModule):
         seed: where chance begins. The same seed gives the same clips, whatever the number of workers.
     """
 
+    @takes(StillClips, "pictures", "augment", "textures", "length")
     def __init__(
         self,
         root: str | None = None,
         val_root: str | None = None,
-        scale: int = 4,
+        *,
         patch: int = 96,
         val_patch: int = 96,
-        frames: int = 41,
-        pattern: str = "RGGB",
-        alpha: float = 0.4,
-        motion: float = 3.0,
-        bend: float = 0.0,
-        rotation: float = 1.0,
-        zoom: float = 0.01,
-        objects: int = 2,
-        brightness: tuple[float, float] = (0.5, 1.0),
-        photons: float | None = None,
-        flow_times: tuple[int, int] = (5, 35),
-        key_frames: int = 1,
-        every: int = 20,
         flow_patch: int = 0,
         cache: str | None = None,
         train_clips: int = 1200,
@@ -338,30 +301,13 @@ class StillScenes(pl.LightningDataModule):
         batch_size: int = 4,
         workers: int | None = None,
         seed: int = 0,
+        **options: Any,
     ) -> None:
-        super().__init__()
+        super().__init__(batch_size, batch_size, workers)
         self.root, self.val_root = root, val_root
         self.patch, self.val_patch, self.flow_patch, self.cache = patch, val_patch, flow_patch, cache
-        self.train_clips, self.val_clips = train_clips, val_clips
-        self.batch_size, self.seed = batch_size, seed
-        self.workers = default_workers() if workers is None else workers
-        self.options = {
-            "scale": scale,
-            "frames": frames,
-            "pattern": pattern,
-            "alpha": alpha,
-            "motion": motion,
-            "bend": bend,
-            "rotation": rotation,
-            "zoom": zoom,
-            "objects": objects,
-            "brightness": brightness,
-            "photons": photons,
-            "flow_times": flow_times,
-            "key_frames": key_frames,
-            "every": every,
-            "seed": seed,
-        }
+        self.train_clips, self.val_clips, self.seed = train_clips, val_clips, seed
+        self.options = {**options, "seed": seed}
 
     def setup(self, stage: str | None = None) -> None:
         """Find the pictures.
@@ -374,13 +320,11 @@ class StillScenes(pl.LightningDataModule):
         if self.batch_size < 1 or self.train_clips < self.batch_size:
             raise ValueError(f"train_clips: expected at least batch_size = {self.batch_size}, got {self.train_clips}")
         train, val = self._pictures()
-        embedded = self.root is None
-        options = self.options
-        more = {"flow_patch": self.flow_patch, "cache": ClipCache(self.cache) if self.cache else None}
-        self.train_set = StillClips(
-            train, **options, patch=self.patch, length=self.train_clips, textures=embedded, **more
-        )
-        self.val_set = StillClips(val, **options, patch=self.val_patch, length=self.val_clips, augment=False)
+        train_only = {"textures": self.root is None, "flow_patch": self.flow_patch}
+        train_only["cache"] = ClipCache(self.cache) if self.cache else None
+        self.train_set = StillClips(train, **self.options, patch=self.patch, length=self.train_clips, **train_only)
+        self.val_set = StillClips(val, **self.options, patch=self.val_patch, length=self.val_clips, augment=False)
+        self.test_set = self.val_set
 
     def _pictures(self) -> tuple[list[Path], list[Path]]:
         if self.root is None:
@@ -390,13 +334,3 @@ class StillScenes(pl.LightningDataModule):
         else:
             train, val = folder_pictures(self.root), []
         return train, val if self.val_root is None else folder_pictures(self.val_root)
-
-    def train_dataloader(self) -> DataLoader:  # noqa: D102
-        clips = FreshClips(self, self.batch_size, self.train_clips)
-        return load_clips(self.train_set, self.batch_size, self.workers, sampler=clips, drop_last=True)
-
-    def val_dataloader(self) -> DataLoader:  # noqa: D102
-        return load_clips(self.val_set, self.batch_size, self.workers, sampler=OwnPart(self, len(self.val_set)))
-
-    def test_dataloader(self) -> DataLoader:  # noqa: D102
-        return load_clips(self.val_set, self.batch_size, self.workers, sampler=OwnPart(self, len(self.val_set)))

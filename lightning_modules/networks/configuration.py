@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable
 from dataclasses import fields
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from spikekit import bayer_pattern
 from spikekit.check import check_positive, check_whole
-
-T = TypeVar("T", bound=Callable[..., None])
 
 
 def check_fields(config: Any) -> None:
@@ -44,25 +40,3 @@ def check_fields(config: Any) -> None:
         elif name == "pattern":
             value = bayer_pattern(value)
         object.__setattr__(config, name, value)  # frozen
-
-
-def takes(config: type) -> Callable[[T], T]:
-    """Decorate a constructor that passes ``*args`` and ``**settings`` on to a configuration.
-
-    Its signature and its documentation become those of both, for ``help``, editors and the command line.
-
-    Args:
-        config: the dataclass.
-    """
-
-    def decorate(init: T) -> T:
-        first, *own = inspect.signature(init).parameters.values()
-        own = [parameter for parameter in own if parameter.kind is parameter.KEYWORD_ONLY]
-        hints = {**get_type_hints(config), **get_type_hints(init)}
-        parameters = [*inspect.signature(config).parameters.values(), *own]
-        parameters = [parameter.replace(annotation=hints[parameter.name]) for parameter in parameters]
-        init.__signature__ = inspect.Signature([first, *parameters])
-        init.__doc__ = config.__doc__
-        return init
-
-    return decorate

@@ -13,7 +13,6 @@ from kornia.filters import filter2d_separable
 from torch import Tensor, nn
 
 from lightning_modules.motion import MotionEstimator
-from lightning_modules.networks.configuration import takes
 from lightning_modules.networks.cscsr_config import CSCSRConfig
 from lightning_modules.networks.layers import enlarge, fold, start_pixel_by_pixel
 from lightning_modules.networks.motion_fusion import assembled_motion, independent_motion, joint_motion
@@ -22,6 +21,7 @@ from lightning_modules.networks.reconstruction import ColorCorrelation, EarlyFus
 from lightning_modules.networks.refinement import FeatureRefinement, TimeFusion
 from lightning_modules.networks.representation import IntervalRepresentation, SpikeRepresentation, WindowMeans
 from lightning_modules.networks.static_scene import WORTH_IT, convolve_at_rest, rest_response
+from lightning_modules.signatures import takes
 from spikekit import bayer_mask, demosaic, flow_warp_idw, linear_motion, split_colors, tfp_at
 from spikekit.warp.bayer_warp import bayer_warp_idw
 

@@ -11,10 +11,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lightning_modules.motion import MotionEstimator
-from lightning_modules.networks.configuration import takes
 from lightning_modules.networks.cscsr import CSCSR
 from lightning_modules.networks.cscsr_config import CSCSRConfig
 from lightning_modules.networks.layers import conv, res_blocks, start_pixel_by_pixel
+from lightning_modules.signatures import takes
 from spikekit import flow_warp, upsample_flow
 from spikekit.check import check_whole
 

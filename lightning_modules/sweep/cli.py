@@ -58,12 +58,9 @@ examples:
   lightning sweep configs/x4.yaml --set model.network.width=16,32,64 --set data.root=DIR --flops 1e15
 """,
     )
-    made.add_argument(
-        "configs", nargs="*", metavar="CONFIG", help="configuration of all trials, as for lightning fit -c"
-    )
-    made.add_argument(
-        "-c", "--config", action="append", default=[], metavar="OVERLAY", help="more of them, over those before"
-    )
+    add = made.add_argument
+    add("configs", nargs="*", metavar="CONFIG", help="configuration of all trials, as for lightning fit -c")
+    add("-c", "--config", action="append", default=[], metavar="OVERLAY", help="more of them, over those before")
     what = made.add_argument_group("what is combined")
     what.add_argument(
         "--over",

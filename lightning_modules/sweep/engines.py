@@ -7,8 +7,10 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from lightning_modules.processes import A_MOMENT, reason, run_commands_on_ray, start, stop
+from lightning_modules.cli.processes import reason, run_commands_on_ray, start, stop
 from lightning_modules.sweep.state import LOG
+
+_A_MOMENT = 0.2  # seconds
 
 #: the trials that ended, with what went wrong: ``None`` if nothing did
 Ended = dict[Path, str | None]
@@ -31,7 +33,7 @@ def run_locally(folders: Sequence[Path], jobs: int | None, every: float) -> Iter
             while waiting and len(running) < jobs:
                 folder = waiting.pop(0)
                 running[folder] = start(folder / LOG, _trial(folder, every), threads)
-            time.sleep(A_MOMENT)
+            time.sleep(_A_MOMENT)
             ended = [folder for folder, process in running.items() if process.poll() is not None]
             yield {folder: reason(folder / LOG, running.pop(folder).returncode) for folder in ended}
     finally:
@@ -52,7 +54,7 @@ def run_on_ray(folders: Sequence[Path], jobs: int | None, every: float) -> Itera
     """
     logs = {folder.absolute() / LOG: folder for folder in folders}
     for ended in run_commands_on_ray(lambda _: {log: _trial(log.parent, every) for log in logs}, jobs):
-        yield {logs[log]: why for log, why in ended.items()}
+        yield {logs[log]: reason for log, reason in ended.items()}
 
 
 def _trial(folder: Path, every: float) -> list[str]:

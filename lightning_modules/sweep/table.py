@@ -158,41 +158,35 @@ def markdown(rows: Sequence[Row], costs: dict[str, Any] | None = None) -> str:
     papers = any(row.paper is not None for row in rows)
     compared = list(dict.fromkeys(reference(row, rows).variant for row in rows))
     versus = compared[0] if len(compared) == 1 else "reference"
-    header = ["variant", "n", *(_heading(name) for name in names)]
-    if names:
-        header.append(f"{_heading(names[0])} - {versus}")
     data = list(dict.fromkeys(name for row in rows for name in row.paper_scores))
-    if papers:
-        header += ["paper, PSNR on REDS (dB)", f"paper - {_OURS if data else 'J'}"]
-    if data:
-        header += ["method", *(f"paper, {name}: PSNR / SSIM / LPIPS" for name in data)]
-    header += ["ms/step", "steps", "parameters", *(name for name, _ in _COSTS.values() if costs)]
-    header += [f"`{name}`" for name in settings]
     lines = []
     for row in rows:
         count = f"{len(row.results)}" + (f", {len(row.failed)} failed" if row.failed else "")
-        cells = [row.variant, count, *(_mean(row.scores(name).values(), _decimals(name)) for name in names)]
+        cells = {"variant": row.variant, "n": count}
+        cells |= {_heading(name): _mean(row.scores(name).values(), _decimals(name)) for name in names}
         if names:
             other = reference(row, rows)
             gaps = differences(row, other, names[0]) if other is not row else []
-            cells.append(_mean(gaps, _decimals(names[0]), "+"))
+            cells[f"{_heading(names[0])} - {versus}"] = _mean(gaps, _decimals(names[0]), "+")
         if papers:
             gap = row.paper_gap
-            cells += ["", ""] if gap is None else [f"{row.paper:.2f}", f"{gap:+.2f}"]
+            cells["paper, PSNR on REDS (dB)"] = "" if gap is None else f"{row.paper:.2f}"
+            cells[f"paper - {_OURS if data else 'J'}"] = "" if gap is None else f"{gap:+.2f}"
         if data:
-            cells += [row.method or "", *(str(row.paper_scores.get(name, "")) for name in data)]
+            cells["method"] = row.method or ""
+            cells |= {f"paper, {name}: PSNR / SSIM / LPIPS": str(row.paper_scores.get(name, "")) for name in data}
         times = [result["seconds_per_step"] for result in row.results.values() if result.get("seconds_per_step")]
-        cells.append(f"{1000 * statistics.mean(times):.0f}" if times else "")
-        cells.append(_values(row, lambda result: result["steps"]))
-        cells.append(_values(row, lambda result: f"{result['parameters']:,}"))
+        cells["ms/step"] = f"{1000 * statistics.mean(times):.0f}" if times else ""
+        cells["steps"] = _values(row, lambda result: result["steps"])
+        cells["parameters"] = _values(row, lambda result: f"{result['parameters']:,}")
         if costs:
             cost = costs["variants"].get(row.variant, {})
-            cells += [
-                f"{cost[name]:{form}}" if cost.get(name) is not None else "" for name, (_, form) in _COSTS.items()
-            ]
-        cells += [_values(row, lambda result, name=name: _settings(result).get(name, "")) for name in settings]
+            for name, (heading, form) in _COSTS.items():
+                cells[heading] = f"{cost[name]:{form}}" if cost.get(name) is not None else ""
+        for name in settings:
+            cells[f"`{name}`"] = _values(row, lambda result, name=name: _settings(result).get(name, ""))
         lines.append(cells)
-    text = [table(header, lines), ""]
+    text = [table(list(lines[0]), [list(cells.values()) for cells in lines]), ""]
     text.append(
         "Means over seeds ± sample standard deviation; differences seed by seed. The weights tested are the last."
     )

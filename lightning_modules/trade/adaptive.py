@@ -133,26 +133,17 @@ def _tile(text: str) -> int:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(prog="python -m lightning_modules.trade.adaptive", description=__doc__)
-    parser.add_argument(
-        "weights", nargs="+", help="those of CSCSR: names, files of safetensors or, without --fit, checkpoints"
-    )
-    parser.add_argument(
-        "--pictures", help="folder of pictures; without it, those of scikit-image, held-out ones for the table"
-    )
-    parser.add_argument(
-        "--fit", action="store_true", help="fit the constants of the weights, and write them beside them"
-    )
-    parser.add_argument(
-        "--halo", action="store_true", help="print the halo that tiles need, to a hundredth of an 8-bit step"
-    )
-    parser.add_argument(
-        "--clips", type=whole(1), default=8, help="with --fit: clips that are fitted, and as many others"
-    )
-    parser.add_argument("--height", type=int, default=250, help="sensor rows")
-    parser.add_argument("--width", type=int, default=400, help="sensor columns")
-    parser.add_argument("--tile", type=_tile, default=128, help="as of lightning predict")
-    parser.add_argument("--rounds", type=int, default=3, help="timings of each")
-    parser.add_argument("--tolerances", type=float, nargs="+", default=TOLERANCES, metavar="DB")
+    add = parser.add_argument
+    add("weights", nargs="+", help="those of CSCSR: names, files of safetensors or, without --fit, checkpoints")
+    add("--pictures", help="folder of pictures; without it, those of scikit-image, held-out ones for the table")
+    add("--fit", action="store_true", help="fit the constants of the weights, and write them beside them")
+    add("--halo", action="store_true", help="print the halo that tiles need, to a hundredth of an 8-bit step")
+    add("--clips", type=whole(1), default=8, help="with --fit: clips that are fitted, and as many others")
+    add("--height", type=int, default=250, help="sensor rows")
+    add("--width", type=int, default=400, help="sensor columns")
+    add("--tile", type=_tile, default=128, help="as of lightning predict")
+    add("--rounds", type=int, default=3, help="timings of each")
+    add("--tolerances", type=float, nargs="+", default=TOLERANCES, metavar="DB")
     args = parser.parse_args(arguments)
     given = None if args.pictures is None else folder_pictures(args.pictures)
     if args.fit:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from lightning_modules.cli.errors import InputError, UsageError, VerbParser
 from lightning_modules.cli.folder_lock import locked_folder
-from lightning_modules.cost.measure import Row, Timed, measure, running
+from lightning_modules.cost.measure import Row, measure, running
 from lightning_modules.cost.runner import CannotRunError, Runner, make_runner
 from lightning_modules.trade.films import PICTURES, measure_films
 from lightning_modules.trade.plot import plot
@@ -56,7 +56,8 @@ examples:
   lightning trade -c configs/x4.yaml --setting "--model.weights cscsr_small_x4" --setting "-c my.yaml --ckpt_path FILE"
 """,
     )
-    made.add_argument(
+    add = made.add_argument
+    add(
         "--setting",
         action="append",
         default=[],
@@ -64,13 +65,9 @@ examples:
         help="'ARGS' or 'NAME: ARGS'; given again, one more. Without any: the networks whose weights come with the "
         "package, or that of --ckpt_path or --model.weights; variants of the first of them; the decoders",
     )
-    made.add_argument(
-        "--rounds", type=whole(1), default=_ROUNDS, metavar="N", help=f"timings of every setting; default {_ROUNDS}"
-    )
-    made.add_argument(
-        "--film", type=whole(1), metavar="EVERY", help="measure films, with a picture every so many clocks"
-    )
-    made.add_argument("-o", "--output", type=Path, default=_OUTPUT, metavar="DIR", help=f"default: {_OUTPUT}")
+    add("--rounds", type=whole(1), default=_ROUNDS, metavar="N", help=f"timings of every setting; default {_ROUNDS}")
+    add("--film", type=whole(1), metavar="EVERY", help="measure films, with a picture every so many clocks")
+    add("-o", "--output", type=Path, default=_OUTPUT, metavar="DIR", help=f"default: {_OUTPUT}")
     return made
 
 
@@ -110,7 +107,12 @@ def _measured(rows: Sequence[Row], base: Runner, asked: argparse.Namespace, comm
     if asked.film is None:
         timed = measure(rows, base.data.test_dataloader(), asked.rounds)
     else:
-        timed = _measure_films(rows, base, asked)
+        try:
+            timed = measure_films(rows, base.data, base.network.frames, asked.film, asked.rounds)
+        except UsageError:
+            raise
+        except ValueError as error:
+            raise InputError(f"trade: {error}") from error
     _check_any(rows)
     text = markdown(rows, commands, timed)
     with whole_file(asked.output / "trade.md", "w") as file:
@@ -119,15 +121,6 @@ def _measured(rows: Sequence[Row], base: Runner, asked: argparse.Namespace, comm
     plot(rows, asked.output / "trade.png")
     print(f"\n{text}")
     print(", ".join(str(path) for path in sorted(asked.output.glob("trade.*"))))
-
-
-def _measure_films(rows: Sequence[Row], base: Runner, asked: argparse.Namespace) -> Timed:
-    try:
-        return measure_films(rows, base.data, base.network.frames, asked.film, asked.rounds)
-    except UsageError:
-        raise
-    except ValueError as error:
-        raise InputError(f"trade: {error}") from error
 
 
 def _own_weights(base: Runner) -> list[str]:

@@ -43,6 +43,9 @@ _FIGURES = [
 
 _OF_FILMS = "flicker", "latency"
 
+#: columns that are left out where no setting has anything in them
+_PERHAPS = ("LPIPS", "J a frame", *_OF_FILMS)
+
 
 def figures(rows: Sequence[Row]) -> list[dict[str, float | None]]:
     """Return what was measured, a dictionary a row; an empty one where a setting could not run."""
@@ -101,38 +104,35 @@ def markdown(rows: Sequence[Row], commands: Sequence[str], timed: Timed) -> str:
         commands: what a user types for each of them.
         timed: how time was taken.
     """
-    shown, best = figures(rows), front(rows)
-    energy = any(row.joules is not None for row in rows)
-    filmed = timed.every is not None
-    perceived = any(row.lpips for row in rows)
-    header = ["", "setting", "PSNR (dB)", "SSIM", *["LPIPS"] * perceived]
-    header += ["ms a frame", "ratio", "MiB", "parameters", "MAC a pixel"]
-    header += ["J a frame"] * energy + ["flicker", "latency"] * filmed + ["front"]
-    lines = []
-    for n, (row, values) in enumerate(zip(rows, shown, strict=True)):
-        if not values:
-            lines.append([n + 1, row.setting.name, *[None] * (len(header) - 2)])
-            continue
-        cells = [
-            f"{values['psnr']:.2f}",
-            f"{values['ssim']:.4f}",
-            *[_text(values["lpips"], ".4f")] * perceived,
-            f"{values['ms']:.4g} ({values['ms_q1']:.4g} .. {values['ms_q3']:.4g})",
-            f"{values['ratio']:.3g}",
-            _text(values["mib"], ".1f"),
-            f"{values['parameters']:,}",
-            f"{values['macs']:,.0f}",
-            *[_text(values["joules"], ".3g")] * energy,
-            *[_text(values["flicker"], ".3f"), _text(values["latency"], "d")] * filmed,
-            "x" if n in best else "",
-        ]
-        lines.append([n + 1, row.setting.name, *cells])
+    best = front(rows)
+    cells = [_cells(values, n in best) if values else {} for n, values in enumerate(figures(rows))]
+    header = [name for name in cells[best[0]] if name not in _PERHAPS or any(own.get(name) for own in cells)]
+    lines = [
+        [n, row.setting.name, *map(own.get, header)] for n, (row, own) in enumerate(zip(rows, cells, strict=True), 1)
+    ]
     missing = why_no_lpips()
     failed = [f"{row.setting.name} cannot run: {row.reason}" for row in rows if row.reason is not None]
     typed = "\n".join(f"# {n + 1}\n{command}" for n, command in enumerate(commands))
     notes = [*([missing] if missing else []), *failed, f"```text\n{COLUMNS}\n```", f"```sh\n{typed}\n```"]
-    parts = [f"```text\n{machine(rows, timed)}\n```", table(header, lines), *notes]
+    parts = [f"```text\n{machine(rows, timed)}\n```", table(["", "setting", *header], lines), *notes]
     return "\n\n".join(parts) + "\n"
+
+
+def _cells(values: dict[str, float | None], best: bool) -> dict[str, str]:
+    return {
+        "PSNR (dB)": f"{values['psnr']:.2f}",
+        "SSIM": f"{values['ssim']:.4f}",
+        "LPIPS": _text(values["lpips"], ".4f"),
+        "ms a frame": f"{values['ms']:.4g} ({values['ms_q1']:.4g} .. {values['ms_q3']:.4g})",
+        "ratio": f"{values['ratio']:.3g}",
+        "MiB": _text(values["mib"], ".1f"),
+        "parameters": f"{values['parameters']:,}",
+        "MAC a pixel": f"{values['macs']:,.0f}",
+        "J a frame": _text(values["joules"], ".3g"),
+        "flicker": _text(values["flicker"], ".3f"),
+        "latency": _text(values["latency"], "d"),
+        "front": "x" if best else "",
+    }
 
 
 def write_csv(rows: Sequence[Row], commands: Sequence[str], timed: Timed, path: Path) -> None:
@@ -145,36 +145,25 @@ def write_csv(rows: Sequence[Row], commands: Sequence[str], timed: Timed, path: 
     height, width = timed.size
     best, reference = front(rows), running(rows)[0].setting.name
     figured = _FIGURES if timed.every is not None else [name for name in _FIGURES if name not in _OF_FILMS]
-    columns = [
-        "setting",
-        *Preset.columns(),
-        *figured,
-        *["every"] * (timed.every is not None),
-        "reference",
-        "height",
-        "width",
-        "front",
-        "command",
-        "failed",
+    lines = [
+        {
+            "setting": row.setting.name,
+            **(row.setting.preset or Preset()).write(),
+            **{name: _text(values.get(name), ".10g") for name in figured},
+            **({} if timed.every is None else {"every": timed.every}),
+            "reference": reference,
+            "height": height,
+            "width": width,
+            "front": int(n in best) if values else "",
+            "command": command,
+            "failed": row.reason,
+        }
+        for n, (row, values, command) in enumerate(zip(rows, figures(rows), commands, strict=True))
     ]
     with whole_file(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, columns)
+        writer = csv.DictWriter(file, list(lines[0]))
         writer.writeheader()
-        for n, (row, values, command) in enumerate(zip(rows, figures(rows), commands, strict=True)):
-            writer.writerow(
-                {
-                    "setting": row.setting.name,
-                    **(row.setting.preset or Preset()).write(),
-                    **{name: _text(values.get(name), ".10g") for name in figured},
-                    **({} if timed.every is None else {"every": timed.every}),
-                    "reference": reference,
-                    "height": height,
-                    "width": width,
-                    "front": int(n in best) if values else "",
-                    "command": command,
-                    "failed": row.reason,
-                }
-            )
+        writer.writerows(lines)
 
 
 def _text(value: float | None, form: str) -> str:

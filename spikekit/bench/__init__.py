@@ -95,17 +95,14 @@ class Row:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the benchmark to a parser."""
-    parser.add_argument(
-        "operators", nargs="*", metavar="OPERATOR", help=f"what to measure, all if not given: {', '.join(CASES)}"
-    )
-    parser.add_argument("--size", choices=SIZES, default="full", help="small shows that everything runs; default full")
-    parser.add_argument("--rounds", type=whole(1), default=7, metavar="N", help="timings of each, in turn; default 7")
-    parser.add_argument(
-        "--threads", type=whole(1), default=1, metavar="N", help="threads of torch; 1 counts CPU time, more wall time"
-    )
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="default cpu")
-    parser.add_argument("--markdown", action="store_true", help="a Markdown table")
-    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="write there what is otherwise printed")
+    add = parser.add_argument
+    add("operators", nargs="*", metavar="OPERATOR", help=f"what to measure, all if not given: {', '.join(CASES)}")
+    add("--size", choices=SIZES, default="full", help="small shows that everything runs; default full")
+    add("--rounds", type=whole(1), default=7, metavar="N", help="timings of each, in turn; default 7")
+    add("--threads", type=whole(1), default=1, metavar="N", help="threads of torch; 1 counts CPU time, more wall time")
+    add("--device", choices=("cpu", "cuda"), default="cpu", help="default cpu")
+    add("--markdown", action="store_true", help="a Markdown table")
+    add("-o", "--output", type=Path, metavar="FILE", help="write there what is otherwise printed")
 
 
 def run(args: argparse.Namespace) -> None:

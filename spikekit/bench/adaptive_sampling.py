@@ -184,13 +184,12 @@ def markdown(rows: Iterable[Row]) -> str:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.add_argument("--side", type=int, default=64, help="rows and columns of the sensor")
-    parser.add_argument("--scale", type=int, default=4, help="how many pixels of a frame a sensor pixel is wide")
-    parser.add_argument(
-        "--spike-tolerance", "--tolerance", type=float, default=0.05, help="share of the spikes that may change"
-    )
-    parser.add_argument("--step", type=float, default=0.5, help="sensor pixels between latent frames")
-    parser.add_argument("--rounds", type=int, default=2, help="timings of each, of which the least counts")
+    add = parser.add_argument
+    add("--side", type=int, default=64, help="rows and columns of the sensor")
+    add("--scale", type=int, default=4, help="how many pixels of a frame a sensor pixel is wide")
+    add("--spike-tolerance", "--tolerance", type=float, default=0.05, help="share of the spikes that may change")
+    add("--step", type=float, default=0.5, help="sensor pixels between latent frames")
+    add("--rounds", type=int, default=2, help="timings of each, of which the least counts")
 
 
 def run(args: argparse.Namespace) -> None:

@@ -71,13 +71,10 @@ def lines(pictures: Path | None, films: Path | None, clocks: int, alpha: float) 
     names = "demosaic", "demosaic_residual", "demosaic_along_motion"
     yield f"| mosaic of | {' | '.join(names)} |"
     yield f"|{'---|' * (len(names) + 1)}"
-    rows: list[tuple[str, Sequence[float]]] = []
     if pictures is not None:
-        rows.append((pictures.name, picture_row(pictures)))
-        yield _line(*rows[-1])
-    for folder in sorted(path for path in films.iterdir() if path.is_dir()) if films is not None else []:
-        rows.append((f"{folder.name}, TFI, {clocks} clocks, alpha {alpha:g}", film_row(folder, clocks, alpha)))
-        yield _line(*rows[-1])
+        yield _line(pictures.name, picture_row(pictures))
+    for folder in sorted(filter(Path.is_dir, films.iterdir())) if films is not None else []:
+        yield _line(f"{folder.name}, TFI, {clocks} clocks, alpha {alpha:g}", film_row(folder, clocks, alpha))
 
 
 def _line(name: str, decibels: Sequence[float]) -> str:

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from spikekit.arguments import FRAMES, UsageError, frames_of, positive, whole
+from spikekit.arguments import FRAMES, UsageError, ending_in, frames_of, positive, whole
 from spikekit.color.cfa import PATTERNS
 from spikekit.color.demosaic import demosaic
 from spikekit.decoders.methods import DECODERS, TFI_REACH
@@ -67,7 +66,9 @@ def run(args: argparse.Namespace) -> None:
         raw = torch.from_numpy(decoder.planes(plane, n, range(first, last + 1), frames, **options))
         raw = recording.correct(raw) / white
         picture = raw if recording.pattern is None else demosaic(raw, recording.pattern)
-        _write(paths[n], recording.show(picture, known=alpha is not None))
+        picture = recording.show(picture, known=alpha is not None)
+        with writing(paths[n], wrong=Exception):  # what a picture library raises depends on the ending
+            write_picture(paths[n], picture)
     if len(chosen) == 1:
         first, last = _span(key, reach, frames)
         print(f"{paths[key]}: frame {key} of {frames} by {args.method} from frames {first} .. {last}, {scaling}")
@@ -99,7 +100,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-o",
         "--output",
         required=True,
-        type=_picture,
+        # with another ending the picture library would write TIFF, over a recording as well
+        type=ending_in(*PICTURE_ENDINGS, said=f"a picture that ends in {', '.join(PICTURE_ENDINGS)}"),
         metavar="OUT.png",
         help=f"the picture to write; {_NUMBER} in it becomes the number of the frame, with leading zeros",
     )
@@ -139,13 +141,6 @@ def _frames(text: str) -> str:
     if not re.fullmatch(FRAMES, text, re.ASCII):
         raise argparse.ArgumentTypeError(f"expected a whole number, 0 or more, or A:B or A:B:STEP, got {text}")
     return text
-
-
-def _picture(text: str) -> Path:
-    path = Path(text)
-    if path.suffix.lower() not in PICTURE_ENDINGS:  # the picture library would write TIFF, over a recording as well
-        raise argparse.ArgumentTypeError(f"expected a picture that ends in {', '.join(PICTURE_ENDINGS)}, got {text}")
-    return path
 
 
 def _chosen(args: argparse.Namespace, frames: int) -> range:
@@ -192,9 +187,3 @@ def _windows(recording: Recording, chosen: range, reach: int) -> Iterator[tuple[
             held[k % len(held)] = next(stream).numpy()
         stop = last + 1
         yield n, plane
-
-
-def _write(path: Path, picture: Tensor) -> None:
-    """Write a picture; what is wrong is said in one line."""
-    with writing(path, wrong=Exception):  # what a picture library raises depends on the ending
-        write_picture(path, picture)

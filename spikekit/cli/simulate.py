@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from spikekit.arguments import UsageError, positive, whole
+from spikekit.arguments import UsageError, ending_in, positive, whole
 from spikekit.cli.simulation import Settings, Source, is_own, simulate
 from spikekit.color.cfa import PATTERNS
 from spikekit.io.calibration import read_calibration
@@ -101,107 +102,51 @@ def _settings_of(path: Path, sidecar: Sidecar, given: dict[str, Any]) -> Setting
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    add, default = parser.add_argument, argparse.SUPPRESS
+    parser.argument_default = argparse.SUPPRESS  # what is not given is not there, so that a side-car can be had alone
+    add = parser.add_argument
+
+    def option(name: str, kind: Callable[[str], Any], metavar: str, said: str, to: Any = parser) -> None:
+        to.add_argument(f"--{name}", type=kind, metavar=metavar, help=f"{said}; {getattr(Settings, name)} if not given")
+
     add("input", type=Path, metavar="INPUT", help="a folder of pictures, a video file, a picture, or a side-car")
-    add("-o", "--output", required=True, type=_stream, metavar="OUT.dat", help="the stream to write, .dat or .npz")
-    add("--scale", type=whole(1), default=default, metavar="S", help="pixels of a frame that a sensor pixel is wide")
-    add(
-        "--pattern",
-        type=str.upper,
-        choices=PATTERNS,
-        default=default,
-        help=f"Bayer phase of the sensor; {Settings.pattern} if not given",
-    )
-    add(
-        "--alpha",
-        type=positive,
-        default=default,
-        metavar="A",
-        help=f"times that a white pixel fires per clock; {Settings.alpha} if not given",
-    )
-    add(
-        "--clocks",
-        type=whole(1),
-        default=default,
-        metavar="N",
-        help=f"clocks from one frame to the next; {Settings.clocks} if not given",
-    )
+    stream = ending_in(".dat", ".npz", said="a stream that ends in .dat or .npz")
+    add("-o", "--output", required=True, type=stream, metavar="OUT.dat", help="the stream to write, .dat or .npz")
+    add("--scale", type=whole(1), metavar="S", help="pixels of a frame that a sensor pixel is wide")
+    said = f"Bayer phase of the sensor; {Settings.pattern} if not given"
+    add("--pattern", type=str.upper, choices=PATTERNS, help=said)
+    option("alpha", positive, "A", "times that a white pixel fires per clock")
+    option("clocks", whole(1), "N", "clocks from one frame to the next")
     part = parser.add_mutually_exclusive_group()
-    part.add_argument(
-        "--frames",
-        type=whole(1),
-        default=default,
-        metavar="N",
-        help=f"frames of the stream, around one of the film; {Settings.frames} if not given",
-    )
-    part.add_argument("--all", dest="frames", action="store_const", const=None, default=default, help="the whole film")
-    add(
-        "--frame",
-        type=whole(0),
-        default=default,
-        metavar="M",
-        help="which frame of the film is in the middle, from 0; that in its middle if not given",
-    )
-    add(
-        "--readout",
-        type=whole(1),
-        default=default,
-        metavar="N",
-        help=f"clocks for every frame of the stream; {Settings.readout} if not given",
-    )
-    add(
-        "--seed",
-        type=whole(0),
-        default=default,
-        metavar="N",
-        help=f"where chance begins: first charge and noise; {Settings.seed} if not given",
-    )
-    add("--source", type=Path, metavar="PATH", help="where the frames of a side-car are, if they have moved")
+    option("frames", whole(1), "N", "frames of the stream, around one of the film", part)
+    part.add_argument("--all", dest="frames", action="store_const", const=None, help="the whole film")
+    said = "which frame of the film is in the middle, from 0; that in its middle if not given"
+    add("--frame", type=whole(0), metavar="M", help=said)
+    option("readout", whole(1), "N", "clocks for every frame of the stream")
+    option("seed", whole(0), "N", "where chance begins: first charge and noise")
+    said = "where the frames of a side-car are, if they have moved"
+    add("--source", type=Path, default=None, metavar="PATH", help=said)
 
     model = parser.add_argument_group("what is modelled")
-    model.add_argument(
-        "--plan",
-        type=_plan,
-        default=default,
-        metavar="scene|everything|K",
-        help="what the scene requires, every clock and all noise, or K latent frames between two frames; "
-        f"{Settings.plan} if not given",
-    )
+    said = "what the scene requires, every clock and all noise, or K latent frames between two frames"
+    option("plan", _plan, "scene|everything|K", said, model)
+    said = "share of the spikes that may change by not modelling more"
     model.add_argument(
         "--spike-tolerance",
         "--tolerance",
         dest="tolerance",
         type=positive,
-        default=default,
         metavar="SHARE",
-        help=f"share of the spikes that may change by not modelling more; {Settings.tolerance} if not given; "
-        "--tolerance is its old name",
+        help=f"{said}; {Settings.tolerance} if not given; --tolerance is its old name",
     )
-    model.add_argument(
-        "--step",
-        type=positive,
-        default=default,
-        metavar="PIXELS",
-        help=f"largest displacement between latent frames, in sensor pixels; {Settings.step} if not given",
-    )
-    model.add_argument(
-        "--interpolation",
-        default=default,
-        metavar="CLASS",
-        help="what makes latent frames: package.module.Class, or package.module.Class(name=value); "
-        f"{Settings.interpolation} if not given",
-    )
+    option("step", positive, "PIXELS", "largest displacement between latent frames, in sensor pixels", model)
+    said = "what makes latent frames: package.module.Class, or package.module.Class(name=value)"
+    option("interpolation", str, "CLASS", said, model)
 
     noise = parser.add_argument_group("noise of the sensor, none if not given")
     for name, said in _NOISE.items():
-        noise.add_argument(f"--{name.replace('_', '-')}", type=_number, default=default, metavar="X", help=said)
-    noise.add_argument(
-        "--calibration",
-        default=default,
-        metavar="FILE",
-        help="instead of dark current, spreads and shares, the pixels of a sensor that spikekit calibrate has "
-        "measured, their rows as the stream has them",
-    )
+        noise.add_argument(f"--{name.replace('_', '-')}", type=_number, metavar="X", help=said)
+    said = "instead of dark current, spreads and shares, the pixels of a sensor that spikekit calibrate has measured, "
+    noise.add_argument("--calibration", metavar="FILE", help=f"{said}their rows as the stream has them")
 
 
 def _number(text: str) -> float:
@@ -217,10 +162,3 @@ def _plan(text: str) -> str | int:
     if text.isascii() and text.isdigit():
         return int(text)
     raise argparse.ArgumentTypeError(f"expected scene, everything or a number of latent frames, got {text}")
-
-
-def _stream(text: str) -> Path:
-    path = Path(text)
-    if path.suffix.lower() not in (".dat", ".npz"):
-        raise argparse.ArgumentTypeError(f"expected a stream that ends in .dat or .npz, got {text}")
-    return path

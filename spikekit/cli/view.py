@@ -9,7 +9,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from spikekit.arguments import UsageError, positive, whole
+from spikekit.arguments import UsageError, ending_in, positive, whole
 from spikekit.cli.drawing import fit, histogram, raster, sheet
 from spikekit.color.cfa import PATTERNS
 from spikekit.color.demosaic import demosaic
@@ -74,7 +73,8 @@ def run(args: argparse.Namespace) -> None:
             data = gif_bytes(pictures, args.seconds / len(starts))
         else:
             data = _page(moment, starts, window, pictures, hint).encode()
-    _write(args.output, data)
+    with writing(args.output), whole_file(args.output) as file:
+        file.write(data)
     print(f"{args.output}: frames {begin} .. {end - 1} of {shown.frames}, {moment.said}")
     if hint:
         print(hint)
@@ -299,12 +299,6 @@ def _data(picture: Tensor, ending: str = ".png", **how: Any) -> str:
     return f"data:image/{kind};base64," + base64.b64encode(picture_bytes(picture, ending, **how)).decode()
 
 
-def _write(path: Path, data: bytes) -> None:
-    """Write a file; what is wrong is said in one line."""
-    with writing(path), whole_file(path) as file:
-        file.write(data)
-
-
 def _span(text: str | None, recording: Recording) -> tuple[int, int]:
     """Return the first frame to show and the one after the last."""
     begin, end = ((text or ":") + ":").split(":")[:2]
@@ -322,7 +316,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     recording.add_arguments(parser)
     recording.add_calibration(parser)
     add = parser.add_argument
-    add("-o", "--output", required=True, type=_output, metavar="OUT", help="what to write: .png, .gif or .html")
+    output = ending_in(".png", ".gif", ".html", said="a file that ends in .png, .gif or .html")
+    add("-o", "--output", required=True, type=output, metavar="OUT", help="what to write: .png, .gif or .html")
     add("--pattern", type=str.upper, choices=PATTERNS, help="Bayer phase after the flip, for colour")
     add(
         "--alpha", type=positive, metavar="A", help="gain of a simulated recording: a white pixel fires A times a frame"
@@ -338,10 +333,3 @@ def _frames(text: str) -> str:
     if not colon or not all(part == "" or (part.isascii() and part.isdigit()) for part in (begin, end)):
         raise argparse.ArgumentTypeError(f"expected A:B, got {text}")
     return text
-
-
-def _output(text: str) -> Path:
-    path = Path(text)
-    if path.suffix.lower() not in (".png", ".gif", ".html"):
-        raise argparse.ArgumentTypeError(f"expected a file that ends in .png, .gif or .html, got {text}")
-    return path

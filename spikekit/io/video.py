@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, overload
+from typing import Any, overload
 from weakref import WeakSet
 
 import torch
@@ -39,23 +39,6 @@ class VideoError(ValueError):
 
 
 _reading = partial(reading, kind=VideoError)
-
-
-class _Source(Protocol):
-    """Where frames come from: all of a folder, or all of a file."""
-
-    path: Path
-    count: int
-    size: tuple[int, int]
-    fps: float | None
-
-    def name(self, index: int) -> str:
-        """Return what frame ``index`` is called."""
-        ...
-
-    def read(self, index: int) -> Tensor:
-        """Return frame ``index`` as ``rgb`` (3, H, W), float32."""
-        ...
 
 
 class VideoFrames(Sequence[Tensor]):
@@ -88,6 +71,11 @@ class VideoFrames(Sequence[Tensor]):
         TypeError: ``start`` is not a whole number.
         ValueError: ``count`` is not a whole number, 1 or more.
 
+    Attributes:
+        height: rows of a frame.
+        width: columns of a frame.
+        fps: frames a second, of a video file that says so; ``None`` for a folder.
+
     Example:
         >>> import tempfile
         >>> from spikekit import write_picture
@@ -108,21 +96,8 @@ class VideoFrames(Sequence[Tensor]):
             wanted = f"frame {start}" if count is None else f"{count} frames from frame {start} on"
             raise VideoError(f"{path}: expected {wanted}, got {total} {'frame' if total == 1 else 'frames'}")
         self._chosen = range(start, stop)
-
-    @property
-    def height(self) -> int:
-        """Rows of every frame."""
-        return self._source.size[0]
-
-    @property
-    def width(self) -> int:
-        """Columns of every frame."""
-        return self._source.size[1]
-
-    @property
-    def fps(self) -> float | None:
-        """Frames a second, where a video file tells; not changed by a slice."""
-        return self._source.fps
+        self.height, self.width = self._source.size
+        self.fps: float | None = self._source.fps
 
     @property
     def names(self) -> list[str]:
@@ -175,7 +150,7 @@ def read_video(path: str | Path, *, start: int = 0, count: int | None = None) ->
     return VideoFrames(path, start=start, count=count)
 
 
-def _open(path: Path) -> _Source:
+def _open(path: Path) -> _Pictures | _Film:
     with _reading(path):
         if path.is_dir():
             return _Pictures(path, _pictures_of(path))

@@ -94,18 +94,22 @@ weighted_dot = _operator(
 )
 
 
-class Gather(torch.autograd.Function):
-    """:func:`weighted_gather` with derivatives in values and weight."""
+class _Weighted(torch.autograd.Function):
+    """What the three have in common: their first three arguments are what derivatives are made of."""
 
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(values: Tensor, index: Tensor, weight: Tensor) -> Tensor:  # noqa: D102
-        return weighted_gather(values, index, weight)
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs[:3])
+
+
+class Gather(_Weighted):
+    """:func:`weighted_gather` with derivatives in values and weight."""
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, Tensor], output: Tensor) -> None:  # noqa: D102
-        ctx.save_for_backward(*inputs)
+    def forward(values: Tensor, index: Tensor, weight: Tensor) -> Tensor:  # noqa: D102
+        return weighted_gather(values, index, weight)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None, Tensor | None]:  # noqa: D102
@@ -118,18 +122,12 @@ class Gather(torch.autograd.Function):
         )
 
 
-class Scatter(torch.autograd.Function):
+class Scatter(_Weighted):
     """:func:`weighted_scatter` with derivatives in grad and weight."""
-
-    generate_vmap_rule = True
 
     @staticmethod
     def forward(grad: Tensor, index: Tensor, weight: Tensor, size: int) -> Tensor:  # noqa: D102
         return weighted_scatter(grad, index, weight, size)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, Tensor, int], output: Tensor) -> None:  # noqa: D102
-        ctx.save_for_backward(*inputs[:3])
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None, Tensor | None, None]:  # noqa: D102
@@ -143,18 +141,12 @@ class Scatter(torch.autograd.Function):
         )
 
 
-class Dot(torch.autograd.Function):
+class Dot(_Weighted):
     """:func:`weighted_dot` with derivatives in values and grad."""
-
-    generate_vmap_rule = True
 
     @staticmethod
     def forward(values: Tensor, grad: Tensor, index: Tensor) -> Tensor:  # noqa: D102
         return weighted_dot(values, grad, index)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, Tensor], output: Tensor) -> None:  # noqa: D102
-        ctx.save_for_backward(*inputs)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:  # noqa: D102

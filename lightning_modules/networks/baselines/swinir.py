@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks.baselines.pictures import Baseline, along_motion, enlarge_picture, mirror_to_multiple
+from lightning_modules.networks.baselines.skip import begin_at_zero
 from lightning_modules.networks.layers import conv
 from spikekit.check import check_whole
 
@@ -105,8 +106,7 @@ class SwinIR(Baseline):
                 nn.init.zeros_(module.bias)
         if skip:
             (*_, last) = (module for module in self.upsample.modules() if isinstance(module, nn.Conv2d))
-            nn.init.zeros_(last.weight)
-            nn.init.zeros_(last.bias)
+            begin_at_zero(last)
 
     def forward(self, spikes: Tensor, flow: Tensor | None = None, static: bool = False) -> Tensor:  # noqa: D102
         self.check_spikes(spikes)

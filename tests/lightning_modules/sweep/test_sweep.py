@@ -457,7 +457,7 @@ def test_trials_end_as_their_processes_do(tmp_path, monkeypatch):
         started.append(Path(command[3]).name)
         return start([sys.executable, "-c", ends[started[-1]][0]], **options)
 
-    monkeypatch.setattr(engines.subprocess, "Popen", start_one)
+    monkeypatch.setattr(subprocess, "Popen", start_one)
     folders = [tmp_path / name for name in ends]
     for folder in folders:
         folder.mkdir()
@@ -475,7 +475,7 @@ def test_a_sweep_that_stops_ends_its_trials(tmp_path, monkeypatch):
         processes.append(start([sys.executable, "-c", "import sys; sys.stdin.read()"], **options))
         return processes[-1]
 
-    monkeypatch.setattr(engines.subprocess, "Popen", start_one)
+    monkeypatch.setattr(subprocess, "Popen", start_one)
     running = engines.run_locally([tmp_path], None, 60)
     next(running)
     assert processes[0].poll() is None

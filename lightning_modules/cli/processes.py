@@ -1,4 +1,4 @@
-"""Work in processes of their own, on this machine or on a Ray cluster."""
+"""Python in processes of its own, on this machine or on a Ray cluster, such as those that make parts of a recording."""
 
 from __future__ import annotations
 
@@ -8,39 +8,69 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from lightning_modules.cli.errors import InputError, UsageError
 from spikekit.arguments import one_line
 
-#: seconds between two looks at what has ended
-A_MOMENT = 0.2
+_A_MOMENT = 0.2  # seconds
 
 
-class EngineError(RuntimeError):
-    """Ray cannot be started."""
+def make_parts(typed: Sequence[str], folder: Path, precision: str, jobs: int | None) -> None:
+    """Make all pictures of a recording, in as many parts as are made at once.
+
+    Args:
+        typed: verb and arguments of ``lightning predict``.
+        folder: of the pictures, under the same path for all nodes.
+        precision: the same for all of them, whatever each would choose.
+        jobs: parts at once; as many as there are GPUs, or else nodes, if ``None``.
+
+    Raises:
+        UsageError: a ``--budget``, which every node would measure for itself.
+        InputError: Ray is not installed, or a part failed.
+    """
+    from lightning_modules.cli.arguments import options  # takes torch, which the cluster runs this module without
+
+    if any(option == "--budget" for _, option, _ in options(typed)):
+        raise UsageError("--engine ray: expected --speed or --model.weights, got --budget, which differs by node")
+    if find_spec("ray") is None:
+        raise InputError("predict: --engine ray: Ray is not installed; pip install '.[ray]' in a clone brings it")
+    quiet = ["--engine", "local", "--trainer.enable_progress_bar", "false", "--trainer.precision", precision]
+    logs: list[Path] = []
+
+    def commands(count: int) -> dict[Path, list[str]]:
+        logs.extend(folder.absolute() / f"part_{n}_of_{count}.log" for n in range(1, count + 1))
+        words = ["-m", "lightning_modules.recording_part", *typed, *quiet]
+        return {log: [*words, "--part", f"{n}/{count}"] for n, log in enumerate(logs, 1)}
+
+    for ended in run_commands_on_ray(commands, jobs):
+        for log, reason in ended.items():
+            if reason is not None:
+                raise InputError(f"{log}: {reason}")
+            print(f"{log.stem.replace('_', ' ')} is made", flush=True)
+    for log in logs:
+        log.unlink(missing_ok=True)
 
 
 def run_commands_on_ray(
     commands: Callable[[int], dict[Path, Sequence[str]]], jobs: int | None
 ) -> Iterator[dict[Path, str | None]]:
-    """Run Python on a Ray cluster, and say again and again which commands ended, and what went wrong, if anything did.
+    """Run Python on the Ray cluster that ``RAY_ADDRESS`` names or that runs here, else on a Ray of this machine's own.
 
-    It is the cluster that ``RAY_ADDRESS`` names or that runs here, else a Ray of this machine's own.
+    It says again and again which commands ended, and with what reason, ``None`` where nothing went wrong.
 
     Args:
         commands: given how many run at once, the arguments of Python by the file that a command's output goes to.
         jobs: commands at once; as many as there are GPUs, or else nodes, if ``None``.
-
-    Raises:
-        EngineError: Ray cannot be started.
     """
     import ray
 
     try:
         ray.init(log_to_driver=False, include_dashboard=False, logging_level="ERROR")
     except Exception as error:  # Ray raises its plainest kind where a machine is too busy to start it
-        raise EngineError(f"--engine ray: {one_line(error)}") from error
+        raise InputError(f"--engine ray: {one_line(error)}") from error
     try:
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         share = _share(nodes, jobs)
@@ -48,7 +78,7 @@ def run_commands_on_ray(
         task = ray.remote(max_retries=0, **share)(_run_to_end)
         running = {task.remote(log, words, os.getcwd()): log for log, words in commands(at_once).items()}
         while running:
-            done, _ = ray.wait(list(running), timeout=A_MOMENT)
+            done, _ = ray.wait(list(running), timeout=_A_MOMENT)
             yield {running.pop(reference): _outcome(ray, reference) for reference in done}
     finally:
         ray.shutdown()
@@ -90,13 +120,7 @@ def _outcome(ray: Any, reference: Any) -> str | None:
 
 
 def start(log: Path, words: Sequence[str], environment: dict[str, str]) -> subprocess.Popen:
-    """Start Python.
-
-    Args:
-        log: file that its output is added to.
-        words: its arguments.
-        environment: variables that differ from those of this process.
-    """
+    """Start Python, with what it prints at the end of a file, and more in its environment."""
     # Threads that spin while they wait hold up the workers that make clips.
     environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ, **environment}
     with open(log, "ab") as file:
@@ -110,7 +134,7 @@ def start(log: Path, words: Sequence[str], environment: dict[str, str]) -> subpr
 
 
 def stop(process: subprocess.Popen) -> None:
-    """End a process that called :func:`end_with_parent`."""
+    """Have a process that was started here end, see :func:`end_with_parent`, and wait for it."""
     process.stdin.close()
     process.wait()
 
@@ -127,12 +151,7 @@ def end_with_parent() -> None:
 
 
 def reason(log: Path, status: int) -> str | None:
-    """Return what went wrong in a process that ended, ``None`` if nothing did.
-
-    Args:
-        log: what it wrote.
-        status: its exit status.
-    """
+    """Return why a process ended with a status, or None where nothing went wrong."""
     if status == 0:
         return None
     if status < 0:

@@ -1,0 +1,35 @@
+"""Constructors that take the arguments of another class."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import TypeVar, get_type_hints
+
+T = TypeVar("T", bound=Callable[..., None])
+
+
+def takes(other: type, *without: str) -> Callable[[T], T]:
+    """Decorate a constructor that passes ``**settings``, and perhaps ``*args``, on to another class.
+
+    Its signature and its documentation become those of both, for ``help``, editors and the command line. What both
+    have is its own.
+
+    Args:
+        other: the class, such as a dataclass.
+        without: arguments of that class that are not passed on.
+    """
+
+    def decorate(init: T) -> T:
+        first, *own = inspect.signature(init).parameters.values()
+        in_place = any(parameter.kind is parameter.VAR_POSITIONAL for parameter in own)
+        own = {one.name: one for one in own if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD)}
+        passed = [one for one in inspect.signature(other).parameters.values() if one.name not in {*own, *without}]
+        passed = passed if in_place else [one.replace(kind=one.KEYWORD_ONLY) for one in passed]
+        hints = {**get_type_hints(other.__init__), **get_type_hints(init)}
+        parameters = [one.replace(annotation=hints[one.name]) for one in (*passed, *own.values())]
+        init.__signature__ = inspect.Signature([first, *sorted(parameters, key=lambda one: one.kind)])
+        init.__doc__ = other.__doc__
+        return init
+
+    return decorate
