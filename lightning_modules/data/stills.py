@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -56,6 +56,8 @@ class StillClips(Dataset):
         objects: most objects that move in front of the background.
         brightness: darkest and brightest exposure. Truth and light of a clip are both multiplied by one number between.
         photons: photons that make one threshold, for photon noise; null for none.
+        noise: instead, what a sensor adds, such as ``{photons: 3000, gain_spread: 0.06}``; a clip with ``augment``, as
+            training clips are, has a random share of it: a network learns sensors from the ideal to this one.
         flow_times: frames to which the flow from the middle frame is given; with 41 frames and a window of 11, 5 and 35
             are the centres of the first and of the last window.
         key_frames: clips that follow each other, of one scene, for a network that makes films.
@@ -86,6 +88,7 @@ class StillClips(Dataset):
     objects: int = 2
     brightness: tuple[float, float] = (0.5, 1.0)
     photons: float | None = None
+    noise: SensorNoise | None = None
     flow_times: tuple[int, int] = (5, 35)
     key_frames: int = 1
     every: int = 20
@@ -122,6 +125,7 @@ class StillClips(Dataset):
         """Digest of all that a clip is made of, besides its index."""
         aside = {"pictures", "length", "cache"}
         options = {name: value for name, value in vars(self).items() if name not in aside}
+        options["noise"] = self.noise and asdict(self.noise)
         files = [file_digest(path) for path in (*_CODE, *self.pictures)]
         return clip_key(simulator=SIMULATOR_VERSION, files=files, **options)
 
@@ -142,8 +146,12 @@ class StillClips(Dataset):
     def spikes(self, index: int, scene: Scene) -> Tensor:
         """Return what the sensor makes of the scene of a clip, uint8 (clocks, H, W)."""
         light = scene.light(self.pattern, scale=self.scale, alpha=self.alpha)
-        generator = torch.Generator().manual_seed(int(self._rng(index, "spikes").integers(2**63)))
-        return simulate_spikes(light, noise=SensorNoise(photons=self.photons), generator=generator)
+        rng = self._rng(index, "spikes")
+        generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
+        noise = self.noise or SensorNoise(photons=self.photons)
+        if self.noise and self.augment:
+            noise = noise.times(1 - rng.uniform())
+        return simulate_spikes(light, noise=noise, generator=generator)
 
     def scene(self, index: int) -> Scene:
         """Return the scene of a clip, to look at other clocks or sizes than the clip has."""
@@ -210,6 +218,7 @@ def _check(clips: StillClips) -> None:
         ("every", clips.every >= 1, "at least 1 clock"),
         ("flow_times", all(0 <= t < clips.frames for t in clips.flow_times), f"clocks in [0, {clips.frames})"),
         ("photons", clips.photons is None or 0 < clips.photons < math.inf, "a number above 0, or null for no noise"),
+        ("photons", None in (clips.photons, clips.noise), "those of the noise instead"),
         ("seed", clips.seed >= 0, "0 or more"),
         ("length", clips.length >= 1, "at least 1 clip"),
     ):

@@ -18,7 +18,7 @@ from lightning_modules.data.pictures import (
 )
 from lightning_modules.data.stills import StillClips, StillScenes
 from lightning_modules.data.textures import outline_mask, texture
-from spikekit import bin_to_sensor
+from spikekit import SensorNoise, bin_to_sensor
 
 SHARED = Path(__file__).parents[3].parent / "shared" / "data"
 SMALL = {"patch": 8, "val_patch": 8, "train_clips": 8, "val_clips": 4, "batch_size": 2}
@@ -245,9 +245,27 @@ def test_options_do_what_they_say():
     clean, noisy = (scenes(photons=p).train_set[4] for p in (None, 10.0))
     assert torch.equal(clean["rgb"], noisy["rgb"])
     assert not torch.equal(clean["spikes"], noisy["spikes"])
+    same = scenes(noise=SensorNoise(photons=10.0)).val_set, scenes(photons=10.0).val_set
+    assert torch.equal(*(clips[4]["spikes"] for clips in same))
     turned = scenes(motion=0.0, rotation=5.0, zoom=0.0, objects=0)
     assert turned.train_set[0]["flow"][0, :, 0, 0].norm() > 0
     assert scenes(frames=11, flow_times=(0, 10)).train_set[0]["spikes"].shape[0] == 11
+
+
+def test_training_sees_sensors_from_the_ideal_to_the_noisiest():
+    """White light on the sensor, of which dead pixels see nothing: 4 % at most, 2 % of them on average."""
+    options = {"brightness": (1.0, 1.0), "motion": 0.0, "objects": 0, "alpha": 1.0, "patch": 32, "val_patch": 32}
+    noisy, clean = (scenes(noise=noise, **options).train_set for noise in (SensorNoise(dead=0.04), None))
+    dead = [[(clips[n]["spikes"].amax(dim=0) == 0).double().mean() for n in range(20)] for clips in (noisy, clean)]
+    more = torch.tensor(dead[0]) - torch.tensor(dead[1])
+    assert more.min() < 0.01 < 0.03 < more.max() < 0.06
+    assert 0.012 < more.mean() < 0.028
+    with pytest.raises(ValueError, match="photons: expected those of the noise instead, got 10"):
+        scenes(photons=10.0, noise=SensorNoise())
+    shown = StillClips(embedded_pictures(), scale=2, patch=32, augment=False, noise=SensorNoise(dead=0.04))
+    assert (shown[0]["spikes"].amax(dim=0) == 0).double().mean() > 0.035
+    keys = {StillClips(embedded_pictures(), noise=noise)._source for noise in (None, SensorNoise(), shown.noise)}
+    assert len(keys) == 3  # of what is kept on disk
 
 
 def test_key_frames_are_one_scene_that_moves_on():
