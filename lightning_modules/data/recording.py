@@ -214,6 +214,7 @@ class Recording(LightningDataModule):
         calibration: str | None = None,
     ) -> None:
         super().__init__()
+        self.allow_zero_length_dataloader_with_multiple_devices = True  # of more processes than pictures are left
         self.path = path
         self.how = {
             "height": height,
