@@ -1,5 +1,6 @@
-"""Damaged files of every kind that lightning reads; SPIKEKIT_FUZZ=N in the environment gives each N cases.
+"""Damaged files of every kind that lightning reads.
 
+SPIKEKIT_FUZZ=N in the environment gives each N cases, and SPIKEKIT_FUZZ_SEED=S others: those of the seeds from S.
 Weights and checkpoints as they are loaded are in test_security.py.
 """
 
