@@ -66,6 +66,12 @@ def damage_values(value: object, rng: random.Random) -> object:
     return value
 
 
+def seeds(cases: int) -> range:
+    """Return a seed for every case: SPIKEKIT_FUZZ says how many there are instead, SPIKEKIT_FUZZ_SEED the first."""
+    first = int(os.environ.get("SPIKEKIT_FUZZ_SEED", "0"))
+    return range(first, first + int(os.environ.get("SPIKEKIT_FUZZ", cases)))
+
+
 @pytest.fixture(name="fuzz")
 def _fuzz(tmp_path, capfd):
     """Read damaged files: of each there is a result, or an error of one line that names it, and nothing on stderr."""
@@ -74,7 +80,7 @@ def _fuzz(tmp_path, capfd):
         """Give ``read`` the path of a file ``name`` whose bytes are ``make(rng)``; return how many were refused."""
         path, refused, before = folder / name, 0, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         capfd.readouterr()
-        for seed in range(int(os.environ.get("SPIKEKIT_FUZZ", cases))):
+        for seed in seeds(cases):
             path.unlink(missing_ok=True)
             path.write_bytes(make(random.Random(seed)))
             try:
@@ -96,7 +102,7 @@ def _fuzz(tmp_path, capfd):
         assert refused, "nothing was damaged"
         return refused
 
-    fuzz.damage, fuzz.values = damage, damage_values
+    fuzz.damage, fuzz.values, fuzz.seeds = damage, damage_values, seeds
     # thousands of files: in memory where the system has such a place
     with tempfile.TemporaryDirectory(dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else tmp_path) as folder:
         folder = Path(folder)

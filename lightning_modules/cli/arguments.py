@@ -69,9 +69,11 @@ def with_network_of_weights(args: Sequence[str]) -> list[str]:
         elif option in WEIGHTS:
             asked = value
         elif _MOTION.fullmatch(option):
-            named = _with_class(yaml.safe_load(value)) or named
+            named = _with_class(_parsed(value, option)) or named
     if asked in (None, "", "null"):
         return list(args)
+    if not isinstance(asked, str):
+        raise ValueError(f"model.weights: expected a file or a name, got {repr(asked)[:80]}")
     found = read_weights(asked)
     check_weights(found, {**NETWORKS, **ESTIMATORS})
     kind, arguments = own_class(found.settings, found.source, {**NETWORKS, **ESTIMATORS})
@@ -87,7 +89,7 @@ def with_network_of_weights(args: Sequence[str]) -> list[str]:
         network["init_args"]["motion"] = chosen
     if alpha is not None:
         network["init_args"]["alpha"] = alpha
-    return behind_configurations(args, ["--config", json.dumps({"model": {"network": network}})])
+    return behind_configurations(args, ["--config", json.dumps({"model": {"network": network}}, default=str)])
 
 
 def options(args: Sequence[str]) -> Iterator[tuple[int, str, str]]:
@@ -188,15 +190,19 @@ def _part_of(config: str, name: str) -> Any:
         text = Path(config).read_text(encoding="utf-8")
     except (OSError, ValueError):  # not there, or the configuration itself
         return None
-    try:
-        content = yaml.safe_load(text)
-    except (ValueError, RecursionError, yaml.YAMLError) as error:
-        raise ValueError(f"{config}: not a configuration ({one_line(error)[:300]})") from error
+    content = _parsed(text, config)
     if content is None:  # an empty file
         return None
     if not isinstance(content, dict):
         raise ValueError(f"{config}: not a configuration (expected names and values, got {type(content).__name__})")
     return content.get(name)
+
+
+def _parsed(text: str, name: str) -> Any:
+    try:
+        return yaml.safe_load(text)
+    except Exception as error:  # what the parser raises depends on the text
+        raise ValueError(f"{name}: not a configuration ({one_line(error)[:300]})") from error
 
 
 def _init_args(choice: Any) -> dict[str, Any]:

@@ -189,6 +189,7 @@ class Recording(LightningDataModule):
     @takes(RecordingClips)
     def __init__(self, *args: Any, **settings: Any) -> None:
         super().__init__()
+        self.allow_zero_length_dataloader_with_multiple_devices = True  # of more processes than pictures are left
         self.how = signature(RecordingClips).bind(*args, **settings)
 
     def setup(self, stage: str | None = None) -> None:

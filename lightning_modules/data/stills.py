@@ -217,7 +217,7 @@ def _check(clips: StillClips) -> None:
         ("key_frames", clips.key_frames >= 1, "at least 1"),
         ("every", clips.every >= 1, "at least 1 clock"),
         ("flow_times", all(0 <= t < clips.frames for t in clips.flow_times), f"clocks in [0, {clips.frames})"),
-        ("photons", clips.photons is None or 0 < clips.photons < math.inf, "a number above 0, or null for no noise"),
+        ("photons", clips.photons is None or 1 <= clips.photons < math.inf, "1 or more, or null for no noise"),
         ("photons", None in (clips.photons, clips.noise), "those of the noise instead"),
         ("seed", clips.seed >= 0, "0 or more"),
         ("length", clips.length >= 1, "at least 1 clip"),

@@ -12,13 +12,15 @@ import torch
 from torch import Tensor
 
 from spikekit._renamed import renamed_argument
-from spikekit.check import check_positive, check_whole
+from spikekit.check import check_whole
 from spikekit.sensor.calibration import DEAD, HOT, WORKS, Calibration
 
 # Each has its own random numbers. The place in the list tells them apart: append, never reorder.
 _PURPOSES = ("charge", "gain", "dark current", "defects", "photons", "electrons")
 
 _MEAN_SIZE = math.sqrt(2 / math.pi)  # E|x| of a standard normal x
+# A pixel that leaks a threshold fires at every clock; of pixels that differ more, nearly all would see nothing.
+_MOST = {"dark_current": 1.0, "dark_spread": 10.0, "gain_spread": 10.0, "hot": 1.0, "dead": 1.0}
 _MOST_PHOTONS = 1e18  # NumPy's Poisson numbers end at 9.2e18, and one photon more or less is no longer seen here
 
 
@@ -62,19 +64,19 @@ class SensorNoise:
         They are drawn on the CPU, and are the same wherever the light is.
 
     Args:
-        photons: p, electrons that make one threshold; ``None`` for no photon noise.
-        dark_current: :math:`\bar d`, mean charge that leaks in per clock, in thresholds.
-        dark_spread: :math:`\sigma_d`, standard deviation of the dark current between pixels, relative to its mean.
-        gain_spread: :math:`\sigma_g`, standard deviation of the gain between pixels: fixed-pattern noise.
+        photons: p, electrons that make one threshold, at least 1; ``None`` for no photon noise.
+        dark_current: :math:`\bar d`, mean charge that leaks in per clock, in thresholds, at most 1.
+        dark_spread: :math:`\sigma_d`, standard deviation of the dark current between pixels, relative to its mean, at
+            most 10.
+        gain_spread: :math:`\sigma_g`, standard deviation of the gain between pixels, at most 10: fixed-pattern noise.
         hot: share of pixels that always fire.
         dead: share of pixels that never fire.
         calibration: gain, dark current and defects of a sensor that was measured, instead of chance; then the spreads
             and shares above are 0.
 
     Raises:
-        ValueError: a number of photons that is not above 0, a negative or infinite one elsewhere, shares of hot and
-            dead pixels that together exceed 1, a spread of a dark current of 0, a calibration with what it would
-            replace.
+        ValueError: a number out of its range, shares of hot and dead pixels that together exceed 1, a spread of a dark
+            current of 0, a calibration with what it would replace.
 
     Example:
         The constants of Hu et al. for a camera of 250 x 400 pixels at 20 kHz, which are bare numbers, read as fF, V and
@@ -104,12 +106,12 @@ class SensorNoise:
     calibration: Calibration | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        if self.photons is not None:
-            check_positive("photons", self.photons)
-        for name in ("dark_current", "dark_spread", "gain_spread", "hot", "dead"):
+        if self.photons is not None and not 1 <= self.photons < math.inf:
+            raise ValueError(f"photons: expected a finite number, 1 or more, got {self.photons}")
+        for name, most in _MOST.items():
             value = getattr(self, name)
-            if not 0 <= value < math.inf:
-                raise ValueError(f"{name}: expected a finite number, 0 or more, got {value}")
+            if not 0 <= value <= most:
+                raise ValueError(f"{name}: expected 0 to {most:g}, got {value}")
         if self.hot + self.dead > 1:
             raise ValueError(f"hot, dead: expected shares that add up to 1 at most, got {self.hot}, {self.dead}")
         if self.dark_spread and not self.dark_current:
@@ -307,8 +309,7 @@ class NoisyPixels:
         return random_numbers(self.seed, "defects").random(self.size)
 
     def _around_one(self, purpose: str, spread: float) -> np.ndarray:
-        # of the logarithm; the second form is for squares that no number holds
-        variance = math.log1p(spread**2) if spread < 1e150 else 2 * math.log(spread)
+        variance = math.log1p(spread**2)  # of the logarithm
         normal = random_numbers(self.seed, purpose).standard_normal(self.size)
         return np.exp(math.sqrt(variance) * normal - variance / 2)
 

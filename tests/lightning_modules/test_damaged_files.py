@@ -1,5 +1,6 @@
-"""Damaged files of every kind that lightning reads; SPIKEKIT_FUZZ=N in the environment gives each N cases.
+"""Damaged files of every kind that lightning reads.
 
+SPIKEKIT_FUZZ=N in the environment gives each N cases, and SPIKEKIT_FUZZ_SEED=S others: those of the seeds from S.
 Weights and checkpoints as they are loaded are in test_security.py.
 """
 
@@ -15,6 +16,7 @@ import yaml
 from pytorch_lightning.callbacks import ModelCheckpoint
 
 from lightning_modules.checkpoint import read_checkpoint
+from lightning_modules.cli.arguments import whole_counts, with_network_of_weights
 from lightning_modules.cli.errors import InputError
 from lightning_modules.data.cache import ClipCache, _digest
 from lightning_modules.error_model import read_error_model
@@ -91,9 +93,43 @@ def test_trials(fuzz, damaged):
     assert fuzz(refuses, lambda rng: _json(fuzz.values(value, rng)), damaged, InputError, 300) > 200
 
 
+def _odd_tags(rng):
+    """YAML whose parser raises more than errors of YAML."""
+    tag = rng.choice(
+        ("bool", "int", "float", "timestamp", "binary", "set", "omap", "pairs", "null", "str", "python/name")
+    )
+    value = rng.choice(("", "''", "x", "'-'", "'0x'", "1:", "2020-13-45", "[1]", "{a: b}", "é", "&a [*a]"))
+    return f"model:\n  init_args:\n    {rng.choice(('tile', 'network', '? [a]'))}: !!{tag} {value}\n".encode()
+
+
 def test_yaml(fuzz):
     good = yaml.safe_dump(CONFIG).encode()
     assert fuzz(read_yaml, lambda rng: fuzz.damage(good, rng), "trial.yaml", InputError) > 100
+    assert fuzz(read_yaml, _odd_tags, "trial.yaml", InputError, 300) > 100
+
+
+def test_configurations(fuzz):
+    """As ``lightning`` reads them before its parser does."""
+    good = yaml.safe_dump(CONFIG).replace("weights", "tile").encode()  # the name of weights would be sought
+
+    def read(path):
+        with_network_of_weights(["fit", "-c", str(path)])
+        whole_counts(["fit", "-c", str(path)])
+
+    assert fuzz(read, lambda rng: fuzz.damage(good, rng), "a.yaml") > 100
+    assert fuzz(read, _odd_tags, "a.yaml", cases=300) > 100
+
+
+def test_values_of_a_configuration_beside_the_weights(tmp_path):
+    """What YAML makes of a text may be no text."""
+    config = tmp_path / "a.yaml"
+    config.write_text("model: {weights: [1]}")
+    with pytest.raises(ValueError, match=r"model\.weights: expected a file or a name, got \[1\]"):
+        with_network_of_weights(["fit", "-c", str(config)])
+    config.write_text("model: {weights: cscsr_tiny_x4, network: {alpha: 2020-01-01}}")
+    assert '"alpha": "2020-01-01"' in with_network_of_weights(["fit", "-c", str(config)])[4]  # for the parser to refuse
+    with pytest.raises(ValueError, match=r"--model\.network\.motion: not a configuration"):
+        with_network_of_weights(["fit", "--model.network.motion", "{"])
 
 
 def test_tables_of_presets(fuzz, monkeypatch):

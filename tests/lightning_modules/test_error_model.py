@@ -40,7 +40,10 @@ def test_constants_of_a_checkpoint_are_not_written(tmp_path):
 
 @pytest.mark.parametrize(
     "text",
-    ["", "[]", '{"a": 1}', '{"a": {"flat": -1}}', '{"a": {"flat": NaN}}', '{"a": {"flat": true}}', '{"a": {"x": 1}}'],
+    [
+        *("", "[]", '{"a": 1}', '{"a": {"flat": -1}}', '{"a": {"flat": NaN}}', '{"a": {"flat": true}}'),
+        *('{"a": {"x": 1}}', f'{{"a": {{"flat": 1{"0" * 400}}}}}'),
+    ],
 )
 def test_a_damaged_file_of_constants_is_named_in_one_line(text, tmp_path):
     (tmp_path / FILE).write_text(text)

@@ -3,7 +3,6 @@
 import json
 import os
 import sys
-import time
 import zipfile
 from pathlib import Path
 
@@ -295,27 +294,11 @@ def test_a_checkpoint_removes_only_checkpoints_of_its_own_folder(content, tmp_pa
     assert not Path(own).exists()
 
 
-def test_random_damage_is_one_line_that_names_the_file(content, tmp_path):
-    """Bytes of a checkpoint and of safetensors changed, cut or added, seeded."""
-    torch.save(content(), tmp_path / "good.ckpt")
-    write(tmp_path / "good.safetensors", SETTINGS, {}, CSCSR(**TINY).state_dict())
-    generator = torch.Generator().manual_seed(24)
-    refused = 0
-    began = time.process_time()
-    for n in range(int(os.environ.get("SPIKEKIT_FUZZ", "60"))):
-        suffix = (".ckpt", ".safetensors")[n % 2]
-        data = bytearray((tmp_path / f"good{suffix}").read_bytes())
-        end = len(data) if n % 4 < 2 else 2000  # headers more often than weights
-        for place in torch.randint(min(end, len(data)), (1 + n % 7,), generator=generator).tolist():
-            data[place] = int(torch.randint(256, (1,), generator=generator))
-        if n % 5 == 0:
-            data = data[: int(torch.randint(len(data), (1,), generator=generator))]
-        path = tmp_path / f"bad{suffix}"
-        path.write_bytes(data)
-        try:
-            read_weights(path)
-        except ValueError as error:
-            assert str(error).startswith(f"{path}: ")  # noqa: PT017
-            assert "\n" not in str(error)  # noqa: PT017
-            refused += 1
-    assert refused > n // 3, time.process_time() - began
+@pytest.mark.parametrize("ending", [".ckpt", ".safetensors"])
+def test_random_damage_is_one_line_that_names_the_file(fuzz, content, tmp_path, ending):
+    good = tmp_path / f"good{ending}"
+    if ending == ".ckpt":
+        torch.save(content(), good)
+    else:
+        write(good, SETTINGS, {}, CSCSR(**TINY).state_dict())
+    assert fuzz(read_weights, lambda rng: fuzz.damage(good.read_bytes(), rng), f"bad{ending}", cases=60) > 20

@@ -145,7 +145,34 @@ def one_graph_a_size(light, *args, **options):
     return FIRE(light * (1 if light.shape[-1] > 15 else 1.0), *args, **options)
 
 
-FIRE, TFI, TFP, IDW = sk.spike_integrate_fire, sk.tfi, sk.tfp, sk.flow_warp_idw
+def learns_nothing_in_autocast(spikes, *args, **options):
+    result = TFP(spikes, *args, **options)
+    return result.detach() if torch.is_autocast_enabled("cpu") else result
+
+
+class TwiceInBatches(torch.autograd.Function):
+    """Has another gradient by vmap."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(features):
+        return features.clone()
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        pass
+
+    @staticmethod
+    def backward(ctx, gradient):
+        return gradient * (2 if torch._C._functorch.is_batchedtensor(gradient) else 1)
+
+
+def learns_twice_by_vmap(features, flow):
+    return WARP(TwiceInBatches.apply(features), flow)
+
+
+FIRE, TFI, TFP, IDW, WARP = sk.spike_integrate_fire, sk.tfi, sk.tfp, sk.flow_warp_idw, sk.flow_warp
 
 
 @pytest.mark.parametrize(
@@ -163,6 +190,8 @@ FIRE, TFI, TFP, IDW = sk.spike_integrate_fire, sk.tfi, sk.tfp, sk.flow_warp_idw
         (half_coordinates, "flow_warp_idw", "columns 2040 to 4104", torch.float16),
         (lets_through, "flow_warp_idw", "NaN at unknown pixels is not read", torch.float32),
         (lets_through, "flow_warp_idw", "no known pixel", torch.float32),
+        (learns_nothing_in_autocast, "tfp", "torch.autocast", torch.float32),
+        (learns_twice_by_vmap, "flow_warp", "torch.func.vmap", torch.float32),
     ],
 )
 def test_a_wrong_operator_fails(broken, operator, extreme, dtype, monkeypatch):

@@ -207,6 +207,10 @@ def test_two_processes_make_what_one_makes(words, tmp_path):
     with command(words, tmp_path / "two", "--trainer.devices", 2) as process:
         assert process.wait() == 0, process.stderr.read()
     assert pictures(tmp_path / "one") == pictures(tmp_path / "two")
+    (tmp_path / "two" / "frame_000040.png").unlink()  # fewer pictures than processes
+    with command(words, tmp_path / "two", "--trainer.devices", 2) as process:
+        assert process.wait() == 0, process.stderr.read()
+    assert pictures(tmp_path / "one") == pictures(tmp_path / "two")
     with command(words, tmp_path / "film.mp4", "--trainer.devices", 2) as process:
         assert process.wait() == 0, process.stderr.read()
     assert len(read_video(tmp_path / "film.mp4")) == 6

@@ -240,6 +240,20 @@ def test_the_defaults_are_those_of_the_film():
     assert isinstance(build(settings.interpolation), type(film.interpolation))
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--gain-spread", "1e200"], "--gain-spread: expected 0 to 10, got 1e+200"),
+        (["--dark-current", "0.1", "--dark-spread", "inf"], "--dark-spread: expected 0 to 10, got inf"),
+        (["--dark-current", "nan"], "--dark-current: expected 0 to 1, got nan"),
+        (["--photons", "1e-300"], "--photons: expected a finite number, 1 or more, got 1e-300"),
+        (["--hot=-1"], "--hot: expected 0 to 1, got -1.0"),
+    ],
+)
+def test_noise_that_no_sensor_has(film, fails, words, said):
+    assert fails(2, film, "-o", "a.dat", *QUICK, *words) == f"spikekit: {said}\n"
+
+
 # --- the same again ---------------------------------------------------------------------------------------------------
 
 

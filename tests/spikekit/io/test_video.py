@@ -330,6 +330,20 @@ def test_a_film_shorter_than_its_header_says(tmp_path):
         assert level_of(frames[0]) == pytest.approx(0, abs=0.4)
 
 
+def test_of_several_streams_the_first_is_the_film(tmp_path):
+    av = pytest.importorskip("av")
+    with av.open(str(tmp_path / "a.mkv"), "w") as container:
+        streams = [container.add_stream("ffv1", rate=25) for _ in range(2)]
+        for stream in streams:
+            stream.height, stream.width, stream.pix_fmt = 32, 48, "yuv420p"
+        for n, stream in enumerate(streams):
+            for _ in range(2):
+                grey = np.full((32, 48, 3), 60 + 120 * n, np.uint8)
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(grey, format="rgb24")))
+            container.mux(stream.encode(None))
+    assert [number(rgb) for rgb in read_video(tmp_path / "a.mkv")] == [60, 60]
+
+
 def test_sound_is_no_film(tmp_path):
     av = pytest.importorskip("av")
     with av.open(str(tmp_path / "a.mkv"), "w") as container:

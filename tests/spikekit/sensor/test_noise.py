@@ -356,18 +356,30 @@ def test_another_device_sees_the_same(device):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"photons": 0.0}, "photons: expected a finite number above 0, got 0.0"),
-        ({"photons": math.nan}, "photons: expected a finite number above 0, got nan"),
-        ({"dark_current": -0.1}, "dark_current: expected a finite number, 0 or more, got -0.1"),
-        ({"gain_spread": math.inf}, "gain_spread: expected a finite number, 0 or more, got inf"),
+        ({"photons": 0.99}, "photons: expected a finite number, 1 or more, got 0.99"),
+        ({"photons": math.nan}, "photons: expected a finite number, 1 or more, got nan"),
+        ({"photons": math.inf}, "photons: expected a finite number, 1 or more, got inf"),
+        ({"dark_current": -0.1}, "dark_current: expected 0 to 1, got -0.1"),
+        ({"dark_current": 1.01}, "dark_current: expected 0 to 1, got 1.01"),
+        ({"dark_current": 0.1, "dark_spread": 10.1}, "dark_spread: expected 0 to 10, got 10.1"),
         ({"dark_spread": 0.1}, "dark_spread: expected a dark_current above 0 with it"),
-        ({"dead": math.nan}, "dead: expected a finite number"),
+        ({"gain_spread": 1e200}, r"gain_spread: expected 0 to 10, got 1e\+200"),
+        ({"gain_spread": math.inf}, "gain_spread: expected 0 to 10, got inf"),
+        ({"hot": 1.01}, "hot: expected 0 to 1, got 1.01"),
+        ({"dead": math.nan}, "dead: expected 0 to 1, got nan"),
         ({"hot": 0.6, "dead": 0.5}, "hot, dead: expected shares that add up to 1 at most, got 0.6, 0.5"),
     ],
 )
 def test_a_noise_that_cannot_be_says_so(settings, message):
     with pytest.raises(ValueError, match=message):
         SensorNoise(**settings)
+
+
+def test_the_most_noise_leaves_a_stream():
+    light = torch.full((30, 40, 40), 0.3)
+    for settings in ({"photons": 1.0}, {"gain_spread": 10.0}, {"dark_current": 1.0, "dark_spread": 10.0}):
+        bits = simulate_spikes(light, noise=SensorNoise(**settings), generator=chance()).double()
+        assert 0.05 < bits.mean() < 0.95
 
 
 def test_errors_say_what_was_expected():
