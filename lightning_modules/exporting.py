@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from lightning_modules.networks import Network
+from lightning_modules.networks import NETWORKS, ClassicalDecoder, Network, RecurrentCSCSR, TwoSpanCSCSR
+from lightning_modules.pretrained import read_weights
 from spikekit.io.whole_file import whole_file
 
 #: formats, and how their files end
@@ -19,8 +21,11 @@ FORMATS = {"torch": ".pt2", "onnx": ".onnx"}
 #: of ONNX
 OPSET = 20
 
+#: networks that have no weights of their own, by name
+WITHOUT_WEIGHTS = {kind.__name__: kind for kind in (ClassicalDecoder, TwoSpanCSCSR)}
+
 _TRACED = 32, 44  # sensor pixels, of the clip that the network is followed on
-_SIZES = (32, 44), (16, 20), (24, 48)
+_SIZES = (32, 44), (20, 16), (24, 48)
 _WITHIN = 1e-4
 
 
@@ -35,29 +40,70 @@ class _Still(nn.Module):
         return self.network(spikes, static=True)
 
 
-class _Moving(nn.Module):
+class _Moving(_Still):
     """A network that is given the motion."""
-
-    def __init__(self, network: Network) -> None:
-        super().__init__()
-        self.network = network
 
     def forward(self, spikes: Tensor, flow: Tensor) -> Tensor:
         return self.network(spikes, flow)
 
 
+class _StillFilm(nn.Module):
+    """A network for films that is given the state of the key frame before, zeros where there is none."""
+
+    def __init__(self, network: RecurrentCSCSR) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, spikes: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        return self._meet(spikes, None, state, None)
+
+    def _meet(self, spikes: Tensor, flow: Tensor | None, state: Tensor, way: Tensor | None) -> tuple[Tensor, Tensor]:
+        features = self.network.features(spikes, flow)
+        met = self.network.advance(features, [self.network.moved(state, way)])
+        state = torch.where((state != 0).any(), met, self.network.advance(features))
+        return self.network.picture(state), state
+
+
+class _Film(_StillFilm):
+    """The same with the motion, and the number of clocks since the key frame before."""
+
+    def forward(self, spikes: Tensor, flow: Tensor, state: Tensor, every: Tensor) -> tuple[Tensor, Tensor]:
+        return self._meet(spikes, flow, state, self.network.flow_to(flow, -1) * every)
+
+
+def load_network(source: str) -> Network:
+    """Return the network that weights are of, or one that has none.
+
+    Args:
+        source: the name of weights that come with the package, a file of weights, or a name in ``WITHOUT_WEIGHTS``.
+
+    Raises:
+        FileNotFoundError: neither a file nor a name.
+        ValueError: a damaged file, or one of something else than a network.
+    """
+    if source in WITHOUT_WEIGHTS:
+        return WITHOUT_WEIGHTS[source]()
+    kind = NETWORKS.get(read_weights(source).settings.get("class"))
+    if kind is None:
+        raise ValueError(f"{source}: expected weights of a network, got those of an estimator of motion")
+    return kind.from_pretrained(source)
+
+
 def export_network(network: Network, path: str | Path, kind: str, *, still: bool = False) -> str:
     """Write a network as a program of torch.export or as ONNX, after a comparison with itself on three sizes.
 
-    Its inputs are ``spikes``, (1, N, H, W), float32 zeros and ones, H and W even and 16 or more, and ``flow``, from the
-    middle to the first and to the last time point, (1, 2, 2, H, W), in sensor pixels, where the network follows motion.
-    Its output is ``rgb``, (1, 3, s H, s W), not clamped.
+    Its inputs are ``spikes``, (1, N, H, W), float32 zeros and ones, H and W even and 16 or more, and ``flow``, as
+    ``network.estimate_flow(spikes)`` gives it, where the network follows motion. Its output is ``rgb``,
+    (1, 3, s H, s W), not clamped.
+
+    A network for films has a second output, ``state``, (1, C, H, W), and takes that of the key frame before, zeros
+    where there is none. Beside a flow it takes ``every``: how many clocks ago that key frame was, a float32.
 
     Args:
         network: any of :mod:`lightning_modules.networks`; what cannot be followed is refused.
         path: where to, ``.pt2`` or ``.onnx``.
         kind: ``"torch"`` or ``"onnx"``.
-        still: nothing moves: ``spikes`` are the only input.
+        still: nothing moves: no flow is an input.
 
     Returns:
         What was written, in words.
@@ -69,41 +115,88 @@ def export_network(network: Network, path: str | Path, kind: str, *, still: bool
     if kind == "onnx":
         _check_onnx()
     network = network.eval().cpu().float()
-    moves = network.takes_flow and not network.motion.static and not still
-    module = _Moving(network) if moves else _Still(network)
-    height, width = (2 * torch.export.Dim(name, min=8, max=2048) for name in ("half_height", "half_width"))
-    open_sizes = ({2: height, 3: width}, {3: height, 4: width})[: 1 + moves]
+    films = isinstance(network, RecurrentCSCSR)
+    module = as_exported(network, still)
     try:
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            inputs = _example(network, _TRACED, moves)
-            program = torch.export.export(module, inputs, dynamic_shapes=open_sizes, strict=False)
+            clips = [example_inputs(network, size, still) for size in (_TRACED, *_SIZES)]
+            if films:
+                clips[-1]["state"] = torch.zeros_like(clips[-1]["state"])  # as a film begins
+            program = _program(module, clips[0])
+            data = (_onnx if kind == "onnx" else _torch)(program, list(clips[0]), ["rgb", "state"][: 1 + films])
+            run = exported(data, kind)
+            # of a tensor, as max() of numbers forgets NaN
+            tried = [difference(run(*clip.values()), module(*clip.values())) for clip in clips[1:]]
+            worst = torch.stack(tried).max().item()
     except Exception as error:  # what torch raises depends on what it cannot follow
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
-        raise ValueError(f"{type(network).__name__}: cannot be exported ({reason})") from error
-    data = (_onnx if kind == "onnx" else _torch)(program, moves)
-    run = exported(data, kind)
-    with torch.no_grad():
-        clips = [_example(network, size, moves) for size in _SIZES]
-        # of a tensor, as max() of numbers forgets NaN
-        worst = torch.stack([(run(*clip) - module(*clip)).abs().max() for clip in clips]).max().item()
+        raise ValueError(f"{type(network).__name__}: cannot be exported ({_reason(error)})") from error
     if not worst <= _WITHIN:
         raise ValueError(
             f"{type(network).__name__}: expected an export within {_WITHIN} of the network, got {worst:.2g}"
         )
     with whole_file(path) as file:
         file.write(data)
-    takes = "spikes and flow" if moves else "spikes"
-    return f"takes {takes} of any even height and width, within {worst:.1g} of the network"
+    takes = " and ".join(f"{name} {_shape(value)}" for name, value in clips[0].items())
+    return f"takes {takes}, H and W even, within {worst:.1g} of the network"
 
 
-def _example(network: Network, size: tuple[int, int], moves: bool) -> tuple[Tensor, ...]:
+def as_exported(network: Network, still: bool = False) -> nn.Module:
+    """Return the module that is exported: it takes what :func:`example_inputs` gives, in this order."""
+    kinds = (_StillFilm, _Film) if isinstance(network, RecurrentCSCSR) else (_Still, _Moving)
+    return kinds[_moves(network, still)](network)
+
+
+def _moves(network: Network, still: bool) -> bool:
+    return network.takes_flow and not network.motion.static and not still
+
+
+def example_inputs(network: Network, size: tuple[int, int], still: bool = False) -> dict[str, Tensor]:
+    """Return inputs of an export by their names: random spikes, motion and state, the same every time.
+
+    Args:
+        network: what is exported.
+        size: of the clip, in sensor pixels.
+        still: as of :func:`export_network`.
+    """
+    moves, films = _moves(network, still), isinstance(network, RecurrentCSCSR)
     generator = torch.Generator().manual_seed(0)
-    spikes = (torch.rand(1, network.frames, *size, generator=generator) < 0.3).float()
-    return (spikes, torch.randn(1, 2, 2, *size, generator=generator))[: 1 + moves]
+    found = {"spikes": (torch.rand(1, network.frames, *size, generator=generator) < 0.3).float()}
+    if moves:
+        found["flow"] = torch.randn(network.estimate_flow(found["spikes"]).shape, generator=generator)
+    if films:
+        channels = 3 * network.scale**2 + network.config.memory
+        found["state"] = torch.rand(1, channels, *size, generator=generator)
+    if films and moves:
+        found["every"] = torch.tensor(20.0)
+    return found
 
 
-def exported(data: bytes, kind: str, threads: int | None = None) -> Callable[..., Tensor]:
+def _program(module: nn.Module, inputs: dict[str, Tensor]) -> torch.export.ExportedProgram:
+    height, width = (2 * torch.export.Dim(name, min=8, max=2048) for name in ("half_height", "half_width"))
+    open_sizes = {
+        name: {value.ndim - 2: height, value.ndim - 1: width} if value.ndim else None for name, value in inputs.items()
+    }
+    return torch.export.export(module, tuple(inputs.values()), dynamic_shapes=open_sizes, strict=False)
+
+
+def difference(found: Tensor | Sequence[Tensor], expected: Tensor | Sequence[Tensor]) -> Tensor:
+    """Return by how much a value of an export differs from that of the network at most; NaN if one is."""
+    pairs = zip(*([one] if isinstance(one, Tensor) else one for one in (found, expected)), strict=True)
+    return torch.stack([(got - wanted).abs().max() for got, wanted in pairs]).max()
+
+
+def _shape(value: Tensor) -> str:
+    return f"({', '.join([*map(str, value.shape[:-2]), 'H', 'W'])})" if value.ndim else "()"
+
+
+def _reason(error: BaseException) -> str:
+    while error.__cause__ is not None:  # what was said first says why
+        error = error.__cause__
+    return ((str(error).strip() or type(error).__name__).splitlines())[0][:200]
+
+
+def exported(data: bytes, kind: str, threads: int | None = None) -> Callable[..., Any]:
     """Return what runs an export, in this process.
 
     Args:
@@ -112,7 +205,7 @@ def exported(data: bytes, kind: str, threads: int | None = None) -> Callable[...
         threads: of onnxruntime, which takes all cores when not given; torch has its own.
 
     Returns:
-        Takes the inputs in their order, and returns the picture.
+        Takes the inputs in their order, and returns the picture; of a film, the picture and the state.
     """
     if kind == "torch":
         return torch.export.load(io.BytesIO(data)).module()
@@ -124,26 +217,24 @@ def exported(data: bytes, kind: str, threads: int | None = None) -> Callable[...
     session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     names = [one.name for one in session.get_inputs()]
 
-    def run(*inputs: Tensor) -> Tensor:
+    def run(*inputs: Tensor) -> Any:
         given = {name: value.numpy() for name, value in zip(names, inputs, strict=True)}
-        return torch.from_numpy(session.run(None, given)[0])
+        found = [torch.from_numpy(value) for value in session.run(None, given)]
+        return found[0] if len(found) == 1 else found
 
     return run
 
 
-def _torch(program: torch.export.ExportedProgram, moves: bool) -> bytes:
+def _torch(program: torch.export.ExportedProgram, inputs: list[str], outputs: list[str]) -> bytes:
     file = io.BytesIO()
     torch.export.save(program, file)
     return file.getvalue()
 
 
-def _onnx(program: torch.export.ExportedProgram, moves: bool) -> bytes:
-    names = ["spikes", "flow"][: 1 + moves]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        # its optimizer takes minutes, and onnxruntime has one of its own
-        options = {"dynamo": True, "optimize": False, "verbose": False, "opset_version": OPSET}
-        made = torch.onnx.export(program, input_names=names, output_names=["rgb"], **options)
+def _onnx(program: torch.export.ExportedProgram, inputs: list[str], outputs: list[str]) -> bytes:
+    # its optimizer takes minutes, and onnxruntime has one of its own
+    options = {"dynamo": True, "optimize": False, "verbose": False, "opset_version": OPSET}
+    made = torch.onnx.export(program, input_names=inputs, output_names=outputs, **options)
     return made.model_proto.SerializeToString()
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from time import perf_counter
 
 from lightning_modules.cli.errors import InputError, VerbParser
-from lightning_modules.exporting import FORMATS, export_network
+from lightning_modules.exporting import FORMATS, WITHOUT_WEIGHTS, export_network, load_network
 from lightning_modules.motion import ESTIMATORS
 from lightning_modules.networks import NETWORKS
 from lightning_modules.pretrained import check_weights, read_weights, write_weights
@@ -25,7 +25,10 @@ def parser() -> argparse.ArgumentParser:
         "Both take a clip of any even height and width, and the motion as a second input where the network follows "
         "motion: an estimate of motion cannot be exported. They are compared with the network on three sizes.",
     )
-    made.add_argument("weights", help="a name that lightning models lists, a .safetensors, or a checkpoint")
+    names = " or ".join(WITHOUT_WEIGHTS)
+    made.add_argument(
+        "weights", help=f"a name that lightning models lists, a .safetensors, a checkpoint; or {names}, which have none"
+    )
     made.add_argument("--format", choices=("safetensors", *FORMATS), default="safetensors", help="safetensors")
     made.add_argument("--still", action="store_true", help="nothing moves: no motion as an input, for torch and onnx")
     made.add_argument("-o", "--output", required=True, metavar="FILE", help="name.safetensors, .pt2 or .onnx")
@@ -48,16 +51,15 @@ def export(args: Sequence[str]) -> None:
         raise InputError(f"-o: expected a name that ends in {ending} for {asked.format}, got {asked.output}")
     said = ""
     try:
-        weights = read_weights(asked.weights)
-        check_weights(weights, {**NETWORKS, **ESTIMATORS})
-        if asked.format == "safetensors":
-            write_weights(weights, asked.output)
-        else:
-            kind = NETWORKS.get(weights.settings.get("class"))
-            if kind is None:
-                raise ValueError(f"{asked.weights}: expected weights of a network, got those of an estimator of motion")
-            network = kind.from_pretrained(asked.weights)
+        if asked.format in FORMATS:
+            network = load_network(asked.weights)
             said = f", {export_network(network, asked.output, asked.format, still=asked.still)}"
+        elif asked.weights in WITHOUT_WEIGHTS:
+            raise ValueError(f"{asked.weights}: expected --format torch or onnx, as it has no weights of its own")
+        else:
+            weights = read_weights(asked.weights)
+            check_weights(weights, {**NETWORKS, **ESTIMATORS})
+            write_weights(weights, asked.output)
     except (OSError, ValueError, ImportError) as error:
         raise InputError(str(error)) from error
     size = Path(asked.output).stat().st_size / 2**20

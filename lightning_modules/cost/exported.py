@@ -10,8 +10,16 @@ from pathlib import Path
 
 import torch
 
-from lightning_modules.exporting import FORMATS, OPSET, export_network, exported
-from lightning_modules.networks import CSCSR
+from lightning_modules.exporting import (
+    FORMATS,
+    OPSET,
+    as_exported,
+    difference,
+    example_inputs,
+    export_network,
+    exported,
+    load_network,
+)
 from spikekit.arguments import whole
 from spikekit.bench import cpu_name
 from spikekit.tables import table
@@ -21,7 +29,7 @@ from spikekit.timing import cpu_timer, interleave, ratio
 def main(args: Sequence[str] | None = None) -> None:
     """Print size, difference and time of every format, as ratios to the network, in turns in one process and thread."""
     parser = argparse.ArgumentParser(prog="python -m lightning_modules.cost.exported", description=main.__doc__)
-    parser.add_argument("weights", nargs="+", help="names that lightning models lists")
+    parser.add_argument("weights", nargs="+", help="what lightning export takes")
     parser.add_argument("--side", type=whole(16), default=96, help="of the clip, in sensor pixels; 96")
     parser.add_argument("--rounds", type=whole(1), default=5, help="timings of each; 5")
     parser.add_argument("--formats", nargs="+", choices=FORMATS, default=list(FORMATS), help="torch onnx")
@@ -36,20 +44,18 @@ def main(args: Sequence[str] | None = None) -> None:
 
 @torch.no_grad()
 def _rows(name: str, formats: Sequence[str], side: int, rounds: int) -> list[list[str]]:
-    network = CSCSR.from_pretrained(name)
-    generator = torch.Generator().manual_seed(0)
-    spikes = (torch.rand(1, network.frames, side, side, generator=generator) < 0.3).float()
-    flow = torch.randn(1, 2, 2, side, side, generator=generator)
-    runs, cells = {"network": lambda: network(spikes, flow)}, {}
+    network = load_network(name)
+    module, inputs = as_exported(network), list(example_inputs(network, (side, side)).values())
+    runs, cells = {"network": lambda: module(*inputs)}, {}
     with tempfile.TemporaryDirectory() as folder:
         for kind in formats:
             path, begin = Path(folder, f"network{FORMATS[kind]}"), time.process_time()
             export_network(network, path, kind)
             took, data = time.process_time() - begin, path.read_bytes()
             run = exported(data, kind, threads=1)
-            worst = (run(spikes, flow) - network(spikes, flow)).abs().max().item()
+            worst = difference(run(*inputs), module(*inputs)).item()
             cells[kind] = [f"{len(data) / 2**20:.1f}", f"{took:.0f}", f"{worst:.1g}"]
-            runs[kind] = lambda run=run: run(spikes, flow)
+            runs[kind] = lambda run=run: run(*inputs)
         times = interleave(runs, rounds, cpu_timer(time.process_time))
     found = [[name, "network", "", "", "", "1", f"{1e3 * min(times['network']):.0f}"]]
     for kind in formats:

@@ -94,6 +94,7 @@ class CSCSR(Network):
         times = config.times
         super().__init__(asdict(config), (times[0], config.frames // 2, times[-1]), motion)
         self.config = config
+        self.takes_flow = config.search
         self.times = times
         self.steps = steps
         sensor = config.resolution == "sensor"
@@ -219,7 +220,9 @@ class CSCSR(Network):
             got = f"steps={self.steps}, neighbors={self.config.neighbors}"
             raise ValueError(f"steps, neighbors: expected rounded positions and 4 neighbours to export, got {got}")
         offsets = offsets.expand(-1, features.shape[1], -1, -1, -1)
-        pixels = enlarge(features.flatten(0, 1), self.scale)
+        height, width = features.shape[-2:]
+        mask = bayer_mask(height, width, self.pattern, scale=self.scale, device=features.device, dtype=torch.bool)
+        pixels = self._enlarge(features.flatten(0, 1), mask[color])
         found = bayer_warp_idw(pixels, offsets.flatten(0, 1), self.pattern, color, self.scale, self.steps)
         return found.unflatten(0, features.shape[:2])
 

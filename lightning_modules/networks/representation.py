@@ -6,10 +6,11 @@ from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
+from kornia.core.utils import is_exporting
 from torch import Tensor, nn
 
 from lightning_modules.networks.layers import ConvBlock, ResBlock, channels_last, conv
-from spikekit import tfi
+from spikekit import tfi, tfi_at
 
 
 class SpikeRepresentation(nn.Module):
@@ -124,4 +125,8 @@ class IntervalRepresentation(nn.Module):
 
     def forward(self, spikes: Tensor) -> Tensor:  # noqa: D102
         fired = spikes.any(dim=1, keepdim=True)
-        return (tfi(spikes)[:, self.times] * fired).unsqueeze(2)
+        if is_exporting():  # of the operators of TFI, that of single frames has a path which other programs know
+            light = torch.stack([tfi_at(spikes, n) for n in self.times], dim=1)
+        else:
+            light = tfi(spikes)[:, self.times]
+        return (light * fired).unsqueeze(2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
+from kornia.core.utils import is_exporting
 from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
@@ -87,10 +88,11 @@ class TwoSpanCSCSR(Network):
             flow = torch.stack([flow * self._nearer.to(flow), flow], dim=1)
         few, many = flow.unbind(dim=1)
         share = self.share_of_long(many)
-        if share.min() == 1:
-            return self.long(spikes, many)
-        if share.max() == 0:
-            return self.short(self._middle(spikes), few)
+        if not is_exporting():  # a program does the same for every clip
+            if share.min() == 1:
+                return self.long(spikes, many)
+            if share.max() == 0:
+                return self.short(self._middle(spikes), few)
         rgb = self.short(self._middle(spikes), few)
         share = F.interpolate(share.to(rgb), scale_factor=self.scale, mode="bilinear", align_corners=False)
         return torch.lerp(rgb, self.long(spikes, many), share)
@@ -101,7 +103,7 @@ class TwoSpanCSCSR(Network):
         clocks = flow.new_tensor([middle - first, last - middle]).reshape(2, 1, 1)
         speed = (flow.norm(dim=2) / clocks).amax(dim=1, keepdim=True)
         speed = F.max_pool2d(speed, 2 * _AROUND + 1, 1, _AROUND)
-        radius = min(int(2 * _BLEND), min(speed.shape[-2:]) - 1)
+        radius = min(int(2 * _BLEND), *(side - 1 for side in speed.shape[-2:]))
         speed = gaussian_blur2d(speed, 2 * radius + 1, (_BLEND, _BLEND))
         return ((_FAST - speed) / (_FAST - _SLOW)).clamp(0, 1)
 

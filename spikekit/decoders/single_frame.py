@@ -7,6 +7,7 @@ from itertools import accumulate
 
 import numpy as np
 import torch
+from kornia.core.utils import is_exporting
 from torch import Tensor
 
 from spikekit.check import check_dtype, check_index, check_planes, check_positive, check_whole, default_float
@@ -14,7 +15,6 @@ from spikekit.decoders.dense import cast_light, check_window, interval_dtype
 from spikekit.kernels import operator
 
 
-@operator(lambda spikes, frame: spikes.new_empty(spikes[..., 0, :, :].shape, dtype=interval_dtype(spikes.shape[-3])))
 def _spike_interval_at(spikes: Tensor, frame: int) -> Tensor:
     fired = spikes != 0
     after, gap_after = _look(fired[..., frame:, :, :])
@@ -22,6 +22,11 @@ def _spike_interval_at(spikes: Tensor, frame: int) -> Tensor:
     frames = spikes.shape[-3]
     gap = torch.where(before == frame, gap_after, torch.where(after == frames - frame, gap_before, 0))
     return torch.maximum(before + after + 1, gap).to(interval_dtype(frames))
+
+
+_operator = operator(
+    lambda spikes, frame: spikes.new_empty(spikes[..., 0, :, :].shape, dtype=interval_dtype(spikes.shape[-3]))
+)(_spike_interval_at)
 
 
 def _look(fired: Tensor) -> tuple[Tensor, Tensor]:
@@ -35,7 +40,7 @@ def _look(fired: Tensor) -> tuple[Tensor, Tensor]:
     return first, torch.where(later.any(-3), later.byte().argmax(-3) - first, 0)
 
 
-@_spike_interval_at.register_kernel("cpu")
+@_operator.register_kernel("cpu")
 def _(spikes: Tensor, frame: int) -> Tensor:
     frames = spikes.shape[-3]
     planes = spikes.detach().movedim(-3, 0)
@@ -261,7 +266,9 @@ def tfp_weights(frames: int, frame: int, window: int, order: int) -> tuple[int, 
 
 def _interval(spikes: Tensor, frame: int) -> Tensor:
     frame = _check_frame(spikes, frame)
-    return _spike_interval_at(spikes.detach(), frame)
+    # other programs know no operator of ours
+    find = _spike_interval_at if is_exporting() else _operator
+    return find(spikes.detach(), frame)
 
 
 def _check_frame(spikes: Tensor, frame: int) -> int:

@@ -2,19 +2,44 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from lightning_modules import exporting
 from lightning_modules.__main__ import main
-from lightning_modules.exporting import export_network
+from lightning_modules.exporting import WITHOUT_WEIGHTS, as_exported, difference, example_inputs, export_network
 from lightning_modules.motion import ClassicalFlow, ZeroFlow
-from lightning_modules.networks import CSCSR, ClassicalDecoder
+from lightning_modules.networks import CSCSR, NETWORKS, ClassicalDecoder, RecurrentCSCSR, TwoSpanCSCSR
+from lightning_modules.pretrained import Weights, settings_of, write_weights
 from spikekit import write_spikes
 
+CONFIGS = Path(__file__).parents[2] / "configs"
 TINY = {"width": 4, "representation_width": 4, "features": 1, "stages": 1, "blocks": 1, "end_blocks": 1}
+
+ABLATIONS = {
+    path.stem: yaml.safe_load(path.read_text())["model"]["network"]["init_args"]
+    for path in sorted((CONFIGS / "ablation").glob("*.yaml"))
+}
+BASELINES = {
+    "TSCNN": {"width": 8, "blocks": 1, "low": 1, "high": 1},
+    "RealRawVSR": {"width": 8, "blocks": 2},
+    "SwinIR": {"width": 12, "groups": 1, "layers": 2, "heads": 2},
+    "BasicVSR": {"width": 8, "blocks": 1},
+    "VidarSR": {"width": 8, "features": 4},
+    "SpikeSRNetLike": {"width": 8, "maps": 4, "corrections": 1},
+}
+STARS = {f"{name}*": {**BASELINES[name], "per_channel": True} for name in ("VidarSR", "SpikeSRNetLike")}
+MADE = {
+    **{f"CSCSR {name}": (CSCSR, {**TINY, **settings}) for name, settings in ABLATIONS.items()},
+    "CSCSR sensor": (CSCSR, {**TINY, "resolution": "sensor"}),
+    "RecurrentCSCSR": (RecurrentCSCSR, {**TINY, "fusion_width": 4, "fusion_blocks": 1, "memory": 2}),
+    **{name: (NETWORKS[name.removesuffix("*")], settings) for name, settings in {**BASELINES, **STARS}.items()},
+    **{method: (ClassicalDecoder, {"method": method}) for method in ("tfi", "tfp")},
+}
 
 ALONE = """
 import sys
@@ -45,13 +70,83 @@ def test_a_program_that_differs_from_the_network_is_not_written(tmp_path, monkey
     assert (tmp_path / "a.pt2").read_bytes() == b"a program"
 
 
+def unlike_at_first(network):
+    """A network whose layers that begin at zero say something."""
+    generator = torch.Generator().manual_seed(0)
+    for weight in network.parameters():
+        weight.data += 0.02 * torch.randn(weight.shape, generator=generator)
+    return network.eval()
+
+
+def test_every_network_is_exported_by_a_test():
+    assert {kind for kind, _ in MADE.values()} == set(NETWORKS.values())
+    assert set(WITHOUT_WEIGHTS.values()) == {ClassicalDecoder, TwoSpanCSCSR}
+
+
+def sizes_differ(path, network, kind):
+    """What a program of two other sizes differs by from the network, higher than wide and wider than high."""
+    run = exporting.exported(path.read_bytes(), kind)
+    clips = [example_inputs(network, size).values() for size in ((38, 20), (18, 30))]
+    with torch.no_grad():
+        return max(difference(run(*clip), as_exported(network)(*clip)).item() for clip in clips)
+
+
+@pytest.mark.parametrize("name", ["TSCNN", "SpikeSRNetLike"])
+def test_a_baseline_as_a_program_of_torch(name, tmp_path):
+    kind, settings = MADE[name]
+    network = unlike_at_first(kind(scale=2, **settings))
+    said = export_network(network, tmp_path / "a.pt2", "torch")
+    assert said.startswith("takes spikes (1, 41, H, W), H and W even, within")
+    assert sizes_differ(tmp_path / "a.pt2", network, "torch") < 1e-4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [2, 4])
+@pytest.mark.parametrize("name", MADE)
+def test_every_network_as_onnx(name, scale, tmp_path):
+    pytest.importorskip("onnxruntime", reason="the extra export is not installed")
+    pytest.importorskip("onnxscript", reason="the extra export is not installed")
+    kind, settings = MADE[name]
+    network = unlike_at_first(kind(scale=scale, **settings))
+    export_network(network, tmp_path / "a.onnx", "onnx")
+    assert sizes_differ(tmp_path / "a.onnx", network, "onnx") < 1e-4
+
+
+def test_what_an_export_takes(tmp_path):
+    film = RecurrentCSCSR(scale=2, **MADE["RecurrentCSCSR"][1])
+    cases = {
+        "spikes": CSCSR(scale=2, **TINY, **ABLATIONS["f"]),  # searches nothing, so no motion
+        "spikes flow": CSCSR(scale=2, **TINY),
+        "spikes flow state every": film,
+    }
+    for names, network in cases.items():
+        assert " ".join(example_inputs(network, (16, 20))) == names
+    assert [*example_inputs(film, (16, 20), still=True)] == ["spikes", "state"]
+    independent = CSCSR(scale=2, **TINY, **ABLATIONS["d"])
+    assert example_inputs(independent, (16, 20))["flow"].shape == (1, 3, 2, 2, 16, 20)
+
+
+def test_a_film_by_its_states_is_that_of_the_network():
+    network = unlike_at_first(RecurrentCSCSR(scale=2, **MADE["RecurrentCSCSR"][1]))
+    generator = torch.Generator().manual_seed(1)
+    clips = (torch.rand(1, 3, 41, 16, 20, generator=generator) < 0.3).float()
+    flows = torch.randn(1, 3, 2, 2, 16, 20, generator=generator)
+    step, state, pictures = as_exported(network), torch.zeros(1, 14, 16, 20), []
+    with torch.no_grad():
+        for clip, flow in zip(clips.unbind(1), flows.unbind(1), strict=True):
+            rgb, state = step(clip, flow, state, torch.tensor(10.0))
+            pictures.append(rgb)
+        expected = network(clips, flows, every=10)
+    torch.testing.assert_close(torch.stack(pictures, dim=1), expected)
+
+
 @pytest.mark.slow
 def test_a_program_of_torch_takes_any_even_size(tmp_path):
     network = CSCSR(scale=2, resolution="sensor", motion=ClassicalFlow(), **TINY).eval()
     said = export_network(network, tmp_path / "a.pt2", "torch")
-    assert said.startswith("takes spikes and flow of any even height and width")
+    assert said.startswith("takes spikes (1, 41, H, W) and flow (1, 2, 2, H, W), H and W even, within")
     run = torch.export.load(tmp_path / "a.pt2").module()
-    spikes, flow = (torch.rand(1, 41, 20, 38) < 0.3).float(), 3 * torch.randn(1, 2, 2, 20, 38)
+    spikes, flow = (torch.rand(1, 41, 38, 20) < 0.3).float(), 3 * torch.randn(1, 2, 2, 38, 20)
     with torch.no_grad():
         torch.testing.assert_close(run(spikes, flow), network(spikes, flow), rtol=0, atol=1e-4)
 
@@ -84,8 +179,24 @@ def test_the_picture_of_a_recording_by_onnxruntime_alone(tmp_path):
     assert np.abs(np.load(tmp_path / "a.npy") - expected.numpy()).max() < 1e-4
 
 
+def test_what_has_no_weights_is_exported_by_its_name(tmp_path, capsys):
+    main(["export", "ClassicalDecoder", "--format", "torch", "-o", str(tmp_path / "a.pt2")])
+    assert "takes spikes (1, 41, H, W), H and W even" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="expected --format torch or onnx, as it has no weights"):
+        main(["export", "ClassicalDecoder", "-o", str(tmp_path / "a.safetensors")])
+
+
 @pytest.mark.slow
-def test_a_decoder_as_onnx(tmp_path):
-    pytest.importorskip("onnxruntime", reason="the extra export is not installed")
-    pytest.importorskip("onnxscript", reason="the extra export is not installed")
-    assert export_network(ClassicalDecoder("tfp", 2), tmp_path / "a.onnx", "onnx").startswith("takes spikes of any")
+def test_two_networks_in_one_program(tmp_path):
+    weights = {name: str(tmp_path / f"{name}.safetensors") for name in ("short", "long")}
+    for path, clip in zip(weights.values(), ({"frames": 21, "stride": 1}, {"frames": 41}), strict=True):
+        part = unlike_at_first(CSCSR(scale=2, **clip, **TINY))
+        write_weights(Weights(path, settings_of(part), {}, part.state_dict()), path)
+    network = TwoSpanCSCSR(2, 41, **weights).eval()
+    said = export_network(network, tmp_path / "a.pt2", "torch")
+    assert said.startswith("takes spikes (1, 41, H, W) and flow (1, 2, 2, 2, H, W)")
+    run = torch.export.load(tmp_path / "a.pt2").module()
+    spikes, flow = example_inputs(network, (38, 20)).values()
+    with torch.no_grad():
+        for motion in (0.1 * flow, 0.4 * flow):  # slow, and where both are seen
+            torch.testing.assert_close(run(spikes, motion), network(spikes, motion), rtol=0, atol=1e-4)

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
+from kornia.core.utils import is_exporting
 from torch import Tensor
 
 from lightning_modules.motion import MotionEstimator
@@ -64,11 +65,20 @@ def mirror_to_multiple(planes: Tensor, multiple: int) -> Tensor:
     """
     for axis in (-2, -1):
         length = planes.shape[axis]
-        missing = -length % multiple
-        if missing:
-            at = torch.arange(length + missing, device=planes.device) % (2 * length - 2)
+        whole = (length + multiple - 1) // multiple * multiple
+        if is_exporting() or whole > length:  # a program is for any length
+            at = torch.arange(whole, device=planes.device) % (2 * length - 2)
             planes = planes.index_select(axis, torch.minimum(at, 2 * length - 2 - at))
     return planes
+
+
+def cut_to(planes: Tensor, height: int, width: int) -> Tensor:
+    """Return the first rows and columns of planes (*, H, W), as what was mirrored is cut off again."""
+    if not is_exporting():
+        return planes[..., :height, :width]
+    # copied also where nothing is cut off: a program is for both
+    rows, columns = (torch.arange(length, device=planes.device) for length in (height, width))
+    return planes.index_select(-2, rows).index_select(-1, columns)
 
 
 class Baseline(Network):

@@ -12,6 +12,7 @@ from lightning_modules.networks.baselines.pictures import (
     Baseline,
     Decoder,
     check_decoder,
+    cut_to,
     decode_pictures,
     mirror_to_multiple,
 )
@@ -103,9 +104,9 @@ class RealRawVSR(Baseline):
         fused = self._fuse(*self._align(raws.unsqueeze(2), packed))
         middle = _FRAMES // 2
         rgb = self.enlarge(self.body(fused), raws[:, middle : middle + 1], packed[:, middle])
-        rgb = rgb[..., : self.scale * height, : self.scale * width]
+        rgb = cut_to(rgb, self.scale * height, self.scale * width)
         if self.skip:
-            rgb = rgb + enlarged_raw(raws[:, middle, :height, :width], self.pattern, self.scale)
+            rgb = rgb + enlarged_raw(cut_to(raws[:, middle], height, width), self.pattern, self.scale)
         return rgb.to(spikes.dtype)
 
     def _align(self, raws: Tensor, packed: Tensor) -> tuple[Tensor, Tensor]:

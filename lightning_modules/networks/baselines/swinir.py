@@ -9,7 +9,13 @@ import torch
 from torch import Tensor, nn
 
 from lightning_modules.motion import MotionEstimator
-from lightning_modules.networks.baselines.pictures import Baseline, along_motion, enlarge_picture, mirror_to_multiple
+from lightning_modules.networks.baselines.pictures import (
+    Baseline,
+    along_motion,
+    cut_to,
+    enlarge_picture,
+    mirror_to_multiple,
+)
 from lightning_modules.networks.baselines.skip import begin_at_zero
 from lightning_modules.networks.layers import conv
 from spikekit.check import check_whole
@@ -117,7 +123,7 @@ class SwinIR(Baseline):
         for group in self.groups:
             tokens = group(tokens, hidden)
         deep = self.after(self.norm(tokens).movedim(-1, 1))
-        rgb = self.upsample(shallow + deep)[..., : self.scale * height, : self.scale * width].to(picture)
+        rgb = cut_to(self.upsample(shallow + deep), self.scale * height, self.scale * width).to(picture)
         return rgb + enlarge_picture(picture, self.scale) if self.skip else rgb + self.mean
 
 

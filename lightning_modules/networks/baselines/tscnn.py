@@ -152,7 +152,7 @@ class KnownPixels(nn.Module):
         self.conv = conv(channels, channels)
 
     def forward(self, raw: Tensor, mask: Tensor) -> Tensor:  # noqa: D102
-        known = F.avg_pool2d(mask[None, None], 5, 1, 2, divisor_override=1)
+        known = F.avg_pool2d(mask[None, None], 5, 1, 2).mul(25).round()  # ONNX ignores a divisor
         features = self.partial(raw * mask) / known.clamp(min=1)
         return self.conv(self.norm(features).relu())
 
