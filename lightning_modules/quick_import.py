@@ -1,14 +1,15 @@
-"""Lightning imported without two parts of other packages, half of the time, of which it reads a single name each.
+"""Lightning imported without three parts of other packages, more than half of the time, of which it reads few names.
 
 Whoever asks for anything else of them meanwhile, or for anything at all afterwards, gets the parts themselves.
 
-Python's own ``importlib.util.LazyLoader`` does not serve: a name of both is read while Lightning and torchmetrics are
+Python's own ``importlib.util.LazyLoader`` does not serve: these names are read while Lightning and torchmetrics are
 imported, which would load them at once, and imports inside of these are not ours to move.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
 from types import ModuleType
@@ -16,6 +17,10 @@ from typing import Any
 
 import scipy  # noqa: F401 - before its part
 import torch
+
+_PLOT = "torchmetrics.utilities.plot"  # it imports Matplotlib
+_PLOTS = "plot_confusion_matrix", "plot_curve", "plot_single_or_multi_val"
+_PLOT_TYPES = "_AX_TYPE", "_CMAP_TYPE", "_PLOT_OUT_TYPE"  # which are read in annotations alone
 
 
 class _Later(ModuleType):
@@ -49,6 +54,10 @@ def _disable(function: Any, recursive: bool = True, reason: str | None = None) -
     return torch._disable_dynamo(function, recursive)
 
 
+def _when_called(module: str, name: str) -> Callable[..., Any]:
+    return lambda *args, **options: getattr(import_module(module), name)(*args, **options)
+
+
 def import_lightning() -> None:
     """Import ``pytorch_lightning``, in half of the time.
 
@@ -60,7 +69,8 @@ def import_lightning() -> None:
     if "pytorch_lightning" in sys.modules:
         return
     compiler = {"OptimizedModule": _OptimizedModule, "disable": _disable}
-    known = {"torch._dynamo": compiler, "scipy.signal": {"hamming": None}}
+    plots = {name: _when_called(_PLOT, name) for name in _PLOTS} | dict.fromkeys(_PLOT_TYPES, object)
+    known = {"torch._dynamo": compiler, "scipy.signal": {"hamming": None}, _PLOT: plots}
     later = [_Later(name, **names) for name, names in known.items() if name not in sys.modules]
     sys.modules.update({module.__name__: module for module in later})
     with suppress(ImportError):  # another version may want more of them

@@ -8,7 +8,6 @@ from collections.abc import Callable
 import torch
 import torch.nn.functional as F
 from kornia.color import CFA
-from kornia.core.utils import is_exporting
 from torch import Tensor
 
 from spikekit.color.cfa import PatternModule, bayer_mask
@@ -164,12 +163,8 @@ def _sums(planes: Tensor, rows: int, columns: int) -> Tensor:
     for half in ((rows, 0), (0, columns)):
         if any(half):
             kernel = 2 * half[0] + 1, 2 * half[1] + 1
-            planes = planes.unsqueeze(1)
-            if is_exporting():  # ONNX ignores a divisor
-                planes = F.avg_pool2d(planes, kernel, 1, half) * math.prod(kernel)
-            else:
-                planes = F.avg_pool2d(planes, kernel, 1, half, divisor_override=1)
-            planes = planes.squeeze(1)
+            # a mean times its size: ONNX ignores another divisor
+            planes = F.avg_pool2d(planes.unsqueeze(1), kernel, 1, half).squeeze(1) * max(kernel)
     return planes
 
 
