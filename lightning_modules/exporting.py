@@ -163,7 +163,10 @@ def example_inputs(network: Network, size: tuple[int, int], still: bool = False)
     generator = torch.Generator().manual_seed(0)
     found = {"spikes": (torch.rand(1, network.frames, *size, generator=generator) < 0.3).float()}
     if moves:
-        found["flow"] = torch.randn(network.estimate_flow(found["spikes"]).shape, generator=generator)
+        # The same in each quarter: of many motions, some lie between two positions of the search, and rounding decides.
+        groups = network.estimate_flow(found["spikes"]).shape[:-2]
+        quarters = torch.randn(*groups, 2, 2, generator=generator)
+        found["flow"] = quarters.repeat_interleave(size[0] // 2, -2).repeat_interleave(size[1] // 2, -1)
     if films:
         channels = 3 * network.scale**2 + network.config.memory
         found["state"] = torch.rand(1, channels, *size, generator=generator)
