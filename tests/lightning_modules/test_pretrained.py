@@ -266,6 +266,7 @@ def test_the_list_of_weights_says_what_the_networks_are(configs):
         "small",
         "base",
         "large",
+        "large",
         "huge",
         "huge_long",
         "large_film",

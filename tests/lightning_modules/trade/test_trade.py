@@ -291,8 +291,8 @@ def test_usual_settings_are_those_of_the_weights_that_are_shipped(monkeypatch, t
     assert set(tscnn[6:]) == {"TFI", *(name for name in settings if name.startswith("TFP"))}
     del shipped["spike2flow"]
     assert not [setting for setting in usual_settings(4) if "Spike2Flow" in setting.args]
-    shipped["cscsr_large_film_x4"] = shipped["cscsr_tiny_x4"]
-    assert not [setting for setting in usual_settings(4) if "film" in setting.name]
+    shipped["cscsr_large_film_x4"] = shipped["cscsr_large_noisy_x4"] = shipped["cscsr_tiny_x4"]
+    assert not [setting for setting in usual_settings(4) if "film" in setting.name or "noisy" in setting.name]
     filmed = [setting.name for setting in usual_settings(4, film=True)]
     networks = [name for name in filmed if name.startswith("cscsr_") and "," not in name]
     assert "cscsr_large_film_x4" in networks
