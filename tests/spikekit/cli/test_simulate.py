@@ -541,7 +541,7 @@ def test_grey_deep_and_transparent(tmp_path, monkeypatch):
         (["film", "--scale", "2", "--plan", "most"], 2, "expected scene, everything or a number"),
         (["film", "--scale", "2", "--interpolation", "Flaw"], 2, "--interpolation: Flaw cannot be made"),
         (["film", "--scale", "2", "--interpolation", "Blend(3)"], 2, "cannot be made (arguments need names)"),
-        (["film", "--scale", "2", "--dark-current", "-1"], 2, "--dark-current: expected a finite number"),
+        (["film", "--scale", "2", "--dark-current", "-1"], 2, "--dark-current: expected 0 to 1, got -1.0"),
         (["film", "--scale", "2", "--hot", "much"], 2, "argument --hot: expected a number, got much"),
         (["film/f0.png", "--scale", "2", "--all"], 2, "one picture, which has no end"),
         (["nothing", "--scale", "2"], 1, "nothing: no such file or folder"),
