@@ -83,7 +83,7 @@ def usual_settings(
         film: pictures of films are measured: those of all networks, for films or not, as they are and without motion.
     """
     shipped = shipped_weights()
-    # Those for longer clips or a noisy sensor would need other scenes; those for films are the same as others on one clip.
+    # Longer clips and noisy sensors would need other scenes; a network for films is another's equal on one clip.
     left_out = ("_long_", "_noisy_", *(() if film else ("_film_",)))
     names = [name for name in shipped if name.endswith(f"_x{scale}") and not any(part in name for part in left_out)]
     names.sort(key=lambda name: (name != _REFERENCE.format(scale=scale), shipped[name].stat().st_size, name))
