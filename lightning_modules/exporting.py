@@ -96,8 +96,9 @@ def export_network(network: Network, path: str | Path, kind: str, *, still: bool
     ``network.estimate_flow(spikes)`` gives it, where the network follows motion. Its output is ``rgb``,
     (1, 3, s H, s W), not clamped.
 
-    A network for films has a second output, ``state``, (1, C, H, W), and takes that of the key frame before, zeros
-    where there is none. Beside a flow it takes ``every``: how many clocks ago that key frame was, a float32.
+    A network for films has a second output, ``next_state``, (1, C, H, W), and takes that of the key frame before as
+    ``state``, zeros where there is none. Beside a flow it takes ``every``: how many clocks ago that key frame was, a
+    float32.
 
     Args:
         network: any of :mod:`lightning_modules.networks`; what cannot be followed is refused.
@@ -124,7 +125,7 @@ def export_network(network: Network, path: str | Path, kind: str, *, still: bool
             if films:
                 clips[-1]["state"] = torch.zeros_like(clips[-1]["state"])  # as a film begins
             program = _program(module, clips[0])
-            data = (_onnx if kind == "onnx" else _torch)(program, list(clips[0]), ["rgb", "state"][: 1 + films])
+            data = (_onnx if kind == "onnx" else _torch)(program, list(clips[0]), ["rgb", "next_state"][: 1 + films])
             run = exported(data, kind)
             # of a tensor, as max() of numbers forgets NaN
             tried = [difference(run(*clip.values()), module(*clip.values())) for clip in clips[1:]]

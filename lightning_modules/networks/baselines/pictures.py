@@ -67,7 +67,9 @@ def mirror_to_multiple(planes: Tensor, multiple: int) -> Tensor:
         length = planes.shape[axis]
         whole = (length + multiple - 1) // multiple * multiple
         if is_exporting() or whole > length:  # a program is for any length
-            at = torch.arange(whole, device=planes.device) % (2 * length - 2)
+            at = torch.arange(whole, device=planes.device)
+            if not is_exporting():  # whose lengths are 16 or more, and less than that is missing
+                at %= 2 * length - 2
             planes = planes.index_select(axis, torch.minimum(at, 2 * length - 2 - at))
     return planes
 

@@ -5,7 +5,8 @@ from lightning_modules.shipped import list_pretrained
 from lightning_modules.trade.adaptive import main
 from lightning_modules.trade.halo import measure_halo
 
-SHIPPED = [weights for weights in list_pretrained() if weights.scale]
+# on one clip, a network for films is that of single clips, which is in the list
+SHIPPED = [weights for weights in list_pretrained() if weights.scale and "_film_" not in weights.name]
 
 
 @pytest.mark.parametrize("weights", SHIPPED, ids=lambda weights: weights.name)
