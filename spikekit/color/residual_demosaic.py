@@ -8,7 +8,6 @@ from collections.abc import Callable
 import torch
 import torch.nn.functional as F
 from kornia.color import CFA
-from kornia.core.utils import is_exporting
 from torch import Tensor
 
 from spikekit.color.cfa import PatternModule, bayer_mask
@@ -173,9 +172,8 @@ def _with_border(planes: Tensor) -> Tensor:
     for axis in (-2, -1):
         length = planes.shape[axis]
         at = torch.arange(-_BORDER, length + _BORDER, device=planes.device)
-        # ONNX divides by no length; of a side of 12 pixels or more, the border is mirrored once at each end
-        at = at.abs() if is_exporting() else at % (2 * length - 2)
-        planes = planes.index_select(axis, torch.minimum(at, 2 * length - 2 - at).abs())
+        at = at.remainder(torch.full((1,), 2 * length - 2, device=planes.device))  # ONNX takes tensors alone
+        planes = planes.index_select(axis, torch.minimum(at, 2 * length - 2 - at))
     return planes
 
 
