@@ -150,7 +150,7 @@ class StillClips(Dataset):
         generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
         noise = self.noise or SensorNoise(photons=self.photons)
         if self.noise and self.augment:
-            noise = noise.times(1 - rng.uniform())
+            noise = noise.scaled(1 - rng.uniform())
         return simulate_spikes(light, noise=noise, generator=generator)
 
     def scene(self, index: int) -> Scene:

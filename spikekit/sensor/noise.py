@@ -120,7 +120,7 @@ class SensorNoise:
         if self.calibration is not None and drawn:
             raise ValueError(f"{drawn[0]}: expected 0, as the calibration has it, got {getattr(self, drawn[0])}")
 
-    def times(self, share: float) -> SensorNoise:
+    def scaled(self, share: float) -> SensorNoise:
         """Return the noise of a better sensor: a share of all that is left to chance.
 
         Args:
@@ -131,7 +131,7 @@ class SensorNoise:
             ValueError: another share.
 
         Example:
-            >>> SensorNoise(photons=3000, gain_spread=0.06).times(0.5)
+            >>> SensorNoise(photons=3000, gain_spread=0.06).scaled(0.5)
             SensorNoise(photons=6000.0, dark_current=0.0, dark_spread=0.0, gain_spread=0.03, hot=0.0, dead=0.0)
         """
         if not 0 < share <= 1:

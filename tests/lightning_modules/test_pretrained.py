@@ -98,6 +98,16 @@ def test_weights_serve_with_any_way_of_joining_motion(fusion, file):
     torch.testing.assert_close(other(SPIKES), network(motion=ZeroFlow())(SPIKES))
 
 
+def test_a_file_names_no_class_from_outside_the_package(tmp_path):
+    outside = type("Foreign", (CSCSR,), {})
+    found = read_weights("cscsr_tiny_x4")
+    path = tmp_path / "foreign.safetensors"
+    write_weights(replace(found, settings={**found.settings, "class": "Foreign"}), path)
+    with pytest.raises(ValueError, match="expected weights of CSCSR, got those of Foreign"):
+        CSCSR.from_pretrained(path)
+    assert isinstance(outside.from_pretrained(path), outside)  # by its own name
+
+
 def test_weights_of_something_else(file, tmp_path):
     with pytest.raises(ValueError, match="expected weights of ClassicalDecoder, got those of CSCSR"):
         ClassicalDecoder.from_pretrained(file)
