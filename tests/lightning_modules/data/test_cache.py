@@ -7,7 +7,7 @@ import sys
 import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from inspect import getsource
 
 import numpy as np
@@ -107,9 +107,15 @@ for line in sys.stdin:
 @contextmanager
 def writers(folder):
     command = [sys.executable, "-c", WRITERS, str(folder)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-        yield process
-        process.stdin.close()
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, **pipes, start_new_session=True) as process:
+        try:
+            yield process
+            process.stdin.close()
+            process.wait(60)
+        finally:  # a test that fails does not wait for a writer that would go on
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
 
 
 def begin(process, rounds):
@@ -118,10 +124,20 @@ def begin(process, rounds):
     return int(process.stdout.readline())
 
 
+def _seen(folder):
+    """The files in a folder; one that is written anew under the same name is another."""
+    found = set()
+    for path in folder.rglob("*"):
+        with suppress(FileNotFoundError):
+            stat = path.stat()
+            found.add((path, stat.st_ino, stat.st_mtime_ns))
+    return found
+
+
 def _wait_for_a_new_file(folder, before):
     """However busy the machine is."""
     for _ in range(60_000):
-        if set(folder.rglob("*")) - before:
+        if _seen(folder) - before:
             return
         time.sleep(0.001)
     pytest.fail("nothing was written within a minute")
@@ -132,7 +148,7 @@ def test_killed_writers_leave_nothing_that_is_believed(tmp_path):
     expected = [arrays(seed=n, size=200_000) for n in range(3)]
     with writers(tmp_path) as process:
         for _ in range(25):
-            before = set(tmp_path.rglob("*"))
+            before = _seen(tmp_path)
             writer = begin(process, 10**6)
             _wait_for_a_new_file(tmp_path, before)
             time.sleep(rng.choice([0, 0.001, 0.01, 0.05]))

@@ -135,9 +135,13 @@ def test_a_full_disk_is_one_line_and_no_film(words, tmp_path, monkeypatch):
     assert len(read_video(tmp_path / "film.mp4")) == 6
 
 
-def command(words, *more, **how):
-    line = [sys.executable, "-m", "lightning_modules", *map(str, [*words, *more])]
-    return subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, **how)
+def command(words, *more):
+    return [sys.executable, "-m", "lightning_modules", *map(str, [*words, *more])]
+
+
+def run(words, *more):
+    done = subprocess.run(command(words, *more), capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.fixture(name="carries_on")
@@ -176,15 +180,14 @@ def test_a_network_carries_on_through_a_film_and_where_it_was_stopped(carries_on
 @pytest.mark.slow
 def test_a_network_that_carries_on_is_the_same_in_two_processes(carries_on, tmp_path):
     for name, devices in (("one", 1), ("two", 2)):
-        with command(carries_on, tmp_path / name, "--model.future", 1, "--trainer.devices", devices) as process:
-            assert process.wait() == 0, process.stderr.read()
+        run(carries_on, tmp_path / name, "--model.future", 1, "--trainer.devices", devices)
     assert pictures(tmp_path / "one") == pictures(tmp_path / "two")
 
 
 @pytest.mark.slow
 def test_a_killed_film_goes_on(words, tmp_path):
     words = [*words, tmp_path / "film.mp4", "--data.every", 1]
-    with command(words) as process:
+    with subprocess.Popen(command(words), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         begin = time.monotonic()
         while not any((tmp_path / "film.mp4.frames").glob("*.png")) and time.monotonic() < begin + 120:
             time.sleep(0.01)
@@ -194,25 +197,20 @@ def test_a_killed_film_goes_on(words, tmp_path):
     assert not (tmp_path / "film.mp4").exists()
     for path in (tmp_path / "film.mp4.frames").glob("*.png"):
         assert read_picture(path).shape == (3, 24, 32)
-    with command(words) as process:
-        assert process.wait() == 0, process.stderr.read()
+    run(words)
     assert len(read_video(tmp_path / "film.mp4")) == 59
     assert sorted(path.name for path in tmp_path.iterdir()) == ["clip.npz", "film.mp4"]
 
 
 @pytest.mark.slow
 def test_two_processes_make_what_one_makes(words, tmp_path):
-    with command(words, tmp_path / "one") as process:
-        assert process.wait() == 0, process.stderr.read()
-    with command(words, tmp_path / "two", "--trainer.devices", 2) as process:
-        assert process.wait() == 0, process.stderr.read()
+    run(words, tmp_path / "one")
+    run(words, tmp_path / "two", "--trainer.devices", 2)
     assert pictures(tmp_path / "one") == pictures(tmp_path / "two")
     (tmp_path / "two" / "frame_000040.png").unlink()  # fewer pictures than processes
-    with command(words, tmp_path / "two", "--trainer.devices", 2) as process:
-        assert process.wait() == 0, process.stderr.read()
+    run(words, tmp_path / "two", "--trainer.devices", 2)
     assert pictures(tmp_path / "one") == pictures(tmp_path / "two")
-    with command(words, tmp_path / "film.mp4", "--trainer.devices", 2) as process:
-        assert process.wait() == 0, process.stderr.read()
+    run(words, tmp_path / "film.mp4", "--trainer.devices", 2)
     assert len(read_video(tmp_path / "film.mp4")) == 6
 
 
