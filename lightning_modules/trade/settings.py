@@ -13,7 +13,7 @@ from lightning_modules.cli.errors import UsageError
 from lightning_modules.cost.setting import Setting
 from lightning_modules.inference.presets import Preset
 from lightning_modules.networks import Network
-from lightning_modules.shipped import shipped_weights
+from lightning_modules.shipped import find_shipped, list_pretrained
 from spikekit.decoders.methods import DECODERS
 
 
@@ -71,9 +71,9 @@ def usual_settings(
 ) -> list[Setting]:
     """Return what is measured where nothing else is asked for.
 
-    The networks whose weights come with the package, as they are, the reference first and then by size; then the same
-    without motion and as a self-ensemble, the reference faster and more exact in other ways, and the largest as larger
-    self-ensembles; then the decoders without learning.
+    The networks whose weights come with the package, as they are: the reference first, then the others by their
+    multiplications. Then the same without motion and as a self-ensemble, the reference faster and more exact in other
+    ways, and the largest as larger self-ensembles; then the decoders without learning.
 
     Args:
         scale: super-resolution factor.
@@ -82,16 +82,15 @@ def usual_settings(
         network: that network, of which only what it has arguments for is changed.
         film: pictures of films are measured: those of all networks, for films or not, as they are and without motion.
     """
-    shipped = shipped_weights()
     # Longer clips and noisy sensors would need other scenes; a network for films is another's equal on one clip.
     left_out = ("_long_", "_noisy_", *(() if film else ("_film_",)))
-    names = [name for name in shipped if name.endswith(f"_x{scale}") and not any(part in name for part in left_out)]
-    names.sort(key=lambda name: (name != _REFERENCE.format(scale=scale), shipped[name].stat().st_size, name))
-    largest = max(names, key=lambda name: shipped[name].stat().st_size, default=None)
-    networks = {name: Preset(name) for name in names}
+    shipped = [weights for weights in list_pretrained(scale) if not any(part in weights.name for part in left_out)]
+    shipped.sort(key=lambda weights: (weights.name != _REFERENCE.format(scale=scale), weights.macs))
+    largest = max(shipped, key=lambda weights: weights.macs).name if shipped else None
+    networks = {weights.name: Preset(weights.name) for weights in shipped}
     if own:
         networks, largest = {"own weights": Preset()}, "own weights"
-    learned = _LEARNED if "spike2flow" in shipped else []
+    learned = _LEARNED if find_shipped("spike2flow") else []
     lacking: set[str] = set()
     if network is not None:
         lacking = {"motion", "steps"} - signature(type(network)).parameters.keys()

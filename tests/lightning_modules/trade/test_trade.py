@@ -26,6 +26,7 @@ from lightning_modules.metrics.flicker import film_flicker
 from lightning_modules.motion import Spike2Flow
 from lightning_modules.networks import CSCSR, TSCNN
 from lightning_modules.pretrained import settings_of
+from lightning_modules.shipped import Pretrained
 from lightning_modules.trade import cli, energy, measure
 from lightning_modules.trade.films import film_scenes
 from lightning_modules.trade.pareto import pareto_front
@@ -239,27 +240,19 @@ def test_usual_settings_all_run_on_weights_of_ones_own(shared, checkpoint, tmp_p
 
 
 def test_usual_settings_are_those_of_the_weights_that_are_shipped(monkeypatch, tmp_path):
-    shipped = {
-        name: tmp_path / name
-        for name in (
-            "spike2flow",
-            "cscsr_small_x2",
-            "cscsr_huge_x4",
-            "cscsr_base_x4",
-            "cscsr_small_x4",
-            "cscsr_tiny_x4",
-        )
-    }
-    for place, path in enumerate(shipped.values()):
-        path.write_bytes(bytes(99 - place))
-    monkeypatch.setattr("lightning_modules.trade.settings.shipped_weights", lambda: shipped)
+    macs = {"spike2flow": 1, "cscsr_small_x2": 3, "cscsr_huge_x4": 5, "cscsr_base_x4": 4, "cscsr_small_x4": 3}
+    shipped = [
+        Pretrained(name, tmp_path / name, scale=int(name[-1]) if "_x" in name else None, macs=count)
+        for name, count in {**macs, "cscsr_tiny_x4": 2}.items()
+    ]
+    monkeypatch.setattr("lightning_modules.shipped._index", lambda: tuple(shipped))
     settings = {setting.name: setting for setting in usual_settings(4)}
     assert list(settings)[:4] == [
         "cscsr_base_x4",
         "cscsr_tiny_x4",
         "cscsr_small_x4",
         "cscsr_huge_x4",
-    ]  # the reference, then by size
+    ]  # the reference, then by their multiplications
     assert "Spike2Flow" in settings["cscsr_base_x4, Spike2Flow"].args
     assert settings["cscsr_base_x4, no tiles"].preset == Preset("cscsr_base_x4", tile=0)
     assert settings["cscsr_tiny_x4, self-ensemble of 2"].args == [
@@ -289,9 +282,9 @@ def test_usual_settings_are_those_of_the_weights_that_are_shipped(monkeypatch, t
     ensembles = [f"own weights, self-ensemble of {views}" for views in (2, 4, 8)]
     assert tscnn[:6] == ["own weights", *ensembles, "own weights, bf16-true", "own weights, bf16-mixed"]
     assert set(tscnn[6:]) == {"TFI", *(name for name in settings if name.startswith("TFP"))}
-    del shipped["spike2flow"]
+    del shipped[0]
     assert not [setting for setting in usual_settings(4) if "Spike2Flow" in setting.args]
-    shipped["cscsr_large_film_x4"] = shipped["cscsr_large_noisy_x4"] = shipped["cscsr_tiny_x4"]
+    shipped += [replace(shipped[-1], name=f"cscsr_large_{made_for}_x4") for made_for in ("film", "noisy")]
     assert not [setting for setting in usual_settings(4) if "film" in setting.name or "noisy" in setting.name]
     filmed = [setting.name for setting in usual_settings(4, film=True)]
     networks = [name for name in filmed if name.startswith("cscsr_") and "," not in name]
