@@ -30,6 +30,8 @@ extensions = [
 exclude_patterns = ["_build", "examples", "sg_execution_times.rst", "gallery/sg_execution_times.rst"]
 html_math_renderer = "mathml"  # browsers draw it themselves: the pages need no network
 html_theme = "furo"
+html_static_path = ["_static"]
+html_css_files = ["style.css"]
 html_title = f"spikekit {version}"
 
 # A name in a docstring that leads nowhere is an error, except where it belongs to another project.
