@@ -7,7 +7,7 @@ lists them. Arguments are those of ``CSCSR.from_pretrained``.
 from functools import partial
 
 from lightning_modules.networks import CSCSR
-from lightning_modules.shipped import list_pretrained
+from lightning_modules.storage.shipped import list_pretrained
 
 dependencies = ["torch", "kornia", "numpy", "safetensors"]
 

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lightning_modules.networks import CSCSR
-    from lightning_modules.shipped import list_pretrained
+    from lightning_modules.storage.shipped import list_pretrained
     from lightning_modules.tasks.super_resolution import SuperResolution
 
 __all__ = ["CSCSR", "SuperResolution", "list_pretrained"]
 
 # where what the package offers is
-_HOME = {"CSCSR": "networks", "SuperResolution": "tasks.super_resolution", "list_pretrained": "shipped"}
+_HOME = {"CSCSR": "networks", "SuperResolution": "tasks.super_resolution", "list_pretrained": "storage.shipped"}
 
 
 class _OldNames:

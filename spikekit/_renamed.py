@@ -65,6 +65,14 @@ RENAMED = {
     "lightning_modules.trade.runner": "lightning_modules.cost.runner",
     "lightning_modules.quality": "lightning_modules.metrics.image",
     "lightning_modules.flow_metrics": "lightning_modules.metrics.flow",
+    "lightning_modules.pretrained": "lightning_modules.storage.pretrained",
+    "lightning_modules.shipped": "lightning_modules.storage.shipped",
+    "lightning_modules.stored_settings": "lightning_modules.storage.settings",
+    "lightning_modules.checkpoint": "lightning_modules.storage.checkpoint",
+    "lightning_modules.error_model": "lightning_modules.storage.error_model",
+    "lightning_modules.training_state": "lightning_modules.tasks.training_state",
+    "lightning_modules.exporting": "lightning_modules.inference.export",
+    "lightning_modules.charts": "lightning_modules.cost.charts",
 }
 
 

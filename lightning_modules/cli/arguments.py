@@ -13,8 +13,8 @@ import yaml
 from lightning_modules.inference.presets import Preset
 from lightning_modules.motion import ESTIMATORS, MotionEstimator
 from lightning_modules.networks import NETWORKS
-from lightning_modules.pretrained import check_weights, read_weights
-from lightning_modules.stored_settings import own_class
+from lightning_modules.storage.pretrained import check_weights, read_weights
+from lightning_modules.storage.settings import own_class
 from spikekit.arguments import one_line
 
 WEIGHTS = "--model.weights", "--model.init_args.weights"

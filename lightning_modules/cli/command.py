@@ -22,7 +22,6 @@ from pytorch_lightning.loggers import TensorBoardLogger
 from pytorch_lightning.utilities import rank_zero_only
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
 
-from lightning_modules.checkpoint import read_checkpoint
 from lightning_modules.cli import prediction
 from lightning_modules.cli.arguments import classes_first, flatten, options, whole_counts, with_network_of_weights
 from lightning_modules.cli.errors import InputError, UsageError
@@ -34,13 +33,14 @@ from lightning_modules.cli.renamed_overlays import with_current_overlays
 from lightning_modules.data import FilmScenes, Recording, StillScenes
 from lightning_modules.motion import Spike2Flow
 from lightning_modules.networks import CSCSR
-from lightning_modules.pretrained import check_settings
+from lightning_modules.storage.checkpoint import read_checkpoint
+from lightning_modules.storage.pretrained import check_settings
 from lightning_modules.tasks.base import Learner
 from lightning_modules.tasks.checkpoint_io import Checkpoints
 from lightning_modules.tasks.optical_flow import FlowTraining
 from lightning_modules.tasks.predictions import is_film, pictures_folder
 from lightning_modules.tasks.super_resolution import SuperResolution
-from lightning_modules.training_state import Begun, check_like_fresh, check_training_state, restoring
+from lightning_modules.tasks.training_state import Begun, check_like_fresh, check_training_state, restoring
 from spikekit.arguments import one_line
 from spikekit.io import PictureError, SpikeFileError, VideoError
 from spikekit.io.video import PICTURE_ENDINGS, VIDEO_ENDINGS

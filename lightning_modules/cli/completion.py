@@ -13,7 +13,7 @@ from lightning_modules.cli.errors import UsageError
 from lightning_modules.cli.short_help import VERBS
 from lightning_modules.motion import ESTIMATORS
 from lightning_modules.networks import NETWORKS
-from lightning_modules.shipped import list_pretrained
+from lightning_modules.storage.shipped import list_pretrained
 from spikekit.arguments import UsageError as SpikekitUsageError
 from spikekit.completion import completion
 from spikekit.io.cameras import CAMERAS

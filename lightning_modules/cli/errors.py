@@ -47,7 +47,7 @@ def _of_users() -> tuple[type[Exception], ...]:
     from pytorch_lightning.utilities.exceptions import MisconfigurationException
 
     from lightning_modules.cli.folder_lock import FolderError
-    from lightning_modules.pretrained import CheckpointMismatchError
+    from lightning_modules.storage.pretrained import CheckpointMismatchError
     from spikekit import SpikeFileError, VideoError
     from spikekit.io import PictureError
 

@@ -8,10 +8,10 @@ from pathlib import Path
 from time import perf_counter
 
 from lightning_modules.cli.errors import InputError, VerbParser
-from lightning_modules.exporting import FORMATS, WITHOUT_WEIGHTS, export_network, load_network
+from lightning_modules.inference.export import FORMATS, WITHOUT_WEIGHTS, export_network, load_network
 from lightning_modules.motion import ESTIMATORS
 from lightning_modules.networks import NETWORKS
-from lightning_modules.pretrained import check_weights, read_weights, write_weights
+from lightning_modules.storage.pretrained import check_weights, read_weights, write_weights
 from spikekit.timing import duration
 
 

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 
 from lightning_modules.cli.errors import VerbParser
-from lightning_modules.shipped import list_pretrained
+from lightning_modules.storage.shipped import list_pretrained
 from spikekit.tables import table
 
 _LEGEND = """

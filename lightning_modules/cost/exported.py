@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from lightning_modules.exporting import (
+from lightning_modules.inference.export import (
     FORMATS,
     OPSET,
     as_exported,

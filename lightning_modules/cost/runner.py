@@ -17,7 +17,7 @@ from lightning_modules.cli.errors import InputError, UsageError
 from lightning_modules.cli.rehearsal import Rehearsal, argument_names, mistake, resolved
 from lightning_modules.inference.film import FilmFrame, film
 from lightning_modules.networks import RecurrentCSCSR
-from lightning_modules.pretrained import load_weights, read_weights
+from lightning_modules.storage.pretrained import load_weights, read_weights
 from spikekit.arguments import one_line
 
 # What the clips of a test do not depend on; and frames, as a network of fewer gets the middle of the clips of all.

@@ -16,7 +16,7 @@ from lightning_modules import motion as estimators
 from lightning_modules.inference.predict import predict
 from lightning_modules.inference.tiles import FAR, TILE
 from lightning_modules.networks import CSCSR, ClassicalDecoder, Network
-from lightning_modules.shipped import find_shipped
+from lightning_modules.storage.shipped import find_shipped
 from spikekit.arguments import one_line
 from spikekit.timing import timer_of
 

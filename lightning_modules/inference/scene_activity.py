@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from kornia.filters import filter2d_separable, get_gaussian_kernel1d
 from torch import Tensor
 
-from lightning_modules.error_model import ErrorModel
+from lightning_modules.storage.error_model import ErrorModel
 from spikekit import bayer_mask
 from spikekit.check import check_planes
 from spikekit.sensor.quantization_noise import flicker

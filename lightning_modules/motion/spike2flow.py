@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lightning_modules.motion.estimator import MotionEstimator, split_any_size
 from lightning_modules.motion.recurrent import RecurrentFlow
-from lightning_modules.pretrained import check_weights, load_weights, read_weights
+from lightning_modules.storage.pretrained import check_weights, load_weights, read_weights
 from spikekit import spike_interval
 from spikekit.check import check_planes
 

@@ -10,10 +10,10 @@ import torch
 from kornia.core.utils import is_exporting
 from torch import Tensor, nn
 
-from lightning_modules.error_model import ErrorModel
 from lightning_modules.motion import ESTIMATORS, ClassicalFlow, MotionEstimator
-from lightning_modules.pretrained import check_weights, load_weights, read_weights
-from lightning_modules.stored_settings import own_class
+from lightning_modules.storage.error_model import ErrorModel
+from lightning_modules.storage.pretrained import check_weights, load_weights, read_weights
+from lightning_modules.storage.settings import own_class
 from spikekit.check import check_planes
 
 

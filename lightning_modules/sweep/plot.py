@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
-from lightning_modules.charts import BLUE, ORANGE, chart
+from lightning_modules.cost.charts import BLUE, ORANGE, chart
 from lightning_modules.sweep.table import Row, differences, reference, score_names
 
 

@@ -17,10 +17,10 @@ from pytorch_lightning import Callback, LightningModule, Trainer
 from pytorch_lightning.callbacks import ModelCheckpoint, Timer
 from torch.utils.flop_counter import FlopCounterMode
 
-from lightning_modules.checkpoint import read_checkpoint
 from lightning_modules.cli.command import Command, run
 from lightning_modules.cli.errors import as_one_line
 from lightning_modules.cli.processes import end_with_parent
+from lightning_modules.storage.checkpoint import read_checkpoint
 from lightning_modules.sweep.budget import has_end, with_budget
 from lightning_modules.sweep.state import PROGRESS, RESULT, read_json, read_yaml, write_json
 from spikekit.io.whole_file import whole_file

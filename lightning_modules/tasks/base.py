@@ -10,8 +10,8 @@ from pytorch_lightning import Callback, LightningModule
 from pytorch_lightning.cli import LRSchedulerCallable, OptimizerCallable
 from torch import Tensor, nn
 
-from lightning_modules.checkpoint import read_checkpoint
-from lightning_modules.pretrained import check_settings, motion_of, settings_of
+from lightning_modules.storage.checkpoint import read_checkpoint
+from lightning_modules.storage.pretrained import check_settings, motion_of, settings_of
 
 
 def step_schedule(optimizer: torch.optim.Optimizer) -> torch.optim.lr_scheduler.StepLR:

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from lightning_fabric.plugins import TorchCheckpointIO
 
-from lightning_modules.checkpoint import read_checkpoint
+from lightning_modules.storage.checkpoint import read_checkpoint
 from spikekit.io.whole_file import whole_file
 
 #: of the state of a ModelCheckpoint: files that it may go on to remove

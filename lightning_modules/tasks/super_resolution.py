@@ -18,7 +18,7 @@ from lightning_modules.inference.presets import Preset, choose
 from lightning_modules.inference.self_ensemble import COUNTS
 from lightning_modules.inference.tiles import TILE
 from lightning_modules.networks import ClassicalDecoder, Network, RecurrentCSCSR
-from lightning_modules.pretrained import load_weights, read_weights, with_own_motion
+from lightning_modules.storage.pretrained import load_weights, read_weights, with_own_motion
 from lightning_modules.tasks.base import Learner, step_schedule
 from lightning_modules.tasks.callbacks import TestReport, ValidationPictures, middle_clip, middle_half
 from spikekit import psnr, ssim

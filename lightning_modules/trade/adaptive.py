@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 
 from lightning_modules.data.pictures import cached_picture, embedded_pictures, folder_pictures, split_pictures
-from lightning_modules.error_model import write_error_model
 from lightning_modules.inference.scene_activity import look, required
 from lightning_modules.inference.tiles import forward_in_tiles
 from lightning_modules.networks import CSCSR, Network
-from lightning_modules.pretrained import read_weights
+from lightning_modules.storage.error_model import write_error_model
+from lightning_modules.storage.pretrained import read_weights
 from lightning_modules.trade import error_fit
 from lightning_modules.trade.error_fit import Clip, Errors, fit_error_model, loss, make_clips, measure_errors
 from lightning_modules.trade.halo import measure_halo

@@ -13,10 +13,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lightning_modules.data.pictures import cached_picture
-from lightning_modules.error_model import ErrorModel
 from lightning_modules.inference.scene_activity import CELL, Activity, Look, expected_errors, look, required
 from lightning_modules.inference.scene_activity import scene_activity as measure_activity
 from lightning_modules.networks import Network
+from lightning_modules.storage.error_model import ErrorModel
 from spikekit.scenes.analytic import Layer, Motion, Scene
 from spikekit.sensor.simulate import simulate_spikes
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from lightning_modules.charts import BLUE, GREY, chart
+from lightning_modules.cost.charts import BLUE, GREY, chart
 from lightning_modules.cost.measure import Row
 from lightning_modules.trade.table import figures, front
 

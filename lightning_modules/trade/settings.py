@@ -13,7 +13,7 @@ from lightning_modules.cli.errors import UsageError
 from lightning_modules.cost.setting import Setting
 from lightning_modules.inference.presets import Preset
 from lightning_modules.networks import Network
-from lightning_modules.shipped import find_shipped, list_pretrained
+from lightning_modules.storage.shipped import find_shipped, list_pretrained
 from spikekit.decoders.methods import DECODERS
 
 

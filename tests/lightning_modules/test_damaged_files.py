@@ -15,17 +15,17 @@ import torch
 import yaml
 from pytorch_lightning.callbacks import ModelCheckpoint
 
-from lightning_modules.checkpoint import read_checkpoint
 from lightning_modules.cli.arguments import whole_counts, with_network_of_weights
 from lightning_modules.cli.errors import InputError
 from lightning_modules.data.cache import ClipCache, _digest
-from lightning_modules.error_model import read_error_model
 from lightning_modules.inference import presets
+from lightning_modules.storage.checkpoint import read_checkpoint
+from lightning_modules.storage.error_model import read_error_model
 from lightning_modules.sweep.state import PROGRESS, RESULT, read_json, read_yaml
 from lightning_modules.sweep.table import collect, markdown, write_csv
 from lightning_modules.sweep.trials import Trial
 from lightning_modules.sweep.view import _standing
-from lightning_modules.training_state import check_like_fresh, check_training_state
+from lightning_modules.tasks.training_state import check_like_fresh, check_training_state
 
 WEIGHTS = Path(presets.__file__).parents[1] / "weights"
 

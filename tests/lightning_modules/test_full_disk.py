@@ -9,16 +9,16 @@ import pytest
 import torch
 import yaml
 
-from lightning_modules import exporting
 from lightning_modules.__main__ import main
-from lightning_modules.charts import chart
 from lightning_modules.cli.command import Configuration
+from lightning_modules.cost.charts import chart
 from lightning_modules.cost.measure import Row as Measured
 from lightning_modules.cost.measure import Timed
 from lightning_modules.data.cache import ClipCache
-from lightning_modules.error_model import FILE, ErrorModel, write_error_model
+from lightning_modules.inference import export
 from lightning_modules.networks import ClassicalDecoder
-from lightning_modules.pretrained import Weights, write_weights
+from lightning_modules.storage.error_model import FILE, ErrorModel, write_error_model
+from lightning_modules.storage.pretrained import Weights, write_weights
 from lightning_modules.sweep import cli as sweep_cli
 from lightning_modules.sweep import table as sweep_table
 from lightning_modules.sweep.state import write_json
@@ -80,9 +80,9 @@ def program(path):
     network = ClassicalDecoder("tfp", 2)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(torch.export, "export", lambda *_, **__: None)  # it takes half a minute
-        patch.setattr(exporting, "_torch", lambda *_: bytes(9999))
-        patch.setattr(exporting, "exported", lambda *_: network)
-        exporting.export_network(network, path, "torch")
+        patch.setattr(export, "_torch", lambda *_: bytes(9999))
+        patch.setattr(export, "exported", lambda *_: network)
+        export.export_network(network, path, "torch")
 
 
 @pytest.mark.parametrize(

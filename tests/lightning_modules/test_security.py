@@ -12,11 +12,11 @@ from safetensors.torch import save_file
 
 from lightning_modules import motion, networks
 from lightning_modules.__main__ import main
-from lightning_modules.checkpoint import read_checkpoint
 from lightning_modules.motion import ESTIMATORS, Spike2Flow
 from lightning_modules.networks import CSCSR, NETWORKS
-from lightning_modules.pretrained import read_weights
-from lightning_modules.stored_settings import check_plain, own_class
+from lightning_modules.storage.checkpoint import read_checkpoint
+from lightning_modules.storage.pretrained import read_weights
+from lightning_modules.storage.settings import check_plain, own_class
 from lightning_modules.tasks.checkpoint_io import Checkpoints
 from lightning_modules.tasks.super_resolution import SuperResolution
 

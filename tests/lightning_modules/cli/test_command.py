@@ -15,7 +15,6 @@ from pytorch_lightning.callbacks import LearningRateMonitor
 import spikekit
 from lightning_modules import list_pretrained
 from lightning_modules.__main__ import main
-from lightning_modules.checkpoint import read_checkpoint
 from lightning_modules.cli.arguments import behind_configurations, given, options
 from lightning_modules.cli.command import Parser
 from lightning_modules.cli.command import run as run_command
@@ -24,6 +23,7 @@ from lightning_modules.cli.rehearsal import Rehearsal
 from lightning_modules.cli.renamed_overlays import FORMER_SIZES, _current, with_current_overlays
 from lightning_modules.cli.short_help import options_of
 from lightning_modules.networks import CSCSR
+from lightning_modules.storage.checkpoint import read_checkpoint
 from spikekit import read_picture, write_spikes
 
 TINY = """

@@ -3,8 +3,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lightning_modules.error_model import ErrorModel
 from lightning_modules.inference.scene_activity import CELL, look, required, scene_activity
+from lightning_modules.storage.error_model import ErrorModel
 from spikekit import spike_integrate_fire
 from spikekit.scenes.analytic import Layer, Motion, Scene
 from spikekit.sensor.noise import SensorNoise

@@ -1,11 +1,11 @@
 import pytest
 import torch
 
-from lightning_modules.error_model import ErrorModel
 from lightning_modules.inference.predict import predict
 from lightning_modules.inference.tiles import AROUND, forward_in_tiles
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks import CSCSR, ClassicalDecoder
+from lightning_modules.storage.error_model import ErrorModel
 from lightning_modules.tasks.super_resolution import SuperResolution
 from spikekit.scenes.analytic import Layer, Motion, Scene
 from spikekit.sensor.simulate import simulate_spikes

@@ -5,7 +5,7 @@ import torch
 
 from lightning_modules.inference.predict import predict
 from lightning_modules.networks import CSCSR, TwoSpanCSCSR
-from lightning_modules.pretrained import Weights, settings_of, write_weights
+from lightning_modules.storage.pretrained import Weights, settings_of, write_weights
 
 TINY = {"width": 4, "representation_width": 4, "features": 1, "stages": 1, "blocks": 1, "end_blocks": 1}
 

@@ -17,8 +17,8 @@ import torch
 import yaml
 
 from lightning_modules.__main__ import main
-from lightning_modules.charts import BLUE, ORANGE
 from lightning_modules.cli.errors import InputError
+from lightning_modules.cost.charts import BLUE, ORANGE
 from lightning_modules.sweep import cli, engines, worker
 from lightning_modules.sweep.budget import seconds
 from lightning_modules.sweep.paper import TABLE_3

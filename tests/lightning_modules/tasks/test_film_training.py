@@ -7,7 +7,7 @@ import torch
 
 from lightning_modules.__main__ import main
 from lightning_modules.networks import CSCSR, ClassicalDecoder, RecurrentCSCSR
-from lightning_modules.pretrained import Weights, read_weights, settings_of, write_weights
+from lightning_modules.storage.pretrained import Weights, read_weights, settings_of, write_weights
 from lightning_modules.tasks.super_resolution import SuperResolution
 
 TINY = {"scale": 2, "width": 8, "representation_width": 8, "features": 1, "stages": 1, "end_blocks": 1}

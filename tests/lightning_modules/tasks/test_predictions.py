@@ -16,7 +16,7 @@ from lightning_modules.__main__ import main
 from lightning_modules.cli import parts
 from lightning_modules.inference.film import film
 from lightning_modules.networks import RecurrentCSCSR
-from lightning_modules.pretrained import Weights, settings_of, write_weights
+from lightning_modules.storage.pretrained import Weights, settings_of, write_weights
 from lightning_modules.tasks import predictions
 from spikekit import read_picture, read_spikes, read_video, write_spikes
 from spikekit.io import video_output

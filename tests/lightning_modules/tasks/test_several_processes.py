@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from lightning_modules.__main__ import main
-from lightning_modules.checkpoint import read_checkpoint
+from lightning_modules.storage.checkpoint import read_checkpoint
 from lightning_modules.tasks.callbacks import TestReport
 
 CONFIGS = Path(__file__).parents[3] / "configs"

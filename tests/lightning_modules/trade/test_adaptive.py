@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from lightning_modules.data.pictures import embedded_pictures
-from lightning_modules.error_model import ErrorModel
 from lightning_modules.inference.tiles import forward_in_tiles
 from lightning_modules.networks import CSCSR
-from lightning_modules.shipped import shipped_weights
+from lightning_modules.storage.error_model import ErrorModel
+from lightning_modules.storage.shipped import shipped_weights
 from lightning_modules.trade.adaptive import main, rows, scenes
 from lightning_modules.trade.error_fit import _envelope, make_clips
 from spikekit import psnr

@@ -1,7 +1,7 @@
 import pytest
 
 from lightning_modules.networks import CSCSR
-from lightning_modules.shipped import list_pretrained
+from lightning_modules.storage.shipped import list_pretrained
 from lightning_modules.trade.adaptive import main
 from lightning_modules.trade.halo import measure_halo
 

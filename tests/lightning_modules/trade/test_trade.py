@@ -25,8 +25,8 @@ from lightning_modules.inference.presets import Preset
 from lightning_modules.metrics.flicker import film_flicker
 from lightning_modules.motion import Spike2Flow
 from lightning_modules.networks import CSCSR, TSCNN
-from lightning_modules.pretrained import settings_of
-from lightning_modules.shipped import Pretrained
+from lightning_modules.storage.pretrained import settings_of
+from lightning_modules.storage.shipped import Pretrained
 from lightning_modules.trade import cli, energy, measure
 from lightning_modules.trade.films import film_scenes
 from lightning_modules.trade.pareto import pareto_front
@@ -245,7 +245,7 @@ def test_usual_settings_are_those_of_the_weights_that_are_shipped(monkeypatch, t
         Pretrained(name, tmp_path / name, scale=int(name[-1]) if "_x" in name else None, macs=count)
         for name, count in {**macs, "cscsr_tiny_x4": 2}.items()
     ]
-    monkeypatch.setattr("lightning_modules.shipped._index", lambda: tuple(shipped))
+    monkeypatch.setattr("lightning_modules.storage.shipped._index", lambda: tuple(shipped))
     settings = {setting.name: setting for setting in usual_settings(4)}
     assert list(settings)[:4] == [
         "cscsr_base_x4",

@@ -12,7 +12,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from lightning_modules import networks
 from lightning_modules.__main__ import main
 from lightning_modules.data import StillScenes
-from lightning_modules.pretrained import read_weights
+from lightning_modules.storage.pretrained import read_weights
 from lightning_modules.sweep.paper import TABLE_2, method_of
 from spikekit import read_picture, write_spikes
 

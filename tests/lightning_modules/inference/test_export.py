@@ -9,15 +9,15 @@ import pytest
 import torch
 import yaml
 
-from lightning_modules import exporting
 from lightning_modules.__main__ import main
-from lightning_modules.exporting import WITHOUT_WEIGHTS, as_exported, difference, example_inputs, export_network
+from lightning_modules.inference import export
+from lightning_modules.inference.export import WITHOUT_WEIGHTS, as_exported, difference, example_inputs, export_network
 from lightning_modules.motion import ClassicalFlow, ZeroFlow
 from lightning_modules.networks import CSCSR, NETWORKS, ClassicalDecoder, RecurrentCSCSR, TwoSpanCSCSR
-from lightning_modules.pretrained import Weights, settings_of, write_weights
+from lightning_modules.storage.pretrained import Weights, settings_of, write_weights
 from spikekit import write_spikes
 
-CONFIGS = Path(__file__).parents[2] / "configs"
+CONFIGS = Path(__file__).parents[3] / "configs"
 TINY = {"width": 4, "representation_width": 4, "features": 1, "stages": 1, "blocks": 1, "end_blocks": 1}
 
 ABLATIONS = {
@@ -58,14 +58,14 @@ assert "torch" not in sys.modules
 def test_a_program_that_differs_from_the_network_is_not_written(tmp_path, monkeypatch):
     network = ClassicalDecoder("tfp", 2)
     monkeypatch.setattr(torch.export, "export", lambda *_, **__: None)
-    monkeypatch.setattr(exporting, "_torch", lambda *_: b"a program")
+    monkeypatch.setattr(export, "_torch", lambda *_: b"a program")
     for wrong in (2e-4, float("nan")):
         run = lambda *inputs, wrong=wrong: network(*inputs) + wrong  # noqa: E731
-        monkeypatch.setattr(exporting, "exported", lambda *_, run=run: run)
+        monkeypatch.setattr(export, "exported", lambda *_, run=run: run)
         with pytest.raises(ValueError, match=r"expected an export within 0\.0001 of the network, got (0\.0002|nan)"):
             export_network(network, tmp_path / "a.pt2", "torch")
     assert not list(tmp_path.iterdir())
-    monkeypatch.setattr(exporting, "exported", lambda *_: lambda *inputs: network(*inputs) + 5e-5)
+    monkeypatch.setattr(export, "exported", lambda *_: lambda *inputs: network(*inputs) + 5e-5)
     assert "within 5e-05 of the network" in export_network(network, tmp_path / "a.pt2", "torch")
     assert (tmp_path / "a.pt2").read_bytes() == b"a program"
 
@@ -85,7 +85,7 @@ def test_every_network_is_exported_by_a_test():
 
 def sizes_differ(path, network, kind):
     """What a program of two other sizes differs by from the network, higher than wide and wider than high."""
-    run = exporting.exported(path.read_bytes(), kind)
+    run = export.exported(path.read_bytes(), kind)
     clips = [example_inputs(network, size).values() for size in ((38, 20), (18, 30))]
     with torch.no_grad():
         return max(difference(run(*clip), as_exported(network)(*clip)).item() for clip in clips)

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lightning_modules.stored_settings import check_plain
+from lightning_modules.storage.settings import check_plain
 
 _NUMBERS = {torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.int64, torch.int32, torch.bool}
 #: what Lightning would build something from

@@ -20,8 +20,8 @@ from lightning_modules.cli.command import run
 from lightning_modules.cli.rehearsal import Rehearsal
 from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
 from lightning_modules.networks import CSCSR, ClassicalDecoder
-from lightning_modules.pretrained import load_weights, read_weights, write_weights
-from lightning_modules.shipped import FOLDER, list_pretrained, shipped_weights
+from lightning_modules.storage.pretrained import load_weights, read_weights, write_weights
+from lightning_modules.storage.shipped import FOLDER, list_pretrained, shipped_weights
 from lightning_modules.tasks.super_resolution import SuperResolution
 from spikekit import read_picture, write_picture, write_spikes
 
@@ -370,7 +370,7 @@ def test_gain_is_that_of_the_weights_unless_another_is_named(named, expected, tm
 
 @pytest.mark.slow
 def test_fit_goes_on_from_weights_and_data_follow_them(file, tmp_path):
-    x4 = Path(__file__).parents[2] / "configs" / "x4.yaml"
+    x4 = Path(__file__).parents[3] / "configs" / "x4.yaml"
     (tmp_path / "tiny.yaml").write_text(
         "data: {init_args: {patch: 8, val_patch: 8, train_clips: 4, val_clips: 1, workers: 0}}\n"
         "trainer: {max_steps: 1, check_val_every_n_epoch: 1}\n"

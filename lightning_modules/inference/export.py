@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from lightning_modules.networks import NETWORKS, ClassicalDecoder, Network, RecurrentCSCSR, TwoSpanCSCSR
-from lightning_modules.pretrained import read_weights
+from lightning_modules.storage.pretrained import read_weights
 from spikekit.io.whole_file import whole_file
 
 #: formats, and how their files end

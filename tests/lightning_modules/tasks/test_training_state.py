@@ -1,6 +1,6 @@
 import pytest
 
-from lightning_modules.training_state import restoring
+from lightning_modules.tasks.training_state import restoring
 
 
 @pytest.mark.parametrize("error", [RuntimeError("sizes differ"), KeyError("a"), AttributeError("none")])

@@ -5,9 +5,9 @@ import shutil
 
 import pytest
 
-from lightning_modules.error_model import FILE, ErrorModel, read_error_model, write_error_model
 from lightning_modules.networks import CSCSR
-from lightning_modules.shipped import FOLDER, list_pretrained
+from lightning_modules.storage.error_model import FILE, ErrorModel, read_error_model, write_error_model
+from lightning_modules.storage.shipped import FOLDER, list_pretrained
 
 
 def test_all_weights_of_the_package_have_their_own():

@@ -14,10 +14,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from lightning_modules.checkpoint import check_tensors, read_checkpoint
-from lightning_modules.error_model import read_error_model
-from lightning_modules.shipped import find_shipped, list_pretrained
-from lightning_modules.stored_settings import check_plain, check_shapes
+from lightning_modules.storage.checkpoint import check_tensors, read_checkpoint
+from lightning_modules.storage.error_model import read_error_model
+from lightning_modules.storage.settings import check_plain, check_shapes
+from lightning_modules.storage.shipped import find_shipped, list_pretrained
 from spikekit.io.whole_file import whole_file
 
 _MOTION = "motion."

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from safetensors import safe_open
 
-FOLDER = Path(__file__).parent / "weights"
+FOLDER = Path(__file__).parents[1] / "weights"
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ def check_like_fresh(checkpoint: Mapping[str, Any], path: str | Path, model: Lea
     """Compare the state of a training with that of one which begins, part by part.
 
     Args:
-        checkpoint: as :func:`lightning_modules.checkpoint.read_checkpoint` returns it, after
+        checkpoint: as :func:`lightning_modules.storage.checkpoint.read_checkpoint` returns it, after
             :func:`check_training_state`.
         path: its file, for the message.
         model: what is to be trained.

@@ -1,0 +1,1 @@
+"""Weights, checkpoints and their settings in files; nothing in a file is run."""
