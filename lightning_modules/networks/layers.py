@@ -41,11 +41,16 @@ class ConvBlock(nn.Sequential):
 
 
 class ResBlock(nn.Module):
-    """Convolution, ReLU, convolution, plus the input: a residual block (He et al., 2016) without normalisation."""
+    """Convolution, activation, convolution, plus the input: a residual block (He et al., 2016) without normalisation.
 
-    def __init__(self, width: int) -> None:
+    Args:
+        width: channels.
+        activation: ReLU when not given.
+    """
+
+    def __init__(self, width: int, activation: nn.Module | None = None) -> None:
         super().__init__()
-        self.body = nn.Sequential(conv(width, width), nn.ReLU(inplace=True), conv(width, width))
+        self.body = nn.Sequential(conv(width, width), activation or nn.ReLU(inplace=True), conv(width, width))
 
     def forward(self, x: Tensor) -> Tensor:  # noqa: D102
         return x + self.body(x)

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from spikekit.arguments import one_line
 from spikekit.io.whole_file import whole_file
 
 #: the file, in the folder of the weights
@@ -91,5 +92,5 @@ def _read(path: Path) -> dict[str, ErrorModel]:
     try:
         return {name: ErrorModel(**constants) for name, constants in json.loads(path.read_text()).items()}
     except (OSError, AttributeError, TypeError, ValueError, RecursionError) as error:
-        said = " ".join(str(error).split())[:300]
-        raise ValueError(f"{path}: expected the constants of weights, by their file ({said})") from error
+        said = f"expected the constants of weights, by their file ({one_line(error)[:300]})"
+        raise ValueError(f"{path}: {said}") from error

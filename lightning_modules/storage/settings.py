@@ -12,6 +12,8 @@ from typing import Any, Literal, Union, get_args, get_origin
 import torch
 from torch import Tensor, nn
 
+from spikekit.arguments import one_line
+
 _DEEPEST, _MOST, _LONGEST = 16, 1000, 1000  # of plain values: nesting, items of a list or dictionary, characters
 _LARGEST = 4096  # of whole numbers that are not listed here
 _LARGEST_OF = {
@@ -92,7 +94,7 @@ def check_shapes(
         with torch.device("meta"):
             expected = kind(**arguments).state_dict()
     except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"{source}: settings that do not make a {kind.__name__} ({_one_line(error)})") from error
+        raise ValueError(f"{source}: settings that do not make a {kind.__name__} ({one_line(error)[:300]})") from error
     for name in sorted(expected.keys() | tensors.keys()):
         wanted, got = expected.get(name), tensors.get(name)
         if wanted is None or got is None:
@@ -165,7 +167,3 @@ def _short(value: Any) -> str:
         return f"a number of {value.bit_length()} bits"
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:300]

@@ -8,11 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from lightning_modules.motion import MotionEstimator
-from lightning_modules.networks.baselines.pictures import Baseline, decode_pictures
+from lightning_modules.networks.baselines.pictures import Baseline, decode_pictures, whole_sizes
 from lightning_modules.networks.baselines.sub_pixel import sub_pixel_convolutions
 from lightning_modules.networks.layers import conv, enlarge, res_blocks
-from spikekit import demosaic_along_motion, demosaic_residual, flow_warp, linear_motion
-from spikekit.check import check_whole
+from spikekit import demosaic_along_motion, demosaic_residual, flow_warp
 
 _TIMES = 11
 
@@ -63,7 +62,7 @@ class BasicVSR(Baseline):
         neighbors: int = 2,
         motion: MotionEstimator | None = None,
     ) -> None:
-        sizes = {"width": check_whole("width", width), "blocks": check_whole("blocks", blocks)}
+        sizes = whole_sizes(width=width, blocks=blocks)
         if not 0 <= neighbors < _TIMES // 2:
             raise ValueError(f"neighbors: expected 0 to {_TIMES // 2 - 1}, got {neighbors}")
         super().__init__(scale, frames, pattern, alpha, {**sizes, "neighbors": neighbors}, motion)
@@ -82,8 +81,7 @@ class BasicVSR(Baseline):
         self.check_spikes(spikes)
         spikes = spikes.to(self.picture[0].weight.dtype)
         flow = self.flow_or_estimate(spikes, flow, static).to(spikes.dtype)
-        first, middle, last = self.flow_times
-        offsets = linear_motion(flow[:, 0], flow[:, 1], self.times, first=first, middle=middle, last=last)
+        offsets = self.offsets(flow, self.times)
         pictures = self._demosaic(spikes, offsets)
         half = _TIMES // 2
         backward = self._propagate(self.backward_trunk, pictures, offsets, range(_TIMES - 1, half - 1, -1))

@@ -18,6 +18,11 @@ from spikekit.check import check_positive, check_whole
 Decoder = Literal["tfi", "tfp"]
 
 
+def whole_sizes(**sizes: int) -> dict[str, int]:
+    """Return sizes by name; raise unless each is a whole number, 1 or more."""
+    return {name: check_whole(name, size) for name, size in sizes.items()}
+
+
 def check_decoder(decoder: str, window: int) -> None:
     """Raise unless mosaics can be decoded so: by TFI, or by TFP of an odd window.
 
@@ -130,6 +135,11 @@ class Baseline(Network):
         flow = self.resolve_flow(spikes, flow, static)
         return torch.zeros(len(spikes), 2, 2, *spikes.shape[-2:], device=spikes.device) if flow is None else flow
 
+    def offsets(self, flow: Tensor, times: Sequence[int]) -> Tensor:
+        """Return the motion from the middle to each of T times, (B, T, 2, H, W), linear on both sides of it."""
+        first, middle, last = self.flow_times
+        return linear_motion(flow[:, 0], flow[:, 1], times, first=first, middle=middle, last=last)
+
 
 @torch.no_grad()
 def along_motion(network: Baseline, spikes: Tensor, flow: Tensor) -> Tensor:
@@ -143,11 +153,9 @@ def along_motion(network: Baseline, spikes: Tensor, flow: Tensor) -> Tensor:
     Returns:
         The picture (B, 3, H, W) of five TFI mosaics, of the frames 10, 15, ..., 30 of 41.
     """
-    first, middle, last = network.flow_times
-    times = [middle + n * (network.frames // 8) for n in range(-2, 3)]
+    times = [network.frames // 2 + n * (network.frames // 8) for n in range(-2, 3)]
     raw = decode_pictures(spikes, times, network.alpha)
-    offsets = linear_motion(flow[:, 0], flow[:, 1], times, first=first, middle=middle, last=last)
-    return demosaic_along_motion(raw, offsets, network.pattern)
+    return demosaic_along_motion(raw, network.offsets(flow, times), network.pattern)
 
 
 def enlarge_picture(picture: Tensor, scale: int) -> Tensor:

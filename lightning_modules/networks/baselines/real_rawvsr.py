@@ -15,11 +15,11 @@ from lightning_modules.networks.baselines.pictures import (
     cut_to,
     decode_pictures,
     mirror_to_multiple,
+    whole_sizes,
 )
 from lightning_modules.networks.baselines.skip import begin_at_zero, enlarged_raw
-from lightning_modules.networks.layers import conv, enlarge
+from lightning_modules.networks.layers import ResBlock, conv, enlarge
 from spikekit import split_bayer
-from spikekit.check import check_whole
 
 _LEVELS = 3
 _FRAMES = 5
@@ -75,8 +75,7 @@ class RealRawVSR(Baseline):
         blocks: int = 10,
         skip: bool = False,
     ) -> None:
-        sizes = {"tfp_window": tfp_window, "width": width, "blocks": blocks}
-        sizes = {name: check_whole(name, size) for name, size in sizes.items()}
+        sizes = whole_sizes(tfp_window=tfp_window, width=width, blocks=blocks)
         check_decoder(decoder, tfp_window)
         super().__init__(scale, frames, pattern, alpha, {"decoder": decoder, **sizes, "skip": skip}, ZeroFlow())
         self.decoder, self.tfp_window, self.skip = decoder, tfp_window, skip
@@ -89,7 +88,7 @@ class RealRawVSR(Baseline):
         self.fuse_raw, self.fuse_packed = _Fusion(2 * _FRAMES, width), _Fusion(2 * _FRAMES, width)
         self.enlarge_packed = nn.Sequential(conv(width, 4 * width), nn.PixelShuffle(2), _relu(), conv(width, width))
         self.select = _SelectiveKernel(width)
-        self.body = nn.Sequential(*(_ResBlock(width) for _ in range(blocks)))
+        self.body = nn.Sequential(*(ResBlock(width, _relu()) for _ in range(blocks)))
         self.enlarge = _Enlargement(width, self.scale)
         if skip:
             begin_at_zero(*self.enlarge.pictures)
@@ -135,21 +134,12 @@ def _relu() -> nn.LeakyReLU:
     return nn.LeakyReLU(0.1)
 
 
-class _ResBlock(nn.Module):
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.body = nn.Sequential(conv(width, width), _relu(), conv(width, width))
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x + self.body(x)
-
-
 class _Pyramid(nn.Module):
     """Features on three levels, each half as large as the one before."""
 
     def __init__(self, inputs: int, width: int, blocks: int) -> None:
         super().__init__()
-        self.first = nn.Sequential(conv(inputs, width), _relu(), *(_ResBlock(width) for _ in range(blocks)))
+        self.first = nn.Sequential(conv(inputs, width), _relu(), *(ResBlock(width, _relu()) for _ in range(blocks)))
         self.shrink = nn.ModuleList(
             nn.Sequential(nn.Conv2d(width, width, 3, 2, 1), _relu(), conv(width, width), _relu())
             for _ in range(_LEVELS - 1)

@@ -8,12 +8,11 @@ from torch import Tensor, nn
 from lightning_modules.motion import ZeroFlow
 from lightning_modules.networks.baselines.deformable import DeformableConv2d
 from lightning_modules.networks.baselines.per_channel import per_channel as run_per_channel
-from lightning_modules.networks.baselines.pictures import Baseline, decode_pictures
+from lightning_modules.networks.baselines.pictures import Baseline, decode_pictures, whole_sizes
 from lightning_modules.networks.baselines.skip import begin_at_zero, enlarged_raw
 from lightning_modules.networks.baselines.sub_pixel import sub_pixel_convolutions
 from lightning_modules.networks.layers import conv, res_blocks
 from spikekit import split_colors
-from spikekit.check import check_whole
 
 
 class SpikeSRNetLike(Baseline):
@@ -70,8 +69,7 @@ class SpikeSRNetLike(Baseline):
         per_channel: bool = False,
         skip: bool = False,
     ) -> None:
-        sizes = {"length": length, "every": every, "width": width, "maps": maps, "corrections": corrections}
-        sizes = {name: check_whole(name, size) for name, size in sizes.items()}
+        sizes = whole_sizes(length=length, every=every, width=width, maps=maps, corrections=corrections)
         super().__init__(scale, frames, pattern, alpha, {**sizes, "per_channel": per_channel, "skip": skip}, ZeroFlow())
         if length % 2 == 0 or length > frames or (frames - length) % (2 * every):
             raise ValueError(

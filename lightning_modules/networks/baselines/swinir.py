@@ -15,10 +15,10 @@ from lightning_modules.networks.baselines.pictures import (
     cut_to,
     enlarge_picture,
     mirror_to_multiple,
+    whole_sizes,
 )
 from lightning_modules.networks.baselines.skip import begin_at_zero
 from lightning_modules.networks.layers import conv
-from spikekit.check import check_whole
 
 _MEAN = 0.4488, 0.4371, 0.4040  # of the DIV2K pictures that SwinIR was trained on
 _SIDE = 8  # of an attention window, in pixels
@@ -86,8 +86,7 @@ class SwinIR(Baseline):
         skip: bool = False,
         motion: MotionEstimator | None = None,
     ) -> None:
-        sizes = {"width": width, "groups": groups, "layers": layers, "heads": heads}
-        sizes = {name: check_whole(name, size) for name, size in sizes.items()}
+        sizes = whole_sizes(width=width, groups=groups, layers=layers, heads=heads)
         if width % heads:
             raise ValueError(f"heads: expected a divisor of width = {width}, got {heads}")
         if upsampler not in ("direct", "steps"):

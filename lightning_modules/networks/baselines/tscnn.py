@@ -14,11 +14,11 @@ from lightning_modules.networks.baselines.pictures import (
     decode_pictures,
     enlarge_picture,
     mirror_to_multiple,
+    whole_sizes,
 )
 from lightning_modules.networks.baselines.skip import begin_at_zero
 from lightning_modules.networks.layers import ConvBlock, ResBlock, conv
 from spikekit import bayer_mask, demosaic_residual
-from spikekit.check import check_whole
 
 _SQUEEZED = 4  # channels in the middle of a channel attention
 _ATTENTIONS = 3  # attention blocks of a group
@@ -82,8 +82,7 @@ class TSCNN(Baseline):
         high: int = 3,
         skip: bool = False,
     ) -> None:
-        sizes = {"tfp_window": tfp_window, "width": width, "blocks": blocks, "low": low, "high": high}
-        sizes = {name: check_whole(name, size) for name, size in sizes.items()}
+        sizes = whole_sizes(tfp_window=tfp_window, width=width, blocks=blocks, low=low, high=high)
         check_decoder(decoder, tfp_window)
         if width % 8:
             raise ValueError(f"width: expected a multiple of 8, got {width}")

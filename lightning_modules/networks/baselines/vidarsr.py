@@ -9,11 +9,10 @@ from torch import Tensor, nn
 
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks.baselines.per_channel import per_channel as run_per_channel
-from lightning_modules.networks.baselines.pictures import Baseline, decode_pictures
+from lightning_modules.networks.baselines.pictures import Baseline, decode_pictures, whole_sizes
 from lightning_modules.networks.baselines.skip import begin_at_zero, enlarged_raw
 from lightning_modules.networks.layers import conv
-from spikekit import linear_motion, split_colors
-from spikekit.check import check_whole
+from spikekit import split_colors
 
 _Move = Callable[[int, int, int], nn.Module]
 
@@ -69,8 +68,7 @@ class VidarSR(Baseline):
         skip: bool = False,
         motion: MotionEstimator | None = None,
     ) -> None:
-        width, features = check_whole("width", width), check_whole("features", features)
-        more = {"width": width, "features": features, "per_channel": per_channel, "skip": skip}
+        more = {**whole_sizes(width=width, features=features), "per_channel": per_channel, "skip": skip}
         super().__init__(scale, frames, pattern, alpha, more, motion)
         self.per_channel, self.skip = per_channel, skip
         #: the middle frame, and the neighbours in time
@@ -99,8 +97,7 @@ class VidarSR(Baseline):
 
     def _reconstruct(self, spikes: Tensor, flow: Tensor) -> Tensor:
         """Return pictures, (B, 1 or 3, s H, s W), s being twice the scale where every colour is by itself."""
-        first, middle, last = self.flow_times
-        offsets = linear_motion(flow[:, 0], flow[:, 1], self.times[1:], first=first, middle=middle, last=last)
+        offsets = self.offsets(flow, self.times[1:])
         raws = decode_pictures(spikes, self.times, self.alpha)
         planes = raws.unsqueeze(2) if self.per_channel else split_colors(raws, self.pattern).movedim(0, 2)
         center, *neighbors = planes.unbind(dim=1)
