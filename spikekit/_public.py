@@ -1,4 +1,4 @@
-"""What ``spikekit`` offers, all of which needs torch: what its rooms offer, and the metrics."""
+"""The public names of ``spikekit``, all of which need torch: those of its folders, and the metrics."""
 
 import sys
 

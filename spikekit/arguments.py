@@ -1,4 +1,4 @@
-"""Kinds of arguments that the verbs of the command line share, and mistakes in them."""
+"""Argument types that the verbs of the command line share, and errors in them."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ FRAMES = r"\d+|\d*:\d*(:0*[1-9]\d*)?"
 
 
 class UsageError(ValueError):
-    """A command line that asks for what cannot be."""
+    """A command line that asks for something impossible."""
 
 
 def whole(least: int) -> Callable[[str], int]:
-    """Return what reads a whole number, ``least`` or more."""
+    """Return an argument type: a whole number, ``least`` or more."""
 
     def read(text: str) -> int:
         try:
@@ -31,7 +31,7 @@ def whole(least: int) -> Callable[[str], int]:
 
 
 def frames_of(text: str, first: int, last: int, step: int = 1) -> range:
-    """Return which frames ``N`` or ``A:B[:STEP]`` asks for, from A to B - 1.
+    """Return the frames that ``N`` or ``A:B[:STEP]`` asks for, from A to B - 1.
 
     Args:
         text: what was typed.
@@ -70,7 +70,7 @@ def positive(text: str) -> float:
 
 
 def ending_in(*endings: str, said: str) -> Callable[[str], Path]:
-    """Return the type of an argument that names a file with one of some endings, ``said`` to be expected if not."""
+    """Return an argument type: a file with one of some endings, which ``said`` describes in the message."""
 
     def read(text: str) -> Path:
         path = Path(text)
@@ -82,6 +82,6 @@ def ending_in(*endings: str, said: str) -> Callable[[str], Path]:
 
 
 def one_line(error: BaseException) -> str:
-    """Return what an error says, on one line, and nothing that a terminal would obey."""
+    """Return an error's message on one line, without characters that a terminal would interpret."""
     text = getattr(error, "strerror", None) or str(error).strip() or type(error).__name__
     return "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))

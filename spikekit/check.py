@@ -1,4 +1,4 @@
-"""The guards that every operator uses, so that the same mistake gives the same message everywhere."""
+"""Argument checks shared by all operators, so that the same mistake gives the same message everywhere."""
 
 from __future__ import annotations
 

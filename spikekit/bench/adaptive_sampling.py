@@ -1,4 +1,4 @@
-"""Measure what adaptive sampling saves and costs, on scenes whose light is known.
+"""Measure the savings and costs of adaptive sampling, on scenes whose light is known.
 
 ``python -m spikekit.bench.adaptive_sampling`` prints the table.
 """
@@ -114,7 +114,7 @@ class Row:
 def measure(
     name: str, scene: Scene, exposures: Sequence[float], scale: int, *, rounds: int = 2, **settings: Any
 ) -> Row:
-    """Simulate a scene from three of its frames, and compare with its own light."""
+    """Simulate a scene from three of its frames and compare the result with the scene's own light."""
     alpha = 0.4
     frames = [scene.rgb(n * CLOCKS) * exposure for n, exposure in enumerate(exposures)]
     truth = scene.light("RGGB", scale=scale, alpha=alpha)

@@ -55,7 +55,7 @@ class Other:
 
 
 def other(name: str, function: Callable[..., object], pair: Any = Other.pair, **how: Any) -> Other:
-    """Return the alternative that is a function of the inputs of the case, which needs no preparation."""
+    """Return an alternative that is a plain function of the case's inputs and needs no preparation."""
     return Other(name, partial(partial, function), pair, **how)
 
 
@@ -108,7 +108,7 @@ class Setup:
         return torch.rand(shape, generator=torch.Generator().manual_seed(SEED)).to(self.device)
 
     def light(self, frames: int) -> Tensor:
-        """Return light of a scene from dark to bright, that changes a little from clock to clock."""
+        """Return the light of a scene from dark to bright that changes slightly from clock to clock."""
         scene = torch.linspace(0.02, 0.9, self.size.width, device=self.device)
         return scene * (0.9 + 0.2 * self.rand(frames, self.size.height, self.size.width))
 

@@ -1,7 +1,7 @@
-"""How good latent frames are where the truth is known: ``python -m spikekit.bench.interpolation [FILM ...]``.
+"""Quality of latent frames where the truth is known: ``python -m spikekit.bench.interpolation [FILM ...]``.
 
-Of every film, each second frame is left out and made again from its two neighbours. Of scenes whose motion is known
-exactly, frames a given displacement apart are given, and the one half way between them is asked for.
+In every film, each second frame is left out and interpolated from its two neighbours. In scenes whose motion is known
+exactly, the frame halfway between two frames a given displacement apart is interpolated.
 """
 
 from __future__ import annotations

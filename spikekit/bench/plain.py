@@ -1,6 +1,6 @@
-"""The operators in plain, straightforward torch, independent of spikekit: what the benchmark compares with.
+"""The operators in plain torch, independent of spikekit, for the benchmark to compare with.
 
-Each function is here to be measured, and to be compared with: the same result where nothing else is said.
+Unless a function says otherwise, its result equals that of the operator.
 """
 
 from __future__ import annotations

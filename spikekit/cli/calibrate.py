@@ -22,7 +22,7 @@ _CHUNK = 1 << 24  # pixels that are counted at a time
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure the pixels of a sensor, and keep what is found beside FILE, where other commands find it.
+    """Measure the pixels of a sensor, and store the result beside FILE, where other commands find it.
 
     With --flat, a recording of an evenly lit wall out of focus, every pixel gets a gain; with --dark, one with the cap
     on, a dark rate; with both, defects show best. A few thousand frames each are enough. What is uneven about the wall

@@ -1,4 +1,4 @@
-"""``spikekit info``: what a recording holds."""
+"""``spikekit info``: the contents of a recording."""
 
 from __future__ import annotations
 

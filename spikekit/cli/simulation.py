@@ -34,7 +34,7 @@ _LARGEST = 64  # number among the arguments of an interpolation that a file name
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings that a stream depends on, beside its source.
+    """Settings that a stream depends on, besides its source.
 
     Args:
         scale: how many pixels a sensor pixel is wide.
@@ -154,7 +154,7 @@ class Source:
 
 
 def build(text: str) -> Any:
-    """Build what makes latent frames.
+    """Build an interpolation from its name.
 
     Args:
         text: ``package.module.Class`` or ``package.module.Class(name=value, ...)``; without a module, one of
@@ -177,7 +177,7 @@ def build(text: str) -> Any:
 
 
 def is_own(text: str) -> bool:
-    """Say whether what makes latent frames is of this package, so that a file may ask for it.
+    """Return whether an interpolation belongs to this package, so that a file may ask for it.
 
     Args:
         text: as for :func:`build`, but from a file that somebody else may have written.

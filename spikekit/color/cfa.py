@@ -1,4 +1,4 @@
-"""The colour filter array: which colour every sensor pixel sees, and how pictures become mosaics and back."""
+"""The colour filter array: which colour every sensor pixel sees, and the way from pictures to mosaics and back."""
 
 from __future__ import annotations
 

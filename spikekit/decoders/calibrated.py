@@ -1,4 +1,4 @@
-"""Spikes of a real sensor made those of an ideal one."""
+"""Convert the spikes of a real sensor to those of an ideal one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ROUNDING = 1e-4  # of a threshold: what sums of light may lack of one
 
 
 def correct_spikes(spikes: Tensor, calibration: Calibration, pattern: str | None = None) -> Tensor:
-    r"""Fire anew what an ideal sensor would have fired, for networks, which take spikes and not light.
+    r"""Re-fire the spikes that an ideal sensor would have fired, for networks, which take spikes rather than light.
 
     .. math:: \hat I_n = \text{corrected } 1 / \Psi_n, \quad \hat S = \text{spikes of } \hat I
 

@@ -1,4 +1,4 @@
-"""Decode streams longer than the memory, chunk by chunk, with the result of the whole."""
+"""Decode streams that do not fit in memory, chunk by chunk, with the same result as decoding the whole."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from spikekit.check import check_index, check_planes
 
 
 def decode_in_chunks(decode: Callable[[Tensor], Tensor], chunks: Iterable[Tensor], overlap: int) -> Iterator[Tensor]:
-    r"""Decode a stream that comes in chunks, in bounded memory, as if it came at once.
+    r"""Decode a stream that arrives in chunks, in bounded memory, as if it arrived at once.
 
     Convention:
         Every frame is decoded with at least ``overlap`` frames before and after it, as far as the recording has them.

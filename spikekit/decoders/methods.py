@@ -1,4 +1,4 @@
-"""The decoders by name: commands, the baseline network and its tables go through this list."""
+"""The decoders by name, a list shared by the commands, the baseline network and its tables."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Packed spikes: one bit a pixel, an eighth of the memory and of the transfers to a GPU."""
+"""Packed spikes: one bit per pixel, for an eighth of the memory and of the transfers to a GPU."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def pack_spikes(spikes: Tensor) -> Tensor:
 
     Convention:
         The leftmost pixel is the least significant bit, as in a ``.dat``. Every row begins with a byte of its own:
-        where 8 does not divide W, the last bits of a row are 0. Nothing is lost, so values other than 0 and 1 are an
-        error; on a GPU, finding out takes a wait. No gradient.
+        where 8 does not divide W, the last bits of a row are 0. Packing is lossless, so values other than 0 and 1 are
+        an error; on a GPU, checking this requires a synchronisation. No gradient.
 
     Args:
         spikes: :math:`(*, H, W)`, zeros and ones, any real dtype; mostly :math:`(T, H, W)`.
@@ -74,8 +74,7 @@ def unpack_spikes(packed: Tensor, width: int, *, dtype: torch.dtype = torch.uint
     r"""Undo :func:`pack_spikes`: one pixel a value.
 
     Convention:
-        The inverse of :func:`pack_spikes`, bit for bit. What stands in the last byte of a row beyond ``width`` is not
-        looked at.
+        The inverse of :func:`pack_spikes`, bit for bit. Bits of a row beyond ``width`` are ignored.
 
     Args:
         packed: bytes :math:`(*, H, \lceil W / 8 \rceil)`, uint8; mostly :math:`(T, H, \lceil W / 8 \rceil)`.

@@ -1,4 +1,4 @@
-"""The decoders at a single frame, reading only the few frames that decide it."""
+"""The decoders at a single frame, which read only the few frames that determine it."""
 
 from __future__ import annotations
 

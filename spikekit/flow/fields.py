@@ -23,10 +23,10 @@ def joint_flow(flows: Tensor | Sequence[Tensor]) -> Tensor:
     .. math:: w = \frac{1}{4} \sum_{C \in \{R, G_1, G_2, B\}} w^C
 
     Convention:
-        The colours are the **first** axis, as :func:`spikekit.split_bayer` leaves them; any number of flows is
-        averaged alike. The result stays at the resolution, and in the pixels, of the flows that came. The four phases
-        of a Bayer cell average to the centre of the cell, which is where :func:`upsample_flow` expects them. Linear:
-        every flow gets its share of the gradient.
+        The colours are the **first** axis, as :func:`spikekit.split_bayer` leaves them; any number of flows is averaged
+        alike. The result has the resolution of the input flows, and is in their pixels. The four phases of a Bayer cell
+        average to the centre of the cell, which is where :func:`upsample_flow` expects them. Linear: every flow gets
+        its share of the gradient.
 
     Args:
         flows: (C, \*, 2, H, W), or a sequence of C flows (\*, 2, H, W); any C of at least one.
@@ -86,8 +86,8 @@ def upsample_flow(flow: Tensor, scale: int) -> Tensor:
     Convention:
         A coarse pixel is the block of ``scale`` x ``scale`` fine ones that begins at (scale x, scale y)
         (``align_corners=False``), as in :func:`spikekit.bayer_mask` and :func:`spikekit.bin_to_sensor`. Beyond the
-        outermost coarse centres the flow is that of the nearest. Linear in the flow, and differentiable as such.
-        Scale 1 returns the flow that came.
+        outermost coarse centres the flow is that of the nearest. Linear in the flow, and differentiable as such. Scale
+        1 returns the input flow.
 
     Args:
         flow: :math:`(*, 2, H, W)`, floating.

@@ -1,4 +1,4 @@
-"""TV-L1 optical flow between two moments, of pictures whose noise is known."""
+"""TV-L1 optical flow between two moments, for pictures whose noise is known."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def tvl1_flow(
     start: Tensor | None = None,
     warps: int = 5,
 ) -> Tensor:
-    r"""Motion v of which two pictures are two moments: :math:`I_0(x + t_0 v) = I_1(x + t_1 v)`.
+    r"""Estimate the motion v between two moments of a scene: :math:`I_0(x + t_0 v) = I_1(x + t_1 v)`.
 
     Least :math:`\int |\nabla v_x| + |\nabla v_y| + \lambda |I_1(x + t_1 v) - I_0(x + t_0 v)|`, from coarse pictures to
     fine ones, linearized around what is known of v and solved alternately, :math:`\theta = 0.25` coupling the flow that

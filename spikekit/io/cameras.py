@@ -23,7 +23,7 @@ CAMERAS = tuple(sorted(preset.name[: -len(".json")] for preset in _PRESETS.iterd
 
 @dataclass(frozen=True)
 class Camera:
-    """A kind of spike camera: what one must know of it to read a recording and to show a picture.
+    """A kind of spike camera: what is needed to read its recordings and show its pictures.
 
     Convention:
         A recording goes through :meth:`prepare` in this order: columns that are no pixels are dropped, frames that are
@@ -85,7 +85,7 @@ class Camera:
 
     @property
     def stored_width(self) -> int:
-        """Columns of a raw stream, with those that are no pixels."""
+        """Columns of a raw stream, including those that are not pixels."""
         return self.width + sum(stop - start for start, stop in self.drop)
 
     @property
@@ -109,7 +109,7 @@ class Camera:
         return "".join(pattern[2 * ((top + y) % 2) + (left + x) % 2] for y in (0, 1) for x in (0, 1))
 
     def prepare(self, spikes: Tensor, *, flip: bool | None = None) -> Tensor:
-        """Make of stored frames what the camera saw: only pixels, upright, without the border.
+        """Turn stored frames into what the camera saw: only pixels, upright, without the border.
 
         Args:
             spikes: frames :math:`(*, H, W)` as they are stored, with or without the columns that are no pixels.

@@ -1,4 +1,4 @@
-"""What goes wrong with a file, said in one line that names it."""
+"""Errors with files, as one line that names the file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from spikekit.arguments import one_line
 
 @contextmanager
 def reading(path: str | Path, kind: type[ValueError], what: str = "", otherwise: str = "{}") -> Iterator[None]:
-    """Turn whatever goes wrong with the bytes of a file into one line.
+    """Turn any error while reading a file into one line.
 
     Args:
         path: the file.
@@ -40,7 +40,7 @@ def reading(path: str | Path, kind: type[ValueError], what: str = "", otherwise:
 
 @contextmanager
 def writing(path: str | Path, kind: type[ValueError] = ValueError, wrong: type[Exception] = OSError) -> Iterator[None]:
-    """Turn what keeps a file from being written into one line.
+    """Turn any error while writing a file into one line.
 
     Args:
         path: the file.

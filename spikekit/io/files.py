@@ -94,11 +94,11 @@ def iter_spikes(
     chunk: int | None = None,
     packed: bool = False,
 ) -> Iterator[Tensor]:
-    """Read a recording frame by frame, or a chunk of frames at a time, for what is longer than the memory.
+    """Read a recording frame by frame, or a chunk of frames at a time, if it does not fit in memory.
 
     Convention:
-        Formats and arguments as in :func:`read_spikes`. What can be known without reading the frames is checked at
-        the call, not at the first frame.
+        Formats and arguments as in :func:`read_spikes`. Whatever can be checked without reading the frames is checked
+        at the call, not at the first frame.
 
     Args:
         path: a file ending in ``.dat`` or ``.npz``.
@@ -177,8 +177,8 @@ def write_spikes(path: str | Path, spikes: Tensor | Iterable[Tensor], *, flip: b
         Formats as in :func:`read_spikes`; the array of an ``.npz`` is called ``spk``. The file appears under its name
         once it is complete, so a run that is killed leaves no half recording.
 
-        A recording that is longer than the memory comes in chunks, of any lengths, and one chunk is held at a time.
-        An ``.npz`` tells its length before its frames, so they wait on the disk, packed, until the last has come.
+        A recording that does not fit in memory can be passed in chunks of any lengths; one chunk is held at a time. An
+        ``.npz`` stores its length before its frames, so they are kept on disk, packed, until the last has arrived.
 
     Args:
         path: where to, ending in ``.dat`` or ``.npz``.

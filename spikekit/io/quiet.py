@@ -1,4 +1,4 @@
-"""Libraries that read files, kept from printing what they think of them: what matters is raised."""
+"""Silence libraries that print about the files they read; real problems are raised."""
 
 from __future__ import annotations
 

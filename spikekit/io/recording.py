@@ -119,12 +119,12 @@ class Recording:
 
 
 def white_rate(rates: Tensor) -> float:
-    """Return what to take for white where nobody knows: the rate that 99.9 per cent of the pixels do not exceed."""
+    """Return the default for white: the rate that 99.9 per cent of the pixels do not exceed."""
     return float(np.quantile(rates.numpy(), 0.999)) or float(rates.max()) or 1.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what names a recording."""
+    """Add the arguments that name a recording."""
     add = parser.add_argument
     add("file", type=Path, metavar="FILE", help="a recording, .dat (8 pixels a byte, no header) or .npz")
     add("--height", type=whole(1), metavar="H", help="rows of a frame; a .dat without side-car or camera needs it")
@@ -139,7 +139,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_calibration(parser: argparse.ArgumentParser) -> None:
-    """Add what names a calibration."""
+    """Add the argument that names a calibration."""
     parser.add_argument(
         "--calibration",
         metavar="FILE",
@@ -149,7 +149,7 @@ def add_calibration(parser: argparse.ArgumentParser) -> None:
 
 
 def open_recording(args: argparse.Namespace) -> Recording:
-    """Return the recording of the arguments, with what its side-car, its camera and its calibration know.
+    """Return the recording that the arguments name, with the metadata of its side-car, camera and calibration.
 
     Raises:
         UsageError: a headerless file whose size nobody knows, or a camera and a size as well.

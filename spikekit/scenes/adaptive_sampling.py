@@ -76,7 +76,7 @@ class Plan:
 
     @classmethod
     def everything(cls, clocks: int, noise: SensorNoise | None = None) -> Plan:
-        """Model all there is: a frame for every clock of the interval, all pixels, every source of noise."""
+        """Model everything: a frame for every clock of the interval, all pixels, every source of noise."""
         return cls(check_whole("clocks", clocks) - 1, noise=noise)
 
     def __str__(self) -> str:

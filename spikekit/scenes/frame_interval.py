@@ -12,7 +12,7 @@ from spikekit.scenes.adaptive_sampling import Plan, Region, SceneProfile
 
 
 class Interval:
-    """Two neighbouring frames and what lies between them; nothing is computed before it is asked for.
+    """Two neighbouring frames and the light between them, computed on demand.
 
     Args:
         film: the :class:`spikekit.Film` that it is a part of, whose settings count.
@@ -41,7 +41,7 @@ class Interval:
         return tuple(map(self.film._seen, self.frames))
 
     def between(self, region: Region | None = None) -> Any:
-        """Return what the interpolation makes of a region of the sensor; of all of it when not given."""
+        """Return the interpolation for a region of the sensor, or for all of it when not given."""
         if region not in self._betweens:
             ends = self.frames
             if region is not None:

@@ -182,7 +182,7 @@ class Film:
     ) -> Iterator[Tensor]:
         """Let a sensor look at a span of the film.
 
-        :func:`spikekit.write_spikes` takes what comes; ``torch.cat(list(film.spikes()))`` is all of it.
+        :func:`spikekit.write_spikes` accepts the result; ``torch.cat(list(film.spikes()))`` is the whole film.
 
         Args:
             first: the first clock.
@@ -225,7 +225,7 @@ class Film:
         return FilmClip(self, frame, frames)
 
     def profile(self, interval: int | None = None) -> SceneProfile:
-        """Look at what happens between frame ``interval`` and the next, or in the whole film.
+        """Profile the change between frame ``interval`` and the next, or in the whole film.
 
         Args:
             interval: 0 to ``len(frames) - 2``; all of them, joined, when not given.

@@ -1,4 +1,4 @@
-"""The sensor: from light to spikes, and what a real one adds."""
+"""The sensor: from light to spikes, and the noise that a real one adds."""
 
 from spikekit.sensor.calibration import Calibration
 from spikekit.sensor.integrate_fire import SpikeIntegrateFire, spike_integrate_fire

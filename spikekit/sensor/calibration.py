@@ -1,4 +1,4 @@
-"""What is known of every pixel of one sensor: gain, dark rate and defects, and pictures corrected by it."""
+"""Calibration of one sensor: gain, dark rate and defects of every pixel, and correction by them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _NEIGHBORS = 4
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    r"""What the pixels of one sensor make of light.
+    r"""How the pixels of one sensor respond to light.
 
     .. math:: r = g I + d, \qquad \hat I = \max(0, (r - d) / g)
 
