@@ -21,7 +21,7 @@ _HOME = {"CSCSR": "networks", "SuperResolution": "tasks.super_resolution", "list
 
 
 class _OldNames:
-    """Asks spikekit where a module of an old name is now; only then, as it imports torch."""
+    """Asks spikekit where a module with an old name is now; only then, because this imports torch."""
 
     @staticmethod
     def find_spec(name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> ModuleSpec | None:

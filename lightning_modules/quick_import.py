@@ -1,6 +1,7 @@
-"""Lightning imported without three parts of other packages, more than half of the time, of which it reads few names.
+"""Import Lightning without three parts of other packages, which take more than half of the time.
 
-Whoever asks for anything else of them meanwhile, or for anything at all afterwards, gets the parts themselves.
+Lightning reads few names of them, which stand-ins provide; any other name, and every name afterwards, comes from the
+parts themselves.
 
 Python's own ``importlib.util.LazyLoader`` does not serve: these names are read while Lightning and torchmetrics are
 imported, which would load them at once, and imports inside of these are not ours to move.
@@ -59,7 +60,7 @@ def _when_called(module: str, name: str) -> Callable[..., Any]:
 
 
 def import_lightning() -> None:
-    """Import ``pytorch_lightning``, in half of the time.
+    """Import ``pytorch_lightning`` in half the time.
 
     Example:
         >>> import_lightning()

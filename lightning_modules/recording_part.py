@@ -1,4 +1,4 @@
-"""``python -m lightning_modules.recording_part ARGS``: ``lightning ARGS`` that ends with the process that began it."""
+"""``python -m lightning_modules.recording_part ARGS``: ``lightning ARGS``, which ends when its parent process does."""
 
 from __future__ import annotations
 

@@ -12,8 +12,8 @@ T = TypeVar("T", bound=Callable[..., None])
 def takes(other: type, *without: str) -> Callable[[T], T]:
     """Decorate a constructor that passes ``**settings``, and perhaps ``*args``, on to another class.
 
-    Its signature and its documentation become those of both, for ``help``, editors and the command line. What both
-    have is its own.
+    It gets the signature and the documentation of both, for ``help``, editors and the command line; its own arguments
+    win.
 
     Args:
         other: the class, such as a dataclass.

@@ -46,10 +46,9 @@ _OLD = {"--model.tolerance": "psnr_tolerance"}
 
 
 def with_network_of_weights(args: Sequence[str]) -> list[str]:
-    """Put in the network that ``--model.weights`` are of, so that it need not be said again.
+    """Insert the network that belongs to ``--model.weights``, so that it need not be specified again.
 
-    An estimator of motion is exchanged freely, and so is the gain: those of the weights are put in where nothing else
-    is named.
+    The motion estimator and the gain can be exchanged freely: those of the weights are used unless others are named.
 
     Args:
         args: verb and arguments of ``lightning``.
@@ -93,7 +92,7 @@ def with_network_of_weights(args: Sequence[str]) -> list[str]:
 
 
 def options(args: Sequence[str]) -> Iterator[tuple[int, str, str]]:
-    """Yield where the word after an option and its value is, the option, and the value."""
+    """Yield the position after an option and its value, the option, and the value."""
     for n, word in enumerate(args):
         option, equals, value = word.partition("=")
         if re.match(r"-[a-z][^=]", word):  # -cFILE
@@ -102,7 +101,7 @@ def options(args: Sequence[str]) -> Iterator[tuple[int, str, str]]:
 
 
 def given(args: Sequence[str], key: str) -> dict[str, str]:
-    """Return what arguments say about an object, unparsed: configurations and options, the later over the earlier.
+    """Return what arguments say about an object, unparsed; later configurations and options override earlier ones.
 
     Args:
         args: verb and arguments of ``lightning``.
@@ -127,13 +126,13 @@ def given(args: Sequence[str], key: str) -> dict[str, str]:
 
 
 def behind_configurations(args: Sequence[str], more: Sequence[str]) -> list[str]:
-    """Put more behind the verb and all configurations, where other arguments still have the last word."""
+    """Insert more arguments after the verb and all configurations, where other arguments still override them."""
     place = max((end for end, option, _ in options(args) if option in ("-c", "--config")), default=1)
     return [*args[:place], *more, *args[place:]]
 
 
 def classes_first(args: Sequence[str]) -> list[str]:
-    """Put what names a class before the first argument of it, where it was typed behind: the parser needs it there.
+    """Move an option that names a class before the first argument of that class, where the parser needs it.
 
     Example:
         >>> classes_first(["predict", "--data.path", "a.dat", "--data", "Recording"])
@@ -150,7 +149,7 @@ def classes_first(args: Sequence[str]) -> list[str]:
 
 
 def whole_counts(args: Sequence[str]) -> dict[str, int]:
-    """Return the numbers of batches in arguments of the Trainer, by name, of which the parser makes 1.0: everything.
+    """Return the Trainer's whole numbers of batches, by name; the parser would turn 1 into 1.0, everything.
 
     Example:
         >>> whole_counts(["test", "--trainer.limit_test_batches", "1", "--trainer.limit_val_batches", "0.5"])
@@ -167,7 +166,7 @@ def whole_counts(args: Sequence[str]) -> dict[str, int]:
 
 
 def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield dotted keys and what is no dictionary.
+    """Yield dotted keys and the values that are not dictionaries.
 
     Example:
         >>> dict(flatten({"network": {"width": 4, "motion": {}}}))
@@ -230,7 +229,7 @@ def preset_arguments(preset: Preset) -> list[str]:
 
 
 def arguments_preset(args: Sequence[str]) -> Preset | None:
-    """Return the preset that arguments make; ``None`` where they say what a preset cannot.
+    """Return the preset that arguments describe; ``None`` if a preset cannot express them.
 
     Example:
         >>> arguments_preset(["--model.weights=cscsr_small_x4"]).weights

@@ -1,4 +1,4 @@
-"""The ``lightning`` command: LightningCLI with one output folder, and with checkpoints that are found again."""
+"""The ``lightning`` command: LightningCLI with one output folder, in which it finds its checkpoints again."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class Parser(LightningArgumentParser):
         return text
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        """Say in one line what is wrong: jsonargparse would show every option, and what it had tried to build."""
+        """Report the error in one line: jsonargparse would show every option and everything it tried to build."""
         if not self.exit_on_error:
             super().error(message, ex)
         if "the following arguments are required: network" in message:
@@ -129,7 +129,7 @@ class Command(LightningCLI):
         super().__init__(*args, **kwargs)
 
     def subcommands(self) -> dict[str, set[str]]:
-        """Return the verb that was typed alone, as building the parser of every verb takes time."""
+        """Return only the verb that was typed, because building the parser of every verb takes time."""
         verbs = LightningCLI.subcommands()
         return {verb: verbs[verb] for verb in self.typed[:1] if verb in verbs} or verbs
 
@@ -251,7 +251,7 @@ class Command(LightningCLI):
             raise (InputError if _is_of_file(error, said) else UsageError)(said) from error
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
-        """Send everything to one folder, and use bfloat16 on a GPU that has it."""
+        """Send everything to one folder, and use bfloat16 on a GPU that supports it."""
         output = Path(self._get(self.config_init, "output"))
         config = self._get(self.config_init, "trainer")
         kwargs["default_root_dir"] = output
@@ -323,7 +323,7 @@ def _listed(value: Any) -> list[Any]:
 
 
 def check_folder(output: str | Path) -> None:
-    """Refuse what cannot be made a folder, or would be a folder that looks like a file.
+    """Refuse an output that cannot be a folder, or would be a folder that looks like a file.
 
     Raises:
         InputError: it is a file, or inside one, or new and ends like a picture, a film or another file.
@@ -388,7 +388,7 @@ def _precision(accelerator: str) -> str:
 
 
 def run(args: Sequence[str] | None, command: type[Command]) -> Command:
-    """Run what was typed after ``lightning``, with one of Lightning's verbs; what is wrong with it is raised."""
+    """Run what was typed after ``lightning``, with one of Lightning's verbs; errors are raised."""
     for says in ("pytorch_lightning.utilities.rank_zero", "lightning_fabric.utilities.seed"):
         logging.getLogger(says).setLevel(logging.WARNING)  # tips, and which devices there are
     for nothing_to_do in _NOTHING_TO_DO:

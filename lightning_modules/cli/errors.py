@@ -13,11 +13,11 @@ from spikekit.arguments import one_line
 
 
 class InputError(ValueError):
-    """Something that the user gave and that cannot be used; shown as one line, and the command ends with 1."""
+    """Unusable input from the user; shown as one line, and the command ends with status 1."""
 
 
 class UsageError(InputError, SpikekitUsageError):
-    """A command line that asks for what cannot be; shown as one line, and the command ends with 2."""
+    """A command line that asks for something impossible; shown as one line, and the command ends with status 2."""
 
 
 class Ended(SystemExit):
@@ -36,7 +36,7 @@ class Ended(SystemExit):
 
 
 class VerbParser(argparse.ArgumentParser):
-    """The arguments of a verb that is ours; what is wrong with them is one line."""
+    """The arguments of one of our own verbs; errors in them are one line."""
 
     def error(self, message: str) -> NoReturn:  # noqa: D102
         raise UsageError(f"{self.prog.removeprefix('lightning ')}: {message}")
@@ -57,7 +57,7 @@ def _of_users() -> tuple[type[Exception], ...]:
 
 @contextmanager
 def as_one_line() -> Iterator[None]:
-    """End the program with one line, and no traceback, where the user made a mistake."""
+    """End the program with one line, and no traceback, if the user made a mistake."""
     try:
         yield
     except OSError as error:

@@ -15,11 +15,11 @@ class FolderError(ValueError):
 
 
 class FolderInUseError(FolderError):
-    """A folder that another run is at work in."""
+    """A folder that another run is using."""
 
 
 def make_folder(folder: str | Path) -> None:
-    """Make a folder and try to write to it, so that a run does not notice at its end that it cannot.
+    """Make a folder and try to write to it, so that a run does not fail at its end.
 
     Args:
         folder: where.
@@ -37,9 +37,9 @@ def make_folder(folder: str | Path) -> None:
 
 @contextmanager
 def locked_folder(folder: str | Path, what: str, name: str = "lock") -> Iterator[None]:
-    """Keep other runs out of a folder; the lock goes when the process does, however it ends.
+    """Keep other runs out of a folder; the lock is released when the process ends, however it ends.
 
-    Where the file system has no locks there is none.
+    On a file system without locks there is no lock.
 
     Args:
         folder: where; made when it is missing.

@@ -1,4 +1,4 @@
-"""What ``lightning predict`` has beside the other verbs: the choice of weights, pictures and films."""
+"""The parts of ``lightning predict`` that other verbs do not have: the choice of weights, pictures and films."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def add_arguments(parser: LightningArgumentParser) -> None:
 
 
 def with_choice(parser: LightningArgumentParser, args: Sequence[str]) -> tuple[list[str], str]:
-    """Put in the setting that ``--speed`` or ``--budget`` asks for, and return what is to be said of it as well.
+    """Insert the setting that ``--speed`` or ``--budget`` asks for, and also return a message about it.
 
     What the choice depends on is read without the parser, which takes as long again: it has its say when all is known,
     and before anything that went wrong here.
@@ -103,7 +103,7 @@ def _choice(args: Sequence[str]) -> tuple[Preset, str]:
 def callbacks(
     output: Path, config: dict[str, Any], precision: int | str | None, given: Sequence[Callback]
 ) -> list[Callback]:
-    """Return what writes pictures and shows progress.
+    """Return the callbacks that write pictures and show progress.
 
     Args:
         output: a folder or a film.

@@ -1,4 +1,4 @@
-"""Python in processes of its own, on this machine or on a Ray cluster, such as those that make parts of a recording."""
+"""Python in separate processes, on this machine or on a Ray cluster, such as those that make parts of a recording."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def run_commands_on_ray(
 ) -> Iterator[dict[Path, str | None]]:
     """Run Python on the Ray cluster that ``RAY_ADDRESS`` names or that runs here, else on a Ray of this machine's own.
 
-    It says again and again which commands ended, and with what reason, ``None`` where nothing went wrong.
+    It repeatedly yields the commands that ended, with the reason of a failure or ``None``.
 
     Args:
         commands: given how many run at once, the arguments of Python by the file that a command's output goes to.
@@ -120,7 +120,7 @@ def _outcome(ray: Any, reference: Any) -> str | None:
 
 
 def start(log: Path, words: Sequence[str], environment: dict[str, str]) -> subprocess.Popen:
-    """Start Python, with what it prints at the end of a file, and more in its environment."""
+    """Start Python with its output appended to a file, and with additions to its environment."""
     # Threads that spin while they wait hold up the workers that make clips.
     environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ, **environment}
     with open(log, "ab") as file:
@@ -134,13 +134,13 @@ def start(log: Path, words: Sequence[str], environment: dict[str, str]) -> subpr
 
 
 def stop(process: subprocess.Popen) -> None:
-    """Have a process that was started here end, see :func:`end_with_parent`, and wait for it."""
+    """End a process that was started here, see :func:`end_with_parent`, and wait for it."""
     process.stdin.close()
     process.wait()
 
 
 def end_with_parent() -> None:
-    """Stop where the one that started this process does, even when it is killed: our standard input then closes."""
+    """End when the process that started this one does, even if it is killed: our standard input then closes."""
 
     def wait() -> None:
         while os.read(0, 1):

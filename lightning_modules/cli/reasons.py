@@ -1,4 +1,4 @@
-"""What is wrong with arguments, in one line."""
+"""Errors in arguments, as one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rehearse a command: parse and build it without running it, and report what is wrong in one line."""
+"""Rehearse a command: parse and build it without running it, and report errors in one line."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lightning_modules.cli.reasons import reason, suggestion, unknown
 
 
 class Rehearsal(Command):
-    """Parses and builds what a verb would, to find mistakes, which are raised; runs nothing and writes nothing."""
+    """Parses and builds what a verb would, and raises any errors; runs and writes nothing."""
 
     verb = "test"
 
@@ -30,7 +30,7 @@ def resolved(command: Rehearsal) -> dict[str, Any]:
 
 
 def mistake(error: Exception, args: Sequence[str], names: Sequence[str]) -> str:
-    """Return in one line what is wrong with arguments.
+    """Describe in one line what is wrong with arguments.
 
     Args:
         error: what was raised on them.

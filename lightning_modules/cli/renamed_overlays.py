@@ -23,7 +23,7 @@ FORMER_SIZES = {
 
 
 def with_current_overlays(args: Sequence[str]) -> list[str]:
-    """Put the overlays that there are in the place of those of former names; a line on stderr says so.
+    """Replace overlays given by former names by the current ones; a line on stderr says so.
 
     Args:
         args: verb and arguments of ``lightning``.

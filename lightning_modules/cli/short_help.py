@@ -1,4 +1,4 @@
-"""What ``--help`` answers at once: the verbs, and the options of each that are typed most often."""
+"""The quick answer of ``--help``: the verbs, and the most common options of each."""
 
 from __future__ import annotations
 

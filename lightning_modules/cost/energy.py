@@ -19,7 +19,7 @@ Meter = Callable[[], float]
 
 
 def energy_meter(device: torch.device) -> Meter | None:
-    """Return what counts the joules of a device, with all that runs on it beside us; None where nothing does."""
+    """Return a counter of a device's joules, which includes everything that runs on it; None if there is no counter."""
     return _gpu_meter(device) if device.type == "cuda" else _cpu_meter()
 
 

@@ -1,4 +1,4 @@
-"""``python -m lightning_modules.cost.exported``: what exported networks take beside the network itself."""
+"""``python -m lightning_modules.cost.exported``: the cost of exported networks compared with the network itself."""
 
 from __future__ import annotations
 

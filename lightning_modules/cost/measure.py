@@ -79,11 +79,11 @@ class Timed:
 
 
 def measure(rows: Sequence[Row], scenes: DataLoader, rounds: int) -> Timed:
-    """Measure the settings that can run; one that fails on the way gets a reason, and the others go on.
+    """Measure the settings that can run; if one fails, its row gets the reason, and the others continue.
 
     All settings see a clip before the next one is made. That also warms them up. Then they are timed, see
-    :func:`time_in_turns`, on the clips that are of one size with the first. Time does not contain the way of the
-    spikes to the device.
+    :func:`time_in_turns`, on the clips that are of one size with the first. Times do not include moving the spikes to
+    the device.
 
     Args:
         rows: of settings that can run.
@@ -125,8 +125,8 @@ def running(rows: Sequence[Row]) -> list[Row]:
 def time_in_turns(rows: Sequence[Row], clips: Sequence[Tensor], rounds: int) -> None:
     """Time all rows once in every round, on the round's clip, each round beginning with the next row.
 
-    What else the machine does, and what a clip asks for, then falls on all of them alike, and no row is always the
-    first of its round.
+    Other work on the machine and the demands of a clip then affect all rows alike, and no row is always the first of
+    its round.
 
     Args:
         rows: their ``seconds`` are added to.
@@ -157,7 +157,7 @@ def _clips(scenes: DataLoader) -> Iterator[dict[str, Tensor]]:
 
 
 def attempt(row: Row, work: Callable[[], None]) -> None:
-    """Do some work for a row; where it fails, the row gets the reason."""
+    """Do some work for a row; if it fails, the row gets the reason."""
     try:
         work()
     except Exception as error:  # the others are worth their rows

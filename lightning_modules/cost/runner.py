@@ -25,7 +25,7 @@ _WITHOUT_EFFECT = ("patch", "train_clips", "batch_size", "workers", "frames", "f
 
 
 class CannotRunError(RuntimeError):
-    """A setting that makes sense, and that cannot run here."""
+    """A valid setting that cannot run here."""
 
 
 class _Test(Rehearsal):
@@ -105,7 +105,7 @@ class Runner:
 
 
 def make_runner(shared: Sequence[str], args: Sequence[str], base: Runner) -> Runner:
-    """Build a setting, and see that it runs on the scenes of all the others.
+    """Build a setting and check that it runs on the scenes of all the others.
 
     Args:
         shared: arguments of all settings.

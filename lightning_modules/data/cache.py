@@ -22,7 +22,7 @@ _DIGEST = 32  # bytes of a SHA-256
 
 
 class ClipCache:
-    """A folder of clips that took time to make.
+    """A folder of clips that are slow to make.
 
     A clip is a file, named after its key. It is written as :func:`spikekit.io.whole_file.whole_file` does: a run that
     is killed leaves a part that nobody looks at, and of two processes that write a clip the last one wins. Before the
@@ -128,7 +128,7 @@ def clip_key(**what: object) -> str:
 
 
 def file_digest(path: Path) -> str:
-    """Return a digest of a file's bytes, computed once in a process as long as the file stays as it is.
+    """Return a digest of a file's bytes, computed once per process as long as the file does not change.
 
     Raises:
         OSError: the file cannot be read.
@@ -144,7 +144,7 @@ def _file_digest(path: Path, size: int, time_ns: int) -> str:
 
 
 def pack_clip(clip: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
-    """Make a clip small, without loss but for flow, which is rounded to half precision.
+    """Pack a clip, losslessly except for flow, which is rounded to half precision.
 
     Spikes become bits. A picture of at most 256 (65,536) values, as one that was read from a file of 8 (16) bits,
     becomes numbers of 8 (16) bits and a table.

@@ -34,7 +34,7 @@ from spikekit.sensor.noise import SensorNoise
 
 @dataclass(frozen=True)
 class ClipRecipe:
-    """How a clip is made of a film; the same of the same frames, in whatever process and order.
+    """How a clip is made from a film; the same frames give the same clip, in whatever process and order.
 
     Args:
         scale: super-resolution factor.
@@ -313,10 +313,10 @@ class FilmClips(Dataset):
 class FilmScenes(ClipScenes):
     """Clips of films, seen by a simulated camera: REDS, Vid4, Vimeo-90K, or any folder of frame folders.
 
-    What lies in ``root`` says which data set it is. Of the 120-fps REDS, 240 scenes train and 30 validate and test, 5
-    clips each. Vid4 is for tests. Vimeo-90K is for a scale of 4: the camera sees its low-resolution sequences, which
-    are the official ones of its test set, or those of a folder ``BIx4`` beside ``sequences``, or made here; the truth
-    is the full-size frame in the middle. Of other films one in twenty validates, and all are tested.
+    The contents of ``root`` determine which data set it is. Of the 120-fps REDS, 240 scenes train and 30 validate and
+    test, 5 clips each. Vid4 is for tests. Vimeo-90K is for a scale of 4: the camera sees its low-resolution sequences,
+    which are the official ones of its test set, or those of a folder ``BIx4`` beside ``sequences``, or made here; the
+    truth is the full-size frame in the middle. Of other films one in twenty validates, and all are tested.
 
     Training takes patches, everything else whole views, cut at the bottom and at the right to multiples of twice the
     scale. The whole view is simulated also for a patch, which takes seconds where frames are large: give a ``cache``.

@@ -19,7 +19,8 @@ _A_MOMENT = 2.0  # seconds
 
 
 class FreshClips(DistributedSampler[int]):
-    """Consecutive indices that go on where training stands, so that a resumed run sees what an unbroken one would.
+    """Consecutive indices that continue where training stands, so that a resumed run sees the same clips as an unbroken
+    one.
 
     Where several processes train, each takes its batch of every step, so that every clip is seen once: two processes
     see in a step what one of twice the batch size would.

@@ -1,4 +1,4 @@
-"""The margin around a training patch, where spikes are there for the estimate of motion alone."""
+"""The margin around a training patch, whose spikes serve only to estimate motion."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ _LOOKS = 8
 
 
 class RecordingClips(Dataset[dict[str, Any]]):
-    """Clips around some frames of a recording, read when they are asked for, or one after the other.
+    """Clips around some frames of a recording, read on demand or one after the other.
 
     Args:
         path: a ``.dat`` or ``.npz`` file, see :func:`spikekit.read_spikes`.
@@ -181,7 +181,7 @@ class _Batches:
 class Recording(LightningDataModule):
     """One recording of a colour spike camera, for ``predict``.
 
-    What a side-car beside the recording knows, or ``camera``, need not be said: size, Bayer phase and gain.
+    Size, Bayer phase and gain can be omitted if a side-car beside the recording, or ``camera``, specifies them.
 
     Its arguments are those of :class:`RecordingClips`.
     """

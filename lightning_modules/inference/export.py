@@ -1,4 +1,4 @@
-"""Networks for other programs: programs of torch.export, and ONNX."""
+"""Export of networks for other programs, by torch.export and as ONNX."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ def _program(module: nn.Module, inputs: dict[str, Tensor]) -> torch.export.Expor
 
 
 def difference(found: Tensor | Sequence[Tensor], expected: Tensor | Sequence[Tensor]) -> Tensor:
-    """Return by how much a value of an export differs from that of the network at most; NaN if one is."""
+    """Return the largest difference between an export's result and the network's; NaN if one of them is."""
     pairs = zip(*([one] if isinstance(one, Tensor) else one for one in (found, expected)), strict=True)
     return torch.stack([(got - wanted).abs().max() for got, wanted in pairs]).max()
 
@@ -201,7 +201,7 @@ def _reason(error: BaseException) -> str:
 
 
 def exported(data: bytes, kind: str, threads: int | None = None) -> Callable[..., Any]:
-    """Return what runs an export, in this process.
+    """Return a function that runs an export in this process.
 
     Args:
         data: the file.

@@ -1,4 +1,4 @@
-"""Films: the pictures of a stream of spikes, one after the other as it comes."""
+"""Films: pictures from a stream of spikes, one after the other as it arrives."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def film(
     white: float | None = None,
     **how: Any,
 ) -> Iterator[FilmFrame]:
-    r"""Yield the pictures of a stream as it comes: a recording that is read on, or a camera at work.
+    r"""Yield the pictures of a stream as it arrives, from a recording or a live camera.
 
     Convention:
         The picture of clock n needs the clocks n - N // 2 to n + (N - 1) // 2, N being the network's frames, and is

@@ -1,4 +1,4 @@
-"""Films by a network that carries what it knows from one key frame to the next."""
+"""Films by a network that carries a state from one key frame to the next."""
 
 from __future__ import annotations
 

@@ -294,9 +294,9 @@ def choose(
     size: tuple[int, int] = (250, 400),
     film: bool = False,
 ) -> Choice:
-    """Pick the preset that serves best.
+    """Choose the best preset for a speed or a budget.
 
-    For a budget of time this machine is tried first, for a second or so, and the times of the table are taken times
+    For a time budget this machine is measured first, for about a second, and the times of the table are multiplied by
     :func:`pace`.
 
     Args:

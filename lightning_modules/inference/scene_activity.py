@@ -79,10 +79,10 @@ def _noise(frames: int) -> Tensor:
 def scene_activity(spikes: Tensor, pattern: str, alpha: float) -> Activity:
     r"""Measure texture, grain and motion of clips.
 
-    Two weighted sums over the frames say nearly all: the mean light of every pixel, and its change from the beginning
-    to the end. Texture is what smoothing takes away from the mean; grain, the noise of the mean, is large where it is
-    dark. Both and the change count only as far as they exceed what an ideal sensor shows of constant light. More
-    noise, as of a real sensor, looks like texture and motion, and is given to the network.
+    Two weighted sums over the frames contain nearly all of it: the mean light of every pixel, and its change from
+    beginning to end. Texture is what smoothing removes from the mean; grain, the noise of the mean, is large where it
+    is dark. Both and the change count only as far as they exceed what an ideal sensor shows of constant light. More
+    noise, as from a real sensor, looks like texture and motion, and goes through the network.
 
     Args:
         spikes: :math:`(B, N, H, W)`, zeros and ones, any real dtype.
@@ -122,7 +122,7 @@ def _scene_activity(spikes: Tensor, pattern: str, alpha: float) -> Activity:
 
 
 def look(spikes: Tensor, scale: int, pattern: str, alpha: float, model: ErrorModel | None = None) -> Look:
-    """Look at clips: what every part of the picture would lose by less work.
+    """Analyse clips: what every part of the picture would lose by less work.
 
     Args:
         spikes: :math:`(B, N, H, W)`, zeros and ones, any real dtype.
@@ -170,12 +170,12 @@ def expected_errors(seen: Activity, model: ErrorModel) -> tuple[Tensor, Tensor, 
 def required(seen: Look, tolerance: float) -> tuple[Tensor, Tensor]:
     r"""Which cells need the network, and which of them its motion.
 
-    What adds least to the squared error is left out first, until the PSNR of the whole picture is expected to have
+    Work that adds least to the squared error is skipped first, until the PSNR of the whole picture is expected to have
     fallen by the tolerance:
 
     .. math:: \Delta E \le (10^{tolerance / 10} - 1) \, E
 
-    So a larger tolerance never asks for more. Of several clips the one that needs most says what is done.
+    So a larger tolerance never needs more work. For several clips, the most demanding one decides.
 
     Args:
         seen: by :func:`look`.

@@ -1,4 +1,4 @@
-"""Measure what errors in the flows of the four sub-streams cost, joined in the three ways of Table 3: J, D and E.
+"""Measure the cost of errors in the flows of the four sub-streams, joined in the three ways of Table 3: J, D and E.
 
 ``python -m lightning_modules.metrics.flow_noise VID4`` prints the table. The flows are those of ``ClassicalFlow``,
 asked for every sub-stream by itself; normal noise is added to each of them, and they are joined as eq. (7) has it (J),

@@ -36,7 +36,7 @@ class Measure(NamedTuple):
 
 
 def measures() -> list[Measure]:
-    """Return the measures that are to be had here.
+    """Return the measures that are available here.
 
     Example:
         >>> [measure.name for measure in measures()][:2]
@@ -47,7 +47,7 @@ def measures() -> list[Measure]:
 
 
 def why_no_lpips() -> str | None:
-    """Return in a line what LPIPS lacks here, or None. Nothing is downloaded unasked."""
+    """Return in one line what LPIPS lacks here, or None. Nothing is downloaded unasked."""
     weights = Path(torch.hub.get_dir()) / "checkpoints" / _ALEXNET
     if find_spec("torchvision") is None:
         return "LPIPS not measured: expected torchvision, which is not installed"

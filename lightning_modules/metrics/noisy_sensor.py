@@ -1,4 +1,4 @@
-"""Measure what a calibration is worth on a noisy sensor, for decoders and a network.
+"""Measure the benefit of a calibration on a noisy sensor, for decoders and a network.
 
 ``python -m lightning_modules.metrics.noisy_sensor PICTURES`` prints the table: still pictures in motion, seen by a BGGR
 sensor of another gain than the weights were trained for.

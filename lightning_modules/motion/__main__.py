@@ -1,6 +1,6 @@
 """``python -m lightning_modules.motion``: error and time of ClassicalFlow and of scikit-image's TV-L1.
 
-Scenes whose flow is known, those of README's table of estimators; all estimate in turns, in one process.
+On scenes whose flow is known; all estimators take turns, in one process.
 """
 
 from __future__ import annotations

@@ -37,8 +37,8 @@ class ClassicalFlow(MotionEstimator):
     of the cells that it is part of, so that the noise of the four sites is averaged *before* motion is estimated;
     averaging four flows afterwards, as eq. (7) does with a learned estimator, was less accurate here.
 
-    A dark pixel fires so rarely that a mean flickers. How much is known, for an ideal sensor, from its rate, and it
-    counts for that much less.
+    A dark pixel fires so rarely that a mean flickers. For an ideal sensor its rate tells by how much, and the pixel is
+    given less weight accordingly.
 
     Args:
         attachment: how much the flow follows the pictures, in firing rates, rather than being smooth.

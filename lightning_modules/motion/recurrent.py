@@ -34,7 +34,7 @@ class ResidualBlock(nn.Module):
 
 
 class GlobalAttention(nn.Module):
-    """Every position adds what it finds at all positions that resemble it; nothing at the beginning of training.
+    """Every position adds the features of all positions that resemble it; nothing at the beginning of training.
 
     Args:
         width: channels that come and go.

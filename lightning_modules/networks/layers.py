@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 
 def channels_last(planes: Tensor) -> Tensor:
-    """(B, C, H, W) with its channels side by side in memory, as convolutions keep them, and are faster with."""
+    """(B, C, H, W) with its channels side by side in memory, the layout in which convolutions are faster."""
     return planes.contiguous(memory_format=torch.channels_last)
 
 

@@ -62,7 +62,7 @@ class Network(nn.Module):
 
     @classmethod
     def from_pretrained(cls, weights: str | Path, motion: MotionEstimator | None = None, **arguments: Any) -> Self:
-        """Build the network that weights are of, this class or one that derives from it, and load them.
+        """Build the network that weights belong to, this class or a subclass, and load them.
 
         Args:
             weights: the name of weights that come with the package, such as ``"cscsr_small_x4"``; a file of
@@ -103,11 +103,11 @@ class Network(nn.Module):
         """Multiply the picture by a factor, in the weights, once and for all.
 
         A camera of twice the gain sees a scene as the other sees one twice as bright: the same spikes, half the
-        picture. A network whose input is divided by alpha knows that already; others override this.
+        picture. A network whose input is divided by alpha does this already; others override this method.
         """
 
     def check_spikes(self, spikes: Tensor) -> None:
-        """Raise unless a clip is one that the network takes.
+        """Raise unless the network can take a clip.
 
         Raises:
             TypeError: not a tensor of real numbers.

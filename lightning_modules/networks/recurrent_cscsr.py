@@ -1,4 +1,4 @@
-"""CSCSR for films: what is known of a key frame helps its neighbours."""
+"""CSCSR for films: the state of a key frame helps its neighbours."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ class RecurrentCSCSR(CSCSR):
         return [torch.stack(pictures, dim=1) for pictures in ([earlier, final] if future else [final])]
 
     def features(self, spikes: Tensor, flow: Tensor | None) -> Tensor:
-        """Return what a clip says of its key frame by itself.
+        """Return the features of a clip's key frame, from this clip alone.
 
         Args:
             spikes: (B, N, H, W).

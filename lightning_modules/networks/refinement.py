@@ -74,8 +74,8 @@ class TimeFusion(nn.Conv2d):
     def start_at_the_mean(self, pixels: int) -> None:
         """Set weights, so that the first channels are the means over time of the first feature.
 
-        A single linear layer of random weights would have to find them behind the noise of every time point: training
-        then rests on a plateau, for longer or shorter as the seed has it.
+        A single linear layer with random weights would have to find them behind the noise of every time point: training
+        would then stay on a plateau, for a time that depends on the seed.
 
         Args:
             pixels: temporal pixels in which the first feature comes, the first channels of every time point.

@@ -1,4 +1,4 @@
-"""Two CSCSR networks, one of shorter and one of longer clips: the motion of every place decides between them."""
+"""Two CSCSR networks, one for shorter and one for longer clips: the local motion decides between them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _BLEND = 4.0  # standard deviation of the transition, in sensor pixels
 
 
 class TwoSpanCSCSR(Network):
-    r"""Super-resolution from as many clocks as the scene allows: many where it is slow, few where it is fast.
+    r"""Super-resolution from as many clocks as the scene allows: many where motion is slow, few where it is fast.
 
     Both networks are trained already. What moves slowly is seen by the one of the longer clip, what moves fast by the
     other, each on the middle of the same clip; between the two speeds their pictures are blended, and that is better

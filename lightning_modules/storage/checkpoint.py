@@ -54,7 +54,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
 
 
 def check_tensors(tensors: Mapping[str, Tensor]) -> None:
-    """Refuse weights that are no finite numbers: a network would return black pictures, and nothing would say why.
+    """Refuse weights that are not finite: a network would return black pictures without any explanation.
 
     Args:
         tensors: weights by name.

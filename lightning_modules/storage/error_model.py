@@ -1,4 +1,4 @@
-"""Error model of a network: how much less work costs in squared error, with constants fitted for its weights."""
+"""Error model of a network: the squared error that skipping work adds, with constants fitted for its weights."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ _ADAPTED = "alpha", "motion_fusion"  # settings that weights serve any value of
 
 
 class CheckpointMismatchError(ValueError):
-    """Weights of another network than the one that they are meant for."""
+    """Weights of a different network than the one they are meant for."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def read_weights(source: str | Path) -> Weights:
 
 
 def check_weights(weights: Weights, kinds: Mapping[str, type[nn.Module]]) -> None:
-    """Compare weights with what they are said to be of, before any of it is built and takes memory.
+    """Compare weights with the network that their file names, before anything is built or takes memory.
 
     Args:
         weights: as they were read.
@@ -122,7 +122,7 @@ def _named(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def write_weights(weights: Weights, path: str | Path) -> None:
-    """Write weights as a file of safetensors that knows what network it is of.
+    """Write weights as a safetensors file that also stores which network they belong to.
 
     Raises:
         ValueError: the name does not end in .safetensors.
@@ -147,19 +147,19 @@ def _same_every_time(data: bytes) -> bytes:
 
 
 def settings_of(network: nn.Module) -> dict[str, Any]:
-    """Return the class of a network and what it was built with."""
+    """Return the class of a network and its arguments."""
     return {"class": type(network).__name__, **network.settings}
 
 
 def motion_of(network: nn.Module) -> dict[str, Any]:
-    """Return the same of the estimator of motion in a network, if it has one with weights."""
+    """Return the same for the motion estimator of a network, if it has one with weights."""
     motion = getattr(network, "motion", None)
     learned = motion is not None and bool(motion.state_dict())
     return settings_of(motion) if learned else {}
 
 
 def check_settings(network: nn.Module, settings: dict[str, Any], source: str | Path) -> None:
-    """Refuse weights of another network: scale, say, is in no parameter, and would go unnoticed.
+    """Refuse weights of another network: a different scale, for example, changes no parameter and would go unnoticed.
 
     Args:
         network: what the weights are meant for.
@@ -184,7 +184,7 @@ def check_settings(network: nn.Module, settings: dict[str, Any], source: str | P
 def with_own_motion(
     tensors: dict[str, Tensor], motion: nn.Module, prefix: str = "", keep: bool = False
 ) -> dict[str, Tensor]:
-    """Weights in which those of another kind of estimator are replaced by an estimator's own.
+    """Replace the weights of another kind of estimator by an estimator's own.
 
     Estimators are exchanged freely: a network is trained with one and used with all of them.
 
@@ -204,11 +204,10 @@ def with_own_motion(
 
 
 def load_weights(network: nn.Module, weights: Weights, keep_motion: bool = False) -> None:
-    """Give a network weights that are of its kind.
+    """Load weights into a network of the same kind.
 
-    Weights are of the gain alpha that they were trained with. Where the network was built for another, its picture is
-    multiplied by what one gain is of the other. How the motion of the colours is joined may differ as well: it has no
-    weights.
+    Weights belong to the gain alpha that they were trained with. If the network was built for another, its picture is
+    multiplied by the ratio of the gains. How the motion of the colours is joined may differ as well: it has no weights.
 
     Args:
         network: what the weights are meant for.

@@ -77,7 +77,7 @@ def check_shapes(
     source: str | Path,
     kinds: Mapping[str, type[nn.Module]],
 ) -> None:
-    """Compare weights with the network that they are said to be of, before that takes any memory.
+    """Compare weights with the network that their settings describe, before it takes any memory.
 
     Args:
         settings: as for :func:`own_class`.

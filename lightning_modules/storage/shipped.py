@@ -42,7 +42,7 @@ class Pretrained:
 
     @property
     def parameters(self) -> int:
-        """How many numbers were learned, an estimator of motion inside included."""
+        """Number of learned parameters, including those of a motion estimator inside."""
         with safe_open(self.path, "numpy") as file:
             return sum(prod(file.get_slice(name).get_shape()) for name in file.keys())  # noqa: SIM118
 

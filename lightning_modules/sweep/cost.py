@@ -20,7 +20,7 @@ _ROUNDS = 5
 
 
 def measure_variants(rows: Sequence[Row], path: Path) -> dict[str, Any]:
-    """Measure what ``lightning predict`` takes for a clip with every variant that is trained, or read what it took.
+    """Measure the cost of ``lightning predict`` on a clip for every trained variant, or read earlier results.
 
     All variants are measured in this process, with the weights of their first seed, and timed in turns: every variant
     once in every round. One that cannot run here is left out.

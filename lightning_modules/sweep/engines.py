@@ -1,4 +1,4 @@
-"""Engines: trials in processes of their own, on this machine or on a Ray cluster."""
+"""Engines: trials in separate processes, on this machine or on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Ended = dict[Path, str | None]
 
 
 def run_locally(folders: Sequence[Path], jobs: int | None, every: float) -> Iterator[Ended]:
-    """Run trials on this machine, and say again and again which ones ended.
+    """Run trials on this machine, and repeatedly yield those that ended.
 
     Args:
         folders: of the trials.

@@ -1,4 +1,4 @@
-"""State of a sweep on disk: small files of JSON and YAML, written whole and looked at before they are believed."""
+"""State of a sweep on disk: small JSON and YAML files, written whole, and checked when they are read."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _KINDS: dict[str, Any] = {
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a file that is there whole or not at all."""
+    """Write a file completely or not at all."""
     with whole_file(path, "w") as file:
         file.write(json.dumps(value, indent=1))
 

@@ -105,7 +105,7 @@ def score_names(rows: Sequence[Row]) -> list[str]:
 
 
 def collect(trials: Sequence[Trial], failed: dict[Path, str]) -> list[Row]:
-    """Gather what is there of the results, in the order of the trials."""
+    """Collect the results so far, in the order of the trials."""
     rows: dict[str, Row] = {}
     for trial in trials:
         row = rows.setdefault(trial.variant, Row([]))

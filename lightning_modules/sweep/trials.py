@@ -49,7 +49,7 @@ class Trial:
         return "-".join(self.labels)
 
     def write(self) -> None:
-        """Write down in the folder what the trial is.
+        """Record in the folder what the trial is.
 
         Raises:
             InputError: the folder holds a trial of another configuration or budget.
@@ -76,7 +76,7 @@ def make_trials(
     budget: dict[str, float],
     output: Path,
 ) -> list[Trial]:
-    """Combine everything with everything, parse and build each combination, and write nothing.
+    """Make all combinations, parse and build each of them, and write nothing.
 
     Args:
         configs: configurations of all trials, in the order of ``lightning fit -c``.

@@ -1,4 +1,4 @@
-"""State of a training in a checkpoint: looked at before it is believed, for Lightning would fail on it midway."""
+"""The training state in a checkpoint, checked before it is used, because Lightning would fail on it midway."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MOST = (1 << 63) - 1
 
 
 def check_training_state(checkpoint: Mapping[str, Any], path: str | Path) -> None:
-    """Refuse a checkpoint that training cannot go on with, before anything is built.
+    """Refuse a checkpoint that training cannot resume from, before anything is built.
 
     Args:
         checkpoint: as :func:`read_checkpoint` returns it.
@@ -50,7 +50,7 @@ def check_training_state(checkpoint: Mapping[str, Any], path: str | Path) -> Non
 
 
 def check_like_fresh(checkpoint: Mapping[str, Any], path: str | Path, model: Learner, trainer: Trainer) -> None:
-    """Compare the state of a training with that of one which begins, part by part.
+    """Compare the state of a training with that of a fresh one, part by part.
 
     Args:
         checkpoint: as :func:`lightning_modules.storage.checkpoint.read_checkpoint` returns it, after

@@ -24,7 +24,7 @@ def whole_sizes(**sizes: int) -> dict[str, int]:
 
 
 def check_decoder(decoder: str, window: int) -> None:
-    """Raise unless mosaics can be decoded so: by TFI, or by TFP of an odd window.
+    """Raise unless the decoder is TFI, or TFP with an odd window.
 
     Raises:
         ValueError: another decoder, or an even window.

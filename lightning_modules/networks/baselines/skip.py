@@ -10,7 +10,7 @@ from spikekit import demosaic_residual
 
 
 def begin_at_zero(*layers: nn.Conv2d) -> None:
-    """Let convolutions begin with nothing, so that training starts at what their result is added to."""
+    """Initialise convolutions with zeros, so that training starts from what their result is added to."""
     for layer in layers:
         nn.init.zeros_(layer.weight)
         nn.init.zeros_(layer.bias)
