@@ -13,8 +13,8 @@ from skimage import data
 import spikekit as sk
 
 # %%
-# The sensor stands behind a Bayer filter: of every colour it sees only some pixels. ``light`` is what reaches a
-# pixel in one clock, in thresholds; ``alpha`` is that of white.
+# The sensor stands behind a Bayer filter, so it sees each colour only at some pixels. ``light`` is what reaches a
+# pixel in one clock, in thresholds; for a white pixel it is ``alpha``.
 
 alpha = 0.4
 rgb = torch.tensor(data.astronaut()).movedim(-1, 0)[:, :192, 128:320] / 255
@@ -42,8 +42,8 @@ for ax in axes:
     ax.set_axis_off()
 
 # %%
-# How much do more clocks help? Rounding is the error that is left: a window of W clocks knows a rate to about 1 /
-# W.
+# How much do more clocks help? The remaining error is rounding: a window of W clocks resolves a rate to about
+# 1 / W.
 
 figure, ax = plt.subplots(figsize=(5, 3), layout="constrained")
 windows = range(1, 42, 4)

@@ -23,7 +23,7 @@ def clip(velocity):
 
 
 # %%
-# TFI takes the inverse of the interval between two spikes: it follows motion, and knows only 1, 1/2, 1/3, ... TFP
+# TFI takes the inverse of the interval between two spikes: it follows motion, but has only 1, 1/2, 1/3, ... TFP
 # counts spikes in a window: smooth at rest, blurred in motion. A mean of means of means (``order=3``) over 13
 # frames each loses much less to rounding than one mean, and weighs the middle most.
 

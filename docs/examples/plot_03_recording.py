@@ -45,8 +45,8 @@ for column, frame in zip(axes.T, (60, 200, 340), strict=True):
         ax.set_axis_off()
 
 # %%
-# What is longer than the memory comes in chunks. Here the green pixels of a column over time, decoded piece by piece:
-# the slopes are the motion.
+# A recording that does not fit in memory comes in chunks. Here the green pixels of a column over time, decoded piece by
+# piece: the slopes are the motion.
 
 chunks = sk.iter_spikes(path, **size, chunk=100)
 pieces = sk.decode_in_chunks(lambda part: sk.tfp(part, 13, order=3), chunks, overlap=18)

@@ -22,7 +22,7 @@ truth = scene.rgb(scene.middle)
 print("spikes", tuple(spikes.shape))
 
 # %%
-# The two decoders show what can be had without learning: decoded, demosaiced, enlarged by bicubic interpolation.
+# The two decoders show what is possible without learning: decoded, demosaiced, enlarged by bicubic interpolation.
 # CSCSR estimates the motion from the spikes and looks for the pixels of every colour along it.
 
 networks = {

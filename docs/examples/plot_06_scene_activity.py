@@ -27,8 +27,8 @@ light = scene.light("RGGB", scale=scale, alpha=alpha)
 spikes = sk.simulate_spikes(light, generator=torch.Generator().manual_seed(0))[None]
 
 # %%
-# ``look`` says for every cell what it would lose by less work, by an error model that was fitted for these weights;
-# ``required`` spends the tolerance, cheapest cells first.
+# ``look`` estimates what every cell would lose by less work, with an error model that was fitted for these weights;
+# ``required`` spends the tolerance on the cheapest cells first.
 
 model = CSCSR.from_pretrained("cscsr_small_x4").error_model
 seen = look(spikes, scale, "RGGB", alpha, model)
@@ -49,5 +49,5 @@ for ax, tolerance in zip(axes, (0.02, 0.1, 0.5), strict=True):
 
 # %%
 # Blue cells get the smooth mean, plain ones the network for a scene at rest, green ones the network with optical
-# flow. A larger tolerance never asks for more. ``lightning predict`` then works tile by tile: a tile is done as its
+# flow. A larger tolerance never needs more work. ``lightning predict`` then works tile by tile: a tile gets what its
 # most demanding cell requires.

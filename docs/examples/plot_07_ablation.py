@@ -56,8 +56,8 @@ ax.grid(alpha=0.3)
 ax.legend()
 
 # %%
-# Without motion every moved pixel is looked for where it is not. At rest, all four agree. A little motion even helps:
-# the sensor sees the scene between its pixels, and the search puts these samples together.
+# Without motion, every moved pixel is looked for in the wrong place. At rest, all four agree. A little motion even
+# helps: the sensor sees the scene between its pixels, and the search puts these samples together.
 
 for name, values in scores.items():
     print(f"{name:12}", "  ".join(f"{value:6.2f}" for value in values))

@@ -21,8 +21,8 @@ spikes = sk.simulate_spikes(scene.light("RGGB", scale=scale, alpha=alpha), gener
 truth = scene.rgb(scene.middle)
 
 # %%
-# The camera model: the picture, moved to every fifth clock as the flow says, averaged by the sensor's pixels. What the
-# decoder says of those clocks is to be met. (The flow is the true one here; an estimate would do.)
+# The camera model: the picture, moved to every fifth clock as the flow says, averaged by the sensor's pixels. Its
+# result has to match what the decoder says of those clocks. (The flow is the true one here; an estimate would do.)
 
 clocks = list(range(5, 36, 5))
 back = torch.stack([-scene.flow(clock, scale=1) for clock in clocks])  # from the clock to the middle

@@ -19,8 +19,7 @@ _A_MOMENT = 2.0  # seconds
 
 
 class FreshClips(DistributedSampler[int]):
-    """Consecutive indices that continue where training stands, so that a resumed run sees the same clips as an unbroken
-    one.
+    """Consecutive indices from where training stands, so that a resumed run sees the clips of an unbroken one.
 
     Where several processes train, each takes its batch of every step, so that every clip is seen once: two processes
     see in a step what one of twice the batch size would.
