@@ -216,7 +216,9 @@ class Command(LightningCLI):
         begun, begin = Begun(), perf_counter()
         self.trainer.callbacks.append(begun)
         try:
-            with _locked(subcommand, config), restoring(config.get("ckpt_path"), begun):
+            if config.ckpt_path:  # before a folder is made and scenes are loaded
+                check_settings(self.model.network, read_checkpoint(config.ckpt_path)["network"], config.ckpt_path)
+            with _locked(subcommand, config), restoring(config.ckpt_path, begun):
                 if subcommand == "predict" and config.engine == "ray":
                     folder = Path(pictures_folder(config.output))
                     make_parts(self.typed, folder, str(self.trainer.precision), config.jobs)
@@ -358,7 +360,7 @@ def _check_verb(verb: str, model: Learner, data: LightningDataModule) -> None:
 def _check_continuation(path: str, model: Learner, trainer: Trainer | None) -> None:
     """Refuse to go on with another network, optimizer or schedule: the checkpoint's would win without a word."""
     checkpoint = read_checkpoint(path)
-    check_settings(model.network, checkpoint["network"], "the checkpoint")
+    check_settings(model.network, checkpoint["network"], path)
     here = dict(flatten(model.recipe))
     there = dict(flatten(checkpoint["recipe"] or model.recipe))  # older checkpoints do not say
     for key in sorted({**there, **here}):

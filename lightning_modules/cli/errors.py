@@ -46,13 +46,19 @@ def _of_users() -> tuple[type[Exception], ...]:
     """Return what is raised where a user made a mistake; importing it takes torch."""
     from pytorch_lightning.utilities.exceptions import MisconfigurationException
 
+    from lightning_modules.checkpoint import DivergedError
     from lightning_modules.cli.folder_lock import FolderError
     from lightning_modules.storage.pretrained import CheckpointMismatchError
     from spikekit import SpikeFileError, VideoError
     from spikekit.io import PictureError
 
-    ours = InputError, SpikeFileError, PictureError, VideoError, CheckpointMismatchError, FolderError
-    return *ours, MisconfigurationException  # of Lightning, such as a device that is not there
+    files = SpikeFileError, PictureError, VideoError, CheckpointMismatchError, FolderError
+    return (
+        InputError,
+        *files,
+        DivergedError,
+        MisconfigurationException,
+    )  # of Lightning, such as a device that is not there
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,6 +16,10 @@ from lightning_modules.storage.settings import check_plain
 _NUMBERS = {torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.int64, torch.int32, torch.bool}
 #: what Lightning would build something from
 _NOT_TAKEN = ("hyper_parameters", "datamodule_hyper_parameters", "hparams_name", "datamodule_hparams_name")
+
+
+class DivergedError(ValueError):
+    """A training whose weights are no longer finite."""
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -49,6 +54,8 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         check_tensors(checkpoint["state_dict"])
     except Exception as error:  # what torch raises depends on the damage
         reason = (str(error).splitlines() or [""])[0][:300]
+        if isinstance(error, pickle.UnpicklingError):  # torch would advise to run what is there
+            reason = "expected tensors and plain values, got something else, which is not run"
         raise ValueError(f"{path}: not a checkpoint of lightning fit ({type(error).__name__}: {reason})") from error
     return {key: value for key, value in checkpoint.items() if key not in _NOT_TAKEN}
 

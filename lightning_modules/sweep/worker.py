@@ -20,7 +20,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from lightning_modules.cli.command import Command, run
 from lightning_modules.cli.errors import as_one_line
 from lightning_modules.cli.processes import end_with_parent
-from lightning_modules.storage.checkpoint import read_checkpoint
+from lightning_modules.storage.checkpoint import DivergedError, read_checkpoint
 from lightning_modules.sweep.budget import has_end, with_budget
 from lightning_modules.sweep.state import PROGRESS, RESULT, read_json, read_yaml, write_json
 from spikekit.io.whole_file import whole_file
@@ -29,10 +29,6 @@ _A_MOMENT = 0.5  # seconds between two reports
 
 # Steps that are run to learn how long one takes, and how many of them are too early to count.
 _TIMED, _WARM_UP = 12, 4
-
-
-class DivergedError(RuntimeError):
-    """A loss that is no number any more."""
 
 
 class Report(Callback):
@@ -228,8 +224,5 @@ def _metrics(path: Path) -> dict[str, dict[str, float]]:
 if __name__ == "__main__":
     end_with_parent()
     arguments, sys.argv = sys.argv[1:], sys.argv[:1]
-    try:
-        with as_one_line():
-            train_and_test(Path(arguments[0]), float(arguments[1]))
-    except DivergedError as error:
-        sys.exit(f"lightning: {error}")
+    with as_one_line():
+        train_and_test(Path(arguments[0]), float(arguments[1]))

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from lightning_fabric.plugins import TorchCheckpointIO
 
-from lightning_modules.storage.checkpoint import read_checkpoint
+from lightning_modules.storage.checkpoint import DivergedError, check_tensors, read_checkpoint
 from spikekit.io.whole_file import whole_file
 
 #: of the state of a ModelCheckpoint: files that it may go on to remove
@@ -20,7 +20,15 @@ class Checkpoints(TorchCheckpointIO):
     """How Lightning reads, writes and removes checkpoints: without running code, whole, and nothing else than them."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
-        """Write a checkpoint; one that was there stays until the new one is complete."""
+        """Write a checkpoint; one that was there stays until the new one is complete.
+
+        Raises:
+            DivergedError: its weights are not finite; the checkpoint that was there is what training can go on from.
+        """
+        try:
+            check_tensors(checkpoint["state_dict"])
+        except ValueError as error:
+            raise DivergedError(f"{path}: not written, as the training has diverged ({error})") from error
         with whole_file(path) as file:
             try:
                 torch.save(checkpoint, file)

@@ -105,11 +105,15 @@ class Predictions(Callback):
         for n, (rgb, frame) in enumerate(zip(outputs, batch["frame"].tolist(), strict=True)):
             if not batch["shown"][n]:
                 continue
+            path = self._paths[frame]
+            if not rgb.isfinite().all():  # it would be black there, and nothing would say why
+                raise PictureError(
+                    f"{path}: expected a picture, the network makes NaN of this clip; nothing is written"
+                )
             shown = to_bytes(show(rgb))  # (H, W, 3), a quarter of the memory
             if self.beside:
                 decoded = to_bytes(show(self._decoded(module, batch, n)))
                 shown = torch.cat([decoded, shown.new_full((len(shown), _GAP, 3), 255), shown], dim=1)
-            path = self._paths[frame]
             with writing(path, PictureError), whole_file(path) as file:
                 file.write(png_bytes(shown.movedim(-1, 0), self._notes))
             self._written += 1

@@ -8,6 +8,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from spikekit.arguments import one_line
+from spikekit.io.images import MOST_PIXELS
 from spikekit.io.whole_file import whole_file
 from spikekit.sensor.calibration import Calibration
 
@@ -16,7 +17,6 @@ ENDING = ".calibration.safetensors"
 
 _KIND = "spikekit calibration 1"
 _PLANES = {"gain": "F32", "dark": "F32", "defects": "U8"}
-_MOST_PIXELS = 1 << 27
 
 
 def write_calibration(path: str | Path, calibration: Calibration) -> None:
@@ -73,8 +73,8 @@ def read_calibration(path: str | Path) -> Calibration:
             size = stored.get("gain", (None, ()))[1]
             if stored != {name: (dtype, size) for name, dtype in _PLANES.items()}:
                 raise ValueError(f"expected gain, dark and defects of one size, got {str(stored)[:200]}")
-            if len(size) != 2 or not 0 < size[0] * size[1] <= _MOST_PIXELS:
-                raise ValueError(f"expected (H, W) of at most {_MOST_PIXELS} pixels, got {size}")
+            if len(size) != 2 or not 0 < size[0] * size[1] <= MOST_PIXELS:
+                raise ValueError(f"expected (H, W) of at most {MOST_PIXELS} pixels, got {size}")
             return Calibration(**{name: file.get_tensor(name) for name in _PLANES})
     except (SafetensorError, OSError, ValueError) as error:
         raise ValueError(f"{path}: not a calibration that can be read ({one_line(error)[:300]})") from error

@@ -27,6 +27,7 @@ from spikekit.io.formats import (
     write_npz,
     writing,
 )
+from spikekit.io.images import MOST_PIXELS
 from spikekit.io.whole_file import whole_file
 
 # Pixels that are written at a time, so that a tensor of any dtype needs no copy of itself as bits.
@@ -165,9 +166,10 @@ def spikes_shape(path: str | Path, height: int | None = None, width: int | None 
         size = path.stat().st_size
     if size == 0:
         raise SpikeFileError(f"{path}: an empty file, 0 bytes")
-    if _check_suffix(path) == ".dat":
-        return dat_shape(path, size, height, width)
-    return npz_shape(path, height, width)
+    shape = dat_shape(path, size, height, width) if _check_suffix(path) == ".dat" else npz_shape(path, height, width)
+    if shape[1] * shape[2] > MOST_PIXELS:  # what is packed well takes little of a disk, and all memory
+        raise SpikeFileError(f"{path}: expected frames of at most {MOST_PIXELS} pixels, got {shape[1]} x {shape[2]}")
+    return shape
 
 
 def write_spikes(path: str | Path, spikes: Tensor | Iterable[Tensor], *, flip: bool = False) -> None:

@@ -12,6 +12,7 @@ from safetensors.torch import save_file
 
 from lightning_modules import motion, networks
 from lightning_modules.__main__ import main
+from lightning_modules.cli.errors import as_one_line
 from lightning_modules.motion import ESTIMATORS, Spike2Flow
 from lightning_modules.networks import CSCSR, NETWORKS
 from lightning_modules.storage.checkpoint import read_checkpoint
@@ -96,8 +97,9 @@ def test_code_in_a_checkpoint_is_not_run_by_lightning(content, tmp_path, monkeyp
     torch.save({**content(), "callbacks": Harmful()}, tmp_path / "a.ckpt")
     for forced in ("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "NOTHING"):
         monkeypatch.setenv(forced, "1")
-        with pytest.raises(ValueError, match=r"a.ckpt: not a checkpoint of lightning fit \(UnpicklingError"):
+        with pytest.raises(ValueError, match=r"a.ckpt: not a checkpoint of lightning fit \(UnpicklingError") as refused:
             Checkpoints().load_checkpoint(tmp_path / "a.ckpt", weights_only=False)
+        assert "weights_only" not in str(refused.value)  # what torch advises would run it
         monkeypatch.delenv(forced)
     assert not (tmp_path / "harmed").exists()
 
@@ -224,6 +226,19 @@ def test_weights_that_are_not_finite_are_refused(bad, suffix, tmp_path):
     path = write(tmp_path / f"bad{suffix}", SETTINGS, {}, tensors)
     with pytest.raises(ValueError, match=rf"bad{suffix}: .*reconstruction.rgb.bias: expected finite weights"):
         read_weights(path)
+
+
+def test_a_training_that_has_diverged_leaves_its_last_good_checkpoint(content, tmp_path):
+    path = tmp_path / "last.ckpt"
+    Checkpoints().save_checkpoint(content(), path)
+    before, bad = path.read_bytes(), content()
+    next(iter(bad["state_dict"].values()))[0] = float("nan")
+    with (
+        pytest.raises(SystemExit, match=r"^lightning: .*last.ckpt: not written, as the training has diverged"),
+        as_one_line(),
+    ):
+        Checkpoints().save_checkpoint(bad, path)
+    assert path.read_bytes() == before
 
 
 @pytest.mark.parametrize(

@@ -184,7 +184,7 @@ def test_a_checkpoint_of_another_scale_is_refused(trained, overlay, configs, tmp
         *("--ckpt_path", trained / "checkpoints/last.ckpt"),
     )
     assert done.returncode == 1
-    assert done.stderr.endswith("lightning: the checkpoint was trained with scale=4; this run asks for scale=2\n")
+    assert done.stderr.endswith("last.ckpt was trained with scale=4; this run asks for scale=2\n")
 
 
 @pytest.mark.slow
@@ -369,7 +369,7 @@ def _checkpoint(overlay, configs, tmp_path):
         ("--model.optimizer.lr=1e-3", "model.optimizer.lr: expected 0.0001, as .*last.ckpt was .* with, got 0.001"),
         ("--model.lr_scheduler.step_size=5", "model.lr_scheduler.step_size: expected 7500, .* got 5"),
         ("--model.optimizer=SGD", "model.optimizer.class_path: expected torch.optim.Adam, .* got torch.optim.SGD"),
-        ("--model.network.width=6", "the checkpoint was trained with width=4; this run asks for width=6"),
+        ("--model.network.width=6", "last.ckpt was trained with width=4; this run asks for width=6"),
     ],
 )
 def test_a_run_does_not_go_on_with_what_the_checkpoint_would_override(checkpoint, change, said):

@@ -1,5 +1,6 @@
 """What every verb ends with: one line on stderr, 2 for wrong use and 1 for a file that is to blame; nothing written."""
 
+import io
 import shlex
 import subprocess
 import sys
@@ -14,6 +15,12 @@ from lightning_modules.cli.errors import as_one_line
 from lightning_modules.cli.folder_lock import FolderError, locked_folder
 from spikekit import write_spikes
 
+
+def _of_another_scale():
+    torch.save({"state_dict": {}, "network": {"class": "CSCSR", "scale": 2}}, file := io.BytesIO())
+    return file.getvalue()
+
+
 OVERLAY = "model: {network: {init_args: {width: 4, representation_width: 4, features: 1, stages: 1, end_blocks: 1}}}"
 FILES = {
     "tiny.yaml": OVERLAY.encode(),
@@ -22,6 +29,7 @@ FILES = {
     "deep.yaml": b"[" * 100_000,
     "odd.yaml": b"model: {network: {class_path: CSCSR, init_args: {motion: nonsense.Estimator}}}",
     "cut.ckpt": b"PK\3\4 and no more",
+    "other.ckpt": _of_another_scale(),
     "cut.safetensors": b"\xff" * 30,
     "odd.dat": bytes(range(256)),
     "a.txt": b"text",
@@ -70,6 +78,10 @@ def _rows():
         ("sweep {configs}/x4.yaml -c deep.yaml", "deep.yaml"),
         (f"fit {x4} --ckpt_path cut.ckpt -o out", "cut.ckpt"),
         (f"validate {x4} --ckpt_path nowhere.ckpt", "nowhere.ckpt"),
+        *(
+            (f"{verb} {x4} --data.val_clips 1 --ckpt_path other.ckpt -o out", "other.ckpt was trained with scale=2")
+            for verb in ("validate", "test")
+        ),
         (f"test {x4} --model.weights cut.safetensors -o out", "cut.safetensors"),
         (f"fit {x4} --data.root nowhere", "nowhere"),
         (f"predict --speed fast {recording} nowhere.dat -o out", "nowhere.dat"),

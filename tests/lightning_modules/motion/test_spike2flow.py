@@ -117,6 +117,14 @@ def test_windows_are_those_of_intervals_around_the_times(window):
             assert seen[:, :, direction, number].equal(sites[:, :, frames].float())
 
 
+def test_context_is_that_of_the_window_where_all_flows_begin():
+    network, seen = Spike2Flow(**TINY).network, []
+    network.context.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    windows = torch.rand(2, 4, 11, 8, 12)
+    network(windows, 1)
+    assert seen[0].equal(windows[:, 0])
+
+
 def test_time_reversed_swaps_the_flows():
     estimator = Spike2Flow(**TINY)
     spikes = clip(2)

@@ -15,7 +15,7 @@ from PIL import Image
 from lightning_modules.__main__ import main
 from lightning_modules.cli import parts
 from lightning_modules.inference.film import film
-from lightning_modules.networks import RecurrentCSCSR
+from lightning_modules.networks import ClassicalDecoder, RecurrentCSCSR
 from lightning_modules.storage.pretrained import Weights, settings_of, write_weights
 from lightning_modules.tasks import predictions
 from spikekit import read_picture, read_spikes, read_video, write_spikes
@@ -62,6 +62,15 @@ def test_a_film_shows_the_pictures_of_the_folder(words, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "film.mkv: 6 pictures, 0." in said
     assert " s a frame: reading 0." in said
+
+
+def test_a_picture_of_nan_is_no_picture(words, tmp_path, monkeypatch):
+    """Weights may be finite and too large; a black picture would say nothing of it."""
+    nan = torch.full((1, 3, 24, 32), float("nan"))
+    monkeypatch.setattr(ClassicalDecoder, "forward", lambda *_: nan)
+    with pytest.raises(SystemExit, match=r"^lightning: .*frame_000020.png: expected a picture, the network makes NaN"):
+        main([*words, str(tmp_path / "out")])
+    assert not pictures(tmp_path / "out")
 
 
 def test_a_decoder_stands_beside_the_picture(words, tmp_path):

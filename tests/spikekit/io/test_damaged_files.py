@@ -240,6 +240,17 @@ def test_a_few_bytes_that_claim_a_large_picture(kind, tmp_path, monkeypatch):
         read_picture(tmp_path / f"a.{kind}")
 
 
+@pytest.mark.parametrize("ending", [".dat", ".npz"])
+def test_frames_of_a_recording_are_no_larger_than_pictures(ending, tmp_path, monkeypatch):
+    """A packed file of 260 kB could hold a frame whose statistics take gigabytes."""
+    write_spikes(path := tmp_path / f"a{ending}", SPIKES)
+    monkeypatch.setattr("spikekit.io.files.MOST_PIXELS", 45)
+    assert read_spikes(path, 5, 9).equal(SPIKES)
+    monkeypatch.setattr("spikekit.io.files.MOST_PIXELS", 44)
+    with pytest.raises(SpikeFileError, match=f"a{ending}: expected frames of at most 44 pixels, got 5 x 9"):
+        read_spikes(path, 5, 9)
+
+
 @pytest.mark.parametrize("shape", [(1, 1 << 20, 1 << 20), (6, 5, 10), (6, 5, 8)])
 def test_an_npz_that_declares_another_size_than_it_holds(shape, tmp_path):
     np.lib.format.write_array_header_1_0(
