@@ -46,8 +46,8 @@ def _of_users() -> tuple[type[Exception], ...]:
     """Return what is raised where a user made a mistake; importing it takes torch."""
     from pytorch_lightning.utilities.exceptions import MisconfigurationException
 
-    from lightning_modules.checkpoint import DivergedError
     from lightning_modules.cli.folder_lock import FolderError
+    from lightning_modules.storage.checkpoint import DivergedError
     from lightning_modules.storage.pretrained import CheckpointMismatchError
     from spikekit import SpikeFileError, VideoError
     from spikekit.io import PictureError
