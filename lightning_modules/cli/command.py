@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from inspect import signature
+from mimetypes import guess_type
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NoReturn
@@ -140,7 +141,7 @@ class Command(LightningCLI):
             type=str,
             default="runs",
             help="Folder of the run: checkpoints, TensorBoard files, config.yaml, tables and pictures; of predict also "
-            "a film, .mp4, .mov, .mkv or .gif.",
+            "a film, .mp4, .mov, .mkv or .gif, or, of a single frame, a .png.",
         )
         parser.set_defaults({"model": {"class_path": "SuperResolution"}})
         network = "model.init_args.network.init_args"
@@ -184,10 +185,10 @@ class Command(LightningCLI):
     def before_instantiate_classes(self) -> None:
         """Turn ``--ckpt_path best`` and ``last`` into files, and keep a run from being written over."""
         config = self.config[self.subcommand]
-        if self.subcommand == "predict" and is_film(config.output):
+        predicts = self.subcommand == "predict"
+        if predicts and is_film(config.output):
             check_film(config.output)
-        else:
-            check_folder(config.output)
+        check_folder(pictures_folder(config.output) if predicts else config.output)
         checkpoints = Path(config.output) / "checkpoints"
         asked = config.get("ckpt_path")
         if asked in ("best", "last"):
@@ -241,6 +242,8 @@ class Command(LightningCLI):
             # here, so that what is wrong with it is known before anything is written
             _check_verb(self.subcommand, self.model, self.datamodule)
             self.datamodule.setup(self.subcommand)
+            if self.subcommand == "predict":
+                prediction.check_output(Path(config.output), self.datamodule.clips)
             _check_agreement(self.model, self.datamodule)
             if self.subcommand == "fit":
                 chosen = self.config_dump["model"]["init_args"]
@@ -331,7 +334,9 @@ def check_folder(output: str | Path) -> None:
         InputError: it is a file, or inside one, or new and ends like a picture, a film or another file.
     """
     ending = Path(output).suffix.lower()
-    if ending in _FILE_ENDINGS and not Path(output).is_dir():
+    kind = guess_type(Path(output).name)[0] or ""
+    looks_like_file = ending in _FILE_ENDINGS or kind.startswith(("image/", "video/", "audio/"))
+    if looks_like_file and not Path(output).is_dir():
         raise UsageError(f"-o: expected a folder, got {output}, which ends like a file, in {ending}")
     there = next(path for path in (Path(output).absolute(), *Path(output).absolute().parents) if path.exists())
     if not there.is_dir():

@@ -15,9 +15,10 @@ from lightning_modules.cli.arguments import WEIGHTS, behind_configurations, give
 from lightning_modules.cli.errors import InputError, UsageError
 from lightning_modules.data import RecordingClips
 from lightning_modules.inference.presets import SPEEDS, Preset, choose
-from lightning_modules.tasks.predictions import PictureProgress, Predictions, file_identity, is_film
+from lightning_modules.tasks.predictions import PictureProgress, Predictions, file_identity, is_film, is_picture
 from spikekit import __version__
 from spikekit.decoders.methods import DECODERS
+from spikekit.io.sidecar import check_unclaimed
 from spikekit.timing import duration
 
 NO_RECORDING = "predict: expected a recording: --data Recording --data.path FILE"
@@ -100,13 +101,30 @@ def _choice(args: Sequence[str]) -> tuple[Preset, str]:
     return choice.preset, f"{choice}\n{len(clips)} pictures, written as PNG: about {took}{instead}"
 
 
+def check_output(output: Path, clips: RecordingClips) -> None:
+    """Refuse a file for several pictures, and one that the recording needs.
+
+    Raises:
+        UsageError: which of them it is.
+    """
+    if is_picture(output) and len(clips) != 1:
+        raise UsageError(
+            f"-o: expected a folder or a film for {len(clips)} pictures, got {output}; --data.frame chooses one"
+        )
+    if is_picture(output) or is_film(output):
+        try:
+            check_unclaimed([output], clips.recording.path)
+        except ValueError as error:
+            raise UsageError(f"-o: {error}") from error
+
+
 def callbacks(
     output: Path, config: dict[str, Any], precision: int | str | None, given: Sequence[Callback]
 ) -> list[Callback]:
     """Return the callbacks that write pictures and show progress.
 
     Args:
-        output: a folder or a film.
+        output: a folder, a film or a picture.
         config: what was asked for, as plain values.
         precision: of the Trainer.
         given: callbacks that were asked for.

@@ -77,7 +77,7 @@ _OPTIONS: dict[str, tuple[str, _Options]] = {
             "--model.weights NAME": "instead, weights: a name that lightning models lists, a .safetensors, a .ckpt",
             **_INFERENCE,
             **_TRAINER,
-            **_OUTPUT,
+            "-o OUT": "a folder, a film (.mp4, .mov, .mkv, .gif) or, of a single frame, a .png; runs if not given",
         },
     ),
 }

@@ -34,9 +34,14 @@ def is_film(output: str | Path) -> bool:
     return Path(output).suffix.lower() in (*VIDEO_ENDINGS, ".gif") and not Path(output).is_dir()
 
 
+def is_picture(output: str | Path) -> bool:
+    """Whether this names a single picture rather than a folder of them."""
+    return Path(output).suffix.lower() == ".png" and not Path(output).is_dir()
+
+
 def pictures_folder(output: str | Path) -> Path:
-    """Return the folder of the pictures: of a film, one beside it, which is removed when the film is whole."""
-    return Path(f"{output}.frames") if is_film(output) else Path(output)
+    """Return the folder of the pictures: of a film or a picture, one beside it, which goes when that is whole."""
+    return Path(f"{output}.frames") if is_film(output) or is_picture(output) else Path(output)
 
 
 class Predictions(Callback):
@@ -47,7 +52,7 @@ class Predictions(Callback):
 
     Args:
         output: a folder, or a film: .mp4, .mov, .mkv or .gif, whose pictures lie in a folder beside it until they are
-            complete.
+            complete; or a .png, where there is one clip.
         made_of: settings of the pictures, as plain values; pictures are made again whatever is there when not given.
         fps: pictures shown in a second of the film.
         beside: ``"tfi"`` or ``"tfp"`` shows what this decoder makes of the same clip left of every picture.
@@ -72,7 +77,7 @@ class Predictions(Callback):
     def setup(self, trainer: Trainer, module: LightningModule, stage: str) -> None:  # noqa: D102
         clips = trainer.datamodule.clips
         clips.part = self.part
-        self._film, self._white, self._written = is_film(self.output) and self.part[1] == 1, clips.white, 0
+        self._file, self._white, self._written = self.folder != self.output and self.part[1] == 1, clips.white, 0
         self._paths = {frame: self.folder / f"frame_{frame:06d}.png" for frame in clips.chosen}
         self._notes = {}
         if self.made_of is not None:
@@ -135,9 +140,13 @@ class Predictions(Callback):
             return
         lacking = [path for path in self._paths.values() if not self._is_there(path)]
         there, total = len(self._paths) - len(lacking), len(self._paths)
-        if self._film and not lacking:
-            pictures = (png_pixels(path) for path in self._paths.values())
-            write_video(self.output, progress(pictures, "film", total), self.fps)
+        if self._file and not lacking:
+            if is_film(self.output):
+                pictures = (png_pixels(path) for path in self._paths.values())
+                write_video(self.output, progress(pictures, "film", total), self.fps)
+            else:
+                (path,) = self._paths.values()
+                path.replace(self.output)
             shutil.rmtree(self.folder, ignore_errors=True)
         count = f"{there} of {total}" if lacking else total
         made = f", {self._written} of them new" if self._written < there and trainer.world_size == 1 else ""

@@ -214,6 +214,6 @@ def _without_size(path: Path) -> str:
             fits[height, width] = f"{height} x {width} ({name}: {frames} frames)"
     sizes = " and ".join(fits.values()) or f"none of {', '.join(f'{h} x {w}' for h, w in USUAL_SIZES)}"
     return (
-        f"{path}: a .dat has no header, give --height and --width; of the usual sizes (H x W), "
-        f"{sizes} divide{'' if len(fits) > 1 else 's'} its {size} bytes exactly"
+        f"{path}: a .dat has no header, give --height and --width (of lightning, --data.height and --data.width); "
+        f"of the usual sizes (H x W), {sizes} divide{'' if len(fits) > 1 else 's'} its {size} bytes exactly"
     )

@@ -238,7 +238,8 @@ def test_a_file_is_no_folder_for_the_output(verb, inside, configs, tmp_path):
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("picture.PNG", "-o: expected a folder, got .*picture.PNG, which ends like a file"),
+        ("picture.JPG", "-o: expected a folder, got .*picture.JPG, which ends like a file"),
+        ("scan.tiff", "-o: expected a folder, got .*scan.tiff, which ends like a file"),
         ("a/page.html", "-o: expected a folder, got .*a/page.html, which ends like a file"),
         ("a/film.webm", ".*a/film.webm: expected a film that ends in .mp4, .mov, .mkv, .gif"),
     ],

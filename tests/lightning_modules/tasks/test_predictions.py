@@ -13,12 +13,13 @@ import torch
 from PIL import Image
 
 from lightning_modules.__main__ import main
-from lightning_modules.cli import parts
+from lightning_modules.cli import processes
 from lightning_modules.inference.film import film
 from lightning_modules.networks import ClassicalDecoder, RecurrentCSCSR
 from lightning_modules.storage.pretrained import Weights, settings_of, write_weights
 from lightning_modules.tasks import predictions
 from spikekit import read_picture, read_spikes, read_video, write_spikes
+from spikekit.cli.command import main as spikekit
 from spikekit.io import video_output
 
 pytest.importorskip("av")
@@ -71,6 +72,34 @@ def test_a_picture_of_nan_is_no_picture(words, tmp_path, monkeypatch):
     with pytest.raises(SystemExit, match=r"^lightning: .*frame_000020.png: expected a picture, the network makes NaN"):
         main([*words, str(tmp_path / "out")])
     assert not pictures(tmp_path / "out")
+
+
+def test_one_frame_is_one_picture(words, tmp_path, capsys):
+    main([*words, str(tmp_path / "out"), "--data.frame", "40"])
+    main([*words, str(tmp_path / "a" / "one.PNG"), "--data.frame", "40"])
+    assert (tmp_path / "a" / "one.PNG").read_bytes() == (tmp_path / "out" / "frame_000040.png").read_bytes()
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["one.PNG"]
+    assert "one.PNG: 1 pictures" in capsys.readouterr().out
+
+
+def test_a_picture_for_several_frames_is_refused(words, tmp_path, capsys):
+    with pytest.raises(SystemExit) as exit:
+        main([*words, str(tmp_path / "b" / "one.png"), "--data.frame", "20:60"])
+    assert exit.value.code == 2
+    assert "-o: expected a folder or a film for 4 pictures, got" in capsys.readouterr().err
+    assert not (tmp_path / "b").exists()
+
+
+def test_the_truth_of_a_simulated_recording_is_not_written_over(words, tmp_path, capsys):
+    Image.effect_noise((40, 32), 60).convert("RGB").save(tmp_path / "scene.png")
+    spikekit(["simulate", str(tmp_path / "scene.png"), "-o", str(tmp_path / "a.dat"), "--scale", "2"])
+    truth = (tmp_path / "a.png").read_bytes()
+    words[words.index(str(tmp_path / "clip.npz"))] = str(tmp_path / "a.dat")
+    with pytest.raises(SystemExit) as exit:
+        main([*words, str(tmp_path / "a.png"), "--data.frame", "20"])
+    assert exit.value.code == 2
+    assert "a.png: the ground truth of a.json would be lost; choose another name" in capsys.readouterr().err
+    assert (tmp_path / "a.png").read_bytes() == truth
 
 
 def test_a_decoder_stands_beside_the_picture(words, tmp_path):
@@ -249,7 +278,7 @@ def test_ray_makes_what_one_process_makes(words, tmp_path, monkeypatch):
 
 
 def test_ray_is_said_to_be_missing(words, tmp_path, monkeypatch):
-    monkeypatch.setattr(parts, "find_spec", lambda _: None)
+    monkeypatch.setattr(processes, "find_spec", lambda _: None)
     with pytest.raises(SystemExit, match="predict: --engine ray: Ray is not installed"):
         main([*words, str(tmp_path / "out"), "--engine", "ray"])
 
@@ -257,7 +286,6 @@ def test_ray_is_said_to_be_missing(words, tmp_path, monkeypatch):
 _PEAK = """
 import resource, sys
 from lightning_modules.__main__ import main
-from lightning_modules.cli import parts
 main(sys.argv[1:])
 print("peak", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
