@@ -27,7 +27,7 @@ def check_training_state(checkpoint: Mapping[str, Any], path: str | Path) -> Non
     """Refuse a checkpoint that training cannot resume from, before anything is built.
 
     Args:
-        checkpoint: as :func:`read_checkpoint` returns it.
+        checkpoint: as :func:`lightning_modules.storage.checkpoint.read_checkpoint` returns it.
         path: its file, for the message.
 
     Raises:

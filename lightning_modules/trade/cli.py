@@ -31,7 +31,7 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         usage="lightning trade -c CONFIG [-c OVERLAY ...] [arguments of lightning test] [--setting SETTING ...] "
         "[--rounds N] [-o DIR]",
-        description="Measure what every setting costs and what it is worth, on this machine and these scenes.",
+        description="Measure the cost and the quality of every setting, on this machine and these scenes.",
         epilog=f"""\
 A setting is arguments of `lightning test`, put behind those that all settings share. Its pictures are those of
 `lightning predict`, tiles and tolerance included, on the test clips; a network of fewer frames than the shared

@@ -46,10 +46,10 @@ _FEW, _ENOUGH = 4, 8  # spikes of a pixel in a window: below the one there is a 
 def run(args: argparse.Namespace) -> None:
     """Show a recording: decoded pictures, spikes over time, how often pixels fire, and what moves.
 
-    A .png is a sheet about one moment, a .gif shows pictures sliding over time, a .html is a page of its own with both
-    and a slider; it needs no network. Only the frames that are shown are read.
+    A .png is a sheet about one moment, a .gif shows pictures sliding over time, a .html is a page with both
+    and a slider, which works offline. Only the frames that are shown are read.
 
-    What the side-car of a simulated stream knows, or --camera, need not be said: size, Bayer phase and brightness.
+    Size, Bayer phase and brightness can be omitted if a side-car or --camera gives them.
     """
     shown = open_recording(args)
     begin, end = _span(args.frames, shown)
