@@ -29,6 +29,7 @@ _PRESET = {
     "window": "--model.network.window",
     "order": "--model.network.order",
     "scale": "--model.network.scale",
+    "frames": "--model.network.frames",
     "motion": "--model.network.motion",
     "motion_weights": "--model.network.motion.weights",
     "motion_iterations": "--model.network.motion.iterations",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,9 @@ from spikekit.timing import duration
 NO_RECORDING = "predict: expected a recording: --data Recording --data.path FILE"
 
 _PART = restricted_string_type("Part", r"[1-9]\d{0,5}/[1-9]\d{0,5}")
+
+# how many times as long as its clips a recording is whose first and last pictures a longer clip may cost
+_MANY = 10
 
 # milliseconds a pixel of a picture, written as PNG by one core
 _WRITING = 7e-5
@@ -90,11 +94,13 @@ def _choice(args: Sequence[str]) -> tuple[Preset, str]:
     known = {name: recording[name] for name in ("path", "pattern", "camera", "frame") if name in recording}
     sizes = {name: int(recording[name]) for name in ("height", "width", "every") if name in recording}
     clips, scale = RecordingClips(**known, **sizes), int(network.get("scale", 4))
-    film = any(option in ("-o", "--output") and is_film(value) for _, option, value in options(args) if value)
-    choice = choose(scale, speed, wishes.get("--budget"), clips.size, film)
+    film = any(later - clock <= clips.frames for clock, later in pairwise(clips.chosen))  # one knows the other
+    longest = max(clips.frames, _room(clips) if "frame" in known else clips.recording.frames // _MANY)
+    choice = choose(scale, speed, wishes.get("--budget"), clips.size, film, longest)
     speeds = list(SPEEDS)
     sooner = speeds[max(speeds.index(speed) - 1, 0)] if speed else None
-    other = choose(scale, sooner, None, clips.size, film) if sooner else choice
+    other = choose(scale, sooner, None, clips.size, film, longest) if sooner else choice
+    clips = RecordingClips(**known, **sizes, frames=choice.preset.clip)
     writing = _WRITING * scale**2 * clips.size[0] * clips.size[1]
     took, sooner_took = (duration(len(clips) * (one.ms + writing) / 1e3) for one in (choice, other))
     instead = f"; --speed {sooner}: {sooner_took}, {other.below:.2f} dB below the best" if other != choice else ""
@@ -116,6 +122,11 @@ def check_output(output: Path, clips: RecordingClips) -> None:
             check_unclaimed([output], clips.recording.path)
         except ValueError as error:
             raise UsageError(f"-o: {error}") from error
+
+
+def _room(clips: RecordingClips) -> int:
+    """Return how many frames clips around all frames that are asked for may have."""
+    return 2 * min(clips.chosen[0], clips.recording.frames - 1 - clips.chosen[-1]) + 1
 
 
 def callbacks(

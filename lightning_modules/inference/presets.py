@@ -15,7 +15,7 @@ import torch
 from lightning_modules import motion as estimators
 from lightning_modules.inference.predict import predict
 from lightning_modules.inference.tiles import FAR, TILE
-from lightning_modules.networks import CSCSR, ClassicalDecoder, Network
+from lightning_modules.networks import CSCSR, ClassicalDecoder, Network, TwoSpanCSCSR
 from lightning_modules.storage.shipped import find_shipped
 from spikekit.arguments import one_line
 from spikekit.timing import timer_of
@@ -23,6 +23,12 @@ from spikekit.timing import timer_of
 _FOLDER = Path(__file__).parents[1] / "weights"
 
 _DECODER = "ClassicalDecoder"
+
+#: networks that are asked for by name, as they need no weights of their own
+_NETWORKS = {_DECODER: ClassicalDecoder, "TwoSpanCSCSR": TwoSpanCSCSR}
+
+#: spike frames of a clip, where nothing else is said
+_FRAMES = 41
 
 #: how far a speed may be below the best, in dB of the table
 SPEEDS = {"fastest": float("inf"), "fast": 1.2, "balanced": 0.3, "best": 0.005}
@@ -45,15 +51,16 @@ _UNITS = {
 
 @dataclass(frozen=True)
 class Preset:
-    """Weights, or a decoder without any, and how they are used; ``None`` leaves everything as it is by default.
+    """Weights, or a network without any of its own, and how they are used; ``None`` leaves all as it is by default.
 
     Args:
         weights: those of a network: a name of the package, or a file.
-        network: instead of weights, ``"ClassicalDecoder"``.
+        network: instead of weights, ``"ClassicalDecoder"`` or ``"TwoSpanCSCSR"``.
         method: of the decoder, ``"tfi"`` or ``"tfp"``.
         window: of the decoder.
         order: of the decoder.
-        scale: super-resolution factor of the decoder; weights know theirs.
+        scale: super-resolution factor of that network; weights know theirs.
+        frames: spike frames of a clip of that network; likewise.
         motion: class of the estimator, such as ``"ZeroFlow"``, in place of the one that the weights were trained with.
         motion_weights: of that estimator.
         motion_iterations: of that estimator.
@@ -64,7 +71,7 @@ class Preset:
         precision: of the Trainer, such as ``"bf16-mixed"``.
 
     Raises:
-        ValueError: weights and a decoder, or arguments of a decoder or of an estimator that is not named.
+        ValueError: weights and a network, or arguments of a network or of an estimator that is not named.
 
     Example:
         >>> Preset("cscsr_small_x4", motion="ZeroFlow").build().motion
@@ -81,6 +88,7 @@ class Preset:
     window: int | None = None
     order: int | None = None
     scale: int | None = None
+    frames: int | None = None
     motion: str | None = None
     motion_weights: str | None = None
     motion_iterations: int | None = None
@@ -91,13 +99,17 @@ class Preset:
     precision: str | None = None
 
     def __post_init__(self) -> None:
-        if self.network not in (None, _DECODER):
-            raise ValueError(f"network: expected {_DECODER!r}, or weights of another, got {self.network!r}")
+        if self.network not in (None, *_NETWORKS):
+            named = " or ".join(map(repr, _NETWORKS))
+            raise ValueError(f"network: expected {named}, or weights of another, got {self.network!r}")
         if self.network and self.weights:
-            raise ValueError(f"weights: expected none with network={_DECODER!r}, got {self.weights!r}")
-        for name in self.given("method", "window", "order", "scale"):
+            raise ValueError(f"weights: expected none with network={self.network!r}, got {self.weights!r}")
+        for name in self.given("method", "window", "order"):
+            if self.network != _DECODER:
+                raise ValueError(f"{name}: expected network={_DECODER!r} with it, got {self.network!r}")
+        for name in self.given("scale", "frames"):
             if self.network is None:
-                raise ValueError(f"{name}: expected network={_DECODER!r} with it, got None")
+                raise ValueError(f"{name}: expected the name of a network with it, got None")
         for name in self.given("motion_weights", "motion_iterations"):
             if self.motion is None:
                 raise ValueError(f"{name}: expected the estimator's class as motion with it, got None")
@@ -106,6 +118,12 @@ class Preset:
         """Return those of some arguments that are not ``None``."""
         values = {name: getattr(self, name) for name in names}
         return {name: value for name, value in values.items() if value is not None}
+
+    @property
+    def clip(self) -> int:
+        """How many spike frames a clip has; that of a file of weights which is not the package's is taken for 41."""
+        shipped = find_shipped(self.weights or "")
+        return (shipped and shipped.frames) or self.frames or _FRAMES
 
     @classmethod
     def columns(cls) -> list[str]:
@@ -142,12 +160,12 @@ class Preset:
 
         Raises:
             FileNotFoundError: there are no such weights.
-            ValueError: neither weights nor a decoder, weights of something else, or an unknown estimator.
+            ValueError: neither weights nor a network, weights of something else, or an unknown estimator.
         """
         if self.network is not None:
-            return ClassicalDecoder(**self.given("method", "window", "order", "scale")).eval()
+            return _NETWORKS[self.network](**self.given("method", "window", "order", "scale", "frames")).eval()
         if self.weights is None:
-            raise ValueError(f"preset: expected weights or network={_DECODER!r}, got {self}")
+            raise ValueError(f"preset: expected weights or the name of a network, got {self}")
         return CSCSR.from_pretrained(self.weights, self._estimator(), **self.given("steps"))
 
     def _estimator(self) -> estimators.MotionEstimator | None:
@@ -189,7 +207,7 @@ class Choice:
         return f"{self.name}: {cost}, {self.below:.2f} dB below the best"
 
 
-def choices(scale: int, size: tuple[int, int], film: bool = False) -> list[Choice]:
+def choices(scale: int, size: tuple[int, int], film: bool = False, frames: int = _FRAMES) -> list[Choice]:
     """Return the presets of the table for a scale that leave the precision as it is, fastest first.
 
     Time is taken to grow with the number of pixels; times are the table's ratios, taken times that of the row which it
@@ -203,6 +221,7 @@ def choices(scale: int, size: tuple[int, int], film: bool = False) -> list[Choic
         size: of a frame, (H, W) in sensor pixels.
         film: whether frames are made one after the other, as ``lightning trade --film`` measures them; where no such
             table comes with the package, a frame in a film is taken for one by itself.
+        frames: spike frames that a clip may have; presets that need more are left out.
 
     Raises:
         ValueError: no table comes with the package for this scale.
@@ -214,13 +233,15 @@ def choices(scale: int, size: tuple[int, int], film: bool = False) -> list[Choic
         preset = Preset.read(row)
         if preset.precision is not None or preset.tile == 0 or not (preset.weights or preset.network):
             continue
+        if preset.clip > frames:
+            continue
         measured = int(row["height"]) * int(row["width"])
         pixels = size[0] * size[1] / measured
         shipped = find_shipped(preset.weights or "")
         halo = shipped.halo if shipped else CSCSR.halo
         in_tile = min(pixels, ((preset.tile or TILE) + 2 * (halo + FAR)) ** 2 / measured)
         psnr, ratio, mib = (float(row[name]) for name in ("psnr", "ratio", "mib"))
-        moves = preset.motion != "ZeroFlow" and preset.network is None
+        moves = preset.motion != "ZeroFlow" and preset.network != _DECODER
         everywhere = frame + moves * _MOTION * measured
         mib = everywhere * pixels + (mib - everywhere) * in_tile
         ms = ratio * float(_reference(rows)["ms"]) * pixels
@@ -293,6 +314,7 @@ def choose(
     budget: str | None = None,
     size: tuple[int, int] = (250, 400),
     film: bool = False,
+    frames: int = _FRAMES,
 ) -> Choice:
     """Choose the best preset for a speed or a budget.
 
@@ -307,6 +329,7 @@ def choose(
             ``"200MB"``. The best preset that fits is chosen.
         size: of a frame, (H, W) in sensor pixels, which a budget depends on.
         film: whether frames are made one after the other, see :func:`choices`.
+        frames: spike frames that a clip may have; 101 or more let longer clips be chosen, where that pays.
 
     Raises:
         ValueError: an unknown speed, a budget that cannot be read or that nothing fits, a scale without a table.
@@ -321,7 +344,7 @@ def choose(
     """
     if (speed is None) == (budget is None):
         raise ValueError(f"speed, budget: expected one of them, got {speed!r} and {budget!r}")
-    found = choices(scale, size, film)
+    found = choices(scale, size, film, frames)
     if speed is not None:
         if speed not in SPEEDS:
             raise ValueError(f"speed: expected one of {', '.join(SPEEDS)}, got {speed!r}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from dataclasses import dataclass
 from functools import lru_cache
 from math import prod
@@ -45,6 +46,12 @@ class Pretrained:
         """Number of learned parameters, including those of a motion estimator inside."""
         with safe_open(self.path, "numpy") as file:
             return sum(prod(file.get_slice(name).get_shape()) for name in file.keys())  # noqa: SIM118
+
+    @property
+    def frames(self) -> int | None:
+        """Spike frames of a clip; None for an estimator of motion."""
+        with safe_open(self.path, "numpy") as file:
+            return json.loads(file.metadata()["network"]).get("frames")
 
 
 @lru_cache(maxsize=1)

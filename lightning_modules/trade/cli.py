@@ -87,7 +87,8 @@ def trade(args: Sequence[str]) -> None:
     except CannotRunError as error:
         raise InputError(f"trade: {error}") from error
     own = _own_weights(base)
-    usual = usual_settings(base.network.scale, own, base.network if own else None, film=asked.film is not None)
+    network, film = base.network, asked.film is not None
+    usual = usual_settings(network.scale, own, network if own else None, film, network.frames)
     settings = given or usual
     names = [setting.name for setting in settings]
     twice = next((name for name in names if names.count(name) > 1), None)

@@ -62,12 +62,15 @@ _VARIANTS = [
     ("tolerance 0.5 dB", {"psnr_tolerance": 0.5}),
 ]
 
+#: networks that two sets of weights make together
+_TOGETHER = [Preset(network="TwoSpanCSCSR", scale=4, frames=101)]
+
 _SPIKE2FLOW = {"motion": "Spike2Flow", "motion_weights": "spike2flow"}
 _LEARNED = [("Spike2Flow", _SPIKE2FLOW), ("Spike2Flow, once", {**_SPIKE2FLOW, "motion_iterations": 1})]
 
 
 def usual_settings(
-    scale: int, own: Sequence[str] = (), network: Network | None = None, film: bool = False
+    scale: int, own: Sequence[str] = (), network: Network | None = None, film: bool = False, frames: int = 41
 ) -> list[Setting]:
     """Return what is measured where nothing else is asked for.
 
@@ -81,13 +84,17 @@ def usual_settings(
             stands in the place of those in the package.
         network: that network, of which only what it has arguments for is changed.
         film: pictures of films are measured: those of all networks, for films or not, as they are and without motion.
+        frames: spike frames of the scenes; networks of longer clips are left out.
     """
-    # Longer clips and noisy sensors would need other scenes; a network for films is another's equal on one clip.
-    left_out = ("_long_", "_noisy_", *(() if film else ("_film_",)))
+    # Noisy sensors would need other scenes; a network for films is another's equal on one clip.
+    left_out = ("_noisy_", *(() if film else ("_film_",)))
     shipped = [weights for weights in list_pretrained(scale) if not any(part in weights.name for part in left_out)]
+    shipped = [weights for weights in shipped if Preset(weights.name).clip <= frames]
     shipped.sort(key=lambda weights: (weights.name != _REFERENCE.format(scale=scale), weights.macs))
     largest = max(shipped, key=lambda weights: weights.macs).name if shipped else None
     networks = {weights.name: Preset(weights.name) for weights in shipped}
+    fitting = [preset for preset in _TOGETHER if preset.scale == scale and preset.clip <= frames]
+    networks |= {preset.network: preset for preset in fitting}
     if own:
         networks, largest = {"own weights": Preset()}, "own weights"
     learned = _LEARNED if find_shipped("spike2flow") else []
@@ -99,11 +106,13 @@ def usual_settings(
     presets = dict(networks)
     for place, (weights, preset) in enumerate(networks.items()):
         more = [_TWO_VIEWS, *(_MOST if weights == largest else []), *([*learned, *_VARIANTS] if place == 0 else [])]
+        fixed = {"motion"} if preset.network else set()
         for name, changes in [_NO_MOTION, *([] if film else more)]:
-            if not lacking & changes.keys():
+            if not (lacking | fixed) & changes.keys():
                 presets[f"{weights}, {name}"] = replace(preset, **changes)
+    usual = {"frames": 41} if frames > 41 else {}  # of a picture by a decoder, whatever a network sees
     decoders = {
-        name: Preset(network="ClassicalDecoder", scale=scale, method=method, **options)
+        name: Preset(network="ClassicalDecoder", scale=scale, method=method, **usual, **options)
         for method, decoder in DECODERS.items()
         for name, options in decoder.shown.items()
     }

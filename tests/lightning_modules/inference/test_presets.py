@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from lightning_modules.__main__ import main
+from lightning_modules.cli import prediction
 from lightning_modules.cli.arguments import preset_arguments
 from lightning_modules.cli.command import run
 from lightning_modules.cli.rehearsal import Rehearsal
@@ -21,6 +22,7 @@ from spikekit import read_picture, write_spikes
 HEADER = ["setting", *Preset.columns(), "psnr", "ratio", "mib", "reference", "height", "width", "failed", "ms"]
 WEIGHTS = {"weights": "tiny.ckpt"}
 DECODER = {"network": "ClassicalDecoder"}
+TWO_SPANS = {"network": "TwoSpanCSCSR", "scale": 4, "frames": 101}
 ROWS = [
     ("tfi", 25.0, 4, 2, DECODER | {"method": "tfi"}, ""),
     ("all", 30.0, 400, 80, WEIGHTS, ""),
@@ -98,10 +100,63 @@ def test_films_have_a_table_of_their_own(table):
         choose(4, "fastest", film=True)
 
 
-def test_a_film_is_made_by_a_network_for_films():
-    film, picture = (choose(4, "balanced", film=film).preset for film in (True, False))
-    assert [film.weights, picture.weights] == ["cscsr_large_film_x4", "cscsr_large_x4"]
+@pytest.mark.parametrize("scale", [2, 3, 4])
+def test_a_film_is_made_by_a_network_for_films(scale):
+    film, picture = (choose(scale, "balanced", film=film).preset for film in (True, False))
+    assert [film.weights, picture.weights] == [f"cscsr_large_film_x{scale}", f"cscsr_large_x{scale}"]
     assert isinstance(film.build(), RecurrentCSCSR)
+
+
+@pytest.fixture(name="longer")
+def _longer(table):
+    """A table whose best setting needs clips of 101 frames."""
+    lines = (table / "x3.csv").read_text().splitlines()
+    row = dict(zip(HEADER, lines[2].split(","), strict=True)) | {"setting": "longer", "psnr": "31.0", "weights": ""}
+    row |= {name: str(value) for name, value in TWO_SPANS.items()}
+    (table / "x3.csv").write_text("\n".join([*lines, ",".join(row[name] for name in HEADER)]))
+    return table
+
+
+@pytest.mark.usefixtures("longer")
+def test_longer_clips_are_chosen_where_there_is_room_for_them():
+    assert choose(3, "best").name == "all"
+    assert choose(3, "best", frames=100).name == "all"
+    assert choose(3, "best", frames=101).preset == Preset(**TWO_SPANS)
+    assert choose(3, budget="1GB", size=(40, 50), frames=101).name == "longer"
+    lengths = [
+        Preset(**given).clip for given in ({}, {"weights": "cscsr_huge_long_x4"}, {"weights": "x4-e"}, TWO_SPANS)
+    ]
+    assert lengths == [41, 101, 41, 101]
+
+
+@pytest.mark.parametrize(
+    ("total", "frame", "expected"),
+    [
+        (1009, [], ("all", 49)),  # a tenth of the recording and more would have no picture
+        (1010, [], ("longer", 46)),
+        (101, ["--data.frame", "50"], ("longer", 1)),
+        (102, ["--data.frame=50:52:1"], ("longer", 2)),
+        (101, ["--data.frame", "49"], ("all", 1)),
+        (101, ["--data.frame=50:52:1"], ("all", 2)),
+    ],
+)
+def test_a_recording_says_how_much_room_there_is(longer, total, frame, expected):
+    path = longer / "recording.npz"
+    write_spikes(path, torch.zeros(total, 6, 6, dtype=torch.uint8))
+    typed = ["predict", "--speed", "best", "--data.path", str(path), "--model.network.scale", "3", *frame]
+    preset, said = prediction._choice(typed)
+    name, count = expected
+    assert (preset.clip, said.partition(":")[0]) == (101 if name == "longer" else 41, name)
+    assert f"\n{count} pictures" in said
+
+
+@pytest.mark.parametrize(("every", "name"), [(41, "cscsr_large_film_x4"), (42, "cscsr_large_x4")])
+@pytest.mark.parametrize("output", ["film.mp4", "pictures"])
+def test_pictures_that_know_each_other_are_a_film(tmp_path, every, name, output):
+    write_spikes(tmp_path / "recording.npz", torch.zeros(200, 6, 6, dtype=torch.uint8))
+    typed = ["--data.path", str(tmp_path / "recording.npz"), "--data.every", str(every), "-o", str(tmp_path / output)]
+    preset, _ = prediction._choice(["predict", "--speed", "balanced", *typed])
+    assert preset.weights == name
 
 
 @pytest.mark.usefixtures("table")
@@ -229,9 +284,14 @@ def test_presets_are_read_as_they_are_written():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"network": "CSCSR"}, "network: expected 'ClassicalDecoder', or weights of another, got 'CSCSR'"),
+        (
+            {"network": "CSCSR"},
+            "network: expected 'ClassicalDecoder' or 'TwoSpanCSCSR', or weights of another, got 'CSCSR'",
+        ),
         (DECODER | WEIGHTS, "weights: expected none with network='ClassicalDecoder', got 'tiny.ckpt'"),
-        (WEIGHTS | {"scale": 3}, "scale: expected network='ClassicalDecoder' with it, got None"),
+        (WEIGHTS | {"scale": 3}, "scale: expected the name of a network with it, got None"),
+        (WEIGHTS | {"frames": 41}, "frames: expected the name of a network with it, got None"),
+        (TWO_SPANS | {"window": 5}, "window: expected network='ClassicalDecoder' with it, got 'TwoSpanCSCSR'"),
         (WEIGHTS | {"motion_iterations": 2}, "motion_iterations: expected the estimator's class as motion with it"),
     ],
 )
@@ -241,7 +301,7 @@ def test_presets_that_contradict_themselves(given, message):
 
 
 def test_presets_that_cannot_be_built():
-    with pytest.raises(ValueError, match="expected weights or network='ClassicalDecoder'"):
+    with pytest.raises(ValueError, match="expected weights or the name of a network"):
         Preset(tile=32).build()
     with pytest.raises(ValueError, match=r"motion: expected one of .*ZeroFlow.*, got 'os'"):
         Preset("x4-e", motion="os").build()

@@ -291,6 +291,15 @@ def test_usual_settings_are_those_of_the_weights_that_are_shipped(monkeypatch, t
     assert "cscsr_large_film_x4" in networks
     assert filmed[: 2 * len(networks)] == [*networks, *(f"{name}, no motion" for name in networks)]
     assert set(filmed[2 * len(networks) :]) == {"TFI", *(name for name in settings if name.startswith("TFP"))}
+    shipped["cscsr_huge_long_x4"] = shipped["cscsr_huge_x4"]
+    assert not [setting for setting in usual_settings(4, frames=100) if "long" in setting.name or "Two" in setting.name]
+    longer = {setting.name: setting for setting in usual_settings(4, frames=101)}
+    assert "cscsr_huge_long_x4" in longer
+    assert longer["TFI"].preset == replace(settings["TFI"].preset, frames=41)
+    two = ["--model.network", "TwoSpanCSCSR", "--model.network.scale", "4", "--model.network.frames", "101"]
+    assert longer["TwoSpanCSCSR"].args == two
+    assert [name for name in longer if name.startswith("Two")][1:] == ["TwoSpanCSCSR, self-ensemble of 2"]
+    assert not [setting for setting in usual_settings(2, frames=101) if "TwoSpan" in setting.name]
 
 
 @pytest.mark.parametrize("name", ["small tiles", "a, b|c", "it's"])
