@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -236,6 +237,7 @@ def _torch(program: torch.export.ExportedProgram, inputs: list[str], outputs: li
 
 
 def _onnx(program: torch.export.ExportedProgram, inputs: list[str], outputs: list[str]) -> bytes:
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # that torchvision, which nothing here uses, is missing
     # its optimizer takes minutes, and onnxruntime has one of its own
     options = {"dynamo": True, "optimize": False, "verbose": False, "opset_version": OPSET}
     made = torch.onnx.export(program, input_names=inputs, output_names=outputs, **options)

@@ -166,11 +166,12 @@ def test_the_name_ends_as_the_format_does(kind, name, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_picture_of_a_recording_by_onnxruntime_alone(tmp_path):
+def test_the_picture_of_a_recording_by_onnxruntime_alone(tmp_path, capfd):
     pytest.importorskip("onnxruntime", reason="the extra export is not installed")
     pytest.importorskip("onnxscript", reason="the extra export is not installed")
     network = CSCSR(scale=2, resolution="sensor", motion=ClassicalFlow(), **TINY).eval()
     export_network(network, tmp_path / "a.onnx", "onnx")
+    assert capfd.readouterr() == ("", "")
     spikes = torch.rand(41, 16, 24) < 0.3
     write_spikes(tmp_path / "a.dat", spikes)
     command = [sys.executable, "-c", ALONE, *(str(tmp_path / name) for name in ("a.onnx", "a.dat", "a.npy"))]
