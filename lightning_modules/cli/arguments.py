@@ -16,6 +16,7 @@ from lightning_modules.networks import NETWORKS
 from lightning_modules.storage.pretrained import check_weights, read_weights
 from lightning_modules.storage.settings import own_class
 from spikekit.arguments import one_line
+from spikekit.io.failures import no_pipe
 
 WEIGHTS = "--model.weights", "--model.init_args.weights"
 
@@ -186,6 +187,10 @@ def _part_of(config: str, name: str) -> Any:
     Raises:
         ValueError: a file that is no YAML; the message is one line and names it.
     """
+    try:
+        no_pipe(config)
+    except OSError as error:
+        raise ValueError(f"{config}: {one_line(error)}") from error
     try:
         text = Path(config).read_text(encoding="utf-8")
     except (OSError, ValueError):  # not there, or the configuration itself

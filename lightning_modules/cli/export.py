@@ -12,6 +12,7 @@ from lightning_modules.inference.export import FORMATS, WITHOUT_WEIGHTS, export_
 from lightning_modules.motion import ESTIMATORS
 from lightning_modules.networks import NETWORKS
 from lightning_modules.storage.pretrained import check_weights, read_weights, write_weights
+from spikekit.io.failures import writing
 from spikekit.timing import duration
 
 
@@ -53,13 +54,15 @@ def export(args: Sequence[str]) -> None:
     try:
         if asked.format in FORMATS:
             network = load_network(asked.weights)
-            said = f", {export_network(network, asked.output, asked.format, still=asked.still)}"
+            with writing(asked.output):
+                said = f", {export_network(network, asked.output, asked.format, still=asked.still)}"
         elif asked.weights in WITHOUT_WEIGHTS:
             raise ValueError(f"{asked.weights}: expected --format torch or onnx, as it has no weights of its own")
         else:
             weights = read_weights(asked.weights)
             check_weights(weights, {**NETWORKS, **ESTIMATORS})
-            write_weights(weights, asked.output)
+            with writing(asked.output):
+                write_weights(weights, asked.output)
     except (OSError, ValueError, ImportError) as error:
         raise InputError(str(error)) from error
     size = Path(asked.output).stat().st_size / 2**20

@@ -10,6 +10,7 @@ import yaml
 
 from lightning_modules.cli.errors import InputError
 from spikekit.arguments import one_line
+from spikekit.io.failures import no_pipe
 from spikekit.io.whole_file import whole_file
 
 PROGRESS, RESULT, LOG, COSTS = "progress.json", "result.json", "log.txt", "costs.json"
@@ -65,7 +66,7 @@ def _parse_json(text: str) -> Any:
 
 def _read(path: Path, parse: Any) -> dict[str, Any]:
     try:
-        value = parse(path.read_text(encoding="utf-8"))
+        value = parse(no_pipe(path).read_text(encoding="utf-8"))
         _check(value, _KINDS.get(path.name, dict), "")
     except Exception as error:  # what the parser of YAML raises depends on the text
         raise InputError(f"{path}: damaged ({one_line(error)[:300]}); delete it, or the folder") from error

@@ -8,6 +8,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from spikekit.arguments import one_line
+from spikekit.io.failures import no_pipe
 from spikekit.io.images import MOST_PIXELS
 from spikekit.io.whole_file import whole_file
 from spikekit.sensor.calibration import Calibration
@@ -64,7 +65,7 @@ def read_calibration(path: str | Path) -> Calibration:
         ValueError: street.calibration.safetensors: not a calibration that can be read (No such file or directory...
     """
     try:
-        with safe_open(path, "pt") as file:
+        with safe_open(no_pipe(path), "pt") as file:
             kind = (file.metadata() or {}).get("kind")
             if kind != _KIND:
                 raise ValueError(f"expected {_KIND}, got {str(kind)[:80]}")

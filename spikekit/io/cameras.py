@@ -14,6 +14,7 @@ from torch import Tensor
 from spikekit.arguments import one_line
 from spikekit.check import check_planes, check_positive, check_whole
 from spikekit.color.cfa import bayer_pattern
+from spikekit.io.failures import no_pipe
 
 _PRESETS = files("spikekit.io") / "camera_presets"
 
@@ -179,6 +180,8 @@ def camera(name: str | Path) -> Camera:
         raise ValueError(f"camera: expected {', '.join(CAMERAS)}, or a .json file, got {name}")
     file = Path(name) if own else _PRESETS / f"{name}.json"
     try:
+        if own:
+            no_pipe(file)
         data = json.loads(file.read_text(encoding="utf-8"))
     except RecursionError as error:
         raise ValueError(f"{name}: nested too deeply for what describes a camera") from error

@@ -2,11 +2,29 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from spikekit.arguments import one_line
+
+
+def no_pipe(path: str | Path) -> Path:
+    """Return the path of what is to be read; a pipe or a device would be waited for.
+
+    Raises:
+        OSError: it is one.
+    """
+    try:
+        mode = os.stat(path).st_mode
+    except (OSError, ValueError):  # whoever reads it says so
+        return Path(path)
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+        raise OSError(errno.EINVAL, "a pipe or a device, expected a file", str(path))
+    return Path(path)
 
 
 @contextmanager

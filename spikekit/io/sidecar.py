@@ -20,7 +20,7 @@ import torch
 
 from spikekit.arguments import one_line
 from spikekit.color.cfa import PATTERNS
-from spikekit.io.failures import writing
+from spikekit.io.failures import no_pipe, writing
 from spikekit.io.whole_file import flush_folder
 
 #: What the first line of a side-car says it is.
@@ -78,7 +78,7 @@ def read_sidecar(path: Path) -> Sidecar:
         ValueError: it cannot be read, or is something else; the message names it.
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(no_pipe(path).read_text(encoding="utf-8"))
         if not isinstance(data, dict) or data.pop("kind", None) != KIND:
             raise ValueError(f"expected the side-car of a simulation ({KIND})")
         sidecar = Sidecar(**data)
@@ -201,7 +201,7 @@ def check_unclaimed(outputs: Iterable[Path], stream: Path) -> None:
 def _claims(path: Path, stream: Path) -> bool:
     """Return whether a damaged side-car still says that it is that of a stream."""
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(no_pipe(path).read_text(encoding="utf-8"))
         return data["kind"] == KIND and data["stream"]["file"] == stream.name
     except (OSError, ValueError, TypeError, LookupError, RecursionError):
         return False

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from spikekit.check import check_whole
-from spikekit.io.failures import reading
+from spikekit.io.failures import no_pipe, reading
 from spikekit.io.images import MOST_PIXELS, read_picture
 from spikekit.io.quiet import quiet
 
@@ -156,6 +156,7 @@ def _open(path: Path) -> _Pictures | _Film:
             return _Pictures(path, _pictures_of(path))
         if not path.exists():
             raise VideoError(f"{path}: no such file or folder")
+        no_pipe(path)
     ending = path.suffix.lower()
     if ending in PICTURE_ENDINGS:
         return _Pictures(path, [path])

@@ -6,6 +6,7 @@ Weights and checkpoints as they are loaded are in test_security.py.
 
 import io
 import json
+import os
 import warnings
 from pathlib import Path
 
@@ -118,6 +119,14 @@ def test_configurations(fuzz):
 
     assert fuzz(read, lambda rng: fuzz.damage(good, rng), "a.yaml") > 100
     assert fuzz(read, _odd_tags, "a.yaml", cases=300) > 100
+
+
+def test_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "a.yaml")
+    with pytest.raises(ValueError, match=r"a.yaml: a pipe or a device, expected a file$"):
+        with_network_of_weights(["fit", "-c", str(tmp_path / "a.yaml")])
+    with pytest.raises(InputError, match=r"a.yaml: .*a pipe"):
+        read_yaml(tmp_path / "a.yaml")
 
 
 def test_values_of_a_configuration_beside_the_weights(tmp_path):

@@ -125,3 +125,9 @@ def test_other_numbers_of_views_are_refused(views):
 def test_a_clip_that_has_no_views_is_refused():
     with pytest.raises(ValueError, match=r"^self_ensemble: expected at least 5 x 5 sensor pixels, got 4 x 9$"):
         SuperResolution(CSCSR(2, **TINY), self_ensemble=2)(torch.zeros(1, 41, 4, 9))
+    assert SuperResolution(ClassicalDecoder("tfp", 2), self_ensemble=8)(torch.zeros(1, 41, 5, 5)).shape == (
+        1,
+        3,
+        10,
+        10,
+    )

@@ -507,6 +507,9 @@ def test_what_is_shown(tmp_path, overlays, capsys):
     first, again = capsys.readouterr().out.split("\x1b[2A\x1b[J")
     assert first == again
     assert "0 of 3 trials done, 1 failed, 1 running" in again
+    (trials[0].folder / "progress.json").write_text(json.dumps({**told, "phase": "testing"}))
+    view.draw()
+    assert "tiny-seed0  testing\n" in capsys.readouterr().out
 
 
 def test_the_paper_is_copied_right():

@@ -18,7 +18,7 @@ from skimage import io
 
 from spikekit import Calibration, read_picture, read_spikes, tfp, write_calibration, write_picture
 from spikekit.cli.command import main
-from spikekit.cli.simulation import Settings, build
+from spikekit.cli.simulation import Settings, Source, build
 from spikekit.io.sidecar import find_sidecar, published, read_sidecar
 from spikekit.scenes.adaptive_sampling import Plan
 from spikekit.scenes.frame_sequence import Film
@@ -601,3 +601,15 @@ def test_progress_on_a_terminal(film, monkeypatch, capsys):
     assert re.search(r"frames of a.dat: .* 0/81 ", err)
     assert err.endswith("\r")
     assert not err.split("\r")[-2].strip()  # the bar is taken away
+
+
+@pytest.mark.parametrize(("frames", "clocks"), [(41, 20), (40, 19), (1, 3), (2, 1), (39, 19), (40, 40)])
+def test_the_frame_in_the_middle_is_seen_when_it_is_shown(frames, clocks, tmp_path):
+    for n in range(5):
+        write_picture(tmp_path / f"{n}.png", torch.zeros(3, 4, 4))
+    source = Source(tmp_path, Settings(scale=2, frames=frames, clocks=clocks, frame=2))
+    [(place, clock)] = source.truth.items()
+    assert source.span[place] == 2
+    assert source.first + clock == place * clocks
+    assert clock == frames // 2
+    assert source.first + frames <= (len(source.span) - 1) * clocks + 1

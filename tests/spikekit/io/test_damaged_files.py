@@ -158,6 +158,31 @@ def test_pictures(fuzz, kind, monkeypatch):
     fuzz(read_picture, lambda rng: fuzz.damage(good, rng), f"bad.{kind}", PictureError, 400)
 
 
+@pytest.mark.parametrize(
+    ("read", "name"),
+    [
+        (read_sidecar, "a.json"),
+        (camera, "a.json"),
+        (read_calibration, "a.safetensors"),
+        (read_picture, "a.png"),
+        (read_video, "a.mp4"),
+        (read_spikes, "a.npz"),
+        (lambda path: read_spikes(path, 4, 4), "a.dat"),
+    ],
+)
+def test_a_pipe_is_not_waited_for(read, name, tmp_path):
+    os.mkfifo(tmp_path / name)
+    with pytest.raises((ValueError, FileNotFoundError), match=f"{name}: ") as refused:
+        read(tmp_path / name)
+    assert len(str(refused.value).splitlines()) == 1
+
+
+def test_a_pipe_beside_a_recording_is_no_sidecar(tmp_path):
+    write_spikes(tmp_path / "a.npz", SPIKES)
+    os.mkfifo(tmp_path / "a.json")
+    assert find_sidecar(tmp_path / "a.npz") is None
+
+
 def _film(path, codec):
     av = pytest.importorskip("av")
     with av.open(str(path), "w") as container:
