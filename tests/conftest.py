@@ -15,6 +15,13 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ["OMP_NUM_THREADS"] = "1"
     torch.set_num_threads(1)
 
+def pytest_collection_modifyitems(items):
+    """Fuzzing at length takes as long as it takes."""
+    if "SPIKEKIT_FUZZ" in os.environ:
+        for item in items:
+            item.add_marker(pytest.mark.timeout(0))
+
+
 _ODD = (
     None, True, False, 0, -1, 1, 2, 2**31, 2**63, 10**400, -(10**30), 0.0, -0.5, 1e308, float("nan"), float("inf"),
     "", "a", "\n", "a\nb", "..", "os.system(command='false')", "\ud800", "9" * 5000, [], {}, [[]], [1, 2], [None],
