@@ -15,6 +15,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ["OMP_NUM_THREADS"] = "1"
     torch.set_num_threads(1)
 
+
 def pytest_collection_modifyitems(items):
     """Fuzzing at length takes as long as it takes."""
     if "SPIKEKIT_FUZZ" in os.environ:
