@@ -112,16 +112,25 @@ def test_what_is_too_far_away_is_not_asked(network, clips):
     torch.testing.assert_close(reader(spikes[1:2], [61 + 42], flow[1:2]), single)
 
 
-@pytest.mark.parametrize(("future", "mmac"), [(None, 2.66), (0, 2.99), (4, 3.39)])
-def test_parameters_and_work_of_size_large_film(configs, future, mmac):
-    model = yaml.safe_load((configs / "size/large_film.yaml").read_text())["model"]
+@pytest.mark.parametrize(
+    ("size", "parameters", "future", "mmac"),
+    [
+        ("large_film", 2_635_654, None, 2.66),
+        ("large_film", 2_635_654, 0, 2.99),
+        ("large_film", 2_635_654, 4, 3.39),
+        ("huge_long_film", 4_206_310, 0, 4.56),
+    ],
+)
+def test_parameters_and_work_of_sizes_for_films(configs, size, parameters, future, mmac):
+    model = yaml.safe_load((configs / f"size/{size}.yaml").read_text())["model"]
     network = RecurrentCSCSR(4, **model["network"]["init_args"])
-    assert sum(weight.numel() for weight in network.parameters()) == 2_635_654
+    assert sum(weight.numel() for weight in network.parameters()) == parameters
+    frames = network.frames
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
         if future is None:
-            network(torch.zeros(1, 41, 8, 8), torch.zeros(1, 2, 2, 8, 8))
+            network(torch.zeros(1, frames, 8, 8), torch.zeros(1, 2, 2, 8, 8))
         else:
-            network(torch.zeros(1, 10, 41, 8, 8), torch.zeros(1, 10, 2, 2, 8, 8), future=future)
+            network(torch.zeros(1, 10, frames, 8, 8), torch.zeros(1, 10, 2, 2, 8, 8), future=future)
     pictures = 1 if future is None else 10
     assert counter.get_total_flops() / 2 / 64 / 1e6 / pictures == pytest.approx(mmac, rel=0.005)
 
