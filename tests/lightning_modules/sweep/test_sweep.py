@@ -19,6 +19,7 @@ import yaml
 from lightning_modules.__main__ import main
 from lightning_modules.cli.errors import InputError
 from lightning_modules.cost.charts import BLUE, ORANGE
+from lightning_modules.storage.checkpoint import DivergedError
 from lightning_modules.sweep import cli, engines, worker
 from lightning_modules.sweep.budget import seconds
 from lightning_modules.sweep.paper import TABLE_3
@@ -77,7 +78,7 @@ def trials_here(folders, jobs, every):
         try:
             worker.train_and_test(folder, every)
             yield {folder: None}
-        except RuntimeError as error:
+        except DivergedError as error:
             yield {folder: str(error)}
 
 
@@ -274,12 +275,14 @@ def test_a_trial_that_fails_is_reported_and_the_others_go_on(typed, overlays, tm
     command = [*typed, "--over", *over, "--steps", "4", "-o", str(tmp_path)]
     with pytest.raises(SystemExit, match="lightning: sweep: 1 of 2 trials failed"):
         main(command)
-    assert "diverges  FAILED: the loss is nan at step" in capsys.readouterr().out
+    assert re.search(
+        "diverges  FAILED: .*best.ckpt: not written, as the training has diverged", capsys.readouterr().out
+    )
     first, *_, last = table(tmp_path)
-    assert "the loss is nan" in first["failed"]
+    assert "the training has diverged" in first["failed"]
     assert (last["variant"], last["seed"]) == ("wide", "spread")
     assert re.search(r"\| diverges +\| 0, 1 failed +\|", (tmp_path / "sweep.md").read_text())
-    assert "diverges, failed: the loss is nan" in (tmp_path / "sweep.md").read_text()
+    assert "the training has diverged" in (tmp_path / "sweep.md").read_text()
     assert (tmp_path / "wide" / "result.json").is_file()
 
 
