@@ -144,6 +144,10 @@ class SuperResolution(Learner):
             >>> SuperResolution.from_pretrained(speed="fastest")(torch.ones(1, 41, 16, 16)).shape
             torch.Size([1, 3, 64, 64])
         """
+        if isinstance(scale, str):
+            raise ValueError(
+                f"scale: expected a number, got {scale!r}; for weights by their name, CSCSR.from_pretrained({scale!r})"
+            )
         if budget is None and speed is None:
             speed = "balanced"
         return cls.from_preset(choose(scale, speed, budget, size).preset)

@@ -233,6 +233,11 @@ def test_wishes_that_cannot_be(table, arguments, message):
         choose(**{"scale": 3, **arguments})
 
 
+def test_a_name_in_place_of_a_scale_is_pointed_to_where_names_go():
+    with pytest.raises(ValueError, match=r"expected a number, got 'x'; .* CSCSR.from_pretrained\('x'\)"):
+        SuperResolution.from_pretrained("x")
+
+
 def test_modules_of_a_speed(table):
     best, balanced, fast = (SuperResolution.from_pretrained(3, name) for name in ("best", "balanced", "fast"))
     assert isinstance(fast.network, ClassicalDecoder)

@@ -1,0 +1,124 @@
+"""Muon for networks of convolutions: fewer steps from random weights than with Adam."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+# of an odd polynomial whose repeated application brings singular values between 0 and 1 close to 1
+_QUINTIC = 3.4445, -4.7750, 2.0315
+_REPEATS = 5
+
+
+def orthogonalized(matrix: Tensor) -> Tensor:
+    r"""Bring all singular values of a matrix close to 1, between 0.6 and 1.3, by Newton-Schulz iterations.
+
+    Singular values that are much smaller than the largest, a thousandth or less, stay smaller.
+
+    Args:
+        matrix: (M, N).
+
+    Returns:
+        (M, N), near to :math:`U V^T` where the matrix is :math:`U S V^T`; zeros where it is zero.
+
+    Example:
+        >>> torch.linalg.svdvals(orthogonalized(torch.diag(torch.tensor([3.0, 2.0, 1.0])))).round(decimals=1)
+        tensor([1.1000, 0.7000, 0.7000])
+    """
+    wide = matrix.mT if matrix.shape[0] > matrix.shape[1] else matrix
+    wide = wide / wide.norm().clamp(min=torch.finfo(wide.dtype).tiny)
+    first, third, fifth = _QUINTIC
+    for _ in range(_REPEATS):
+        gram = wide @ wide.mT
+        wide = first * wide + (third * gram + fifth * gram @ gram) @ wide
+    return wide.mT if matrix.shape[0] > matrix.shape[1] else wide
+
+
+class MuonWithAdam(torch.optim.Optimizer):
+    """Muon for the weights of layers, Adam for biases and for layers to or from three channels or fewer.
+
+    Muon takes the momentum of a weight's gradient as a matrix, a row for every output channel, and makes the step
+    equally large in all its directions. It is ``torch.optim.Muon``, which takes matrices alone, for convolutions too:
+    without weight decay, with its ``match_rms_adamw``, by which a learning rate for Adam suits Muon as well.
+
+    Args:
+        params: parameters, or groups of them.
+        lr: learning rate.
+        momentum: share of the momentum that the next step keeps, of Muon.
+        betas: decays of the mean and of the mean square, of Adam.
+        eps: added to the root of the mean square, of Adam.
+
+    Raises:
+        ValueError: an argument out of its range.
+
+    Example:
+        >>> layer = torch.nn.Conv2d(8, 8, 3)
+        >>> optimizer = MuonWithAdam(layer.parameters(), lr=1e-3)
+        >>> layer(torch.ones(1, 8, 5, 5)).mean().backward()
+        >>> optimizer.step()
+
+    Reference:
+        Jordan et al., Muon: An optimizer for hidden layers in neural networks, 2024; Liu et al., Muon is Scalable for
+        LLM Training, 2025, for the size of the step; Kingma and Ba, Adam, ICLR 2015.
+    """
+
+    def __init__(
+        self,
+        params: Iterable[Tensor] | Iterable[dict[str, Any]],
+        lr: float = 1e-3,
+        momentum: float = 0.95,
+        betas: tuple[float, float] = (0.9, 0.99),
+        eps: float = 1e-8,
+    ) -> None:
+        if not 0 <= lr < math.inf:
+            raise ValueError(f"lr: expected 0 or more, got {lr}")
+        if not 0 <= momentum < 1:
+            raise ValueError(f"momentum: expected 0 or more and below 1, got {momentum}")
+        if not all(0 <= beta < 1 for beta in betas):
+            raise ValueError(f"betas: expected 0 or more and below 1, got {betas}")
+        if not eps > 0:
+            raise ValueError(f"eps: expected more than 0, got {eps}")
+        super().__init__(params, {"lr": lr, "momentum": momentum, "betas": tuple(betas), "eps": eps})
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:
+        """Change the parameters by their gradients.
+
+        Args:
+            closure: computes the loss and the gradients anew.
+
+        Returns:
+            The loss that ``closure`` returned.
+        """
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is not None:
+                    matrix = parameter.ndim > 1 and min(parameter.flatten(1).shape) > 3
+                    change = self._muon(parameter, group) if matrix else self._adam(parameter, group)
+                    parameter.add_(change, alpha=-group["lr"])
+        return loss
+
+    def _muon(self, parameter: Tensor, group: dict[str, Any]) -> Tensor:
+        state = self.state[parameter]
+        if not state:
+            state["momentum"] = torch.zeros_like(parameter)
+        state["momentum"].lerp_(parameter.grad, 1 - group["momentum"])
+        ahead = parameter.grad.lerp(state["momentum"], group["momentum"]).flatten(1)  # Nesterov's
+        return (0.2 * math.sqrt(max(ahead.shape)) * orthogonalized(ahead)).reshape(parameter.shape)
+
+    def _adam(self, parameter: Tensor, group: dict[str, Any]) -> Tensor:
+        state, (first, second) = self.state[parameter], group["betas"]
+        if not state:
+            state |= {"steps": 0, "mean": torch.zeros_like(parameter), "square": torch.zeros_like(parameter)}
+        state["steps"] += 1
+        mean = state["mean"].lerp_(parameter.grad, 1 - first) / (1 - first ** state["steps"])
+        square = state["square"].lerp_(parameter.grad.square(), 1 - second) / (1 - second ** state["steps"])
+        return mean / (square.sqrt() + group["eps"])

@@ -1,0 +1,121 @@
+import copy
+
+import pytest
+import torch
+from torch import nn
+
+from lightning_modules.tasks.muon import MuonWithAdam, orthogonalized
+
+
+def _steps(optimizer, parameter, gradients):
+    for gradient in gradients:
+        parameter.grad = gradient.clone()
+        optimizer.step()
+    return parameter.detach()
+
+
+@pytest.mark.parametrize("shape", [(6, 6), (12, 5), (5, 12)])
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
+def test_singular_values_become_about_one_and_directions_stay(shape, size):
+    torch.manual_seed(0)
+    left, _ = torch.linalg.qr(torch.randn(shape[0], 5, dtype=torch.float64))
+    right, _ = torch.linalg.qr(torch.randn(shape[1], 5, dtype=torch.float64))
+    values = torch.tensor([1.0, 0.7, 0.3, 0.1, 0.05], dtype=torch.float64)
+    found = orthogonalized(size * left @ torch.diag(values) @ right.mT)
+    inside = left.mT @ found @ right
+    assert found.shape == shape
+    assert torch.allclose(inside, torch.diag(inside.diag()), atol=1e-9)
+    assert torch.allclose(left @ inside @ right.mT, found, atol=1e-9)
+    assert 0.6 < inside.diag().min() <= inside.diag().max() < 1.3
+
+
+def test_nothing_stays_nothing():
+    assert orthogonalized(torch.zeros(4, 6)).eq(0).all()
+
+
+def test_on_matrices_it_is_the_muon_of_torch():
+    torch.manual_seed(0)
+    start, gradients = torch.randn(8, 20), torch.randn(4, 8, 20)
+    ours, theirs = nn.Parameter(start.clone()), nn.Parameter(start.clone())
+    reference = torch.optim.Muon([theirs], lr=1e-2, weight_decay=0, adjust_lr_fn="match_rms_adamw")
+    moved = _steps(MuonWithAdam([ours], lr=1e-2), ours, gradients) - start
+    expected = _steps(reference, theirs, gradients) - start
+    assert (moved - expected).norm() < 0.02 * expected.norm()  # torch rounds to bfloat16 on the way
+
+
+def test_a_convolution_is_the_matrix_of_its_output_channels():
+    torch.manual_seed(0)
+    start, gradients = torch.randn(8, 4, 3, 3), torch.randn(3, 8, 4, 3, 3)
+    whole, flat = nn.Parameter(start.clone()), nn.Parameter(start.flatten(1).clone())
+    last = nn.Parameter(start.clone().contiguous(memory_format=torch.channels_last))
+    expected = _steps(MuonWithAdam([flat]), flat, gradients.flatten(2))
+    assert torch.equal(_steps(MuonWithAdam([whole]), whole, gradients).flatten(1), expected)
+    assert torch.allclose(_steps(MuonWithAdam([last]), last, gradients).flatten(1), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(7,), (16, 3), (3, 16, 3, 3), ()])
+def test_biases_and_layers_of_three_channels_are_left_to_adam(shape):
+    torch.manual_seed(0)
+    start, gradients = torch.randn(shape), torch.randn(5, *shape)
+    ours, theirs = nn.Parameter(start.clone()), nn.Parameter(start.clone())
+    reference = torch.optim.Adam([theirs], lr=1e-2, betas=(0.9, 0.99))
+    expected = _steps(reference, theirs, gradients)
+    assert torch.allclose(_steps(MuonWithAdam([ours], lr=1e-2), ours, gradients), expected, atol=1e-6)
+
+
+def test_a_step_is_as_large_as_one_of_adam():
+    torch.manual_seed(0)
+    weight = nn.Parameter(torch.zeros(64, 32, 3, 3))
+    change = _steps(MuonWithAdam([weight], lr=1.0), weight, torch.randn(1, 64, 32, 3, 3))
+    assert 0.1 < change.square().mean().sqrt() < 0.3  # match_rms_adamw: 0.2
+
+
+def test_it_goes_on_where_it_stopped():
+    torch.manual_seed(0)
+    start, gradients = [torch.randn(6, 5), torch.randn(6)], [(torch.randn(6, 5), torch.randn(6)) for _ in range(4)]
+
+    def run(parameters, optimizer, part):
+        for pair in part:
+            for parameter, gradient in zip(parameters, pair, strict=True):
+                parameter.grad = gradient.clone()
+            optimizer.step()
+
+    whole = [nn.Parameter(part.clone()) for part in start]
+    run(whole, MuonWithAdam(whole), gradients)
+    halves = [nn.Parameter(part.clone()) for part in start]
+    first = MuonWithAdam(halves)
+    run(halves, first, gradients[:2])
+    again = MuonWithAdam(halves)
+    again.load_state_dict(copy.deepcopy(first.state_dict()))
+    run(halves, again, gradients[2:])
+    assert all(map(torch.equal, whole, halves))
+
+
+def test_a_closure_is_asked_and_parameters_without_a_gradient_rest():
+    used, unused = nn.Parameter(torch.ones(4, 4)), nn.Parameter(torch.ones(4, 4))
+    optimizer = MuonWithAdam([used, unused])
+
+    def closure():
+        optimizer.zero_grad()
+        loss = used.square().sum()
+        loss.backward()
+        return loss
+
+    assert optimizer.step(closure) == 16
+    assert used.ne(1).any()
+    assert unused.eq(1).all()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"lr": -1.0}, "lr: expected 0 or more, got -1.0"),
+        ({"lr": float("nan")}, "lr: expected 0 or more, got nan"),
+        ({"momentum": 1.0}, "momentum: expected 0 or more and below 1, got 1.0"),
+        ({"betas": (0.9, 1.0)}, r"betas: expected 0 or more and below 1, got \(0.9, 1.0\)"),
+        ({"eps": 0.0}, "eps: expected more than 0, got 0.0"),
+    ],
+)
+def test_wrong_arguments_are_refused(wrong, message):
+    with pytest.raises(ValueError, match=f"^{message}$"):
+        MuonWithAdam([nn.Parameter(torch.ones(2, 2))], **wrong)
