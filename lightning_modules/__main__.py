@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from lightning_modules.cli.errors import Ended
+from lightning_modules.cli import errors
 from lightning_modules.cli.short_help import VERBS, overview, usage
 from spikekit.completion import OPTION
 
@@ -21,6 +21,11 @@ def main(args: Sequence[str] | None = None) -> None:
     Args:
         args: what was typed after ``lightning``; ``sys.argv`` when not given.
     """
+    with errors.as_one_line():
+        _main(args)
+
+
+def _main(args: Sequence[str] | None) -> None:
     verb, *rest = (sys.argv[1:] if args is None else list(args)) or [""]
     if verb in ("-h", "--help"):
         print(overview())  # noqa: T201
@@ -30,7 +35,7 @@ def main(args: Sequence[str] | None = None) -> None:
         print(f"lightning of spikekit {__version__}")  # noqa: T201
     elif verb not in VERBS and not verb.startswith("-"):
         got = f"got {verb}" if verb else "got none"
-        raise Ended(f"lightning: expected a verb, one of {', '.join(VERBS)}, {got} (see lightning --help)", 2)
+        raise errors.Ended(f"lightning: expected a verb, one of {', '.join(VERBS)}, {got} (see lightning --help)", 2)
     elif verb not in _OURS and {"-h", "--help"} & {*rest}:
         print(usage(verb))  # noqa: T201
     else:
@@ -44,19 +49,16 @@ def _run(verb: str, rest: Sequence[str], args: Sequence[str] | None) -> None:
         from lightning_modules.quick_import import import_lightning
 
         import_lightning()
-    from lightning_modules.cli import errors
+    if verb == OPTION:
+        from lightning_modules.cli.completion import print_completion
 
-    with errors.as_one_line():
-        if verb == OPTION:
-            from lightning_modules.cli.completion import print_completion
+        print_completion("".join(rest), _OURS)
+    elif verb in _OURS:
+        getattr(import_module(f"lightning_modules.{_OURS[verb]}"), verb)(rest)
+    else:
+        from lightning_modules.cli.command import Command, run
 
-            print_completion("".join(rest), _OURS)
-        elif verb in _OURS:
-            getattr(import_module(f"lightning_modules.{_OURS[verb]}"), verb)(rest)
-        else:
-            from lightning_modules.cli.command import Command, run
-
-            run(args, Command)
+        run(args, Command)
 
 
 if __name__ == "__main__":

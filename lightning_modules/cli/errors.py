@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,6 +11,7 @@ from typing import NoReturn
 
 from spikekit.arguments import UsageError as SpikekitUsageError
 from spikekit.arguments import one_line
+from spikekit.standard_output import BROKEN_PIPE, stop_printing
 
 
 class InputError(ValueError):
@@ -63,13 +65,26 @@ def _of_users() -> tuple[type[Exception], ...]:
 
 @contextmanager
 def as_one_line() -> Iterator[None]:
-    """End the program with one line, and no traceback, if the user made a mistake."""
+    """End the program with one line, and no traceback, if the user made a mistake or a disk is full.
+
+    Where the reader of standard output is gone, as in ``lightning models | head -1``, it ends without a word.
+    """
     try:
-        yield
+        try:
+            yield
+        finally:
+            print(end="", flush=True)
     except OSError as error:
-        if error.filename is None or isinstance(error, BrokenPipeError):
+        from spikekit.io.whole_file import FULL
+
+        if error.filename is not None:
+            raise Ended(f"lightning: {error.filename}: {one_line(error)}", 1) from error
+        if error.errno not in (errno.EPIPE, *FULL):
             raise
-        raise Ended(f"lightning: {error.filename}: {one_line(error)}", 1) from error
+        stop_printing()
+        if isinstance(error, BrokenPipeError):
+            raise SystemExit(BROKEN_PIPE) from error
+        raise Ended(f"lightning: {one_line(error)}", 1) from error
     except Exception as error:
         if not isinstance(error, _of_users()):
             raise

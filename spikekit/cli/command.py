@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import inspect
-import io
-import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -15,6 +13,7 @@ from typing import NoReturn
 from spikekit import __version__
 from spikekit.arguments import UsageError, one_line
 from spikekit.completion import OPTION, completion
+from spikekit.standard_output import BROKEN_PIPE, stop_printing
 
 #: what every verb does, the module whose ``add_arguments`` and ``run`` it is, and an example
 VERBS = {
@@ -55,11 +54,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if error.filename is not None:
             print(f"spikekit: {error.filename}: {one_line(error)}", file=sys.stderr)
             return 1
-        # nobody reads what is printed, or it finds no room: Python would complain when it flushes at exit
-        with suppress(io.UnsupportedOperation):  # what is printed goes to no file
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        stop_printing()  # nobody reads it, or it finds no room
         if isinstance(error, BrokenPipeError):
-            return 141
+            return BROKEN_PIPE
         print(f"spikekit: standard output: {one_line(error)}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -18,7 +18,8 @@ except ImportError:  # Windows, which removes no file that is open
 
 _SIDE_BY_SIDE = 8  # writers of one file whose leftovers are found
 
-_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)  # what the system says without a name
+#: errors of a full disk, which the system reports without a name
+FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)
 
 
 @contextmanager
@@ -79,7 +80,7 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
             file.close()
         os.replace(part, target)
     except BaseException as error:
-        if isinstance(error, OSError) and error.errno in _FULL and error.filename is None:
+        if isinstance(error, OSError) and error.errno in FULL and error.filename is None:
             error.filename = str(path)
         with suppress(OSError):
             file.close()

@@ -1,9 +1,11 @@
 """What every verb ends with: one line on stderr, 2 for wrong use and 1 for a file that is to blame; nothing written."""
 
 import io
+import os
 import shlex
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -189,5 +191,26 @@ def test_a_disk_that_refuses_is_failed_work():
     with pytest.raises(SystemExit) as ended, as_one_line():
         raise OSError(28, "No space left on device", "a.png")
     assert ended.value.code == "lightning: a.png: No space left on device"  # Python prints it and ends with 1
-    with pytest.raises(BrokenPipeError), as_one_line():
-        raise BrokenPipeError(32, "Broken pipe", "a.png")
+    with pytest.raises(SystemExit, match=r"^lightning: No room$"), as_one_line():
+        raise OSError(28, "No room")
+    with pytest.raises(OSError, match="no errno"), as_one_line():  # a fault of the program
+        raise OSError("no errno")
+
+
+@pytest.mark.parametrize("words", ["--help", "--version", "models", "predict --help"])
+def test_nobody_reads_what_is_printed(words):
+    """As with ``| head -1``, but without a race."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "lightning_modules", *words.split()]
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, timeout=120)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
+def test_what_is_printed_finds_no_room():
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "lightning_modules", "models"]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (1, "lightning: No space left on device\n")

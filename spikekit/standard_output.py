@@ -1,0 +1,17 @@
+"""Standard output that nobody reads, or that finds no room."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+from contextlib import suppress
+
+#: exit status of a command that was still printing when its reader went, as a shell has it: 128 + SIGPIPE
+BROKEN_PIPE = 141
+
+
+def stop_printing() -> None:
+    """Drop what is still to be printed: Python would complain about it when it flushes at exit."""
+    with suppress(io.UnsupportedOperation):  # what is printed goes to no file
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
