@@ -9,10 +9,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from jsonargparse import Namespace
 from pytorch_lightning.utilities import rank_zero_only
 
 from lightning_modules.__main__ import main
 from lightning_modules.cli import folder_lock
+from lightning_modules.cli.command import _locked
 from lightning_modules.cli.errors import as_one_line
 from lightning_modules.cli.folder_lock import FolderError, locked_folder
 from spikekit import write_spikes
@@ -168,6 +170,28 @@ def test_the_lock_of_another_process_goes_with_it(output, folder, tmp_path, monk
         other.kill()
     main([*words.split(), output])
     assert (tmp_path / ("out/frame_000020.png" if output == "out" else output)).is_file()
+
+
+@pytest.mark.parametrize(
+    ("verb", "asked", "made"),
+    [
+        ("fit", {"trainer.fast_dev_run": False}, {"out/lock"}),
+        ("fit", {"trainer.fast_dev_run": 1}, set()),  # which writes nothing
+        ("validate", {}, set()),  # likewise
+        ("test", {}, {"out/.test.lock"}),
+        ("predict", {"part": None}, {"out/.predict.lock"}),
+        ("predict", {"part": None, "output": "film.mp4"}, {"film.mp4.frames/.predict.lock"}),
+        ("predict", {"part": "1/2"}, {"out"}),  # a folder that all parts share
+    ],
+)
+def test_what_a_verb_locks(verb, asked, made, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with _locked(verb, Namespace(**{"output": "out", **asked})):
+        found = {path for path in tmp_path.rglob("*") if path.is_file() or not any(path.iterdir())}
+        assert {str(path.relative_to(tmp_path)) for path in found} == made
+        if verb == "predict" and asked["part"]:  # as another part does
+            with _locked(verb, Namespace(output="out", **asked)):
+                pass
 
 
 def test_a_folder_that_cannot_be_locked(tmp_path, monkeypatch):

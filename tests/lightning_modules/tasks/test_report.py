@@ -1,0 +1,65 @@
+"""What ``lightning test`` writes about clips: their names, their scores, their pictures."""
+
+import csv
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from lightning_modules.tasks import callbacks
+from lightning_modules.tasks.callbacks import TestReport
+from spikekit import read_picture
+
+
+def report_of(folder, clips, names, processes=1, pictures=8):
+    """Report of clips that a network scores n + 0.5 and TFI n, where n counts them."""
+    report = TestReport(folder, pictures)
+    report.on_test_start(None, None)
+    width = len(report.columns())
+    for n in range(clips):
+        report.score = lambda *_, n=n: {"CSCSR": [(n + 0.5,) * width], "TFI": [(float(n),) * width]}
+        report.rows = lambda *_, n=n: [[torch.full((3, 4, 4), n / 10)]]
+        report.on_test_batch_end(None, None, {}, {})
+    report._gather = lambda _: None
+    trainer = SimpleNamespace(
+        world_size=processes, is_global_zero=True, datamodule=SimpleNamespace(test_names=names) if names else None
+    )
+    report.on_test_end(trainer, None)
+    with open(folder / "test.csv", newline="") as file:
+        return {(row["method"], row["clip"]): float(list(row.values())[2]) for row in csv.DictReader(file)}
+
+
+def test_clips_have_their_names(tmp_path, capsys):
+    scores = report_of(tmp_path, 2, ["walk", "city", "foliage"])
+    assert scores == {
+        ("CSCSR", "walk"): 0.5,
+        ("CSCSR", "city"): 1.5,
+        ("CSCSR", "mean"): 1.0,
+        ("TFI", "walk"): 0.0,
+        ("TFI", "city"): 1.0,
+        ("TFI", "mean"): 0.5,
+    }
+    said = capsys.readouterr().out
+    assert "mean of 2 clips" in said
+    assert "walk" in said
+    assert "foliage" not in said
+
+
+@pytest.mark.parametrize(("clips", "expected"), [(2, {"0", "1", "mean"}), (3, {"walk", "city", "foliage", "mean"})])
+def test_first_clips_of_several_processes_have_no_names(clips, expected, tmp_path):
+    """With --trainer.limit_test_batches each process has seen the first of its own."""
+    found = report_of(tmp_path, clips, ["walk", "city", "foliage"], processes=2)
+    assert {clip for _, clip in found} == expected
+
+
+@pytest.mark.parametrize("more", [0, 1])
+def test_of_many_clips_the_mean_alone_is_printed(more, tmp_path, capsys):
+    clips = callbacks._MOST_TABLES + more
+    report_of(tmp_path, clips, [f"clip{n}" for n in range(clips)])
+    assert ("clip0" in capsys.readouterr().out) == (not more)
+
+
+def test_as_many_pictures_as_asked_for(tmp_path):
+    report_of(tmp_path, 3, None, pictures=2)
+    shown = read_picture(tmp_path / "test.png")
+    assert shown[0].unique().mul(10).round().tolist() in ([0, 1, 10], [0, 1])
