@@ -32,6 +32,9 @@ _MANY = 10
 # milliseconds a pixel of a picture, written as PNG by one core
 _WRITING = 7e-5
 
+# spikes of a white pixel in a clip, below which pictures by a decoder are mostly noise
+_ENOUGH = 8
+
 
 def add_arguments(parser: LightningArgumentParser) -> None:
     """Add the arguments of the verb."""
@@ -104,7 +107,18 @@ def _choice(args: Sequence[str]) -> tuple[Preset, str]:
     writing = _WRITING * scale**2 * clips.size[0] * clips.size[1]
     took, sooner_took = (duration(len(clips) * (one.ms + writing) / 1e3) for one in (choice, other))
     instead = f"; --speed {sooner}: {sooner_took}, {other.below:.2f} dB below the best" if other != choice else ""
-    return choice.preset, f"{choice}\n{len(clips)} pictures, written as PNG: about {took}{instead}"
+    said = f"{choice}\n{len(clips)} pictures, written as PNG: about {took}{instead}"
+    return choice.preset, "\n".join([said, *_noise(choice.preset, clips)])
+
+
+def _noise(preset: Preset, clips: RecordingClips) -> list[str]:
+    """Return a hint where a decoder has too few spikes for a picture."""
+    if not preset.method or (spikes := clips.white * preset.clip) >= _ENOUGH:
+        return []
+    return [
+        f"a white pixel fires {spikes:.1f} times in {preset.clip} frames: a decoder's picture is noisy; --speed fast "
+        "and slower ones use a network, which sees less noise"
+    ]
 
 
 def check_output(output: Path, clips: RecordingClips) -> None:
