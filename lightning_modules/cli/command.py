@@ -32,6 +32,7 @@ from lightning_modules.cli.processes import make_parts
 from lightning_modules.cli.reasons import reason, suggestion, unknown
 from lightning_modules.cli.renamed_overlays import with_current_overlays
 from lightning_modules.data import FilmScenes, Recording, StillScenes
+from lightning_modules.data.loading import end_when_orphaned
 from lightning_modules.motion import Spike2Flow
 from lightning_modules.networks import CSCSR
 from lightning_modules.storage.checkpoint import read_checkpoint
@@ -400,6 +401,8 @@ def run(args: Sequence[str] | None, command: type[Command]) -> Command:
         logging.getLogger(says).setLevel(logging.WARNING)  # tips, and which devices there are
     for nothing_to_do in _NOTHING_TO_DO:
         warnings.filterwarnings("ignore", nothing_to_do)
+    if rank_zero_only.rank:  # one of several processes, which the first has started
+        end_when_orphaned()
     return command(
         Learner,
         LightningDataModule,

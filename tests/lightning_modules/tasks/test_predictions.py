@@ -208,8 +208,11 @@ def test_a_network_carries_on_through_a_film_and_where_it_was_stopped(carries_on
     (tmp_path / "out" / "frame_000040.png").unlink()
     (tmp_path / "out" / "frame_000070.png").unlink()
     stop_after(monkeypatch, 2)
+    timed = []
+    monkeypatch.setattr(predictions.Stopwatch, "said", lambda _, frames: timed.append(frames))
     main(words)
     assert pictures(tmp_path / "out") == unbroken
+    assert timed == [6]  # two that were missing, four that help them
     monkeypatch.undo()
     main([*carries_on, str(tmp_path / "alone"), "--data.frame", "40", "--data.white", "0.3"])
     assert pictures(tmp_path / "alone")["frame_000040.png"] != unbroken["frame_000040.png"]
