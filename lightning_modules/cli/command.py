@@ -169,6 +169,8 @@ class Command(LightningCLI):
                 raise
             names = [name.removeprefix("--") for name in option_names(*self._subcommand_parsers.values())]
             meant = suggestion(unknown(self.typed, names), names)
+            if error.code.startswith("data.frames: "):
+                meant = ", the frames of a clip; --data.frame chooses pictures"
             raise UsageError(error.code + (meant or f" (see lightning {self.typed[0]} --help)")) from error
         self.counts = whole_counts(args)
         if said:

@@ -82,6 +82,13 @@ def test_one_frame_is_one_picture(words, tmp_path, capsys):
     assert "one.PNG: 1 pictures" in capsys.readouterr().out
 
 
+def test_the_frames_of_a_clip_choose_no_pictures(words, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main([*words, str(tmp_path / "out"), "--data.frames", "20:60"])
+    said = "data.frames: expected int, got '20:60', the frames of a clip; --data.frame chooses pictures"
+    assert said in capsys.readouterr().err
+
+
 def test_a_picture_for_several_frames_is_refused(words, tmp_path, capsys):
     with pytest.raises(SystemExit) as exit:
         main([*words, str(tmp_path / "b" / "one.png"), "--data.frame", "20:60"])
