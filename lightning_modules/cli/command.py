@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
 import sys
 import warnings
 from collections.abc import Sequence
@@ -32,6 +33,7 @@ from lightning_modules.cli.processes import make_parts
 from lightning_modules.cli.reasons import reason, suggestion, unknown
 from lightning_modules.cli.renamed_overlays import with_current_overlays
 from lightning_modules.data import FilmScenes, Recording, StillScenes
+from lightning_modules.data.loading import end_when_orphaned
 from lightning_modules.motion import Spike2Flow
 from lightning_modules.networks import CSCSR
 from lightning_modules.storage.checkpoint import read_checkpoint
@@ -70,6 +72,9 @@ _NOTHING_TO_DO = (
     r"No seed found",
     r".*the `outputs` folder",
 )
+
+# environment variable: number of the process that starts the others, where a run has several
+_FIRST = "SPIKEKIT_FIRST_PROCESS"
 
 # of what users may take the output for
 _FILE_ENDINGS = (*PICTURE_ENDINGS, *VIDEO_ENDINGS, ".gif", ".html", ".npz", ".dat", ".ckpt", ".safetensors")
@@ -168,6 +173,8 @@ class Command(LightningCLI):
                 raise
             names = [name.removeprefix("--") for name in option_names(*self._subcommand_parsers.values())]
             meant = suggestion(unknown(self.typed, names), names)
+            if error.code.startswith("data.frames: "):
+                meant = ", the frames of a clip; --data.frame chooses pictures"
             raise UsageError(error.code + (meant or f" (see lightning {self.typed[0]} --help)")) from error
         self.counts = whole_counts(args)
         if said:
@@ -400,6 +407,10 @@ def run(args: Sequence[str] | None, command: type[Command]) -> Command:
         logging.getLogger(says).setLevel(logging.WARNING)  # tips, and which devices there are
     for nothing_to_do in _NOTHING_TO_DO:
         warnings.filterwarnings("ignore", nothing_to_do)
+    if os.environ.get(_FIRST) == str(os.getppid()):  # one of several processes, which the first has started
+        end_when_orphaned()
+    elif not rank_zero_only.rank:
+        os.environ[_FIRST] = str(os.getpid())
     return command(
         Learner,
         LightningDataModule,

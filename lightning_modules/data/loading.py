@@ -175,11 +175,15 @@ def _to_arrays(clips: list[dict[str, Tensor]]) -> dict[str, np.ndarray]:
 
 def _start_worker(_: int) -> None:
     torch.set_num_threads(1)
-    threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
+    end_when_orphaned()  # torch's own watch does not reach a worker that waits for its clip to leave a full pipe
 
 
-def _end_with_parent(parent: int) -> None:
-    # torch's own watch does not reach a worker that waits for its clip to be taken out of a full pipe
+def end_when_orphaned() -> None:
+    """End this process soon after the one that started it, even if that is killed."""
+    threading.Thread(target=_end_without, args=(os.getppid(),), daemon=True).start()
+
+
+def _end_without(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(_A_MOMENT)
     os._exit(1)

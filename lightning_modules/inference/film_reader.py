@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lightning_modules.inference.tiles import TILE, Box, reach, tiled
 from lightning_modules.networks import Network, RecurrentCSCSR
-from lightning_modules.networks.recurrent_cscsr import read_group
+from lightning_modules.networks.recurrent_cscsr import read_forward, read_from_end
 
 
 class _Known(NamedTuple):
@@ -69,7 +69,7 @@ class FilmReader:
         clips = spikes.split(1)
         given = [None] * len(clips) if flow is None else flow.split(1)
         flows = [network.resolve_flow(clip, way, static) for clip, way in zip(clips, given, strict=True)]
-        features = [self._features(clip, way, whole) for clip, way in zip(clips, flows, strict=True)]
+        features = {n: self._features(clip, flows[n], whole) for n, clip in enumerate(clips)}
 
         def meet(n: int, *around: _Known | None) -> _Known:
             neighbors = []
@@ -79,9 +79,12 @@ class FilmReader:
                     neighbors.append((known.state, None if flows[n] is None else network.flow_to(flows[n], away)))
             return _Known(clocks[n], self._advance(features[n], neighbors, whole))
 
-        _, states = read_group(range(len(clips)), meet, self._last)
-        self._last = states[-1]
-        return torch.cat([network.picture(known.state) for known in states])
+        group, pictures = range(len(clips)), []
+        for n, known in enumerate(read_forward(group, meet, self._last, read_from_end(group, meet))):
+            self._last = known
+            del features[n]  # of a large film what a group remembers fills the memory
+            pictures.append(network.picture(known.state))
+        return torch.cat(pictures)
 
     def _features(self, spikes: Tensor, flow: Tensor | None, whole: Box) -> Tensor:
         def run(outer: Box) -> Tensor:

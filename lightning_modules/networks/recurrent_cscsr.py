@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
@@ -163,8 +163,8 @@ class RecurrentCSCSR(CSCSR):
     ) -> list[Tensor]:
         """Return the pictures of a film, as they are after every time that it was read.
 
-        It is read in groups of ``future + 1`` key frames, see
-        :func:`~lightning_modules.networks.recurrent_cscsr.read_group`.
+        It is read in groups of ``future + 1`` key frames: a single one knows the one before it; more are read from
+        their end and then forward, so that a key frame knows both its neighbours.
 
         Args:
             spikes: (B, K, N, H, W).
@@ -194,8 +194,9 @@ class RecurrentCSCSR(CSCSR):
         earlier, final, last = [], [], None
         for first in range(0, spikes.shape[1], size):
             group = range(first, min(first + size, spikes.shape[1]))
-            once, twice = read_group(group, meet, last)
-            earlier += map(self.picture, once)
+            later = read_from_end(group, meet)
+            once, twice = later.copy(), list(read_forward(group, meet, last, later))
+            earlier += map(self.picture, once or twice)
             final += map(self.picture, twice)
             last = twice[-1]
         return [torch.stack(pictures, dim=1) for pictures in ([earlier, final] if future else [final])]
@@ -262,28 +263,43 @@ class RecurrentCSCSR(CSCSR):
         return torch.cat([F.pixel_unshuffle(rgb, self.scale), flow_warp(memory, flow)], dim=1)
 
 
-def read_group(
-    group: Sequence[int], meet: Callable[[int, State | None, State | None], State], before: State | None = None
-) -> tuple[list[State], list[State]]:
-    """Return the states of key frames that follow each other, as they are after the group was read, and read again.
-
-    A single key frame knows the one before it. More are read from their end to their beginning, so that a key frame
-    knows the one behind it, and then forward, so that it knows both its neighbours.
+def read_from_end(group: Sequence[int], meet: Callable[[int, State | None, State | None], State]) -> list[State]:
+    """Return the states of key frames that know the one behind them; of a single one, which has none, there are none.
 
     Args:
         group: numbers of the key frames.
         meet: makes the state of a key frame out of those before and behind it, None where there is none.
-        before: state of the key frame before the group.
 
     Example:
-        >>> read_group("abc", lambda n, before, after: f"({before or ''}{n}{after or ''})")[1][1]
-        '((a(b(c)))b(c))'
+        >>> read_from_end("abc", lambda n, before, after: f"({before or ''}{n}{after or ''})")
+        ['(a(b(c)))', '(b(c))', '(c)']
     """
-    later: list[State | None] = [None]
+    later: list[State] = []
     for n in reversed(group if len(group) > 1 else []):
-        later.insert(0, meet(n, None, later[0]))
-    states = [] if before is None else [before]
-    for n, after in zip(group, [*later[1:], None], strict=False):
-        states.append(meet(n, states[-1] if states else None, after))
-    states = states[-len(group) :]
-    return later[:-1] or states, states
+        later.insert(0, meet(n, None, later[0] if later else None))
+    return later
+
+
+def read_forward(
+    group: Sequence[int],
+    meet: Callable[[int, State | None, State | None], State],
+    before: State | None,
+    later: list[State],
+) -> Iterator[State]:
+    """Yield the states of key frames that know the one before them, and what was read from the end behind them.
+
+    Args:
+        group: numbers of the key frames.
+        meet: as of :func:`read_from_end`.
+        before: state of the key frame before the group, if there is one.
+        later: what :func:`read_from_end` returns; emptied on the way, as states are large.
+
+    Example:
+        >>> meet = lambda n, before, after: f"({before or ''}{n}{after or ''})"
+        >>> list(read_forward("bc", meet, "A", read_from_end("bc", meet)))
+        ['(Ab(c))', '((Ab(c))c)']
+    """
+    for n in group:
+        del later[:1]
+        before = meet(n, before, later[0] if later else None)
+        yield before

@@ -78,6 +78,7 @@ class Predictions(Callback):
         clips = trainer.datamodule.clips
         clips.part = self.part
         self._file, self._white, self._written = self.folder != self.output and self.part[1] == 1, clips.white, 0
+        self._made = 0  # with those that a network sees again, and nobody is shown
         self._paths = {frame: self.folder / f"frame_{frame:06d}.png" for frame in clips.chosen}
         self._notes = {}
         if self.made_of is not None:
@@ -106,6 +107,7 @@ class Predictions(Callback):
         self, trainer: Trainer, module: LightningModule, outputs: Tensor, batch: dict[str, Tensor], *_: Any
     ) -> None:
         self._watch.lap("network")
+        self._made += len(outputs)
         show = trainer.datamodule.show
         for n, (rgb, frame) in enumerate(zip(outputs, batch["frame"].tolist(), strict=True)):
             if not batch["shown"][n]:
@@ -151,8 +153,8 @@ class Predictions(Callback):
         count = f"{there} of {total}" if lacking else total
         made = f", {self._written} of them new" if self._written < there and trainer.world_size == 1 else ""
         print(f"{self.output}: {count} pictures{made}, {self._white:.4g} spikes a frame are white")  # noqa: T201
-        if self._written:
-            print(self._watch.said(self._written))  # noqa: T201
+        if self._made:
+            print(self._watch.said(self._made))  # noqa: T201
 
 
 class PictureProgress(ProgressBar):

@@ -49,6 +49,25 @@ def test_workers_end_with_a_killed_run():
     assert not any(map(alive, workers))
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no such signals")
+def test_a_process_of_several_ends_with_the_first():
+    started = """
+from lightning_modules.cli import command
+command.run(None, lambda *_, **__: print("begun", flush=True) or input())
+"""
+    first = """
+import os, subprocess, sys
+from lightning_modules.cli import command
+command.run(None, lambda *_, **__: None)
+subprocess.run([sys.executable, "-c", sys.argv[1]], env={**os.environ, "LOCAL_RANK": "1"})
+"""
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", first, started], **pipes) as process:
+        assert process.stdout.readline() == "begun\n"
+        process.send_signal(signal.SIGKILL)
+        assert process.stdout.read() == ""  # the pipe ends with the last process that holds it
+
+
 def test_workers_are_no_more_than_there_are_batches():
     class Clips(torch.utils.data.Dataset):
         def __len__(self):

@@ -6,7 +6,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from lightning_modules.inference.film import film
 from lightning_modules.inference.film_reader import FilmReader
 from lightning_modules.networks import CSCSR, ClassicalDecoder, RecurrentCSCSR
-from lightning_modules.networks.recurrent_cscsr import read_group
+from lightning_modules.networks.recurrent_cscsr import read_forward, read_from_end
 from spikekit import flow_warp
 
 TINY = {"scale": 2, "width": 8, "representation_width": 8, "features": 1, "stages": 1, "end_blocks": 1, "skip": True}
@@ -139,9 +139,13 @@ def test_groups_are_read_from_their_end_first():
     def meet(n, before, after):
         return f"({before or ''}{n}{after or ''})"
 
-    assert read_group("a", meet) == (["(a)"], ["(a)"])
-    assert read_group("b", meet, "A") == (["(Ab)"], ["(Ab)"])
-    assert read_group("bc", meet, "A") == (["(b(c))", "(c)"], ["(Ab(c))", "((Ab(c))c)"])
+    assert read_from_end("a", meet) == []
+    assert list(read_forward("a", meet, None, [])) == ["(a)"]
+    assert list(read_forward("b", meet, "A", [])) == ["(Ab)"]
+    later = read_from_end("bc", meet)
+    assert later == ["(b(c))", "(c)"]
+    assert list(read_forward("bc", meet, "A", later)) == ["(Ab(c))", "((Ab(c))c)"]
+    assert later == []
 
 
 @pytest.mark.parametrize("future", [0, 1, 3])

@@ -82,6 +82,13 @@ def test_one_frame_is_one_picture(words, tmp_path, capsys):
     assert "one.PNG: 1 pictures" in capsys.readouterr().out
 
 
+def test_the_frames_of_a_clip_choose_no_pictures(words, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main([*words, str(tmp_path / "out"), "--data.frames", "20:60"])
+    said = "data.frames: expected int, got '20:60', the frames of a clip; --data.frame chooses pictures"
+    assert said in capsys.readouterr().err
+
+
 def test_a_picture_for_several_frames_is_refused(words, tmp_path, capsys):
     with pytest.raises(SystemExit) as exit:
         main([*words, str(tmp_path / "b" / "one.png"), "--data.frame", "20:60"])
@@ -208,8 +215,11 @@ def test_a_network_carries_on_through_a_film_and_where_it_was_stopped(carries_on
     (tmp_path / "out" / "frame_000040.png").unlink()
     (tmp_path / "out" / "frame_000070.png").unlink()
     stop_after(monkeypatch, 2)
+    timed = []
+    monkeypatch.setattr(predictions.Stopwatch, "said", lambda _, frames: timed.append(frames))
     main(words)
     assert pictures(tmp_path / "out") == unbroken
+    assert timed == [6]  # two that were missing, four that help them
     monkeypatch.undo()
     main([*carries_on, str(tmp_path / "alone"), "--data.frame", "40", "--data.white", "0.3"])
     assert pictures(tmp_path / "alone")["frame_000040.png"] != unbroken["frame_000040.png"]
