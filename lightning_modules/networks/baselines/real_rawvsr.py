@@ -110,15 +110,10 @@ class RealRawVSR(Baseline):
 
     def _align(self, raws: Tensor, packed: Tensor) -> tuple[Tensor, Tensor]:
         """Features of both branches as they are in the middle, (B, T, C, H, W) and (B, T, C, H / 2, W / 2)."""
-        levels = []
-        for features, planes in ((self.raw_features, raws), (self.packed_features, packed)):
-            found = features(planes.flatten(0, 1))
-            levels.append([level.unflatten(0, planes.shape[:2]) for level in found])
-        middle = [level[:, _FRAMES // 2] for level in levels[1]]
-        aligned = [
-            self.align(*([level[:, n] for level in branch] for branch in levels), middle) for n in range(_FRAMES)
-        ]
-        return tuple(torch.stack(branch, dim=1) for branch in zip(*aligned, strict=True))
+        times = raws.shape[:2]
+        raw, packed = self.raw_features(raws.flatten(0, 1)), self.packed_features(packed.flatten(0, 1))
+        middle = [level.unflatten(0, times)[:, _FRAMES // 2].repeat_interleave(_FRAMES, dim=0) for level in packed]
+        return tuple(branch.unflatten(0, times) for branch in self.align(raw, packed, middle))
 
     def _fuse(self, raw: Tensor, packed: Tensor) -> Tensor:
         """Bring the times and the branches together: (B, C, H, W)."""
@@ -167,7 +162,7 @@ class _Alignment(nn.Module):
         self.act = _relu()
 
     def forward(self, raw: list[Tensor], packed: list[Tensor], middle: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Move what two branches have of one time to the middle, of which the packed branch is given."""
+        """Move what two branches have of any time to the middle, of which the packed branch is given."""
         guide, moved = None, []
         for level in reversed(range(_LEVELS)):
             found = self.act(self.compare[level](torch.cat([packed[level], middle[level]], dim=1)))

@@ -1,10 +1,12 @@
 """``lightning trade``, as its users type it, and the parts of it that have laws of their own."""
 
 import csv
+import math
 import random
 import re
 import shlex
 import sys
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +18,7 @@ from pytorch_lightning import LightningDataModule
 from lightning_modules.__main__ import main
 from lightning_modules.cli.arguments import arguments_preset
 from lightning_modules.cli.errors import InputError, UsageError
+from lightning_modules.cost import charts
 from lightning_modules.cost.energy import energy_meter, energy_per_call
 from lightning_modules.cost.measure import Row, Timed, running, time_in_turns
 from lightning_modules.cost.runner import Runner, make_runner
@@ -30,7 +33,7 @@ from lightning_modules.storage.shipped import Pretrained
 from lightning_modules.trade import cli, energy, measure
 from lightning_modules.trade.films import film_scenes
 from lightning_modules.trade.pareto import pareto_front
-from lightning_modules.trade.plot import plot
+from lightning_modules.trade.plot import _labels, plot
 from lightning_modules.trade.settings import Setting, read_setting, usual_settings
 from lightning_modules.trade.table import figures, front, markdown, write_csv
 from spikekit import flow_warp, psnr, read_picture
@@ -526,6 +529,41 @@ def test_the_front_leaves_out_what_cannot_run(tmp_path):
         blue, grey = ((pixels == torch.tensor(colour)).all(-1).sum() for colour in ((38, 92, 160), (150, 150, 150)))
         assert blue > 500  # two dots and the line, at least
         assert (grey > 100) == beaten  # a dot; rounded letters have some grey, too
+
+
+def test_the_front_is_joined_by_its_steps_and_named_in_blue(tmp_path, monkeypatch):
+    rows, _ = some_rows(3, [(2.0,), (3.0,), (1.0,)])
+    rows[1].psnr = [15.0]  # slower and worse than both
+    rows[0].psnr, rows[2].psnr = [22.0], [20.0]
+    seen = []
+    from matplotlib.colors import to_hex
+
+    @contextmanager
+    def watched(*args):
+        with charts.chart(*args) as axes:
+            yield axes
+            seen.append(axes)
+
+    monkeypatch.setattr("lightning_modules.trade.plot.chart", watched)
+    plot(rows, tmp_path / "trade.png")
+    (axes,) = seen
+    (steps,) = (line for line in axes.lines if line.get_drawstyle() == "steps-post")
+    times, scores = steps.get_data()
+    assert [*scores] == [20.0, 22.0, 22.0]
+    assert [*times[:2]] == [figures(rows)[2]["ms"], figures(rows)[0]["ms"]]
+    assert times[2] == axes.get_xlim()[1]
+    colours = [text.get_color() for text in axes.figure.legends[0].get_texts()]
+    assert [to_hex(colour) == charts.BLUE for colour in colours] == [True, False, True]
+
+
+def test_labels_keep_away_from_points_and_from_each_other():
+    points = [(0.0, 0.0), (12.0, 0.0), (0.0, 12.0), (200.0, 0.0), (212.0, 3.0), (206.0, 12.0)]
+    labels = [(x + right, y + up) for (x, y), (right, up) in zip(points, _labels(points), strict=True)]
+    for n, label in enumerate(labels):
+        others = [*points[:n], *points[n + 1 :], *labels[:n], *labels[n + 1 :]]
+        assert min(math.dist(label, other) for other in others) > 8
+        assert 9.9 < math.dist(label, points[n]) < 24.1
+    assert _labels([(5.0, 5.0)]) == [pytest.approx((0, 10))]  # above, where all is free
 
 
 def test_energy_is_counted_where_the_machine_counts_it(tmp_path, monkeypatch):

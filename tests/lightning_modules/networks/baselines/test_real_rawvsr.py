@@ -65,9 +65,25 @@ def test_offsets_of_the_mosaic_are_twice_those_of_the_packed_branch():
     network, guides = awake(RealRawVSR(scale=2, **TINY)), []
     network.align.cascade.register_forward_pre_hook(lambda _, inputs: guides.append(inputs[1]))
     network(clip(1, 8, 16))
-    assert len(guides) == 10
-    for raw, packed in zip(guides[::2], guides[1::2], strict=True):
-        torch.testing.assert_close(raw, 2 * F.interpolate(packed, scale_factor=2, mode="bilinear"))
+    raw, packed = guides
+    assert len(raw) == len(packed) == 5
+    torch.testing.assert_close(raw, 2 * F.interpolate(packed, scale_factor=2, mode="bilinear"))
+
+
+def test_every_time_of_every_clip_is_aligned_to_the_middle_of_its_clip():
+    torch.manual_seed(0)
+    network = awake(RealRawVSR(scale=2, **TINY))
+    raws, packed = torch.rand(2, 5, 1, 16, 24), torch.rand(2, 5, 4, 8, 12)
+    found = network._align(raws, packed)
+    for clip in range(2):
+        middle = network.packed_features(packed[clip, 2:3])
+        for time in range(5):
+            one = (
+                network.raw_features(raws[clip, time : time + 1]),
+                network.packed_features(packed[clip, time : time + 1]),
+            )
+            for branch, expected in zip(found, network.align(*one, middle), strict=True):
+                torch.testing.assert_close(branch[clip, time], expected[0])
 
 
 def test_attention_over_time():
