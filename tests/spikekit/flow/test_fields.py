@@ -114,6 +114,7 @@ FLOW = torch.zeros(1, 2, 3, 3)
         (ValueError, lambda: linear_motion(FLOW, FLOW, [1])),
         (ValueError, lambda: linear_motion(FLOW, FLOW, [2, 1])),
         (ValueError, lambda: linear_motion(FLOW, FLOW, [0, 4], middle=4)),
+        (ValueError, lambda: linear_motion(FLOW, FLOW, [0, 4], middle=0)),
         (ValueError, lambda: linear_motion(FLOW, FLOW[:, :, 1:], [0, 4])),
         (TypeError, lambda: linear_motion(FLOW, None, [0, 4])),
     ],
