@@ -280,6 +280,7 @@ def test_the_list_of_weights_says_what_the_networks_are(configs):
         "huge",
         "huge_long",
         "large_film",
+        "large_film",
         "huge_long_film",
     ]
     for weights in listed:
