@@ -407,10 +407,10 @@ def run(args: Sequence[str] | None, command: type[Command]) -> Command:
         logging.getLogger(says).setLevel(logging.WARNING)  # tips, and which devices there are
     for nothing_to_do in _NOTHING_TO_DO:
         warnings.filterwarnings("ignore", nothing_to_do)
-    if os.environ.get(_FIRST) == str(os.getppid()):  # one of several processes, which the first has started
-        end_when_orphaned()
-    elif not rank_zero_only.rank:
+    if not rank_zero_only.rank:
         os.environ[_FIRST] = str(os.getpid())
+    elif os.environ.get(_FIRST) == str(os.getppid()):
+        end_when_orphaned()
     return command(
         Learner,
         LightningDataModule,

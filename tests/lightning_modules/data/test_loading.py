@@ -62,7 +62,8 @@ command.run(None, lambda *_, **__: None)
 subprocess.run([sys.executable, "-c", sys.argv[1]], env={**os.environ, "LOCAL_RANK": "1"})
 """
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with subprocess.Popen([sys.executable, "-c", first, started], **pipes) as process:
+    earlier = {**os.environ, "SPIKEKIT_FIRST_PROCESS": str(os.getpid())}  # as a run in this process would leave it
+    with subprocess.Popen([sys.executable, "-c", first, started], env=earlier, **pipes) as process:
         assert process.stdout.readline() == "begun\n"
         process.send_signal(signal.SIGKILL)
         assert process.stdout.read() == ""  # the pipe ends with the last process that holds it
