@@ -99,7 +99,7 @@ class Runner:
         """
         module, alpha = self.module, self.network.settings["alpha"]
         names = ("tile",) if isinstance(self.network, RecurrentCSCSR) else ("tile", "psnr_tolerance", "self_ensemble")
-        how = {name: getattr(module, name) for name in ("future", *names)}
+        how = {name: getattr(module, name) for name in ("future", "interpolated", *names)}
         with torch.inference_mode(), self.precision.predict_step_context():
             yield from film(self.network, map(self.precision.convert_input, chunks), every, white=alpha, **how)
 

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from itertools import islice
+from typing import TypeVar
 
 import torch
 from torch import Tensor
+
+Item = TypeVar("Item")
 
 
 def clips_around(
@@ -48,3 +52,22 @@ def clips_around(
             held.append(frame)
             at += 1
         yield middle, torch.stack(tuple(held))
+
+
+def film_groups(items: Iterable[Item], future: int = 0, interpolated: int = 0) -> Iterator[list[Item]]:
+    """Yield the clips of a film, or what stands for them, group by group, each ending with a picture of the network.
+
+    Args:
+        items: of every picture, in order.
+        future: key frames that a picture may wait for.
+        interpolated: pictures between two that the network makes; there are none before the first.
+
+    Example:
+        >>> [*film_groups("abcdefg", interpolated=1)], [*film_groups("abcdefg", future=1, interpolated=1)]
+        ([['a'], ['b', 'c'], ['d', 'e'], ['f', 'g']], [['a', 'b', 'c'], ['d', 'e', 'f', 'g']])
+    """
+    items, size = iter(items), (future + 1) * (interpolated + 1)
+    group = list(islice(items, size - interpolated))
+    while group:
+        yield group
+        group = list(islice(items, size))

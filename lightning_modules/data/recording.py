@@ -17,7 +17,7 @@ from pytorch_lightning import LightningDataModule
 from torch import Tensor
 from torch.utils.data import Dataset, default_collate
 
-from lightning_modules.data.clips_around import clips_around
+from lightning_modules.data.clips_around import clips_around, film_groups
 from lightning_modules.signatures import takes
 from spikekit import bayer_sites
 from spikekit.arguments import frames_of
@@ -157,14 +157,22 @@ class _Batches:
     one key frame to the next has to see again: their clips are not ``shown``.
     """
 
-    def __init__(self, clips: RecordingClips, process: int, processes: int, group: int = 1, warm_up: int = 0) -> None:
+    def __init__(
+        self,
+        clips: RecordingClips,
+        process: int,
+        processes: int,
+        future: int = 0,
+        interpolated: int = 0,
+        warm_up: int = 0,
+    ) -> None:
         self.clips = clips
-        groups = [clips.chosen[n : n + group] for n in range(0, len(clips), group)]
+        groups = list(film_groups(clips.chosen, future, interpolated))
         part, parts = clips.part
         wanted = range(*(len(groups) * n // parts for n in (part, part + 1)))
         wanted = [n for n in wanted if not clips.made.issuperset(groups[n])]
         mine = {*wanted[slice(*(len(wanted) * n // processes for n in (process, process + 1)))]}
-        before = -(-warm_up // group)
+        before = -(-warm_up // ((future + 1) * (interpolated + 1)))
         seen = sorted({n for last in mine for n in range(max(last - before, 0), last + 1)})
         self.groups = [(groups[n], n in mine) for n in seen]
 
@@ -212,5 +220,5 @@ class Recording(LightningDataModule):
         if not self.trainer:
             return _Batches(self.clips, 0, 1)
         module = self.trainer.lightning_module
-        group, warm_up = module.future + 1, module.network.warm_up
-        return _Batches(self.clips, self.trainer.global_rank, self.trainer.world_size, group, warm_up)
+        process = self.trainer.global_rank, self.trainer.world_size
+        return _Batches(self.clips, *process, module.future, module.interpolated, module.film_warm_up)

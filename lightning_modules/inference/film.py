@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from itertools import count, islice
+from functools import partial
+from itertools import count
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from lightning_modules.data.clips_around import clips_around
-from lightning_modules.inference.film_reader import FilmReader, check_future
-from lightning_modules.inference.predict import predict
-from lightning_modules.inference.tiles import TILE
-from lightning_modules.networks import Network, RecurrentCSCSR
+from lightning_modules.data.clips_around import clips_around, film_groups
+from lightning_modules.inference.film_pictures import FilmPictures
+from lightning_modules.inference.film_reader import check_future
+from lightning_modules.networks import Network
 from spikekit.check import check_planes, check_positive, check_whole
 from spikekit.io.recording import white_rate
 
@@ -36,6 +36,7 @@ def film(
     every: int = 20,
     *,
     future: int = 0,
+    interpolated: int = 0,
     white: float | None = None,
     **how: Any,
 ) -> Iterator[FilmFrame]:
@@ -49,7 +50,9 @@ def film(
 
         A :class:`lightning_modules.networks.RecurrentCSCSR` carries on what it knows of the key frame before. With a
         ``future`` it makes pictures in groups of ``future + 1``, when the last of them has come: they are up to
-        ``future * every`` clocks later, and better. A group is held meanwhile.
+        ``future * every`` clocks later, and better. A group is held meanwhile. With ``interpolated`` pictures between
+        two of the network's, a group has ``interpolated + 1`` times as many pictures and ends with one of the
+        network's. See :class:`lightning_modules.inference.film_pictures.FilmPictures`.
 
         White is the same in all pictures: ``white``, or else what 99.9 % of the pixels of the first clip do not exceed.
 
@@ -59,6 +62,7 @@ def film(
             with the network's Bayer phase.
         every: clocks between two pictures.
         future: key frames that a picture may wait for.
+        interpolated: pictures between two that the network makes; these are moved there along the motion.
         white: spikes a clock of a pixel that is shown white.
         how: ``tile``, ``psnr_tolerance``, ``self_ensemble`` and ``static`` of
             :func:`lightning_modules.inference.predict.predict`; a network that carries on takes ``tile`` and
@@ -79,40 +83,26 @@ def film(
         >>> [(clock, rgb.shape) for clock, rgb in film(ClassicalDecoder(scale=2), stream)]
         [(20, torch.Size([3, 16, 20])), (40, torch.Size([3, 16, 20])), (60, torch.Size([3, 16, 20]))]
     """
-    every, group = check_whole("every", every), check_future(network, future) + 1
+    check_whole("every", every)
+    check_future(network, future)
     if white is not None:
         check_positive("white", white)
-    if isinstance(network, RecurrentCSCSR):
-        how = {"tile": TILE, "static": False, **how}
-        if how.keys() != {"tile", "static"}:
-            raise ValueError(f"how: expected tile or static with {type(network).__name__}, got {', '.join(how)}")
-        reader = FilmReader(network, how["tile"])
-
-        def run(clips: Tensor, clocks: list[int], exposure: float) -> Tensor:
-            return (reader(clips, clocks, static=how["static"]) * exposure).clamp_(0, 1)
-    else:
-
-        def run(clips: Tensor, clocks: list[int], exposure: float) -> Tensor:
-            return predict(network, clips, exposure=exposure, **how)
-
-    return _pictures(network, chunks, every, group, white, run)
+    static = how.pop("static", False)
+    pictures = FilmPictures(network, interpolated, **how)
+    clips = clips_around(count(network.frames // 2, every), network.frames, _frames(chunks))
+    groups = film_groups(clips, future, interpolated)
+    return _pictures(network.settings["alpha"], groups, white, partial(pictures, static=static))
 
 
 def _pictures(
-    network: Network,
-    chunks: Iterable[Tensor],
-    every: int,
-    group: int,
-    white: float | None,
-    run: Callable[[Tensor, list[int], float], Tensor],
+    alpha: float, groups: Iterable[list[tuple[int, Tensor]]], white: float | None, run: Callable[..., Tensor]
 ) -> Iterator[FilmFrame]:
-    length, alpha = network.frames, network.settings["alpha"]
-    clips = clips_around(count(length // 2, every), length, _frames(chunks))
-    while some := list(islice(clips, group)):
-        clocks, seen = [clock for clock, _ in some], torch.stack([clip for _, clip in some])
+    for group in groups:
+        clocks, clips = [clock for clock, _ in group], torch.stack([clip for _, clip in group])
         if white is None:
-            white = white_rate(seen[0].float().mean(0).cpu())
-        yield from map(FilmFrame, clocks, run(seen, clocks, alpha / white))
+            white = white_rate(clips[0].float().mean(0).cpu())
+        for clock, rgb in zip(clocks, run(clips, clocks, exposure=alpha / white), strict=True):
+            yield FilmFrame(clock, rgb.clone() if len(group) > 1 else rgb)  # who keeps one does not keep the group
 
 
 def _frames(chunks: Iterable[Tensor]) -> Iterator[Tensor]:

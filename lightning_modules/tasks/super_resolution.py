@@ -11,8 +11,10 @@ import torch.nn.functional as F
 from pytorch_lightning.cli import LRSchedulerCallable, OptimizerCallable
 from torch import Tensor, nn
 
+from lightning_modules.data.clips_around import film_groups
 from lightning_modules.data.margin import trim
-from lightning_modules.inference.film_reader import FilmReader, check_future
+from lightning_modules.inference.film_pictures import FilmPictures, check_interpolated
+from lightning_modules.inference.film_reader import check_future
 from lightning_modules.inference.predict import predict
 from lightning_modules.inference.presets import Preset, choose
 from lightning_modules.inference.self_ensemble import COUNTS
@@ -52,6 +54,7 @@ class SuperResolution(Learner):
             estimator, which learns as well unless it is frozen; it sees what there is of a scene around a patch.
         frozen: parts of the network that do not learn, such as ``representation``.
         future: key frames that a picture of a film may wait for, where the network makes films.
+        interpolated: pictures of a film between two that the network makes; these are moved there along the motion.
         weights: what the network starts with: the name of weights that come with the package, such as
             ``cscsr_small_x4``, a file of safetensors, or a checkpoint of which only the weights are taken.
         tolerance: old name of ``psnr_tolerance``.
@@ -72,6 +75,7 @@ class SuperResolution(Learner):
         flow: Literal["scene", "estimated"] = "scene",
         frozen: Sequence[str] = (),
         future: int = 0,
+        interpolated: int = 0,
         weights: str | None = None,
         tolerance: float | None = None,
     ) -> None:
@@ -101,8 +105,9 @@ class SuperResolution(Learner):
         self.self_ensemble = self_ensemble
         self.flow = flow
         self.future = check_future(network, future)
+        self.interpolated = check_interpolated(network, interpolated)
         self.done: Callable[[float], object] | None = None  # told how far a picture is, see predict
-        self._reader: FilmReader | None = None
+        self._film_pictures: FilmPictures | None = None
         if isinstance(network, RecurrentCSCSR) and (psnr_tolerance or self_ensemble > 1):
             got = f"{psnr_tolerance} and {self_ensemble}"
             raise ValueError(
@@ -232,7 +237,7 @@ class SuperResolution(Learner):
             clips = spikes[:, judged]
             alone = self._of_clips(clips.flatten(0, 1), shared) | {f"{name}, single clips": self(clips.flatten(0, 1))}
             pictures = {method: rgb.unflatten(0, clips.shape[:2]) for method, rgb in alone.items()}
-            if isinstance(self.network, RecurrentCSCSR):
+            if self._makes_films:
                 films = [self._film(clip, int(batch["every"][0])) for clip in spikes]
                 pictures[f"{name}, film"] = torch.stack(films)[:, judged]
             return pictures
@@ -244,24 +249,41 @@ class SuperResolution(Learner):
     def _of_clips(self, spikes: Tensor, shared: tuple[int, str, float]) -> dict[str, Tensor]:
         return {method.upper(): ClassicalDecoder(method, *shared)(spikes) for method in DECODERS}
 
+    @property
+    def _makes_films(self) -> bool:
+        return isinstance(self.network, RecurrentCSCSR) or self.interpolated > 0
+
+    @property
+    def film_warm_up(self) -> int:
+        """On how many pictures before a group of a film it depends, as far as one can see."""
+        keys = max(self.network.warm_up, min(self.interpolated, 1))
+        return keys * (self.interpolated + 1)
+
+    def _new_film(self) -> FilmPictures:
+        how = {"tile": self.tile, "psnr_tolerance": self.psnr_tolerance, "self_ensemble": self.self_ensemble}
+        if isinstance(self.network, RecurrentCSCSR):
+            how = {"tile": self.tile}
+        else:
+            how["done"] = self.done
+        return FilmPictures(self.network, self.interpolated, **how)
+
     def _film(self, clips: Tensor, every: int) -> Tensor:
         """Pictures (K, 3, s H, s W) of clips (K, N, H, W), every so many clocks."""
-        reader, size = FilmReader(self.network, self.tile), self.future + 1
-        clocks = [every * n for n in range(len(clips))]
-        groups = [slice(first, first + size) for first in range(0, len(clips), size)]
-        return torch.cat([reader(clips[group], clocks[group]) for group in groups]).clamp_(0, 1)
+        pictures = self._new_film()
+        groups = film_groups(range(len(clips)), self.future, self.interpolated)
+        return torch.cat([pictures(clips[group], [every * n for n in group]) for group in groups])
 
     def predict_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:
         """Return rgb (B, 3, s H, s W), clamped to [0, 1]; a rate of ``white``, where it is known, is 1, else alpha."""
         exposure = self.network.settings["alpha"] / batch["white"][:, None, None, None] if "white" in batch else 1.0
-        if self._reader is None:
+        if self._film_pictures is None:
             return self(batch["spikes"], exposure=exposure)
-        return (self._reader(batch["spikes"], batch["frame"].tolist()) * exposure).clamp_(0, 1)
+        return self._film_pictures(batch["spikes"], batch["frame"].tolist(), exposure=exposure)
 
     def on_predict_start(self) -> None:
         """Begin a film."""
-        if isinstance(self.network, RecurrentCSCSR):
-            self._reader = FilmReader(self.network, self.tile)
+        if self._makes_films:
+            self._film_pictures = self._new_film()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:  # noqa: D102
         super().on_load_checkpoint(checkpoint)

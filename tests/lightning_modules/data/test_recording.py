@@ -3,6 +3,7 @@ import torch
 
 from lightning_modules.__main__ import main
 from lightning_modules.data import Recording, RecordingClips
+from lightning_modules.data.clips_around import film_groups
 from lightning_modules.data.recording import _Batches
 from spikekit import (
     Calibration,
@@ -176,18 +177,20 @@ def test_processes_share_the_clips_in_parts_that_follow_each_other(tmp_path, spi
 
 
 @pytest.mark.parametrize("processes", [1, 2, 3])
-@pytest.mark.parametrize("group", [1, 3])
-def test_groups_are_those_of_the_film_and_what_comes_before_is_seen_again(tmp_path, spikes, processes, group):
+@pytest.mark.parametrize(("future", "interpolated"), [(0, 0), (2, 0), (0, 2), (1, 1)])
+def test_groups_are_those_of_the_film_and_what_comes_before_is_seen_again(
+    tmp_path, spikes, processes, future, interpolated
+):
     write_spikes(tmp_path / "clip.npz", spikes)
     clips = RecordingClips(str(tmp_path / "clip.npz"), every=2, white=1.0)
     clips.made = {30, 34, 36}
-    of_group = [clips.chosen[n : n + group] for n in range(0, len(clips), group)]
+    of_group = list(film_groups(clips.chosen, future, interpolated))
     shown = []
     for process in range(processes):
-        batches = list(_Batches(clips, process, processes, group, warm_up=4))
+        batches = list(_Batches(clips, process, processes, future, interpolated, warm_up=4))
         frames = [batch["frame"].tolist() for batch in batches]
         assert all(part in of_group for part in frames)
-        assert len(batches) == len(_Batches(clips, process, processes, group, warm_up=4))
+        assert len(batches) == len(_Batches(clips, process, processes, future, interpolated, warm_up=4))
         seen = [frame for part in frames for frame in part]
         for batch in batches:
             for frame, whether in zip(batch["frame"].tolist(), batch["shown"].tolist(), strict=True):

@@ -82,7 +82,8 @@ def test_a_reader_gives_the_same_group_by_group_and_tile_by_tile(network, clips,
         reader(spikes[n : n + future + 1], CLOCKS[n : n + future + 1], flow[n : n + future + 1])
         for n in range(0, 5, future + 1)
     ]
-    torch.testing.assert_close(torch.cat(found), network(spikes[None], flow[None], future=future)[0], rtol=0, atol=1e-4)
+    expected = network(spikes[None], flow[None], future=future)[0]
+    torch.testing.assert_close(torch.cat(found), expected, rtol=0, atol=2e-3 if tile else 1e-4)
 
 
 def test_a_state_moves_with_the_scene(network):
@@ -140,13 +141,12 @@ def test_groups_are_read_from_their_end_first():
     def meet(n, before, after):
         return f"({before or ''}{n}{after or ''})"
 
-    assert read_from_end("a", meet) == []
+    assert list(read_from_end("abc", meet)) == ["(c)", "(b(c))", "(a(b(c)))"]
     assert list(read_forward("a", meet, None, [])) == ["(a)"]
     assert list(read_forward("b", meet, "A", [])) == ["(Ab)"]
-    later = read_from_end("bc", meet)
-    assert later == ["(b(c))", "(c)"]
-    assert list(read_forward("bc", meet, "A", later)) == ["(Ab(c))", "((Ab(c))c)"]
-    assert later == []
+    behind = ["(c)"]
+    assert list(read_forward("bc", meet, "A", behind)) == ["(Ab(c))", "((Ab(c))c)"]
+    assert behind == []
 
 
 @pytest.mark.parametrize("future", [0, 1, 3])
@@ -197,5 +197,5 @@ def test_errors(network, clips):
         film(network, [], future=-1)
     with pytest.raises(ValueError, match="future: expected 0, as ClassicalDecoder takes every clip by itself, got 1"):
         film(ClassicalDecoder(), [], future=1)
-    with pytest.raises(ValueError, match=r"how: expected tile or static with RecurrentCSCSR, got .*self_ensemble"):
+    with pytest.raises(ValueError, match=r"how: expected tile with RecurrentCSCSR, got self_ensemble"):
         film(network, [], self_ensemble=2)

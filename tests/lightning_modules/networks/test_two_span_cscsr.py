@@ -3,9 +3,11 @@
 import pytest
 import torch
 
+from lightning_modules.__main__ import main
 from lightning_modules.inference.predict import predict
 from lightning_modules.networks import CSCSR, TwoSpanCSCSR
 from lightning_modules.storage.pretrained import Weights, settings_of, write_weights
+from spikekit import write_spikes
 
 TINY = {"width": 4, "representation_width": 4, "features": 1, "stages": 1, "blocks": 1, "end_blocks": 1}
 
@@ -80,3 +82,15 @@ def test_errors(files):
         TwoSpanCSCSR(2, 101, **files)
     with pytest.raises(ValueError, match=r"frames: expected 21, .* more than the 41 of"):
         TwoSpanCSCSR(2, 41, short=files["long"], long=files["short"])
+
+
+@pytest.mark.parametrize(("speed", "said"), [(0.0, "100%"), (9.0, "0%")])
+def test_predict_says_which_clips_the_pictures_are_of(files, tmp_path, monkeypatch, capsys, speed, said):
+    monkeypatch.setattr(TwoSpanCSCSR, "estimate_flow", lambda _, spikes: uniform(speed, *spikes.shape[-2:]))
+    write_spikes(tmp_path / "clip.npz", clip()[0].to(torch.uint8))
+    network = ["--model.network", "TwoSpanCSCSR", "--model.network.scale", "2", "--model.network.frames", "41"]
+    network += [f"--model.network.{name}={file}" for name, file in files.items()]
+    data = ["--data", "Recording", "--data.path", str(tmp_path / "clip.npz"), "--data.white", "0.3"]
+    main(["predict", *network, *data, "--trainer.accelerator", "cpu", "-o", str(tmp_path / "out")])
+    expected = f"{said} of the pictures are of clips of 41 frames, the faster rest of 21\n"
+    assert expected in capsys.readouterr().out

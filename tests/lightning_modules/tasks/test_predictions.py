@@ -15,7 +15,7 @@ from PIL import Image
 from lightning_modules.__main__ import main
 from lightning_modules.cli import processes
 from lightning_modules.inference.film import film
-from lightning_modules.networks import ClassicalDecoder, RecurrentCSCSR
+from lightning_modules.networks import CSCSR, ClassicalDecoder, RecurrentCSCSR
 from lightning_modules.storage.pretrained import Weights, settings_of, write_weights
 from lightning_modules.tasks import predictions
 from spikekit import read_picture, read_spikes, read_video, write_spikes
@@ -223,6 +223,35 @@ def test_a_network_carries_on_through_a_film_and_where_it_was_stopped(carries_on
     monkeypatch.undo()
     main([*carries_on, str(tmp_path / "alone"), "--data.frame", "40", "--data.white", "0.3"])
     assert pictures(tmp_path / "alone")["frame_000040.png"] != unbroken["frame_000040.png"]
+
+
+def test_a_film_of_interpolated_pictures_goes_on_where_it_was_stopped_and_has_parts(words, tmp_path, monkeypatch):
+    network = CSCSR(scale=2, width=8, representation_width=8, features=1, stages=1, end_blocks=1, skip=True)
+    write_weights(Weights(tmp_path, settings_of(network), {}, network.state_dict()), tmp_path / "alone.safetensors")
+    data = words[words.index("--data") : -1]
+    words = ["predict", "--model.weights", str(tmp_path / "alone.safetensors"), *data, "--data.white", "0.3", "-o"]
+    main([*words, str(tmp_path / "all")])
+    words = [*words, str(tmp_path / "out"), "--model.interpolated", "1"]
+    main(words)
+    every, unbroken = pictures(tmp_path / "all"), pictures(tmp_path / "out")
+    light = {name: read_picture(tmp_path / "all" / name) for name in every}
+    for n, name in enumerate(sorted(unbroken)):  # 20, 30 .. 70: every other one is of the network, and the last
+        same = read_picture(tmp_path / "out" / name).equal(light[name])
+        assert same == (n in (0, 2, 4, 5))
+    stop = ("frame_000030.png", "frame_000050.png", "frame_000060.png", "frame_000070.png")
+    for name in stop:
+        (tmp_path / "out" / name).unlink()
+    stop_after(monkeypatch, 2)
+    with pytest.raises((KeyboardInterrupt, SystemExit)):
+        main(words)
+    assert len(pictures(tmp_path / "out")) == 4
+    monkeypatch.undo()
+    main(words)
+    assert pictures(tmp_path / "out") == unbroken
+    words[words.index(str(tmp_path / "out"))] = str(tmp_path / "parts")
+    for part in ("2/2", "1/2"):
+        main([*words, "--part", part])
+    assert pictures(tmp_path / "parts") == unbroken
 
 
 @pytest.mark.slow
