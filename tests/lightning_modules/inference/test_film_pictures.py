@@ -39,6 +39,10 @@ def waves(clock, height=SIDE, width=SIDE):
     )
 
 
+def clock(spikes):
+    return spikes[:, 0, 0, 0].reshape(-1, 1, 1, 1)
+
+
 def error(found, expected):
     """But for two corners, which come from outside of both neighbours."""
     apart = (found - expected).abs()
@@ -101,6 +105,19 @@ def test_brightness_of_every_clip():
     found = FilmPictures(Truth(), 2)(clips([0, 1, 2]), [0, 1, 2], exposure=exposure)
     torch.testing.assert_close(found[0], 0.5 * waves(0))
     torch.testing.assert_close(found[2], waves(2))
+
+
+def test_light_and_motion_go_from_those_of_one_picture_to_those_of_the_other(monkeypatch):
+    network, x = Truth(), torch.arange(2.0 * SIDE).expand(1, 3, 2 * SIDE, -1) / 1000
+    monkeypatch.setattr(network, "forward", lambda spikes, *_: x * (1 + clock(spikes) / 4))
+    ends = torch.tensor([-2.0, 2.0]).reshape(1, 2, 1, 1, 1).expand(1, 2, 2, SIDE, SIDE)
+    monkeypatch.setattr(network, "estimate_flow", lambda spikes: clock(spikes)[None] / 8 * ends)
+    pictures = FilmPictures(network, 3)
+    pictures(clips([0]), [0])
+    found = pictures(clips([1, 2, 3, 4]), [1, 2, 3, 4])
+    share, moved = 1 / 4, SCALE * (0.5 * 1 / 4) / 1000  # 0.5 sensor pixels a clock at 4, none at 0
+    expected = (1 - share) * (x - moved) + share * 2 * (x + 3 * moved)
+    torch.testing.assert_close(found[:1, :, 8:-8, 8:-8], expected[:, :, 8:-8, 8:-8])
 
 
 def test_a_network_for_films_advances_from_one_of_its_pictures_to_the_next():
