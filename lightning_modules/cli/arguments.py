@@ -38,6 +38,7 @@ _PRESET = {
     "tile": "--model.tile",
     "psnr_tolerance": "--model.psnr_tolerance",
     "self_ensemble": "--model.self_ensemble",
+    "interpolated": "--model.interpolated",
     "precision": "--trainer.precision",
 }
 #: arguments of the Trainer that count batches where they are whole, and are shares where they are not

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,9 @@ _PART = restricted_string_type("Part", r"[1-9]\d{0,5}/[1-9]\d{0,5}")
 
 # how many times as long as its clips a recording is whose first and last pictures a longer clip may cost
 _MANY = 10
+
+# clocks between two pictures of the network up to which those between, interpolated, lose nothing
+_APART = 12
 
 # milliseconds a pixel of a picture, written as PNG by one core
 _WRITING = 7e-5
@@ -97,7 +101,8 @@ def _choice(args: Sequence[str]) -> tuple[Preset, str]:
     known = {name: recording[name] for name in ("path", "pattern", "camera", "frame") if name in recording}
     sizes = {name: int(recording[name]) for name in ("height", "width", "every") if name in recording}
     clips, scale = RecordingClips(**known, **sizes), int(network.get("scale", 4))
-    film = any(later - clock <= clips.frames for clock, later in pairwise(clips.chosen))  # one knows the other
+    every = min((later - clock for clock, later in pairwise(clips.chosen)), default=clips.frames + 1)
+    film = every <= clips.frames  # one picture knows the other
     longest = max(clips.frames, _room(clips) if "frame" in known else clips.recording.frames // _MANY)
     choice = choose(scale, speed, wishes.get("--budget"), clips.size, film, longest)
     speeds = list(SPEEDS)
@@ -105,10 +110,26 @@ def _choice(args: Sequence[str]) -> tuple[Preset, str]:
     other = choose(scale, sooner, None, clips.size, film, longest) if sooner else choice
     clips = RecordingClips(**known, **sizes, frames=choice.preset.clip)
     writing = _WRITING * scale**2 * clips.size[0] * clips.size[1]
-    took, sooner_took = (duration(len(clips) * (one.ms + writing) / 1e3) for one in (choice, other))
+    took, sooner_took = (
+        duration(len(clips) * (one.ms / (_interpolated(one.preset, every) + 1) + writing) / 1e3)
+        for one in (choice, other)
+    )
     instead = f"; --speed {sooner}: {sooner_took}, {other.below:.2f} dB below the best" if other != choice else ""
-    said = f"{choice}\n{len(clips)} pictures, written as PNG: about {took}{instead}"
-    return choice.preset, "\n".join([said, *_noise(choice.preset, clips)])
+    said = [str(choice), f"{len(clips)} pictures, written as PNG: about {took}{instead}"]
+    interpolated = _interpolated(choice.preset, every)
+    if interpolated:
+        said.append(
+            f"{interpolated} of {interpolated + 1} pictures are interpolated, being {every} frames apart; "
+            "--model.interpolated 0 makes all by the network"
+        )
+    preset = replace(choice.preset, interpolated=interpolated or None)
+    return preset, "\n".join([*said, *_noise(preset, clips)])
+
+
+def _interpolated(preset: Preset, every: int) -> int:
+    """How many pictures between two of the network's follow from these as well."""
+    follows = preset.weights is not None and preset.motion != "ZeroFlow"
+    return max(_APART // every - 1, 0) if follows else 0
 
 
 def _noise(preset: Preset, clips: RecordingClips) -> list[str]:

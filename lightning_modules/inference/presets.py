@@ -68,6 +68,8 @@ class Preset:
         tile: see :func:`lightning_modules.inference.predict.predict`.
         psnr_tolerance: in dB, see there.
         self_ensemble: number of views, see there.
+        interpolated: pictures of a film between two that the network makes, see
+            :class:`lightning_modules.inference.film_pictures.FilmPictures`.
         precision: of the Trainer, such as ``"bf16-mixed"``.
 
     Raises:
@@ -96,6 +98,7 @@ class Preset:
     tile: int | None = None
     psnr_tolerance: float | None = None
     self_ensemble: int | None = None
+    interpolated: int | None = None
     precision: str | None = None
 
     def __post_init__(self) -> None:

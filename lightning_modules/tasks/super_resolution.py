@@ -174,7 +174,7 @@ class SuperResolution(Learner):
         """
         if preset.precision is not None:
             raise ValueError(f"precision: expected none, as a Trainer sets it, got {preset.precision!r}")
-        return cls(preset.build(), **preset.given("tile", "psnr_tolerance", "self_ensemble")).eval()
+        return cls(preset.build(), **preset.given("tile", "psnr_tolerance", "self_ensemble", "interpolated")).eval()
 
     def forward(
         self, spikes: Tensor, flow: Tensor | None = None, static: bool = False, exposure: float | Tensor = 1.0
@@ -264,7 +264,7 @@ class SuperResolution(Learner):
         if isinstance(self.network, RecurrentCSCSR):
             how = {"tile": self.tile}
         else:
-            how["done"] = self.done
+            how["done"] = lambda share: self.done(share) if self.done else None  # which begins with every picture
         return FilmPictures(self.network, self.interpolated, **how)
 
     def _film(self, clips: Tensor, every: int) -> Tensor:

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from lightning_modules.cli.prediction import _choice
+from lightning_modules.cli.prediction import _choice, _interpolated, with_choice
+from lightning_modules.inference.presets import Preset
 from spikekit import spike_integrate_fire, write_spikes
 
 
@@ -17,3 +18,25 @@ def test_a_decoder_of_a_dark_recording_is_said_to_be_noisy(white, speed, hint, t
     assert bool(preset.method) == (speed == "fastest")
     assert ("a white pixel fires 3.0 times in 41 frames" in said) == hint
     assert ("noisy" in said) == hint
+
+
+@pytest.mark.parametrize(
+    ("every", "speed", "interpolated"),
+    [(1, "balanced", 11), (3, "balanced", 3), (6, "best", 1), (7, "best", 0), (20, "balanced", 0), (3, "fastest", 0)],
+)
+def test_pictures_close_to_each_other_are_interpolated(every, speed, interpolated, tmp_path):
+    write_spikes(tmp_path / "a.npz", torch.rand(200, 8, 8) < 0.3)
+    words = ["predict", "--data", "Recording", "--data.path", str(tmp_path / "a.npz"), "--data.every", str(every)]
+    preset, said = _choice([*words, "--speed", speed])
+    assert (preset.interpolated or 0) == interpolated
+    hint = f"{interpolated} of {interpolated + 1} pictures are interpolated, being {every} frames apart"
+    assert (hint in said) == (interpolated > 0)
+
+
+def test_pictures_without_motion_are_not_interpolated(tmp_path):
+    assert _interpolated(Preset("cscsr_small_x4", motion="ZeroFlow"), 3) == 0
+    assert _interpolated(Preset("cscsr_small_x4"), 3) == 3
+    write_spikes(tmp_path / "a.npz", torch.rand(200, 8, 8) < 0.3)
+    data = ["--data", "Recording", "--data.path", str(tmp_path / "a.npz"), "--data.frame", "60:120:3"]
+    choice, said = with_choice(None, ["predict", *data, "--speed", "balanced", "--model.interpolated", "0"])
+    assert choice.index("3") < choice.index("0")  # what is asked for stands behind and wins
