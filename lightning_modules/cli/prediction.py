@@ -30,8 +30,9 @@ _PART = restricted_string_type("Part", r"[1-9]\d{0,5}/[1-9]\d{0,5}")
 # how many times as long as its clips a recording is whose first and last pictures a longer clip may cost
 _MANY = 10
 
-# clocks between two pictures of the network up to which those between, interpolated, lose nothing
-_APART = 12
+# clocks between two pictures of the network up to which those between, interpolated, lose nothing: in fast scenes, and
+# in slower ones
+_APART, _FARTHER_APART = 6, 12
 
 # milliseconds a pixel of a picture, written as PNG by one core
 _WRITING = 7e-5
@@ -111,12 +112,12 @@ def _choice(args: Sequence[str]) -> tuple[Preset, str]:
     clips = RecordingClips(**known, **sizes, frames=choice.preset.clip)
     writing = _WRITING * scale**2 * clips.size[0] * clips.size[1]
     took, sooner_took = (
-        duration(len(clips) * (one.ms / (_interpolated(one.preset, every) + 1) + writing) / 1e3)
-        for one in (choice, other)
+        duration(len(clips) * (one.ms / (_interpolated(one.preset, every, at) + 1) + writing) / 1e3)
+        for one, at in ((choice, speed), (other, sooner))
     )
     instead = f"; --speed {sooner}: {sooner_took}, {other.below:.2f} dB below the best" if other != choice else ""
     said = [str(choice), f"{len(clips)} pictures, written as PNG: about {took}{instead}"]
-    interpolated = _interpolated(choice.preset, every)
+    interpolated = _interpolated(choice.preset, every, speed)
     if interpolated:
         said.append(
             f"{interpolated} of {interpolated + 1} pictures are interpolated, being {every} frames apart; "
@@ -126,10 +127,12 @@ def _choice(args: Sequence[str]) -> tuple[Preset, str]:
     return preset, "\n".join([*said, *_noise(preset, clips)])
 
 
-def _interpolated(preset: Preset, every: int) -> int:
+def _interpolated(preset: Preset, every: int, speed: str | None) -> int:
     """How many pictures between two of the network's follow from these as well."""
-    follows = preset.weights is not None and preset.motion != "ZeroFlow"
-    return max(_APART // every - 1, 0) if follows else 0
+    if preset.weights is None or preset.motion == "ZeroFlow":
+        return 0
+    apart = _APART if speed in (None, "best") else _FARTHER_APART
+    return max(apart // every - 1, 0)
 
 
 def _noise(preset: Preset, clips: RecordingClips) -> list[str]:

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from lightning_modules.storage.checkpoint import check_tensors, read_checkpoint
 from lightning_modules.storage.error_model import read_error_model
 from lightning_modules.storage.settings import check_plain, check_shapes
-from lightning_modules.storage.shipped import find_shipped, list_pretrained
+from lightning_modules.storage.shipped import FUSION, find_shipped, list_pretrained
 from spikekit.io.whole_file import whole_file
 
 _MOTION = "motion."
@@ -67,7 +67,17 @@ def read_weights(source: str | Path) -> Weights:
         names = ", ".join(weights.name for weights in list_pretrained())
         raise FileNotFoundError(f"{source}: neither a file of weights nor the name of those in the package ({names})")
     found = _read_safetensors(path) if path.suffix == ".safetensors" else _read_checkpoint(path)
+    if shipped and not shipped.film and found.settings["class"] == "RecurrentCSCSR":
+        found = _of_a_clip(found)
     return replace(found, halo=shipped.halo) if shipped else found
+
+
+def _of_a_clip(weights: Weights) -> Weights:
+    """Return the weights of the CSCSR that a network for films contains, which came first and shares its file."""
+    added = ("fusion_width", "fusion_blocks", "memory")
+    settings = {name: value for name, value in weights.settings.items() if name not in added} | {"class": "CSCSR"}
+    tensors = {name: value for name, value in weights.tensors.items() if not name.startswith(FUSION)}
+    return replace(weights, settings=settings, tensors=tensors)
 
 
 def check_weights(weights: Weights, kinds: Mapping[str, type[nn.Module]]) -> None:

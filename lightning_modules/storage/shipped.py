@@ -12,6 +12,8 @@ from pathlib import Path
 from safetensors import safe_open
 
 FOLDER = Path(__file__).parents[1] / "weights"
+#: how the names of weights begin that a network for films has beside those of the network for a clip
+FUSION = "fusion."
 
 
 @dataclass(frozen=True)
@@ -20,7 +22,7 @@ class Pretrained:
 
     Args:
         name: what ``from_pretrained`` and ``--model.weights`` call them, such as ``"cscsr_small_x4"``.
-        path: their file.
+        path: their file; that of a network for films holds those of the network for a clip which it contains.
         former: an older name, which goes on working; None where there is none.
         scale: super-resolution factor; None for an estimator of motion.
         size: of the network, as in ``configs/size``; None for an estimator of motion.
@@ -42,10 +44,16 @@ class Pretrained:
     vid4: float | None = None
 
     @property
+    def film(self) -> bool:
+        """Whether the network makes films."""
+        return (self.size or "").endswith("_film")
+
+    @property
     def parameters(self) -> int:
         """Number of learned parameters, including those of a motion estimator inside."""
         with safe_open(self.path, "numpy") as file:
-            return sum(prod(file.get_slice(name).get_shape()) for name in file.keys())  # noqa: SIM118
+            own = [name for name in file.keys() if self.film or not name.startswith(FUSION)]  # noqa: SIM118
+            return sum(prod(file.get_slice(name).get_shape()) for name in own)
 
     @property
     def frames(self) -> int | None:

@@ -22,7 +22,15 @@ def test_a_decoder_of_a_dark_recording_is_said_to_be_noisy(white, speed, hint, t
 
 @pytest.mark.parametrize(
     ("every", "speed", "interpolated"),
-    [(1, "balanced", 11), (3, "balanced", 3), (6, "best", 1), (7, "best", 0), (20, "balanced", 0), (3, "fastest", 0)],
+    [
+        (1, "balanced", 11),
+        (3, "fast", 3),
+        (6, "fast", 1),
+        (3, "best", 1),
+        (4, "best", 0),
+        (20, "fast", 0),
+        (3, "fastest", 0),
+    ],
 )
 def test_pictures_close_to_each_other_are_interpolated(every, speed, interpolated, tmp_path):
     write_spikes(tmp_path / "a.npz", torch.rand(200, 8, 8) < 0.3)
@@ -34,9 +42,10 @@ def test_pictures_close_to_each_other_are_interpolated(every, speed, interpolate
 
 
 def test_pictures_without_motion_are_not_interpolated(tmp_path):
-    assert _interpolated(Preset("cscsr_small_x4", motion="ZeroFlow"), 3) == 0
-    assert _interpolated(Preset("cscsr_small_x4"), 3) == 3
+    assert _interpolated(Preset("cscsr_small_x4", motion="ZeroFlow"), 3, "fast") == 0
+    assert _interpolated(Preset("cscsr_small_x4"), 3, "fast") == 3
+    assert _interpolated(Preset("cscsr_small_x4"), 3, None) == 1
     write_spikes(tmp_path / "a.npz", torch.rand(200, 8, 8) < 0.3)
     data = ["--data", "Recording", "--data.path", str(tmp_path / "a.npz"), "--data.frame", "60:120:3"]
-    choice, said = with_choice(None, ["predict", *data, "--speed", "balanced", "--model.interpolated", "0"])
+    choice, _ = with_choice(None, ["predict", *data, "--speed", "balanced", "--model.interpolated", "0"])
     assert choice.index("3") < choice.index("0")  # what is asked for stands behind and wins

@@ -224,13 +224,27 @@ SHIPPED_ONCE = ["x2-e", "x2-d", "x2-w", "x3-e", "x3-d", "x3-w", "x4-t", "x4-e", 
 
 
 def test_every_file_of_weights_is_in_the_index_and_loads_by_every_name_it_had():
-    assert sorted(path for path in FOLDER.glob("*.safetensors")) == sorted(shipped_weights().values())
-    by_file = {path: name for name, path in shipped_weights().items()}
-    for name in SHIPPED_ONCE:
-        assert read_weights(name).source == FOLDER / f"{name}.safetensors"
-        assert read_weights(by_file[FOLDER / f"{name}.safetensors"]).source == FOLDER / f"{name}.safetensors"
+    assert set(FOLDER.glob("*.safetensors")) == set(shipped_weights().values())
+    for former in SHIPPED_ONCE:
+        (name,) = [weights.name for weights in list_pretrained() if former in (weights.name, weights.former)]
+        assert read_weights(former).source == read_weights(name).source == shipped_weights()[name]
     with pytest.raises(FileNotFoundError, match=r"^x4-q: neither a file of weights nor .* \(cscsr_small_x2, "):
         read_weights("x4-q")
+
+
+@pytest.mark.parametrize(
+    "film", [weights for weights in list_pretrained() if weights.film], ids=lambda weights: weights.name
+)
+def test_a_network_for_films_shares_its_file_with_the_one_that_it_contains(film):
+    (inside,) = [weights for weights in list_pretrained() if weights.path == film.path and weights != film] or [None]
+    if inside is None:
+        return
+    assert inside.parameters == sum(value.numel() for value in CSCSR.from_pretrained(inside.name).parameters())
+    assert inside.parameters < film.parameters
+    spikes = (torch.rand(1, inside.frames, 12, 10) < 0.3).to(torch.uint8)
+    clip, both = CSCSR.from_pretrained(inside.name), CSCSR.from_pretrained(film.name)
+    assert type(clip) is CSCSR
+    assert torch.equal(clip(spikes, static=True), both(spikes, static=True))
 
 
 def _rows_of_card(path):
@@ -280,7 +294,7 @@ def test_the_list_of_weights_says_what_the_networks_are(configs):
         "huge",
         "huge_long",
         "large_film",
-        "large_film",
+        "huge_film",
         "huge_long_film",
     ]
     for weights in listed:
