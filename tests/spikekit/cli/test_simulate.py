@@ -23,11 +23,18 @@ from spikekit.scenes.adaptive_sampling import Plan
 from spikekit.scenes.frame_sequence import Film
 from spikekit.sensor.calibration import DEAD, HOT
 
-# Forks processes of the command, so many at once: what is started anew takes seconds to import torch.
+# Forks processes of the command, so many at once. What is started anew takes seconds to import torch and more.
 FORKS = """
-import json, os, sys
-import spikekit.cli.simulate
+import json, os, sys, tempfile, torch
+from spikekit import write_picture
 from spikekit.cli.command import main
+
+answers = os.fdopen(os.dup(1), "w")
+os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+with tempfile.TemporaryDirectory() as folder:  # what is imported late is there for all of them
+    for n in range(3):
+        write_picture(f"{folder}/{n}.png", torch.rand(3, 40, 40))
+    assert main(["simulate", folder, "-o", f"{folder}/a.dat", "--scale", "2"]) == 0
 for line in sys.stdin:
     folder, count, words = json.loads(line)
     running = []
@@ -35,10 +42,9 @@ for line in sys.stdin:
         running.append(os.fork())
         if not running[-1]:
             os.chdir(folder)
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
             os._exit(main(words))
-    print(json.dumps(running), flush=True)
-    print(json.dumps([os.waitpid(process, 0)[1] for process in running]), flush=True)
+    print(json.dumps(running), file=answers, flush=True)
+    print(json.dumps([os.waitpid(process, 0)[1] for process in running]), file=answers, flush=True)
 """
 QUICK = ["--scale", "2", "--interpolation", "Blend"]
 
@@ -63,7 +69,8 @@ def film(tmp_path, monkeypatch):
 def processes():
     """A function that starts processes of the command; it returns their numbers, and what waits for how they ended."""
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with subprocess.Popen([sys.executable, "-c", FORKS], **pipes) as process:
+    one_thread = os.environ | {"OMP_NUM_THREADS": "1"}  # others would not be there after a fork
+    with subprocess.Popen([sys.executable, "-c", FORKS], env=one_thread, **pipes) as process:
 
         def start(*words, count=1):
             print(json.dumps([os.getcwd(), count, words]), file=process.stdin, flush=True)
