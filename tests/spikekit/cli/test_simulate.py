@@ -4,7 +4,6 @@ import hashlib
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
 import time
@@ -23,9 +22,10 @@ from spikekit.scenes.adaptive_sampling import Plan
 from spikekit.scenes.frame_sequence import Film
 from spikekit.sensor.calibration import DEAD, HOT
 
-# Forks processes of the command, so many at once. What is started anew takes seconds to import torch and more.
+# Forks processes of the command, so many at once, and kills them where seconds are given. What is started anew takes
+# seconds to import torch and more.
 FORKS = """
-import json, os, sys, tempfile, torch
+import json, os, signal, sys, tempfile, time, torch
 from spikekit import write_picture
 from spikekit.cli.command import main
 
@@ -36,14 +36,17 @@ with tempfile.TemporaryDirectory() as folder:  # what is imported late is there 
         write_picture(f"{folder}/{n}.png", torch.rand(3, 40, 40))
     assert main(["simulate", folder, "-o", f"{folder}/a.dat", "--scale", "2"]) == 0
 for line in sys.stdin:
-    folder, count, words = json.loads(line)
+    folder, words, count, seconds = json.loads(line)
     running = []
     for _ in range(count):
         running.append(os.fork())
         if not running[-1]:
             os.chdir(folder)
             os._exit(main(words))
-    print(json.dumps(running), file=answers, flush=True)
+    if seconds is not None:
+        time.sleep(seconds)
+        for process in running:
+            os.kill(process, signal.SIGKILL)
     print(json.dumps([os.waitpid(process, 0)[1] for process in running]), file=answers, flush=True)
 """
 QUICK = ["--scale", "2", "--interpolation", "Blend"]
@@ -67,16 +70,16 @@ def film(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def processes():
-    """A function that starts processes of the command; it returns their numbers, and what waits for how they ended."""
+    """A function that runs processes of the command, and returns how they ended."""
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     one_thread = os.environ | {"OMP_NUM_THREADS": "1"}  # others would not be there after a fork
     with subprocess.Popen([sys.executable, "-c", FORKS], env=one_thread, **pipes) as process:
 
-        def start(*words, count=1):
-            print(json.dumps([os.getcwd(), count, words]), file=process.stdin, flush=True)
-            return json.loads(process.stdout.readline()), lambda: json.loads(process.stdout.readline())
+        def run(*words, count=1, killed_after=None):
+            print(json.dumps([os.getcwd(), words, count, killed_after]), file=process.stdin, flush=True)
+            return json.loads(process.stdout.readline())
 
-        yield start
+        yield run
         process.stdin.close()
 
 
@@ -399,8 +402,7 @@ def test_a_long_seed_is_read_again(film):
 def test_four_at_once(film, processes):
     """Processes that write one name, and one process with as many threads as there are, give the same files."""
     words = ["simulate", str(film), "--scale", "2", "--photons", "30"]
-    _, ended = processes(*words, "-o", "a.dat", count=4)
-    assert ended() == [0] * 4
+    assert processes(*words, "-o", "a.dat", count=4) == [0] * 4
     assert believed(Path("a.dat"))
     at_once = {name: Path(name).read_bytes() for name in ("a.dat", "a.png", "a.json")}
     assert not list(Path().glob(".*"))
@@ -468,16 +470,12 @@ def test_killed_while_it_publishes(film, monkeypatch, step):
 def test_killed_at_random_moments(film, processes):
     words = ["simulate", str(film), "-o", "a.dat", "--scale", "2", "--all"]
     begin = time.monotonic()
-    _, ended = processes(*words)
-    assert ended() == [0]
+    assert processes(*words) == [0]
     whole = time.monotonic() - begin
     for name in ("a.dat", "a.json"):
         Path(name).unlink()
     for share in (0.3, 0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 1.0):
-        [process], ended = processes(*words)
-        time.sleep(share * whole)
-        os.kill(process, signal.SIGKILL)
-        ended()
+        processes(*words, killed_after=share * whole)
         if Path("a.json").exists():
             assert believed(Path("a.dat"))
     simulate(film, "-o", "a.dat", *QUICK)
