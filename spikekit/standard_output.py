@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import sys
@@ -9,6 +10,9 @@ from contextlib import suppress
 
 #: exit status of a command that was still printing when its reader went, as a shell has it: 128 + SIGPIPE
 BROKEN_PIPE = 141
+
+#: errors of a full disk, which the system reports without a name
+FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)
 
 
 def stop_printing() -> None:

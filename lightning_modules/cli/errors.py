@@ -11,7 +11,7 @@ from typing import NoReturn
 
 from spikekit.arguments import UsageError as SpikekitUsageError
 from spikekit.arguments import one_line
-from spikekit.standard_output import BROKEN_PIPE, stop_printing
+from spikekit.standard_output import BROKEN_PIPE, FULL, stop_printing
 
 
 class InputError(ValueError):
@@ -75,8 +75,6 @@ def as_one_line() -> Iterator[None]:
         finally:
             print(end="", flush=True)
     except OSError as error:
-        from spikekit.io.whole_file import FULL
-
         if error.filename is not None:
             raise Ended(f"lightning: {error.filename}: {one_line(error)}", 1) from error
         if error.errno not in (errno.EPIPE, *FULL):

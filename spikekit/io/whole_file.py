@@ -11,15 +11,14 @@ from itertools import chain, count
 from pathlib import Path
 from typing import IO, Any
 
+from spikekit.standard_output import FULL
+
 try:
     import fcntl
 except ImportError:  # Windows, which removes no file that is open
     fcntl = None
 
 _SIDE_BY_SIDE = 8  # writers of one file whose leftovers are found
-
-#: errors of a full disk, which the system reports without a name
-FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)
 
 
 @contextmanager

@@ -76,13 +76,14 @@ def scores(path):
         report.on_test_end(SimpleNamespace(is_global_zero=True, world_size=1, datamodule=None), None)
 
 
-def program(path):
+def program(path, kind="torch"):
     network = ClassicalDecoder("tfp", 2)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(torch.export, "export", lambda *_, **__: None)  # it takes half a minute
-        patch.setattr(export, "_torch", lambda *_: bytes(9999))
+        patch.setattr(export, f"_{kind}", lambda *_: bytes(9999))
+        patch.setattr(export, "_check_onnx", lambda: None)
         patch.setattr(export, "exported", lambda *_: network)
-        export.export_network(network, path, "torch")
+        export.export_network(network, path, kind)
 
 
 @pytest.mark.parametrize(
@@ -98,6 +99,7 @@ def program(path):
         ("config.yaml", configuration),
         ("test.csv", scores),
         ("a.pt2", program),
+        ("a.onnx", lambda path: program(path, "onnx")),
     ],
 )
 def test_a_file_stays_whole(name, write, stays_whole):

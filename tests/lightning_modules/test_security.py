@@ -55,16 +55,19 @@ def _trap(tmp_path, monkeypatch):
     return trace
 
 
-@pytest.mark.parametrize("verb", ["fit", "validate", "test", "predict"])
-def test_hyper_parameters_of_a_checkpoint_build_nothing(verb, content, trap, configs, tmp_path):
+@pytest.mark.parametrize(
+    ("verb", "kinds"), [("fit", "abcd"), ("validate", "a"), ("test", "b"), ("predict", "c"), ("predict", "d")]
+)
+def test_hyper_parameters_of_a_checkpoint_build_nothing(verb, kinds, content, trap, configs, tmp_path):
     parts = {"optimizer": {"class_path": "os.mkdir", "init_args": {"path": str(trap)}}}
-    for name, hyper in {
+    hyper = {
         "a": parts,
         "b": {"network": {"class_path": "evilmod.X"}},
         "c": {"_class_path": "evilmod.X"},
         "d": {"_instantiator": "evilmod.X"},
-    }.items():
-        torch.save({**content(), "hyper_parameters": hyper}, tmp_path / f"{name}.ckpt")
+    }
+    for name in kinds:
+        torch.save({**content(), "hyper_parameters": hyper[name]}, tmp_path / f"{name}.ckpt")
         # wrong at the end, so that nothing is computed: what a checkpoint says would have been built before
         words = [
             "-c",

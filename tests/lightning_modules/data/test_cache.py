@@ -7,7 +7,7 @@ import sys
 import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from inspect import getsource
 
 import numpy as np
@@ -86,7 +86,7 @@ def _write(folder, rounds, size):
         cache.store(clip_key(n=n % 3), arrays(seed=n % 3, size=size))
 
 
-# Forks a writer for every line that it reads. Pytest's own process has threads, and what is forked from it may hang.
+# Forks writers for every line that it reads. Pytest's own process has threads, and what is forked from it may hang.
 WRITERS = f"""
 import os, sys
 import numpy as np
@@ -95,20 +95,23 @@ from lightning_modules.data.cache import ClipCache, clip_key
 {getsource(arrays)}
 {getsource(_write)}
 for line in sys.stdin:
-    writer = os.fork()
-    if not writer:
-        _write(sys.argv[1], int(line), 200_000)
-        os._exit(0)
-    print(writer, flush=True)
-    print(os.waitpid(writer, 0)[1], flush=True)
+    rounds, count, folder = line.rstrip().split(" ", 2)
+    writers = []
+    for _ in range(int(count)):
+        writers.append(os.fork())
+        if not writers[-1]:
+            _write(folder, int(rounds), 200_000)
+            os._exit(0)
+    print(*writers, flush=True)
+    print(*(os.waitpid(writer, 0)[1] for writer in writers), flush=True)
 """
 
 
-@contextmanager
-def writers(folder):
-    command = [sys.executable, "-c", WRITERS, str(folder)]
+@pytest.fixture(scope="module")
+def writers():
+    """A process whose writers write to the cache."""
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with subprocess.Popen(command, **pipes, start_new_session=True) as process:
+    with subprocess.Popen([sys.executable, "-c", WRITERS], **pipes, start_new_session=True) as process:
         try:
             yield process
             process.stdin.close()
@@ -118,10 +121,10 @@ def writers(folder):
                 os.killpg(process.pid, signal.SIGKILL)
 
 
-def begin(process, rounds):
-    """Let a writer write so often, and return its number."""
-    print(rounds, file=process.stdin, flush=True)
-    return int(process.stdout.readline())
+def begin(process, folder, rounds, count=1):
+    """Let writers write so often, and return their numbers."""
+    print(rounds, count, folder, file=process.stdin, flush=True)
+    return [int(number) for number in process.stdout.readline().split()]
 
 
 def _seen(folder):
@@ -143,24 +146,25 @@ def _wait_for_a_new_file(folder, before):
     pytest.fail("nothing was written within a minute")
 
 
-def test_killed_writers_leave_nothing_that_is_believed(tmp_path):
+def test_killed_writers_leave_nothing_that_is_believed(writers, tmp_path):
     rng, unfinished = np.random.default_rng(0), 0
     expected = [arrays(seed=n, size=200_000) for n in range(3)]
-    with writers(tmp_path) as process:
-        for _ in range(25):
-            before = _seen(tmp_path)
-            writer = begin(process, 10**6)
+    for _ in range(25):
+        before = _seen(tmp_path)
+        [writer] = begin(writers, tmp_path, 10**6)
+        try:
             _wait_for_a_new_file(tmp_path, before)
             time.sleep(rng.choice([0, 0.001, 0.01, 0.05]))
+        finally:
             os.kill(writer, signal.SIGKILL)
-            assert process.stdout.readline() == f"{int(signal.SIGKILL)}\n"
-            unfinished = max(unfinished, len(list(tmp_path.rglob("*.part"))))
-            with warnings.catch_warnings():
-                warnings.simplefilter("error")  # nothing has even to be recognised as damaged
-                cache = ClipCache(tmp_path)
-                for n in range(3):
-                    clip = cache.load(clip_key(n=n))
-                    assert clip is None or same(clip, expected[n])
+        assert writers.stdout.readline() == f"{int(signal.SIGKILL)}\n"
+        unfinished = max(unfinished, len(list(tmp_path.rglob("*.part"))))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # nothing has even to be recognised as damaged
+            cache = ClipCache(tmp_path)
+            for n in range(3):
+                clip = cache.load(clip_key(n=n))
+                assert clip is None or same(clip, expected[n])
     assert unfinished  # some were killed in the middle
     for part in tmp_path.rglob("*.part"):  # made again, which removes them
         number = next(n for n in range(10**6) if part.name.startswith(f".{cache._path(clip_key(n=n)).name}."))
@@ -168,18 +172,17 @@ def test_killed_writers_leave_nothing_that_is_believed(tmp_path):
     assert not list(tmp_path.rglob("*.part"))
 
 
-def test_two_writers_and_a_reader(tmp_path):
+def test_two_writers_and_a_reader(writers, tmp_path):
     cache, expected = ClipCache(tmp_path), [arrays(seed=n, size=200_000) for n in range(3)]
-    with writers(tmp_path) as one, writers(tmp_path) as other, ThreadPoolExecutor() as pool, warnings.catch_warnings():
+    with ThreadPoolExecutor() as pool, warnings.catch_warnings():
         warnings.simplefilter("error")
-        for process in (one, other):
-            begin(process, 30)
-        ended = [pool.submit(process.stdout.readline) for process in (one, other)]
-        while not all(writer.done() for writer in ended):
+        begin(writers, tmp_path, 20, count=2)
+        ended = pool.submit(writers.stdout.readline)
+        while not ended.done():
             for n in range(3):
                 clip = cache.load(clip_key(n=n))
                 assert clip is None or same(clip, expected[n])
-        assert [writer.result() for writer in ended] == ["0\n", "0\n"]
+        assert ended.result() == "0 0\n"
     assert all(same(cache.load(clip_key(n=n)), expected[n]) for n in range(3))
     assert len(files(tmp_path)) == 3
 

@@ -15,6 +15,8 @@ from skimage import io
 from lightning_modules.data import films
 from lightning_modules.data.films import ClipRecipe, FilmScenes
 from lightning_modules.data.layouts import find_films
+from lightning_modules.data.loading import load_clips
+from lightning_modules.data.stills import StillScenes
 from spikekit import bin_to_sensor, read_picture
 from spikekit.flow.interpolate import FlowInterpolation
 from spikekit.sensor.noise import SensorNoise
@@ -210,10 +212,20 @@ def test_same_clips_whatever_the_workers(tmp_path, reds):
 
 
 def test_spawned_workers_make_the_same_clips(tmp_path, write_film):
+    """Of films, and of still pictures in motion: a worker that is started anew takes seconds to import torch."""
     write_film(tmp_path / "film", 4)
-    loader = scenes(tmp_path, workers=1).test_dataloader()
-    loader.multiprocessing_context = "spawn"
-    assert all(equal(*pair) for pair in zip(loader, scenes(tmp_path).test_dataloader(), strict=True))
+    still = {"patch": 8, "val_patch": 8, "train_clips": 2, "val_clips": 1, "batch_size": 2, "workers": 0}
+
+    def clips():
+        stills = StillScenes(**still)
+        stills.setup("fit")
+        return torch.utils.data.ConcatDataset([scenes(tmp_path).test_set, stills.train_set])
+
+    loader = load_clips(clips(), 1, 1, multiprocessing_context="spawn")
+    assert loader.num_workers == 1
+    found, expected = list(loader), list(load_clips(clips(), 1, 0))
+    assert len(found) > 2
+    assert all(equal(*pair) for pair in zip(found, expected, strict=True))
 
 
 def test_training_goes_on_where_it_stands(tmp_path, reds):

@@ -134,12 +134,6 @@ def test_same_clips_whatever_the_workers():
         assert clips_of(data.val_dataloader()) == clips_of(alone.val_dataloader())
 
 
-def test_spawned_workers_make_the_same_clips():
-    loader = scenes(workers=1, train_clips=2).train_dataloader()
-    loader.multiprocessing_context = "spawn"
-    assert clips_of(loader) == clips_of(scenes(train_clips=2).train_dataloader())
-
-
 def test_chance_of_others_does_not_matter():
     torch.manual_seed(1)
     np.random.seed(1)  # noqa: NPY002

@@ -1,7 +1,9 @@
 """Networks as programs of other programs."""
 
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -86,32 +88,44 @@ def test_every_network_is_exported_by_a_test():
     assert set(WITHOUT_WEIGHTS.values()) == {ClassicalDecoder, TwoSpanCSCSR}
 
 
-def sizes_differ(path, network, kind):
+@pytest.fixture(name="program")
+def _program(monkeypatch):
+    """What export_network has loaded of its bytes to compare it, by the path of the file: to load it takes seconds."""
+    loaded, load = {}, export.exported
+
+    def exported(data, kind):
+        loaded[data] = load(data, kind)
+        return loaded[data]
+
+    monkeypatch.setattr(export, "exported", exported)
+    return lambda path: loaded[path.read_bytes()]
+
+
+def sizes_differ(run, network):
     """What a program of two other sizes differs by from the network, higher than wide and wider than high."""
-    run = export.exported(path.read_bytes(), kind)
     clips = [example_inputs(network, size).values() for size in ((38, 20), (18, 30))]
     with torch.no_grad():
         return max(difference(run(*clip), as_exported(network)(*clip)).item() for clip in clips)
 
 
-def test_a_baseline_as_a_program_of_torch(tmp_path):
+def test_a_baseline_as_a_program_of_torch(tmp_path, program):
     kind, settings = MADE["SpikeSRNetLike"]
     network = unlike_at_first(kind(scale=2, **settings))
     said = export_network(network, tmp_path / "a.pt2", "torch")
     assert said.startswith("takes spikes (1, 41, H, W), H and W even, within")
-    assert sizes_differ(tmp_path / "a.pt2", network, "torch") < 1e-4
+    assert sizes_differ(program(tmp_path / "a.pt2"), network) < 1e-4
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", [2, 4])
 @pytest.mark.parametrize("name", MADE)
-def test_every_network_as_onnx(name, scale, tmp_path):
+def test_every_network_as_onnx(name, scale, tmp_path, program):
     pytest.importorskip("onnxruntime", reason="the extra export is not installed")
     pytest.importorskip("onnxscript", reason="the extra export is not installed")
     kind, settings = MADE[name]
     network = unlike_at_first(kind(scale=scale, **settings))
     export_network(network, tmp_path / "a.onnx", "onnx")
-    assert sizes_differ(tmp_path / "a.onnx", network, "onnx") < 1e-4
+    assert sizes_differ(program(tmp_path / "a.onnx"), network) < 1e-4
 
 
 def test_what_an_export_takes(tmp_path):
@@ -144,6 +158,7 @@ def test_a_film_by_its_states_is_that_of_the_network():
 
 @pytest.mark.slow
 def test_a_program_of_torch_takes_any_even_size(tmp_path):
+    """And the file is one that torch alone loads."""
     network = CSCSR(scale=2, resolution="sensor", motion=ClassicalFlow(), **TINY).eval()
     said = export_network(network, tmp_path / "a.pt2", "torch")
     assert said.startswith("takes spikes (1, 41, H, W) and flow (1, 2, 2, H, W), H and W even, within")
@@ -151,6 +166,30 @@ def test_a_program_of_torch_takes_any_even_size(tmp_path):
     spikes, flow = (torch.rand(1, 41, 38, 20) < 0.3).float(), 3 * torch.randn(1, 2, 2, 38, 20)
     with torch.no_grad():
         torch.testing.assert_close(run(spikes, flow), network(spikes, flow), rtol=0, atol=1e-4)
+
+
+# Without what writes ONNX, and with more to write than is written at once.
+KILLED = """
+import sys, torch
+from lightning_modules.inference import export
+from lightning_modules.__main__ import main
+export._check_onnx = lambda: None
+export._program = lambda *_: None
+export._onnx = lambda *_: bytes(300_000_000)
+export.exported = lambda *_: export.ClassicalDecoder()
+main(["export", "ClassicalDecoder", "--still", "--format", "onnx", "-o", sys.argv[1]])
+"""
+
+
+@pytest.mark.slow
+def test_an_export_that_is_killed_leaves_what_was_there(tmp_path):
+    (tmp_path / "a.onnx").write_bytes(b"old")
+    with subprocess.Popen([sys.executable, "-c", KILLED, tmp_path / "a.onnx"], stdout=subprocess.DEVNULL) as process:
+        while process.poll() is None and not any(path.stat().st_size for path in tmp_path.glob(".*.part")):
+            time.sleep(0.001)
+        process.kill()
+    assert process.returncode == -signal.SIGKILL
+    assert (tmp_path / "a.onnx").read_bytes() == b"old"
 
 
 def test_what_cannot_be_exported_is_said_in_one_line(tmp_path):
@@ -190,7 +229,7 @@ def test_what_has_no_weights_is_exported_by_its_name(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_two_networks_in_one_program(tmp_path):
+def test_two_networks_in_one_program(tmp_path, program):
     weights = {name: str(tmp_path / f"{name}.safetensors") for name in ("short", "long")}
     for path, clip in zip(weights.values(), ({"frames": 21, "stride": 1}, {"frames": 41}), strict=True):
         part = unlike_at_first(CSCSR(scale=2, **clip, **TINY))
@@ -198,7 +237,7 @@ def test_two_networks_in_one_program(tmp_path):
     network = TwoSpanCSCSR(2, 41, **weights).eval()
     said = export_network(network, tmp_path / "a.pt2", "torch")
     assert said.startswith("takes spikes (1, 41, H, W) and flow (1, 2, 2, 2, H, W)")
-    run = torch.export.load(tmp_path / "a.pt2").module()
+    run = program(tmp_path / "a.pt2")
     spikes, flow = example_inputs(network, (38, 20)).values()
     with torch.no_grad():
         for motion in (0.1 * flow, 0.4 * flow):  # slow, and where both are seen

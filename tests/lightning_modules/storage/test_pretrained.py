@@ -307,35 +307,37 @@ def test_the_list_of_weights_says_what_the_networks_are(configs):
             assert overlay["model"]["network"]["init_args"].items() <= found.settings.items()
 
 
-def predict(*args, cwd):
-    """From elsewhere: nothing but the package and the file of weights is to be needed."""
-    command = [sys.executable, "-m", "lightning_modules", "predict", *map(str, args), "--trainer.accelerator", "cpu"]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, cwd=cwd)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["argument", "configuration"])
-def test_predict_needs_nothing_but_weights(file, how, tmp_path):
+def test_predict_needs_nothing_but_weights(file, how, tmp_path, monkeypatch, capfd):
+    """From elsewhere, and once in a process of its own: nothing but the package and the file of weights is needed."""
+    monkeypatch.setattr(sys, "argv", ["lightning"])
+    monkeypatch.chdir(tmp_path)
     write_spikes(tmp_path / "clip.dat", SPIKES[0])
     recording = ["--data", "Recording", "--data.path", "clip.dat", "--data.height", "8", "--data.width", "10"]
-    recording += ["--data.white", "0.4"]
+    recording += ["--data.white", "0.4", "--trainer.accelerator", "cpu"]
     if how == "argument":
-        args = ["--model.weights", file.name]
+        args = ["predict", "--model.weights", file.name]
+        command = [sys.executable, "-m", "lightning_modules", *args, *recording, "-o", "out"]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        said = done.stderr
     else:
         (tmp_path / "own.yaml").write_text(yaml.safe_dump({"model": {"weights": file.name}}))
-        args = ["-c", "own.yaml"]
-    done = predict(*args, *recording, "-o", "out", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+        args = ["predict", "-c", "own.yaml"]
+        main([*args, *recording, "-o", "out"])
+        said = capfd.readouterr().err
+    assert "ZeroFlow" not in said
     expected = network()(SPIKES)[0].clamp(0, 1)
     assert (read_picture(tmp_path / "out" / "frame_000020.png") - expected).abs().max() < 0.51 / 255
-    moved = predict(*args, "--model.network.motion", "ZeroFlow", *recording, "-o", "still", cwd=tmp_path)
-    assert moved.returncode == 0, moved.stderr
-    assert "ZeroFlow" not in done.stderr
+    main([*args, "--model.network.motion", "ZeroFlow", *recording, "-o", "still"])
     still = network()(SPIKES, torch.zeros(1, 2, 2, 8, 10))[0].clamp(0, 1)
     assert (read_picture(tmp_path / "still" / "frame_000020.png") - still).abs().max() < 0.51 / 255
-    refused = predict(*args, "--model.network.width", "8", *recording, "-o", "no", cwd=tmp_path)
-    assert refused.returncode == 2
-    assert refused.stderr.endswith("was trained with width=4; this run asks for width=8\n")
+    capfd.readouterr()
+    with pytest.raises(SystemExit) as exit:
+        main([*args, "--model.network.width", "8", *recording, "-o", "no"])
+    assert exit.value.code == 2
+    assert capfd.readouterr().err.endswith("was trained with width=4; this run asks for width=8\n")
 
 
 @pytest.mark.parametrize(

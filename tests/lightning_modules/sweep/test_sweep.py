@@ -9,6 +9,7 @@ import statistics
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,6 +19,7 @@ import yaml
 
 from lightning_modules.__main__ import main
 from lightning_modules.cli.errors import InputError
+from lightning_modules.cost import charts
 from lightning_modules.cost.charts import BLUE, ORANGE
 from lightning_modules.storage.checkpoint import DivergedError
 from lightning_modules.sweep import cli, engines, worker
@@ -577,13 +579,15 @@ def test_ray_runs_trials(typed, overlays, tmp_path, monkeypatch):
     assert all(ours[name].equal(value) for name, value in theirs.items())
 
 
-def test_the_plot_has_what_is_there(tmp_path):
-    def row(label, *psnr):
-        trials = [Trial((label,), seed, tmp_path, {}, {}, label.upper()) for seed in range(2)]
-        found = {"method": "CSCSR", "network": {"scale": 4}}
-        results = {seed: {**found, "metrics": {"CSCSR": {"psnr": value}}} for seed, value in enumerate(psnr)}
-        return Row(trials, results, {} if psnr else {0: "killed"})
+def row(label, *scores, measure="psnr"):
+    """A variant of two seeds, and what they scored; it has failed if nothing."""
+    trials = [Trial((label,), seed, Path(), {}, {}, label.upper()) for seed in range(2)]
+    found = {"method": "CSCSR", "network": {"scale": 4}}
+    results = {seed: {**found, "metrics": {"CSCSR": {measure: value}}} for seed, value in enumerate(scores)}
+    return Row(trials, results, {} if scores else {0: "killed"})
 
+
+def test_the_plot_has_what_is_there(tmp_path):
     def marks(*rows):
         plot(rows, tmp_path / "plot.png")
         pixels = (read_picture(tmp_path / "plot.png") * 255).round().int().permute(1, 2, 0)[:-70]  # without the legend
@@ -597,3 +601,46 @@ def test_the_plot_has_what_is_there(tmp_path):
     assert marks(row("c", 20.0, 21.0), row("h", 22.0)) == (True, False)  # no J to compare with
     assert marks(row("width=4", 20.0), row("width=8")) == (True, True)  # the word "failed"
     assert marks(row("$x^{$", 20.0)) == (True, False)  # no formula
+
+
+def test_the_plot_shows_seeds_means_and_the_paper(tmp_path, monkeypatch):
+    seen = []
+
+    @contextmanager
+    def watched(*args):
+        with charts.chart(*args) as axes:
+            yield axes
+            seen.append(axes)
+
+    monkeypatch.setattr("lightning_modules.sweep.plot.chart", watched)
+
+    def drawn(*rows):
+        """Title, points by their marks, (x, y), bars, (x, from, to), and the legend of a plot."""
+        plot(rows, tmp_path / "plot.png")
+        axes = seen[-1]
+        marks = {}
+        for line in axes.lines:
+            marks.setdefault(line.get_marker(), []).extend(zip(*map(list, line.get_data()), strict=True))
+        bars = [(start[0], start[1], end[1]) for part in axes.collections for start, end in part.get_segments()]
+        texts = [text.get_text() for text in axes.figure.legends[0].get_texts()]
+        assert [label.get_text() for label in axes.get_yticklabels()] == [row.variant for row in rows]
+        bottom, top = axes.get_ylim()
+        assert top < 0 <= len(rows) - 1 < bottom  # the first row at the top
+        return axes.get_title(loc="left"), marks, bars, texts
+
+    title, marks, bars, texts = drawn(row("c", 20.0, 21.0), row("j", 22.0, 22.5))
+    assert title == "PSNR (dB) above or below J, the same seed"
+    assert marks["o"] == [(-2.0, 0), (-1.5, 0), (0.0, 1), (0.0, 1)]
+    assert marks["D"] == [(pytest.approx(28.06 - 28.77), 0), (0.0, 1)]
+    assert [seen[-1].lines[0].get_xdata()] == [[0, 0]]  # where J is
+    assert bars == [(-1.75, -0.3, 0.3), (0.0, 0.7, 1.3)]
+    assert texts == ["a seed; bar: the mean", "the paper, Table 3 (REDS)"]
+
+    title, marks, bars, texts = drawn(row("width=4", 20.0, 21.0), row("width=8"), row("width=12", 22.0))
+    assert title == "PSNR (dB)"
+    assert marks == {"o": [(20.0, 0), (21.0, 0), (22.0, 2)]}
+    assert bars == [(20.5, -0.3, 0.3), (22.0, 1.7, 2.3)]
+    assert texts == ["a seed; bar: the mean"]
+    [failed] = seen[-1].texts
+    assert (failed.get_text(), failed.get_position()[1]) == ("failed", 1)
+    assert drawn(row("width=4", 1.5, measure="epe"))[0] == "epe"

@@ -1,8 +1,10 @@
 """Pictures and films of ``lightning predict``, as its users type it: killed, continued, with bad disks, in parts."""
 
 import errno
+import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -256,8 +258,8 @@ def test_a_film_of_interpolated_pictures_goes_on_where_it_was_stopped_and_has_pa
 
 @pytest.mark.slow
 def test_a_network_that_carries_on_is_the_same_in_two_processes(carries_on, tmp_path):
-    for name, devices in (("one", 1), ("two", 2)):
-        run(carries_on, tmp_path / name, "--model.future", 1, "--trainer.devices", devices)
+    main([*carries_on, str(tmp_path / "one"), "--model.future", "1"])
+    run(carries_on, tmp_path / "two", "--model.future", 1, "--trainer.devices", 2)
     assert pictures(tmp_path / "one") == pictures(tmp_path / "two")
 
 
@@ -281,14 +283,15 @@ def test_a_killed_film_goes_on(words, tmp_path):
 
 @pytest.mark.slow
 def test_two_processes_make_what_one_makes(words, tmp_path):
-    run(words, tmp_path / "one")
+    main([*words, str(tmp_path / "one")])
+    main([*words, str(tmp_path / "one.mp4")])
     run(words, tmp_path / "two", "--trainer.devices", 2)
     assert pictures(tmp_path / "one") == pictures(tmp_path / "two")
-    (tmp_path / "two" / "frame_000040.png").unlink()  # fewer pictures than processes
-    run(words, tmp_path / "two", "--trainer.devices", 2)
-    assert pictures(tmp_path / "one") == pictures(tmp_path / "two")
-    run(words, tmp_path / "film.mp4", "--trainer.devices", 2)
-    assert len(read_video(tmp_path / "film.mp4")) == 6
+    shutil.move(tmp_path / "two", tmp_path / "two.mp4.frames")
+    (tmp_path / "two.mp4.frames" / "frame_000040.png").unlink()  # fewer pictures than processes
+    run(words, tmp_path / "two.mp4", "--trainer.devices", 2)
+    assert len(read_video(tmp_path / "two.mp4")) == 6
+    assert (tmp_path / "two.mp4").read_bytes() == (tmp_path / "one.mp4").read_bytes()
 
 
 def test_parts_make_what_one_makes(words, tmp_path):
@@ -323,24 +326,26 @@ def test_ray_is_said_to_be_missing(words, tmp_path, monkeypatch):
 
 
 _PEAK = """
-import resource, sys
+import json, resource, sys
 from lightning_modules.__main__ import main
-main(sys.argv[1:])
-print("peak", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+for words in json.loads(sys.argv[1]):
+    main(words)
+    print("peak", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss is in KiB on Linux alone")
 def test_memory_does_not_grow_with_the_recording(words, tmp_path):
-    peaks = []
+    runs = []
     for frames in (200, 2000):  # of 12.5 kB packed and 100 kB unpacked
         path = tmp_path / f"{frames}.dat"
         path.write_bytes(bytes(range(250)) * 50 * frames)
         data = ["--data.path", path, "--data.height", 250, "--data.width", 400, "--data.every", 40]
-        run = [sys.executable, "-c", _PEAK, *words, tmp_path / f"{frames}.mp4", *data]
-        done = subprocess.run([*map(str, run)], capture_output=True, text=True, check=True)
-        peaks.append(int(done.stdout.split("peak ")[1]) / 1024)
+        runs.append([*map(str, [*words, tmp_path / f"{frames}.mp4", *data])])
+    run = [sys.executable, "-c", _PEAK, json.dumps(runs)]
+    done = subprocess.run(run, capture_output=True, text=True, check=True)
+    peaks = [int(peak) / 1024 for peak in re.findall(r"^peak (\d+)$", done.stdout, flags=re.MULTILINE)]
     assert peaks[1] < peaks[0] + 60  # MiB; the 2000 frames are 190 MiB
 
 

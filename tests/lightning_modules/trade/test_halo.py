@@ -1,4 +1,5 @@
 import pytest
+import torch
 
 from lightning_modules.networks import CSCSR
 from lightning_modules.storage.shipped import list_pretrained
@@ -10,7 +11,9 @@ SHIPPED = [weights for weights in list_pretrained() if weights.scale and "_film_
 
 
 @pytest.mark.parametrize("weights", SHIPPED, ids=lambda weights: weights.name)
-def test_shipped_networks_see_no_further_than_their_halo(weights):
+def test_shipped_networks_see_no_further_than_their_halo(weights, monkeypatch):
+    """In float32, whose roundings are a hundredth of the bound; the next test is of what the command does."""
+    monkeypatch.setattr(torch.nn.Module, "double", torch.nn.Module.float)
     network = CSCSR.from_pretrained(weights.name)
     assert network.halo == weights.halo <= CSCSR.halo
     assert measure_halo(network, start=network.halo) == network.halo

@@ -8,6 +8,7 @@ import shlex
 import sys
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import pytest
@@ -552,6 +553,7 @@ def test_the_front_is_joined_by_its_steps_and_named_in_blue(tmp_path, monkeypatc
     assert [*scores] == [20.0, 22.0, 22.0]
     assert [*times[:2]] == [figures(rows)[2]["ms"], figures(rows)[0]["ms"]]
     assert times[2] == axes.get_xlim()[1]
+    assert (axes.get_xscale(), axes.get_xlabel(), axes.get_ylabel()) == ("log", "ms a frame", "PSNR (dB)")
     colours = [text.get_color() for text in axes.figure.legends[0].get_texts()]
     assert [to_hex(colour) == charts.BLUE for colour in colours] == [True, False, True]
 
@@ -563,6 +565,10 @@ def test_labels_keep_away_from_points_and_from_each_other():
         others = [*points[:n], *points[n + 1 :], *labels[:n], *labels[n + 1 :]]
         assert min(math.dist(label, other) for other in others) > 8
         assert 9.9 < math.dist(label, points[n]) < 24.1
+    # so many on a spot that each takes the place of another
+    points = [(4.0 * (n % 3), 4.0 * (n // 3)) for n in range(9)]
+    labels = [(x + right, y + up) for (x, y), (right, up) in zip(points, _labels(points), strict=True)]
+    assert min(math.dist(*pair) for pair in combinations(labels, 2)) > 8
     assert _labels([(5.0, 5.0)]) == [pytest.approx((0, 10))]  # above, where all is free
 
 

@@ -4,8 +4,6 @@ import hashlib
 import json
 import os
 import re
-import resource
-import signal
 import subprocess
 import sys
 import time
@@ -24,9 +22,33 @@ from spikekit.scenes.adaptive_sampling import Plan
 from spikekit.scenes.frame_sequence import Film
 from spikekit.sensor.calibration import DEAD, HOT
 
-COMMAND = [sys.executable, "-c", "from spikekit.cli.command import main; raise SystemExit(main())"]
-IGNORING = "import signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN); "
-LIMITED = [*COMMAND[:2], IGNORING + COMMAND[2]]
+# Forks processes of the command, so many at once, and kills them where seconds are given. What is started anew takes
+# seconds to import torch and more.
+FORKS = """
+import json, os, signal, sys, tempfile, time, torch
+from spikekit import write_picture
+from spikekit.cli.command import main
+
+answers = os.fdopen(os.dup(1), "w")
+os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+with tempfile.TemporaryDirectory() as folder:  # what is imported late is there for all of them
+    for n in range(3):
+        write_picture(f"{folder}/{n}.png", torch.rand(3, 40, 40))
+    assert main(["simulate", folder, "-o", f"{folder}/a.dat", "--scale", "2"]) == 0
+for line in sys.stdin:
+    folder, words, count, seconds = json.loads(line)
+    running = []
+    for _ in range(count):
+        running.append(os.fork())
+        if not running[-1]:
+            os.chdir(folder)
+            os._exit(main(words))
+    if seconds is not None:
+        time.sleep(seconds)
+        for process in running:
+            os.kill(process, signal.SIGKILL)
+    print(json.dumps([os.waitpid(process, 0)[1] for process in running]), file=answers, flush=True)
+"""
 QUICK = ["--scale", "2", "--interpolation", "Blend"]
 
 
@@ -44,6 +66,21 @@ def film(tmp_path, monkeypatch):
     for n, rgb in enumerate(frames(5)):
         write_picture(f"film/f{n}.png", rgb)
     return Path("film")
+
+
+@pytest.fixture(scope="module")
+def processes():
+    """A function that runs processes of the command, and returns how they ended."""
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    one_thread = os.environ | {"OMP_NUM_THREADS": "1"}  # others would not be there after a fork
+    with subprocess.Popen([sys.executable, "-c", FORKS], env=one_thread, **pipes) as process:
+
+        def run(*words, count=1, killed_after=None):
+            print(json.dumps([os.getcwd(), words, count, killed_after]), file=process.stdin, flush=True)
+            return json.loads(process.stdout.readline())
+
+        yield run
+        process.stdin.close()
 
 
 def simulate(*words):
@@ -362,11 +399,10 @@ def test_a_long_seed_is_read_again(film):
 
 
 @pytest.mark.slow
-def test_four_at_once(film):
+def test_four_at_once(film, processes):
     """Processes that write one name, and one process with as many threads as there are, give the same files."""
     words = ["simulate", str(film), "--scale", "2", "--photons", "30"]
-    running = [subprocess.Popen([*COMMAND, *words, "-o", "a.dat"], stdout=subprocess.DEVNULL) for _ in range(4)]
-    assert [process.wait(120) for process in running] == [0] * 4
+    assert processes(*words, "-o", "a.dat", count=4) == [0] * 4
     assert believed(Path("a.dat"))
     at_once = {name: Path(name).read_bytes() for name in ("a.dat", "a.png", "a.json")}
     assert not list(Path().glob(".*"))
@@ -431,18 +467,15 @@ def test_killed_while_it_publishes(film, monkeypatch, step):
 
 
 @pytest.mark.slow
-def test_killed_at_random_moments(film):
-    words = [*COMMAND, "simulate", str(film), "-o", "a.dat", "--scale", "2", "--all"]
+def test_killed_at_random_moments(film, processes):
+    words = ["simulate", str(film), "-o", "a.dat", "--scale", "2", "--all"]
     begin = time.monotonic()
-    subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
+    assert processes(*words) == [0]
     whole = time.monotonic() - begin
     for name in ("a.dat", "a.json"):
         Path(name).unlink()
-    for share in (0.5, 0.7, 0.8, 0.9, 0.95, 1.0):
-        process = subprocess.Popen(words, stdout=subprocess.DEVNULL)
-        time.sleep(share * whole)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+    for share in (0.3, 0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 1.0):
+        processes(*words, killed_after=share * whole)
         if Path("a.json").exists():
             assert believed(Path("a.dat"))
     simulate(film, "-o", "a.dat", *QUICK)
@@ -461,19 +494,13 @@ def test_what_was_killed_is_removed_and_what_runs_is_not(film):
 
 
 @pytest.mark.parametrize(("room", "words", "name"), [(8000, ["--all", "--clocks", "200"], "a.dat"), (500, [], "a.png")])
-def test_a_full_disk(film, room, words, name):
+def test_a_full_disk(film, fails, capsys, full_disk, room, words, name):
     """One line that names the file for which there is no room; what was there is untouched."""
     simulate(film, "-o", "a.dat", *QUICK)
-    before = everything()
-    done = subprocess.run(
-        [*LIMITED, "simulate", str(film), "-o", "a.dat", *QUICK, *words],
-        capture_output=True,
-        text=True,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (room, room)),
-    )
-    assert done.returncode == 1
-    assert done.stderr == f"spikekit: {name}: cannot be written (File too large)\n"
-    assert everything() == before
+    capsys.readouterr()
+    with full_disk(room):
+        said = fails(1, film, "-o", "a.dat", *QUICK, *words)
+    assert said == f"spikekit: {name}: cannot be written (File too large)\n"
     assert not list(Path().glob(".*"))
 
 

@@ -1,6 +1,5 @@
 """Recordings: bits, rows, flips, parts of files, and every way in which a file can be wrong."""
 
-import subprocess
 import sys
 import tracemalloc
 import zipfile
@@ -480,20 +479,11 @@ def test_chunks_that_fail_leave_the_old_file(tmp_path, name):
 
 @pytest.mark.parametrize("name", ["a.dat", "a.npz"])
 @pytest.mark.skipif(sys.platform == "win32", reason="no limits on file sizes")
-def test_full_disk(tmp_path, name):
+def test_full_disk(tmp_path, name, full_disk):
     """A file that may not grow, like a full disk, is one line, and nothing is left behind."""
-    code = (
-        "import resource, signal, sys, torch\n"
-        "from spikekit import SpikeFileError, write_spikes\n"
-        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))\n"
-        "try:\n"
-        "    write_spikes(sys.argv[1], (torch.rand(10, 100, 100) < 0.5 for _ in range(20)))\n"
-        "except SpikeFileError as error:\n"
-        "    print(error)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code, tmp_path / name], capture_output=True, text=True, check=True)
-    assert done.stdout == f"{tmp_path / name}: cannot be written (File too large)\n"
+    with full_disk(50_000), pytest.raises(SpikeFileError) as error:
+        write_spikes(tmp_path / name, (torch.rand(10, 100, 100) < 0.5 for _ in range(20)))
+    assert str(error.value) == f"{tmp_path / name}: cannot be written (File too large)"
     assert not list(tmp_path.iterdir())
 
 
