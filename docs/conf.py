@@ -38,7 +38,7 @@ html_title = f"spikekit {version}"
 nitpicky = True
 nitpick_ignore_regex = [
     ("py:.*", r"(torch|kornia|collections|pathlib|optional|numpy|pytorch_lightning)\b.*"),
-    ("py:.*", "(CFA|(Recurrent)?CSCSRConfig|.*recurrent_cscsr.State|Tensor|Path|Callback|InputError|UsageError)"),
+    ("py:.*", "(CFA|(Recurrent)?CSCSRConfig|.*recurrent_cscsr.State|Tensor|Path|Callback|.*clips_around.Item|InputError|UsageError)"),
 ]
 
 autosummary_generate = False  # every name has a page already

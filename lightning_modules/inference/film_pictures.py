@@ -39,11 +39,12 @@ class FilmPictures:
         network: any of :mod:`lightning_modules.networks`.
         interpolated: pictures between two that the network makes.
         how: ``tile``, ``psnr_tolerance``, ``self_ensemble`` and ``done`` of
-            :func:`lightning_modules.inference.predict.predict`; a :class:`RecurrentCSCSR` takes ``tile`` alone.
+            :func:`lightning_modules.inference.predict.predict`; a
+            :class:`~lightning_modules.networks.RecurrentCSCSR` takes ``tile`` alone.
 
     Raises:
         ValueError: ``interpolated`` is not a whole number, 0 or more, or above 0 for a network that estimates no motion
-            or two of them; another argument than ``tile`` for a :class:`RecurrentCSCSR`.
+            or two of them; another argument than ``tile`` for a :class:`~lightning_modules.networks.RecurrentCSCSR`.
 
     Example:
         >>> from lightning_modules.networks import CSCSR
