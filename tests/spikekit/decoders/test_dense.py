@@ -242,6 +242,22 @@ def test_second_gradients():
     assert torch.allclose(again, expected, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize("op", [tfi, lambda clip: tfp(clip, 5)], ids=["tfi", "tfp"])
+def test_gradients_of_many_clips_at_once(op):
+    """vmap over the gradients of one clip, first and second, and over many vectors for one gradient."""
+    clips = torch.from_numpy(np.stack([streams(17), streams(17)[::-1]])).double()
+
+    def first(clip):
+        return torch.func.grad(lambda given: op(given).pow(3).sum())(clip)
+
+    second = torch.func.grad(lambda clip: first(clip).square().sum())
+    for gradient in (first, second):
+        assert torch.func.vmap(gradient)(clips).equal(torch.stack([gradient(clip) for clip in clips]))
+    vectors = torch.randn(3, *clips[0].shape, dtype=torch.float64)
+    pull = torch.func.vjp(op, clips[0])[1]
+    assert torch.func.vmap(pull)(vectors)[0].equal(torch.stack([pull(one)[0] for one in vectors]))
+
+
 def test_tfp_forgets_what_has_left_the_window():
     """A large number must not leave its rounding error behind."""
     spikes = torch.zeros(60, 1, 1)
