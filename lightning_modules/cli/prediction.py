@@ -116,7 +116,8 @@ def _choice(args: Sequence[str]) -> tuple[Preset, str]:
         for one, at in ((choice, speed), (other, sooner))
     )
     instead = f"; --speed {sooner}: {sooner_took}, {other.below:.2f} dB below the best" if other != choice else ""
-    said = [str(choice), f"{len(clips)} pictures, written as PNG: about {took}{instead}"]
+    count = "1 picture" if len(clips) == 1 else f"{len(clips)} pictures"
+    said = [str(choice), f"{count}, written as PNG: about {took}{instead}"]
     interpolated = _interpolated(choice.preset, every, speed)
     if interpolated:
         said.append(

@@ -155,8 +155,9 @@ class Predictions(Callback):
                 path.replace(self.output)
             shutil.rmtree(self.folder, ignore_errors=True)
         count = f"{there} of {total}" if lacking else total
+        count = f"{count} {'picture' if total == 1 else 'pictures'}"
         made = f", {self._written} of them new" if self._written < there and trainer.world_size == 1 else ""
-        print(f"{self.output}: {count} pictures{made}, {self._white:.4g} spikes a frame are white")  # noqa: T201
+        print(f"{self.output}: {count}{made}, {self._white:.4g} spikes a frame are white")  # noqa: T201
         if self._made:
             print(self._watch.said(self._made))  # noqa: T201
             if self._shares:

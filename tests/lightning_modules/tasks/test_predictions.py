@@ -81,7 +81,7 @@ def test_one_frame_is_one_picture(words, tmp_path, capsys):
     main([*words, str(tmp_path / "a" / "one.PNG"), "--data.frame", "40"])
     assert (tmp_path / "a" / "one.PNG").read_bytes() == (tmp_path / "out" / "frame_000040.png").read_bytes()
     assert [path.name for path in (tmp_path / "a").iterdir()] == ["one.PNG"]
-    assert "one.PNG: 1 pictures" in capsys.readouterr().out
+    assert "one.PNG: 1 picture," in capsys.readouterr().out
 
 
 def test_the_frames_of_a_clip_choose_no_pictures(words, tmp_path, capsys):
