@@ -27,8 +27,8 @@ class FilmReader:
         A key frame's neighbour helps if it is at most a clip's length away; further away nothing is known of the
         motion. So a reader may be given the groups of another part of the film at any time.
 
-        Where frames are larger than a tile, what is known of a key frame waits in half precision: a group of three,
-        1000 x 1000 sensor pixels each, then fits into 3 GiB at x4. Pictures change by 0.05 of an 8-bit step (rms).
+        Where frames are larger than a tile, what is known of a key frame waits in half precision: 0.35 GiB at x4 and
+        1000 x 1000 sensor pixels. Pictures change by 0.05 of an 8-bit step (rms).
 
     Args:
         network: a network for films.

@@ -147,7 +147,7 @@ def test_a_recording_says_how_much_room_there_is(longer, total, frame, expected)
     preset, said = prediction._choice(typed)
     name, count = expected
     assert (preset.clip, said.partition(":")[0]) == (101 if name == "longer" else 41, name)
-    assert f"\n{count} pictures" in said
+    assert f"\n{count} {'picture' if count == 1 else 'pictures'}, " in said
 
 
 @pytest.mark.parametrize(("every", "name"), [(41, "cscsr_large_film_x4"), (42, "cscsr_large_x4")])
