@@ -82,7 +82,7 @@ class CSCSR(Network):
         Dong et al., Super-Resolution Reconstruction from Bayer-Pattern Spike Streams, CVPR 2024.
     """
 
-    halo = 14  #: enough for every shipped network; its weights bring their own
+    halo = 16  #: enough for every shipped network; its weights bring their own
     flow_groups = ((), (3,))
     configuration: ClassVar[type[CSCSRConfig]] = CSCSRConfig  #: of the fields that ``settings`` are
 
