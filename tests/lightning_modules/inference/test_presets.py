@@ -166,7 +166,7 @@ def test_memory_beyond_a_tile_is_that_of_the_picture_and_of_motion():
     for size, pixels in (((40, 50), 1), ((80, 100), 4), ((4000, 5000), 10_000)):
         found = {choice.name: choice.mib for choice in choices(3, size)}
         assert found["tfi"] == pytest.approx(2 * pixels)
-        tile, small = min(pixels, 252**2 / 2000), min(pixels, 140**2 / 2000)
+        tile, small = min(pixels, 256**2 / 2000), min(pixels, 144**2 / 2000)
         assert found["all"] == pytest.approx((2 + motion) * pixels + (78 - motion) * tile)
         assert found["small tiles"] == pytest.approx((2 + motion) * pixels + (18 - motion) * small)
         assert found["no motion"] == pytest.approx(2 * pixels + 68 * tile)
