@@ -94,9 +94,9 @@ class FilmReader:
             del features[n]  # of a large film what a group remembers fills the memory
             picture = network.picture(known.state)
             if rgb is None:
-                rgb = torch.empty(len(clips), *picture.shape[1:], dtype=self._dtype, device=picture.device)
+                rgb = picture.new_empty(len(clips), *picture.shape[1:])
             rgb[n] = picture[0]
-        return rgb
+        return rgb.to(self._dtype)
 
     def _features(self, spikes: Tensor, flow: Tensor | None, whole: Box) -> Tensor:
         def run(outer: Box) -> Tensor:

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from spikekit import __version__
 from spikekit.arguments import UsageError, one_line
@@ -69,12 +69,20 @@ class _Parser(argparse.ArgumentParser):
         raise UsageError(f"{message} (see {self.prog} --help)")
 
 
+class _VerbParser(_Parser):
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        namespace, unknown = super().parse_known_args(args, namespace)
+        if unknown:  # the parser of all verbs would name its own --help, where none of this verb's options are
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return namespace, unknown
+
+
 def _parser(*asked: str) -> argparse.ArgumentParser:
     """Return a parser that knows the arguments of some verbs: those of the others would take importing them."""
     parser = _Parser(prog="spikekit", description="Look into spike recordings and turn them into pictures.")
     parser.add_argument("--version", action="version", version=f"spikekit {__version__}")
     parser.add_argument(OPTION, metavar="SHELL", help="print what lets bash or zsh complete with the tab key")
-    verbs = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
+    verbs = parser.add_subparsers(title="verbs", metavar="VERB", required=True, parser_class=_VerbParser)
     for name, (summary, home, example) in VERBS.items():
         verb = verbs.add_parser(
             name,

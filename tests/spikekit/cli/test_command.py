@@ -375,6 +375,7 @@ def test_decode_darkness(tmp_path, capsys):
         ([], "required: VERB (see spikekit --help)"),
         (["look"], "invalid choice: 'look'"),
         (["info"], "required: FILE (see spikekit info --help)"),
+        (["info", "a.dat", "--hight", 3], "unrecognized arguments: --hight 3 (see spikekit info --help)"),
         (["info", "a.dat", "--height", "0"], "--height: expected a whole number, 1 or more, got 0"),
         (["info", "a.dat", "--width", "wide"], "--width: expected a whole number, 1 or more, got wide"),
         (["decode", "a.dat"], "required: --method, -o/--output (see spikekit decode --help)"),
