@@ -174,8 +174,9 @@ def _check_like(fresh: Any, value: Any, name: str, known: bool = False) -> None:
         if type(value) is not type(fresh):
             raise TypeError(f"{name}: expected a {type(fresh).__name__}, got {str(value)[:80]}")
     elif isinstance(fresh, int):
-        if type(value) is not int or (value < 0 <= fresh):
-            raise TypeError(f"{name}: expected a whole number, 0 or more, got {str(value)[:80]}")
+        least = min(fresh, 1)  # a count may begin at 0; a period, such as StepLR's, is never 0
+        if type(value) is not int or value < least:
+            raise TypeError(f"{name}: expected a whole number, {least} or more, got {str(value)[:80]}")
     elif isinstance(fresh, float):
         if type(value) not in (int, float) or (math.isfinite(fresh) and not math.isfinite(value)):
             raise TypeError(f"{name}: expected a finite number, got {str(value)[:80]}")

@@ -253,3 +253,13 @@ def test_states_of_a_training(fuzz, training, tmp_path):
     torch.save(content, tmp_path / "good.ckpt")
     read(tmp_path / "good.ckpt")
     assert fuzz(read, make, "bad.ckpt", cases=30) > 10
+
+
+@pytest.mark.parametrize(("name", "value", "least"), [("step_size", 0, 1), ("step_size", -3, 1), ("last_epoch", -1, 0)])
+def test_periods_and_counts_of_a_schedule(training, name, value, least):
+    model, trainer, content = training
+    [schedule] = content["lr_schedulers"]
+    assert name in schedule
+    with pytest.raises(ValueError, match=f"^a.ckpt: .*{name}: expected a whole number, {least} or more, got {value}$"):
+        check_like_fresh({**content, "lr_schedulers": [{**schedule, name: value}]}, "a.ckpt", model, trainer)
+    check_like_fresh(content, "a.ckpt", model, trainer)
