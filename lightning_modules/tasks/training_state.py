@@ -67,10 +67,14 @@ def check_like_fresh(checkpoint: Mapping[str, Any], path: str | Path, model: Lea
         optimizer, scheduler = fresh["optimizer"], fresh["lr_scheduler"]["scheduler"]
         (state,), (schedule,) = checkpoint["optimizer_states"], checkpoint["lr_schedulers"]
         _check_like(scheduler.state_dict(), schedule, "lr_schedulers", known=True)
-        for group, own in zip(state["param_groups"], optimizer.state_dict()["param_groups"], strict=True):
+        groups = optimizer.state_dict()["param_groups"]
+        for group, own in zip(state["param_groups"], groups, strict=True):
             _check_like(own, group, "optimizer_states.param_groups")
         _check_states(state, model)
-        optimizer.load_state_dict(state)
+        optimizer.load_state_dict(state)  # which knows what older versions of torch did not write
+        for group, own in zip(optimizer.param_groups, groups, strict=True):
+            if lacking := own.keys() - group.keys():
+                raise ValueError(f"optimizer_states.param_groups: expected {', '.join(sorted(lacking))}, got none")
         _check_like(trainer.fit_loop.state_dict(), checkpoint["loops"]["fit_loop"], "loops")
         states = checkpoint.get("callbacks", {})
         for callback in trainer.callbacks:

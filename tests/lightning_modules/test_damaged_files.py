@@ -263,3 +263,17 @@ def test_periods_and_counts_of_a_schedule(training, name, value, least):
     with pytest.raises(ValueError, match=f"^a.ckpt: .*{name}: expected a whole number, {least} or more, got {value}$"):
         check_like_fresh({**content, "lr_schedulers": [{**schedule, name: value}]}, "a.ckpt", model, trainer)
     check_like_fresh(content, "a.ckpt", model, trainer)
+
+
+def test_settings_of_an_optimizer_that_are_not_there(training):
+    model, trainer, content = training
+    [state] = content["optimizer_states"]
+    [group] = state["param_groups"]
+
+    def without(name):
+        left = {key: value for key, value in group.items() if key != name}
+        return {**content, "optimizer_states": [{**state, "param_groups": [left]}]}
+
+    with pytest.raises(ValueError, match=r"^a.ckpt: .*param_groups: expected weight_decay, got none$"):
+        check_like_fresh(without("weight_decay"), "a.ckpt", model, trainer)
+    check_like_fresh(without("amsgrad"), "a.ckpt", model, trainer)  # torch fills in what older versions did not have
