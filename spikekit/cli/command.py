@@ -68,11 +68,9 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message} (see {self.prog} --help)")
 
-
-class _VerbParser(_Parser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
         namespace, unknown = super().parse_known_args(args, namespace)
-        if unknown:  # the parser of all verbs would name its own --help, where none of this verb's options are
+        if unknown:  # said by the parser of the verb: that of all verbs would point to its own --help
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
         return namespace, unknown
 
@@ -82,7 +80,7 @@ def _parser(*asked: str) -> argparse.ArgumentParser:
     parser = _Parser(prog="spikekit", description="Look into spike recordings and turn them into pictures.")
     parser.add_argument("--version", action="version", version=f"spikekit {__version__}")
     parser.add_argument(OPTION, metavar="SHELL", help="print what lets bash or zsh complete with the tab key")
-    verbs = parser.add_subparsers(title="verbs", metavar="VERB", required=True, parser_class=_VerbParser)
+    verbs = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
     for name, (summary, home, example) in VERBS.items():
         verb = verbs.add_parser(
             name,
