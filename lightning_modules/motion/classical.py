@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import groupby
 
 import torch
 from kornia.filters import filter2d_separable, gaussian_blur2d, get_gaussian_kernel1d
@@ -18,6 +19,7 @@ _GREY = torch.tensor([[0.25, 0.5, 0.25]])  # each pixel the mean of the Bayer ce
 _BLUR = get_gaussian_kernel1d(5, 0.5)  # of the pictures of a site, in Bayer cells
 _ORDER = 3  # of the means that pictures are
 _LONGEST = 17  # their window, in frames: in longer clips more of motion blurs them than noise is averaged
+_LIGHT = 0.1  # mean firing rate of a clip below which noise harms more, and their window is longer
 _NOISE = 0.002  # standard deviation, in firing rates, of a pixel that counts half
 _RATES = 1024
 _NEAR = 2.0  # around a pixel where it is asked whether motion is linear, in pixels
@@ -29,13 +31,13 @@ class ClassicalFlow(MotionEstimator):
     r"""TV-L1 optical flow on decoded pictures: no weights, any device; on a CPU faster with Numba.
 
     The clip is decoded in its middle and a quarter of it before and after, by means of third order that see nearly all
-    of it, but at most 49 frames, see :func:`spikekit.tfp_at`: noise harms the estimate more than what moves meanwhile.
-    Motion is taken to be
-    linear, so that both flows are those of one velocity, the one that takes the earlier picture to the later; from
-    there each half of the clip finds its own, and the flows part where one velocity leaves the pictures clearly more
-    different than these two do. The joint flow is estimated on grey pictures of the sensor's size, each pixel the mean
-    of the cells that it is part of, so that the noise of the four sites is averaged *before* motion is estimated;
-    averaging four flows afterwards, as eq. (7) does with a learned estimator, was less accurate here.
+    of it, see :func:`spikekit.tfp_at`: noise harms the estimate more than what moves meanwhile. In a clip of at least
+    0.1 spikes a frame and pixel they see at most 49 frames; in one with a quarter of that light, twice as many. Motion
+    is taken to be linear, so that both flows are those of one velocity, the one that takes the earlier picture to the
+    later; from there each half of the clip finds its own, and the flows part where one velocity leaves the pictures
+    clearly more different than these two do. The joint flow is estimated on grey pictures of the sensor's size, each
+    pixel the mean of the cells that it is part of, so that the noise of the four sites is averaged *before* motion is
+    estimated; averaging four flows afterwards, as eq. (7) does with a learned estimator, was less accurate here.
 
     A dark pixel fires so rarely that a mean flickers. For an ideal sensor its rate tells by how much, and the pixel is
     given less weight accordingly.
@@ -79,8 +81,19 @@ class ClassicalFlow(MotionEstimator):
             expected = f"(B, N, H, W) of at least 2 x 2 pixels, with frames before and after the middle, {middle}"
             raise ValueError(f"spikes: expected {expected}, got {tuple(spikes.shape)}")
         bayer_pattern(pattern)
+        runs = [(window, len(list(clips))) for window, clips in groupby(map(_window, spikes))]
+        parts = spikes.split([count for _, count in runs])  # clips that need one window are seen at once
+        velocities = [
+            self._of_window(part, middle, window, pattern, by_site)
+            for part, (window, _) in zip(parts, runs, strict=True)
+        ]
+        before, after = torch.cat(velocities, dim=-5).unbind(dim=-4)
+        return before * (first - middle), after * (last - middle)
+
+    def _of_window(self, spikes: Tensor, middle: int, window: int, pattern: str, by_site: bool) -> Tensor:
+        """Velocities before and after the middle, (*, B, 2, 2, h, w), by means of one window."""
         with torch.autocast(spikes.device.type, enabled=False):
-            raw, clock, window = _decode(spikes, middle)
+            raw, clock = _decode(spikes, middle, window)
             noise = _noise(window).to(raw)[(raw.mean(dim=1, keepdim=True) * _RATES).long().clamp(0, _RATES - 1)]
             if by_site:
                 raw, noise = (split_any_size(part, pattern).flatten(0, 1) for part in (raw, noise))
@@ -91,10 +104,7 @@ class ClassicalFlow(MotionEstimator):
             )
             attachment = self.attachment / (1 + noise[:, 0] / _NOISE**2)
             velocities = self._velocities(pictures, clock, attachment)
-        if by_site:
-            velocities = velocities.unflatten(0, (4, -1))
-        before, after = velocities.unbind(dim=-4)
-        return before * (first - middle), after * (last - middle)
+        return velocities.unflatten(0, (4, -1)) if by_site else velocities
 
     def _velocities(self, pictures: Tensor, clock: Tensor, attachment: Tensor) -> Tensor:
         """Velocities before and after the middle, (B, 2, 2, h, w), in pixels a frame, of pictures (B, 3, h, w)."""
@@ -115,18 +125,25 @@ class ClassicalFlow(MotionEstimator):
         return f"attachment={self.attachment}, warps={self.warps}"
 
 
-def _decode(spikes: Tensor, middle: int) -> tuple[Tensor, Tensor, int]:
-    """Three raw pictures (B, 3, H, W), the times that they show, and the window of their means."""
+def _window(clip: Tensor) -> int:
+    """Window of the means of a clip (N, H, W), in frames."""
+    rate = clip.mean(dtype=torch.float32).clamp(min=1 / clip.numel()).item()
+    longest = _LONGEST * max((_LIGHT / rate) ** 0.5, 1)
+    return 2 * max(int(min((len(clip) - 1) // 6, longest / 2)), 1) + 1
+
+
+def _decode(spikes: Tensor, middle: int, window: int) -> tuple[Tensor, Tensor]:
+    """Three raw pictures (B, 3, H, W) by means of a window, and the times that they show."""
     frames = spikes.shape[1]
-    window, away = min(2 * max((frames - 1) // 6, 1) + 1, _LONGEST), max(frames // 4, 1)
+    away = max(frames // 4, 1)
     seen = [max(middle - away, 0), middle, min(middle + away, frames - 1)]
     raw = torch.stack([tfp_at(spikes, n, window, order=_ORDER, dtype=torch.float32) for n in seen], dim=1)
     # where the mean is cut by the ends of the clip, it stands for a later or an earlier time
     clock = torch.arange(frames, dtype=torch.float64).reshape(-1, 1, 1)
-    return raw, torch.cat([tfp_at(clock, n, window, order=_ORDER).flatten() for n in seen]), window
+    return raw, torch.cat([tfp_at(clock, n, window, order=_ORDER).flatten() for n in seen])
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=16)
 def _noise(window: int) -> Tensor:
     """Variance of the mean of a pixel in constant light, by its firing rate."""
     frames = 3 * window

@@ -9,17 +9,17 @@ from spikekit.flow import tvl1
 TIMES = (5, 20, 35)
 
 
-def moving(velocity, height=48, width=64, pattern="RGGB"):
+def moving(velocity, height=48, width=64, pattern="RGGB", frames=41, alpha=0.4):
     """A smooth coloured texture that moves by ``velocity`` (x, y) sensor pixels a frame."""
     generator = torch.Generator().manual_seed(1)
     waves = torch.rand(3, 12, 4, generator=generator, dtype=torch.float64)
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     light = []
-    for clock in range(41):
-        u, v = x - velocity[0] * (clock - 20), y - velocity[1] * (clock - 20)
+    for clock in range(frames):
+        u, v = (axis - speed * (clock - frames // 2) for axis, speed in zip((x, y), velocity, strict=True))
         phase = sum((w - 0.5) * 1.2 * axis[..., None, None] for w, axis in ((waves[..., 0], u), (waves[..., 1], v)))
         rgb = (torch.cos(phase + 6.3 * waves[..., 2]) * waves[..., 3]).mean(-1).movedim(-1, 0) * 0.6 + 0.5
-        light.append(0.4 * mosaic(rgb.clamp(0, 1), pattern))
+        light.append(alpha * mosaic(rgb.clamp(0, 1), pattern))
     charge = torch.rand(height, width, generator=generator)
     return spike_integrate_fire(torch.stack(light).float(), charge=charge)[0][None]
 
@@ -124,13 +124,48 @@ def test_few_frames():
         assert all(flow.isfinite().all() for flow in ClassicalFlow()(spikes, times, "RGGB"))
 
 
-@pytest.mark.parametrize(("frames", "reach"), [(41, 18), (101, 24), (401, 24)])
-def test_pictures_of_longer_clips_see_no_more_than_49_frames(frames, reach):
-    middle = frames // 2
-    for away, seen in ((reach, True), (reach + 1, False)):
-        spikes = torch.zeros(1, frames, 2, 2)
-        spikes[:, [middle - away, middle + away]] = 1
-        assert bool(classical._decode(spikes, middle)[0][:, 1].any()) == seen
+@pytest.mark.parametrize(
+    ("frames", "rate", "window"),
+    [
+        (41, 0.01, 13),
+        (41, 0.5, 13),
+        (101, 0.0, 33),
+        (101, 0.01, 33),
+        (101, 0.05, 25),
+        (101, 0.5, 17),
+        (401, 0.5, 17),
+        (401, 0.011, 51),
+    ],
+)
+def test_the_less_light_the_longer_are_the_means(frames, rate, window):
+    clip = torch.zeros(frames, 20, 20)
+    clip.flatten()[: round(rate * clip.numel())] = 1
+    assert classical._window(clip) == window
+
+
+def test_every_clip_of_a_batch_is_seen_by_its_own_light():
+    dark = moving((0.2, 0.1), frames=101, alpha=0.05)
+    bright = moving((0.2, 0.1), frames=101, alpha=0.8)
+    assert classical._window(dark[0]) > classical._window(bright[0])
+    both = torch.cat([dark, bright, dark])
+    for estimate in (ClassicalFlow(), ClassicalFlow().channel_flows):
+        together = estimate(both, (5, 50, 95), "RGGB")
+        for n in range(3):
+            alone = estimate(both[n : n + 1], (5, 50, 95), "RGGB")
+            for flow, part in zip(together, alone, strict=True):
+                torch.testing.assert_close(flow[..., n, :, :, :], part[..., 0, :, :, :])
+
+
+def test_motion_in_dim_light_is_seen_by_longer_means(monkeypatch):
+    """0.02 spikes a frame on average; the motion is half a pixel every ten clocks."""
+    spikes, truth = moving((0.05, 0.02), frames=101, alpha=0.05), torch.tensor([0.05, 0.02]) * 45
+
+    def error():
+        return (ClassicalFlow()(spikes, (5, 50, 95), "RGGB")[1][0] - truth[:, None, None]).norm(dim=0).mean()
+
+    longer = error()
+    monkeypatch.setattr(classical, "_LIGHT", 0)
+    assert longer < 0.7 * error()
 
 
 def expected_flows(pictures, raw, clock, squared, border):
