@@ -117,7 +117,7 @@ def _inline(text):
 
 
 class ShippedTrade(SphinxDirective):
-    """``.. shipped-trade:: 4`` is the table that comes with the weights of this scale, fastest setting first."""
+    """``.. shipped-trade:: 4`` is the table of a scale that comes with the weights, ``4_dim`` that for little light."""
 
     required_arguments = 1
 

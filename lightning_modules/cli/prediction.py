@@ -16,7 +16,7 @@ from pytorch_lightning.cli import LightningArgumentParser
 from lightning_modules.cli.arguments import WEIGHTS, behind_configurations, given, options, preset_arguments
 from lightning_modules.cli.errors import InputError, UsageError
 from lightning_modules.data import RecordingClips
-from lightning_modules.inference.presets import SPEEDS, Preset, choose
+from lightning_modules.inference.presets import SPEEDS, Choice, Preset, choose
 from lightning_modules.tasks.predictions import PictureProgress, Predictions, file_identity, is_film, is_picture
 from spikekit import __version__
 from spikekit.decoders.methods import DECODERS
@@ -29,6 +29,9 @@ _PART = restricted_string_type("Part", r"[1-9]\d{0,5}/[1-9]\d{0,5}")
 
 # how many times as long as its clips a recording is whose first and last pictures a longer clip may cost
 _MANY = 10
+
+# dB that longer clips have to be worth to be mentioned where the recording leaves no room for them
+_WORTH_ROOM = 0.3
 
 # clocks between two pictures of the network up to which those between, interpolated, lose nothing: in fast scenes, and
 # in slower ones
@@ -105,10 +108,11 @@ def _choice(args: Sequence[str]) -> tuple[Preset, str]:
     every = min((later - clock for clock, later in pairwise(clips.chosen)), default=clips.frames + 1)
     film = every <= clips.frames  # one picture knows the other
     longest = max(clips.frames, _room(clips) if "frame" in known else clips.recording.frames // _MANY)
-    choice = choose(scale, speed, wishes.get("--budget"), clips.size, film, longest)
+    budget, asked = wishes.get("--budget"), (clips.size, film, longest, clips.white)
+    choice = choose(scale, speed, budget, *asked)
     speeds = list(SPEEDS)
     sooner = speeds[max(speeds.index(speed) - 1, 0)] if speed else None
-    other = choose(scale, sooner, None, clips.size, film, longest) if sooner else choice
+    other = choose(scale, sooner, None, *asked) if sooner else choice
     clips = RecordingClips(**known, **sizes, frames=choice.preset.clip)
     writing = _WRITING * scale**2 * clips.size[0] * clips.size[1]
     took, sooner_took = (
@@ -125,6 +129,9 @@ def _choice(args: Sequence[str]) -> tuple[Preset, str]:
             "--model.interpolated 0 makes all by the network"
         )
     preset = replace(choice.preset, interpolated=interpolated or None)
+    if speed:
+        ideal = choose(scale, speed, None, clips.size, film, clips.recording.frames, clips.white)
+        said += _longer(ideal, choice, clips)
     return preset, "\n".join([*said, *_noise(preset, clips)])
 
 
@@ -134,6 +141,17 @@ def _interpolated(preset: Preset, every: int, speed: str | None) -> int:
         return 0
     apart = _APART if speed in (None, "best") else _FARTHER_APART
     return max(apart // every - 1, 0)
+
+
+def _longer(ideal: Choice, choice: Choice, clips: RecordingClips) -> list[str]:
+    """Return a hint where clips at the ends of the recording keep longer ones from being chosen."""
+    gain, half = ideal.psnr - choice.psnr, ideal.preset.clip // 2
+    if ideal.preset.clip <= choice.preset.clip or gain < _WORTH_ROOM:
+        return []
+    return [
+        f"clips of {ideal.preset.clip} frames would be about {gain:.1f} dB better: --data.frame "
+        f"{half}:{clips.recording.frames - half} leaves room for them"
+    ]
 
 
 def _noise(preset: Preset, clips: RecordingClips) -> list[str]:

@@ -33,6 +33,9 @@ _FRAMES = 41
 #: how far a speed may be below the best, in dB of the table
 SPEEDS = {"fastest": float("inf"), "fast": 1.2, "balanced": 0.3, "best": 0.005}
 
+#: spikes a frame of a white pixel in the table that is for less light than 0.4, and up to which it is asked
+DIM, _DIM_UP_TO = 0.1, 0.2
+
 #: times this close cannot be told apart, and the better preset is picked
 _AS_FAST = 1.1
 
@@ -210,7 +213,9 @@ class Choice:
         return f"{self.name}: {cost}, {self.below:.2f} dB below the best"
 
 
-def choices(scale: int, size: tuple[int, int], film: bool = False, frames: int = _FRAMES) -> list[Choice]:
+def choices(
+    scale: int, size: tuple[int, int], film: bool = False, frames: int = _FRAMES, white: float = 0.4
+) -> list[Choice]:
     """Return the presets of the table for a scale that leave the precision as it is, fastest first.
 
     Time is taken to grow with the number of pixels; times are the table's ratios, taken times that of the row which it
@@ -225,11 +230,13 @@ def choices(scale: int, size: tuple[int, int], film: bool = False, frames: int =
         film: whether frames are made one after the other, as ``lightning trade --film`` measures them; where no such
             table comes with the package, a frame in a film is taken for one by itself.
         frames: spike frames that a clip may have; presets that need more are left out.
+        white: spikes a frame of a white pixel; below 0.2 the table is that of scenes at 0.1, where longer clips are
+            worth more, if the package has one for the scale.
 
     Raises:
         ValueError: no table comes with the package for this scale.
     """
-    rows = _table(scale, film)
+    rows = _table(scale, film, white)
     frame = min(float(row["mib"]) for row in rows)
     found = []
     for row in rows:
@@ -256,10 +263,10 @@ def choices(scale: int, size: tuple[int, int], film: bool = False, frames: int =
     return sorted(found, key=lambda choice: choice.ms)
 
 
-def _table(scale: int, film: bool = False) -> list[dict[str, str]]:
-    path, filmed = (_FOLDER / f"x{scale}{ending}.csv" for ending in ("", "_film"))
-    if film and filmed.is_file():
-        path = filmed
+def _table(scale: int, film: bool = False, white: float = 0.4) -> list[dict[str, str]]:
+    lights, uses = ("_dim", "") if white < _DIM_UP_TO else ("",), ("_film", "") if film else ("",)
+    paths = [_FOLDER / f"x{scale}{light}{use}.csv" for light in lights for use in uses]
+    path = next((path for path in paths if path.is_file()), paths[-1])
     if not path.is_file():
         there = ", ".join(sorted(path.stem for path in _FOLDER.glob("x?.csv"))) or "none"
         raise ValueError(f"scale: expected one that was measured ({there}), got {scale}")
@@ -289,17 +296,18 @@ def _reference(rows: list[dict[str, str]]) -> dict[str, str]:
     return next(row for row in rows if row["setting"] == row["reference"])
 
 
-def pace(scale: int, film: bool = False) -> float:
+def pace(scale: int, film: bool = False, white: float = 0.4) -> float:
     """Measure how many times longer a frame takes here than in the table: its reference, on a quarter of a clip.
 
     Args:
         scale: super-resolution factor.
         film: whether it is the table of films.
+        white: which light it is for, see :func:`choices`.
 
     Returns:
         1 on the machine of the table, 2 on one that takes twice as long.
     """
-    row = _reference(_table(scale, film))
+    row = _reference(_table(scale, film, white))
     preset = Preset.read(row)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network = preset.build().to(device)
@@ -318,6 +326,7 @@ def choose(
     size: tuple[int, int] = (250, 400),
     film: bool = False,
     frames: int = _FRAMES,
+    white: float = 0.4,
 ) -> Choice:
     """Choose the best preset for a speed or a budget.
 
@@ -333,6 +342,7 @@ def choose(
         size: of a frame, (H, W) in sensor pixels, which a budget depends on.
         film: whether frames are made one after the other, see :func:`choices`.
         frames: spike frames that a clip may have; 101 or more let longer clips be chosen, where that pays.
+        white: spikes a frame of a white pixel, see :func:`choices`.
 
     Raises:
         ValueError: an unknown speed, a budget that cannot be read or that nothing fits, a scale without a table.
@@ -347,7 +357,7 @@ def choose(
     """
     if (speed is None) == (budget is None):
         raise ValueError(f"speed, budget: expected one of them, got {speed!r} and {budget!r}")
-    found = choices(scale, size, film, frames)
+    found = choices(scale, size, film, frames, white)
     if speed is not None:
         if speed not in SPEEDS:
             raise ValueError(f"speed: expected one of {', '.join(SPEEDS)}, got {speed!r}")
@@ -359,7 +369,7 @@ def choose(
     what, unit = _UNITS.get(read[2], ("ms", 1e3))
     limit = unit / float(read[1]) if read[2] == "fps" else unit * float(read[1])
     if what == "ms":
-        here = pace(scale, film)
+        here = pace(scale, film, white)
         where = f"on this machine, which takes {here:.2g} times as long as that of the table"
         found = [replace(choice, ms=here * choice.ms, where=where) for choice in found]
     fitting = [choice for choice in found if getattr(choice, what) <= limit]

@@ -21,6 +21,19 @@ def test_a_decoder_of_a_dark_recording_is_said_to_be_noisy(white, speed, hint, t
 
 
 @pytest.mark.parametrize(
+    ("white", "frame", "clip", "hint"),
+    [(0.05, None, 41, True), (0.05, "50:150", 101, False), (0.05, "50:151", 41, True), (0.4, None, 41, False)],
+)
+def test_longer_clips_are_chosen_or_hinted_at_in_little_light(white, frame, clip, hint, tmp_path):
+    charge = torch.rand(8, 8, generator=torch.Generator().manual_seed(0))
+    write_spikes(tmp_path / "a.npz", spike_integrate_fire(torch.full((200, 8, 8), white), charge=charge)[0])
+    words = ["predict", "--data", "Recording", "--data.path", str(tmp_path / "a.npz"), "--speed", "best"]
+    preset, said = _choice([*words, *([] if frame is None else ["--data.frame", frame])])
+    assert preset.clip == clip
+    assert ("dB better: --data.frame 50:150 leaves room for them" in said) == hint
+
+
+@pytest.mark.parametrize(
     ("every", "speed", "interpolated"),
     [
         (1, "balanced", 11),

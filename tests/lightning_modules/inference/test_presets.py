@@ -107,6 +107,52 @@ def test_a_film_is_made_by_a_network_for_films(scale):
     assert isinstance(film.build(), RecurrentCSCSR)
 
 
+def test_little_light_has_tables_of_its_own(table, monkeypatch):
+    """Those of films before those of pictures; without any, those of more light."""
+    assert choose(3, "best", white=0.1).name == choose(3, "best").name == "all"
+    lines = (table / "x3.csv").read_text().splitlines()
+    for name, best in (("x3_dim", "tfp"), ("x3_film", "tfi"), ("x3_dim_film", "no motion")):
+        rows = [line.replace(",29.", ",30.").replace(",25.0", ",30.9") for line in lines if line.startswith(best)]
+        reference = next(line for line in lines if line.startswith("all,"))
+        (table / f"{name}.csv").write_text("\n".join([lines[0], reference.replace(",30.0,", ",24.0,"), *rows]))
+        if name == "x3_dim":
+            assert choose(3, "best", white=0.1, film=True).name == "tfp"
+    found = {
+        (white, film): choose(3, "best", None, (40, 50), film, 41, white).name
+        for white in (0.05, 0.19, 0.2, 0.4)
+        for film in (False, True)
+    }
+    assert found == {
+        (0.05, False): "tfp",
+        (0.05, True): "no motion",
+        (0.19, False): "tfp",
+        (0.19, True): "no motion",
+        (0.2, False): "all",
+        (0.2, True): "tfi",
+        (0.4, False): "all",
+        (0.4, True): "tfi",
+    }
+    monkeypatch.setattr(speed, "pace", lambda *asked: asked[1] + asked[2])
+    assert choose(3, budget="2s", size=(40, 50), film=True, white=0.1).where.split(",")[1].split()[2] == "1.1"
+
+
+def test_in_little_light_the_longer_clips_are_chosen():
+    """At x4, where there are weights for them and room."""
+    for film, weights in ((False, "cscsr_huge_long_x4"), (True, "cscsr_huge_long_film_x4")):
+        assert choose(4, "best", film=film, frames=101, white=0.07).preset.weights == weights
+        assert choose(4, "best", film=film, frames=100, white=0.07).preset.clip == 41
+        assert choose(4, "best", film=film, frames=101, white=0.4).preset.weights != weights
+
+
+@pytest.mark.parametrize(("column", "cell"), [("tile", "wide"), ("psnr", "-1"), ("height", "4.5"), ("ms", "inf")])
+def test_a_damaged_table_is_named(table, column, cell):
+    lines = (table / "x3.csv").read_text().splitlines()
+    row = dict(zip(HEADER, lines[2].split(","), strict=True)) | {column: cell}
+    (table / "x3.csv").write_text("\n".join([*lines[:2], ",".join(row.values()), *lines[3:]]))
+    with pytest.raises(ValueError, match=r"x3.csv: not a table of lightning trade, or a damaged one"):
+        choose(3, "best")
+
+
 @pytest.fixture(name="longer")
 def _longer(table):
     """A table whose best setting needs clips of 101 frames."""
