@@ -37,7 +37,7 @@ SPEEDS = {"fastest": float("inf"), "fast": 1.2, "balanced": 0.3, "best": 0.005}
 DIM, _DIM_UP_TO = 0.1, 0.2
 
 #: times this close cannot be told apart, and the better preset is picked
-_AS_FAST = 1.1
+_AS_FAST = 1.2
 
 #: MiB a sensor pixel that an estimate of motion takes, which is made on the whole frame: ClassicalFlow's, measured
 _MOTION = 240 / 2**20

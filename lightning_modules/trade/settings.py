@@ -116,6 +116,10 @@ def usual_settings(
         for method, decoder in DECODERS.items()
         for name, options in decoder.shown.items()
     }
+    if usual:  # in little light a decoder, too, gains by what it sees of a longer clip
+        window = 2 * ((frames - 1) // 6) + 1
+        longer = Preset(network="ClassicalDecoder", scale=scale, method="tfp", window=window, order=3, frames=frames)
+        decoders[f"TFP {window}, order 3"] = longer
     without = [word for option in own for word in (option, "null")]  # decoders take no weights
     return [Setting(name, preset_arguments(preset), preset) for name, preset in presets.items()] + [
         Setting(name, [*preset_arguments(preset), *without], preset) for name, preset in decoders.items()

@@ -304,6 +304,8 @@ def test_usual_settings_are_those_of_the_weights_that_are_shipped(monkeypatch, t
     two = ["--model.network", "TwoSpanCSCSR", "--model.network.scale", "4", "--model.network.frames", "101"]
     assert longer["TwoSpanCSCSR"].args == two
     assert [name for name in longer if name.startswith("Two")][1:] == ["TwoSpanCSCSR, self-ensemble of 2"]
+    assert longer["TFP 33, order 3"].preset == replace(longer["TFP 13, order 3"].preset, window=33, frames=101)
+    assert "TFP 33, order 3" not in {setting.name for setting in usual_settings(4)}
     assert not [setting for setting in usual_settings(2, frames=101) if "TwoSpan" in setting.name]
 
 
