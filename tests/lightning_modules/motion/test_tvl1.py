@@ -151,6 +151,15 @@ def test_the_comparison_runs(capsys):
     main(["--clips", "3", "--patch", "32", "--rounds", "1"])
     table = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
     errors = {name.strip(): float(error) for name, error, *_ in table[2:]}
-    assert set(errors) == {"ClassicalFlow", "without Numba", "3 warps", "1 warp", "scikit-image's TV-L1", "no motion"}
+    variants = {"without Numba", "3 warps", "1 warp", "means of 49 frames at most"}
+    assert set(errors) == {"ClassicalFlow", *variants, "scikit-image's TV-L1", "no motion"}
     assert errors["ClassicalFlow"] == pytest.approx(errors["without Numba"], abs=2e-3)
+    assert errors["ClassicalFlow"] == errors["means of 49 frames at most"]  # 41 frames have no longer ones
     assert errors["ClassicalFlow"] < 0.5 * errors["no motion"]
+
+
+def test_the_comparison_in_little_light(capsys):
+    main(["--clips", "2", "--patch", "32", "--rounds", "1", "--frames", "101", "--alpha", "0.1"])
+    table = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
+    errors = {name.strip(): float(error) for name, error, *_ in table[2:]}
+    assert errors["ClassicalFlow"] < errors["means of 49 frames at most"]
