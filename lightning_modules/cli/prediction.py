@@ -108,7 +108,8 @@ def _choice(args: Sequence[str]) -> tuple[Preset, str]:
     every = min((later - clock for clock, later in pairwise(clips.chosen)), default=clips.frames + 1)
     film = every <= clips.frames  # one picture knows the other
     longest = max(clips.frames, _room(clips) if "frame" in known else clips.recording.frames // _MANY)
-    budget, asked = wishes.get("--budget"), (clips.size, film, longest, clips.white)
+    white = clips.white  # a second look would read a packed file again
+    budget, asked = wishes.get("--budget"), (clips.size, film, longest, white)
     choice = choose(scale, speed, budget, *asked)
     speeds = list(SPEEDS)
     sooner = speeds[max(speeds.index(speed) - 1, 0)] if speed else None
@@ -130,9 +131,9 @@ def _choice(args: Sequence[str]) -> tuple[Preset, str]:
         )
     preset = replace(choice.preset, interpolated=interpolated or None)
     if speed:
-        ideal = choose(scale, speed, None, clips.size, film, clips.recording.frames, clips.white)
+        ideal = choose(scale, speed, None, clips.size, film, clips.recording.frames, white)
         said += _longer(ideal, choice, clips)
-    return preset, "\n".join([*said, *_noise(preset, clips)])
+    return preset, "\n".join([*said, *_noise(preset, white)])
 
 
 def _interpolated(preset: Preset, every: int, speed: str | None) -> int:
@@ -154,9 +155,9 @@ def _longer(ideal: Choice, choice: Choice, clips: RecordingClips) -> list[str]:
     ]
 
 
-def _noise(preset: Preset, clips: RecordingClips) -> list[str]:
-    """Return a hint where a decoder has too few spikes for a picture."""
-    if not preset.method or (spikes := clips.white * preset.clip) >= _ENOUGH:
+def _noise(preset: Preset, white: float) -> list[str]:
+    """Return a hint where a decoder has too few spikes for a picture, by those of a white pixel in a frame."""
+    if not preset.method or (spikes := white * preset.clip) >= _ENOUGH:
         return []
     return [
         f"a white pixel fires {spikes:.1f} times in {preset.clip} frames: a decoder's picture is noisy; --speed fast "

@@ -33,8 +33,8 @@ _FRAMES = 41
 #: how far a speed may be below the best, in dB of the table
 SPEEDS = {"fastest": float("inf"), "fast": 1.2, "balanced": 0.3, "best": 0.005}
 
-#: spikes a frame of a white pixel in the table that is for less light than 0.4, and up to which it is asked
-DIM, _DIM_UP_TO = 0.1, 0.2
+#: spikes a frame of a white pixel below which light is little, and a table of its own is asked: between those of both
+_LITTLE_LIGHT = 0.2
 
 #: times this close cannot be told apart, and the better preset is picked
 _AS_FAST = 1.2
@@ -264,7 +264,7 @@ def choices(
 
 
 def _table(scale: int, film: bool = False, white: float = 0.4) -> list[dict[str, str]]:
-    lights, uses = ("_dim", "") if white < _DIM_UP_TO else ("",), ("_film", "") if film else ("",)
+    lights, uses = ("_dim", "") if white < _LITTLE_LIGHT else ("",), ("_film", "") if film else ("",)
     paths = [_FOLDER / f"x{scale}{light}{use}.csv" for light in lights for use in uses]
     path = next((path for path in paths if path.is_file()), paths[-1])
     if not path.is_file():
