@@ -21,6 +21,7 @@ from spikekit.kernels.gpu_warp import nearest_known, weighted_dot, weighted_gath
 
 _BLOCK = 512  # pixels of a program: four a thread, so that a thread reads four bytes or more at a time
 _STAGES = tl.constexpr(4)  # frames on their way from memory while one is worked on
+_LONGEST = 32766  # frames whose intervals, up to one more, fit into int16
 
 
 def _bytes(tensor: Tensor) -> Tensor:
@@ -167,7 +168,7 @@ def _interval_kernel(following, first, result, max_range, frames, pixels, as_lig
 def _intervals(spikes: Tensor, max_range: float = 1.0, dtype: torch.dtype | None = None) -> Tensor:
     flat = _flat(spikes)
     batch, frames, pixels = flat.shape
-    following = flat.new_empty(flat.shape, dtype=torch.int16 if frames < 32767 else torch.int32)
+    following = flat.new_empty(flat.shape, dtype=torch.int16 if frames <= _LONGEST else torch.int32)
     first = flat.new_empty(batch, pixels, dtype=torch.int32)
     launch(_next_spike_kernel, _blocks(flat), flat, following, first, frames, pixels, *flat.stride(), block=_BLOCK)
     result = following if dtype is None else flat.new_empty(flat.shape, dtype=dtype)
