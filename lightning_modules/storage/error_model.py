@@ -40,7 +40,7 @@ class ErrorModel:
     blurred: float = 0.25
     still: float = 0.18
     textured: float = 0.085
-    moved: float = 0.0013
+    moved: float = 0.00125
     faint: float = 1.3e-5
 
     def __post_init__(self) -> None:

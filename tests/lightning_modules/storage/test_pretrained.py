@@ -293,6 +293,7 @@ def test_the_list_of_weights_says_what_the_networks_are(configs):
         "large",
         "huge",
         "huge_long",
+        "huge_long",
         "large_film",
         "huge_film",
         "huge_long_film",
