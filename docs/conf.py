@@ -3,9 +3,10 @@
 import csv
 import os
 import re
-import subprocess
-import sys
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
 from pathlib import Path
+from unittest.mock import patch
 
 from docutils import nodes
 from docutils.statemachine import StringList
@@ -14,6 +15,7 @@ from sphinx.util.docutils import SphinxDirective
 
 import lightning_modules
 import spikekit
+from spikekit.cli.command import main
 
 project = "spikekit"
 author = copyright = "the spikekit contributors"
@@ -86,12 +88,12 @@ class Run(SphinxDirective):
 
 
 def _spikekit(arguments):
-    main = "import sys; from spikekit.cli.command import main; sys.exit(main())"
-    command = [sys.executable, "-c", main, *arguments.split()]
-    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "COLUMNS": "90"}, check=False)
-    if done.returncode:
-        raise RuntimeError(f"spikekit {arguments}: {done.stderr}")
-    return done.stdout
+    printed, said = StringIO(), StringIO()
+    with patch.dict(os.environ, COLUMNS="90"), redirect_stdout(printed), redirect_stderr(said):
+        code = main(arguments.split())
+    if code:
+        raise RuntimeError(f"spikekit {arguments}: {said.getvalue()}")
+    return printed.getvalue()
 
 
 def _restructured(markdown):

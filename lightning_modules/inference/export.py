@@ -60,8 +60,8 @@ class _StillFilm(nn.Module):
 
     def _meet(self, spikes: Tensor, flow: Tensor | None, state: Tensor, way: Tensor | None) -> tuple[Tensor, Tensor]:
         features = self.network.features(spikes, flow)
-        met = self.network.advance(features, [self.network.moved(state, way)])
-        state = torch.where((state != 0).any(), met, self.network.advance(features))
+        met = self.network.advance(features, spikes, [self.network.moved(state, way)])
+        state = torch.where((state != 0).any(), met, self.network.advance(features, spikes))
         return self.network.picture(state), state
 
 

@@ -156,7 +156,7 @@ class RecurrentCSCSR(CSCSR):
         if spikes.ndim == 5:
             return self.film(spikes, flow, static, every, future)[-1]
         self.check_spikes(spikes)
-        return self.picture(self.advance(self.features(spikes, self.resolve_flow(spikes, flow, static))))
+        return self.picture(self.advance(self.features(spikes, self.resolve_flow(spikes, flow, static)), spikes))
 
     def film(
         self, spikes: Tensor, flow: Tensor | None = None, static: bool = False, every: int = 20, future: int = 0
@@ -189,7 +189,8 @@ class RecurrentCSCSR(CSCSR):
         def meet(n: int, before: Tensor | None, after: Tensor | None) -> Tensor:
             ways = (None if flow is None else self.flow_to(flow[:, n], clocks) for clocks in (-every, every))
             around = zip((before, after), ways, strict=True)
-            return self.advance(features[:, n], [self.moved(state, way) for state, way in around if state is not None])
+            neighbors = [self.moved(state, way) for state, way in around if state is not None]
+            return self.advance(features[:, n], spikes[:, n], neighbors)
 
         earlier, final, last = [], [], None
         for first in range(0, spikes.shape[1], size):
@@ -209,26 +210,26 @@ class RecurrentCSCSR(CSCSR):
             flow: (B, 2, 2, H, W), or None where nothing moves.
 
         Returns:
-            The picture, as channels, and the features that it was made of, (B, 3 s^2 + width, H, W).
+            What the picture is made of, (B, width, H, W).
         """
         spikes = spikes.to(self.reconstruction.rgb.weight.dtype)
-        features = self.reconstruction.features(self._colors(spikes, flow))
-        rgb = self.reconstruction.rgb(features)
-        if self.config.skip:
-            rgb = rgb + self._base(spikes)
-        return torch.cat([F.pixel_unshuffle(rgb, self.scale), features], dim=1)
+        return self.reconstruction.features(self._colors(spikes, flow))
 
-    def advance(self, features: Tensor, neighbors: Sequence[Tensor] = ()) -> Tensor:
+    def advance(self, features: Tensor, spikes: Tensor, neighbors: Sequence[Tensor] = ()) -> Tensor:
         """Return the state of a key frame: its picture, as channels, and a memory.
 
         Args:
             features: see :meth:`features`.
+            spikes: (B, N, H, W), its clip.
             neighbors: states of its neighbours, moved to where they are in it.
 
         Returns:
             (B, 3 s^2 + memory, H, W)
         """
-        picture, features = self._parted(features)
+        rgb = self.reconstruction.rgb(features)
+        if self.config.skip:
+            rgb = rgb + self._base(spikes.to(rgb.dtype))
+        picture = F.pixel_unshuffle(rgb, self.scale)
         if neighbors:
             return self.fusion(features, picture, neighbors)
         nothing = picture.new_zeros(len(picture), self.config.memory, *picture.shape[-2:])

@@ -133,7 +133,7 @@ def test_overlays_name_what_there_is(configs):
 
 
 @pytest.mark.slow
-def test_decoders_on_vid4():
+def test_decoders_on_a_film_of_vid4():
     if not (SHARED / "video" / "vid4").is_dir():
         pytest.skip("no films of Vid4 beside the checkout")
     from lightning_modules.networks import ClassicalDecoder
@@ -141,8 +141,7 @@ def test_decoders_on_vid4():
     data = FilmScenes(str(SHARED / "video" / "vid4"), scale=4, workers=0)
     data.setup("test")
     assert data.test_names == ["foliage/00000024", "walk/00000023"]
-    clips = [data.test_set[n] for n in range(2)]
-    for method, expected in (("tfi", [20.2, 21.9]), ("tfp", [20.7, 22.5])):
-        decode = ClassicalDecoder(method, 4)
-        measured = [psnr(decode(clip["spikes"][None]), clip["rgb"][None]).item() for clip in clips]
-        assert measured == pytest.approx(expected, abs=0.3)
+    walk = data.test_set[1]
+    for method, expected in (("tfi", 21.9), ("tfp", 22.5)):
+        picture = ClassicalDecoder(method, 4)(walk["spikes"][None])
+        assert psnr(picture, walk["rgb"][None]).item() == pytest.approx(expected, abs=0.3)

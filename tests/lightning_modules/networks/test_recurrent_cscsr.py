@@ -118,7 +118,7 @@ def test_what_is_too_far_away_is_not_asked(network, clips):
     [
         ("large_film", 2_635_654, None, 2.66),
         ("large_film", 2_635_654, 0, 2.99),
-        ("large_film", 2_635_654, 4, 3.39),
+        ("large_film", 2_635_654, 4, 3.41),
         ("large_long_film", 2_661_574, 0, 3.02),
         ("huge_film", 4_180_390, 0, 4.54),
         ("huge_long_film", 4_206_310, 0, 4.56),
