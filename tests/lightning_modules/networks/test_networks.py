@@ -42,6 +42,7 @@ def test_a_trace_keeps_no_motion_of_its_example():
         ("tiny", 300_963, 0.356),
         ("large", 2_257_222, 2.66),
         ("huge", 3_783_526, 4.18),
+        ("large_long", 2_283_142, 2.68),
         ("huge_long", 3_809_446, 4.21),
     ],
 )

@@ -45,6 +45,13 @@ def test_untrained_it_is_the_network_that_it_began_as(clips):
     torch.testing.assert_close(pictures, single(spikes, flow))
 
 
+def test_what_waits_of_a_key_frame_is_only_what_its_picture_is_made_of(network, clips):
+    spikes, flow = clips
+    features = network.features(spikes, flow)
+    assert features.shape == (5, TINY["width"], 22, 26)
+    torch.testing.assert_close(network.picture(network.advance(features, spikes)), network(spikes, flow))
+
+
 def test_the_first_key_frame_is_that_of_a_single_clip_and_the_others_are_not(network, clips):
     spikes, flow = clips
     pictures, single = network(spikes[None], flow[None])[0], network(spikes, flow)
