@@ -1,6 +1,7 @@
 """Where tests run side by side (pytest -n), each has one thread; what damages files for readers."""
 
 import copy
+import gc
 import os
 import random
 import resource
@@ -14,6 +15,16 @@ import torch
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ["OMP_NUM_THREADS"] = "1"
     torch.set_num_threads(1)
+
+
+def pytest_collection_finish():
+    """The garbage collector need not look through thousands of tests and all that they import, again and again."""
+    gc.collect()
+    gc.freeze()
+
+
+def pytest_sessionfinish():
+    gc.unfreeze()
 
 
 def pytest_collection_modifyitems(items):

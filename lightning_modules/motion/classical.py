@@ -13,6 +13,7 @@ from lightning_modules.motion.estimator import MotionEstimator, split_any_size
 from spikekit import bayer_pattern, flow_warp, tfp_at
 from spikekit.check import check_planes, check_positive, check_whole
 from spikekit.flow.tvl1 import tvl1_flow
+from spikekit.kernels import compiler_kept_out
 from spikekit.sensor.quantization_noise import flicker
 
 _GREY = torch.tensor([[0.25, 0.5, 0.25]])  # each pixel the mean of the Bayer cells that it is part of
@@ -71,8 +72,7 @@ class ClassicalFlow(MotionEstimator):
     def forward(self, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> tuple[Tensor, Tensor]:  # noqa: D102
         return self._flows(spikes, times, pattern, by_site=False)
 
-    # Numba compiles its loops; torch.compiler.disable would import the compiler for those who compile nothing
-    @torch._disable_dynamo
+    @compiler_kept_out  # Numba compiles its loops
     @torch.no_grad()
     def _flows(self, spikes: Tensor, times: tuple[int, int, int], pattern: str, by_site: bool) -> tuple[Tensor, Tensor]:
         check_planes("spikes", spikes, 4, "(B, N, H, W)")

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from spikekit.check import check_planes, check_whole
-from spikekit.kernels import operator
+from spikekit.kernels import operator, register_kernel
 
 _NOT_BITS = "spikes: expected zeros and ones, got other values"
 
@@ -22,7 +22,7 @@ def _pack_bits(spikes: Tensor) -> Tensor:
     return (eights << torch.arange(8, dtype=torch.uint8, device=spikes.device)).sum(-1, dtype=torch.uint8)
 
 
-@_pack_bits.register_kernel("cpu")
+@register_kernel(_pack_bits, "cpu")
 def _(spikes: Tensor) -> Tensor:
     values = (spikes.float() if spikes.dtype is torch.bfloat16 else spikes).numpy()  # NumPy has no bfloat16
     bits = values if values.dtype == np.uint8 else values != 0
@@ -37,7 +37,7 @@ def _unpack_bits(packed: Tensor, width: int) -> Tensor:
     return ((packed[..., None] >> places) & 1).flatten(-2)[..., :width].contiguous()
 
 
-@_unpack_bits.register_kernel("cpu")
+@register_kernel(_unpack_bits, "cpu")
 def _(packed: Tensor, width: int) -> Tensor:
     return torch.from_numpy(np.unpackbits(packed.numpy(), axis=-1, count=width, bitorder="little"))
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from spikekit.check import check_dtype, check_index, check_planes, check_positive, check_whole, default_float
 from spikekit.decoders.dense import cast_light, check_window, interval_dtype
-from spikekit.kernels import operator
+from spikekit.kernels import operator, register_kernel
 
 
 def _spike_interval_at(spikes: Tensor, frame: int) -> Tensor:
@@ -40,7 +40,7 @@ def _look(fired: Tensor) -> tuple[Tensor, Tensor]:
     return first, torch.where(later.any(-3), later.byte().argmax(-3) - first, 0)
 
 
-@_operator.register_kernel("cpu")
+@register_kernel(_operator, "cpu")
 def _(spikes: Tensor, frame: int) -> Tensor:
     frames = spikes.shape[-3]
     planes = spikes.detach().movedim(-3, 0)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
+from functools import cache, wraps
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -25,10 +27,9 @@ def operator(fake: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
 
     def make(plain: Callable[..., Any]) -> Any:
         name = plain.__name__.removeprefix("_")
-        op = torch.library.custom_op(f"spikekit::{name}", plain, mutates_args=())
-        op.register_fake(fake)
+        op = custom_operator(name, plain, fake)
         if hasattr(cpu, name):
-            op.register_kernel("cpu")(getattr(cpu, name))
+            register_kernel(op, "cpu")(getattr(cpu, name))
             register_on_gpu(op, lambda *args: gpu_kernel(name)(*args))
         batch_first(op)
         return op
@@ -36,10 +37,37 @@ def operator(fake: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
     return make
 
 
+def custom_operator(name: str, plain: Callable[..., Any], fake: Callable[..., Any]) -> Any:
+    """Make the custom operator ``spikekit::name``, which ``plain`` runs where no kernel is registered."""
+    op = torch.library.custom_op(f"spikekit::{name}", plain, mutates_args=(), device_types=())
+    op.register_fake(fake)
+    register_kernel(op, "default")(plain)
+    return op
+
+
+def register_kernel(op: Any, device: str) -> Callable[[Callable[..., Any]], None]:
+    """Run a custom operator by the decorated function on a type of device.
+
+    The operator's own ``register_kernel`` would import the compiler at the first call, which takes a second or two.
+    """
+    return lambda kernel: torch.library.impl(f"spikekit::{op._name}", device, compiler_kept_out(kernel))
+
+
+def compiler_kept_out(function: Callable[..., Any]) -> Callable[..., Any]:
+    """As ``torch.compiler.disable``, which imports the compiler even for those who compile nothing."""
+    disabled = cache(lambda: torch.compiler.disable(function))
+
+    @wraps(function)
+    def run(*args: Any, **options: Any) -> Any:
+        return (disabled() if "torch._dynamo" in sys.modules else function)(*args, **options)
+
+    return run
+
+
 def register_on_gpu(op: Any, kernel: Callable[..., Any]) -> None:
     """Run a custom operator by a Triton kernel, where Triton is installed; else its own torch path runs."""
     if find_spec("triton") is not None:
-        op.register_kernel("cuda")(kernel)
+        register_kernel(op, "cuda")(kernel)
 
 
 def gpu_kernel(name: str) -> Callable[..., Any]:

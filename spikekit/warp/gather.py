@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from spikekit.check import wide_dtype
-from spikekit.kernels import cpu_warp, gpu_kernel, register_on_gpu
+from spikekit.kernels import cpu_warp, custom_operator, gpu_kernel, register_kernel, register_on_gpu
 from spikekit.kernels.layout import empty_like_layout, is_channels_last
 
 _FEW = 8  # channels: of fewer planes, a CPU gathers one after the other faster than rows of all
@@ -70,11 +70,10 @@ def fold_into_batch(op: Any, count: int) -> None:
 
 def _operator(plain: Callable[..., Tensor], fake: Callable[..., Tensor]) -> Any:
     name = f"weighted{plain.__name__}"
-    op = torch.library.custom_op(f"spikekit::{name}", plain, mutates_args=())
-    op.register_fake(fake)
+    op = custom_operator(name, plain, fake)
     rows = getattr(cpu_warp, name)
 
-    @op.register_kernel("cpu")
+    @register_kernel(op, "cpu")
     def _(first: Tensor, *others: Any) -> Tensor:
         return (rows if is_channels_last(first) or first.shape[1] >= _FEW else plain)(first, *others)
 

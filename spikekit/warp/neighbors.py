@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
-from spikekit.kernels import cpu_warp, gpu_kernel, register_on_gpu
+from spikekit.kernels import cpu_warp, custom_operator, gpu_kernel, register_kernel, register_on_gpu
 from spikekit.kernels.position_table import PositionTable
 from spikekit.warp.gather import fold_into_batch
 
@@ -207,16 +207,15 @@ def _nearest_known(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tu
     return index.reshape(shape).movedim(0, 1).contiguous(), weight.reshape(shape).movedim(0, 1).contiguous()
 
 
-nearest_known = torch.library.custom_op("spikekit::nearest_known", _nearest_known, mutates_args=())
-
-
-@nearest_known.register_fake
-def _(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
+def _fake(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
     shape = flow.shape[0], neighbors, flow.shape[2] * flow.shape[3]
     return flow.new_empty(shape, dtype=torch.int64), flow.new_empty(shape)
 
 
-@nearest_known.register_kernel("cpu")
+nearest_known = custom_operator("nearest_known", _nearest_known, _fake)
+
+
+@register_kernel(nearest_known, "cpu")
 def _(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
     if steps:
         return cpu_warp.nearest_in_table(flow, table_of(mask, neighbors, steps, flow.dtype))

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from spikekit.kernels import loops
+from spikekit.kernels import custom_operator, loops, register_kernel
 from spikekit.kernels.layout import empty_like_layout, is_channels_last
 from spikekit.warp.gather import Dot, fold_into_batch, weighted_gather, weighted_scatter
 from spikekit.warp.neighbors import NearestKnown, finite, nearest_known, table_of
@@ -35,11 +35,10 @@ def _unwarp(grad: Tensor, flow: Tensor, mask: Tensor, neighbors: int, steps: int
 
 
 def _operator(plain: Any, name: str) -> Any:
-    op = torch.library.custom_op(f"spikekit::table_{name}", plain, mutates_args=())
-    op.register_fake(lambda values, *_: empty_like_layout(values, values.shape[2]))
+    op = custom_operator(f"table_{name}", plain, lambda values, *_: empty_like_layout(values, values.shape[2]))
     fold_into_batch(op, 2)
 
-    @op.register_kernel("cpu")
+    @register_kernel(op, "cpu")
     def _(values: Tensor, flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> Tensor:
         compiled = None if is_channels_last(values) else loops.import_loops("spikekit.kernels.cpu_table")
         if compiled is None:

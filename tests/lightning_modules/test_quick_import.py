@@ -10,7 +10,7 @@ import sys
 from lightning_modules import SuperResolution
 import torch
 from lightning_modules.networks import CSCSR
-picture = SuperResolution.from_pretrained(4, "fastest")(torch.ones(1, 41, 16, 16))
+picture = SuperResolution.from_pretrained(4, "balanced")(torch.ones(1, 41, 16, 16))
 print(*sys.modules)
 """
 

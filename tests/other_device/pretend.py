@@ -6,6 +6,7 @@ It takes PyTorch's place for devices from elsewhere, ``PrivateUse1``, in the who
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import torch
@@ -67,6 +68,7 @@ class _Module(backend_registration._DummyBackendModule):
         return [torch.float16, torch.bfloat16]
 
 
+@cache
 def register() -> torch.library.Library:
     """Let this process have the device, as long as what is returned is kept."""
     backend_registration._setup_privateuseone_for_python_backend("pretend", backend_module=_Module())

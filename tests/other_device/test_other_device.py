@@ -8,17 +8,16 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).parent
+CASES = [HERE / f"{name}.py" for name in ("operators", "networks")]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("cases", "beside"), [("operators", "spikekit"), ("networks", "lightning_modules")])
-def test_on_another_device(cases, beside):
+def test_on_another_device():
     # in a process of its own: PyTorch takes up such a device for good
-    path = os.pathsep.join(
-        [str(HERE), *map(str, (HERE.parent / beside).rglob("")), *filter(None, [os.environ.get("PYTHONPATH")])]
-    )
+    folders = (folder for beside in ("spikekit", "lightning_modules") for folder in (HERE.parent / beside).rglob(""))
+    path = os.pathsep.join([str(HERE), *map(str, folders), *filter(None, [os.environ.get("PYTHONPATH")])])
     run = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-n", "0", "--noconftest", str(HERE / f"{cases}.py")],
+        [sys.executable, "-m", "pytest", "-q", "-n", "0", "--noconftest", *map(str, CASES)],
         env={**os.environ, "PYTHONPATH": path},
         cwd=HERE.parents[1],
         capture_output=True,

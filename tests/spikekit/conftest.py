@@ -1,3 +1,6 @@
+import warnings
+from contextlib import contextmanager
+
 import pytest
 import torch
 from hypothesis import settings
@@ -9,3 +12,18 @@ settings.load_profile("spikekit")
 @pytest.fixture(autouse=True)
 def _seed():
     torch.manual_seed(0)
+
+
+@pytest.fixture(name="without_kernels")
+def _without_kernels():
+    """A context in which custom operators run by their torch path on the CPU too."""
+
+    @contextmanager
+    def without_kernels(*operators):
+        with torch.library._scoped_library("spikekit", "IMPL") as library, warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # that kernels are overridden, once
+            for op in operators:
+                library.impl(op._name, op._init_fn, "CPU", allow_override=True)
+            yield
+
+    return without_kernels

@@ -157,12 +157,11 @@ def test_a_film_by_its_states_is_that_of_the_network():
 
 
 @pytest.mark.slow
-def test_a_program_of_torch_takes_any_even_size(tmp_path):
-    """And the file is one that torch alone loads."""
+def test_a_program_of_torch_takes_any_even_size(tmp_path, program):
     network = CSCSR(scale=2, resolution="sensor", motion=ClassicalFlow(), **TINY).eval()
     said = export_network(network, tmp_path / "a.pt2", "torch")
     assert said.startswith("takes spikes (1, 41, H, W) and flow (1, 2, 2, H, W), H and W even, within")
-    run = torch.export.load(tmp_path / "a.pt2").module()
+    run = program(tmp_path / "a.pt2")
     spikes, flow = (torch.rand(1, 41, 38, 20) < 0.3).float(), 3 * torch.randn(1, 2, 2, 38, 20)
     with torch.no_grad():
         torch.testing.assert_close(run(spikes, flow), network(spikes, flow), rtol=0, atol=1e-4)
@@ -224,6 +223,9 @@ def test_the_picture_of_a_recording_by_onnxruntime_alone(tmp_path, capfd):
 def test_what_has_no_weights_is_exported_by_its_name(tmp_path, capsys):
     main(["export", "ClassicalDecoder", "--format", "torch", "-o", str(tmp_path / "a.pt2")])
     assert "takes spikes (1, 41, H, W), H and W even" in capsys.readouterr().out
+    run = torch.export.load(tmp_path / "a.pt2").module()  # torch alone loads the file
+    spikes = (torch.rand(1, 41, 38, 20) < 0.3).float()
+    torch.testing.assert_close(run(spikes), ClassicalDecoder()(spikes), rtol=0, atol=1e-4)
     with pytest.raises(SystemExit, match="expected --format torch or onnx, as it has no weights"):
         main(["export", "ClassicalDecoder", "-o", str(tmp_path / "a.safetensors")])
 

@@ -300,7 +300,7 @@ def window_loop(values, window, max_range, adjoint=False):
 def test_tfp(shape, window, max_range):
     spikes = random_spikes(shape, torch.uint8)
     exact = of_pixels(lambda stream: window_loop(stream, window, max_range), spikes)
-    for out in (*FLOATS, torch.uint8):
+    for out in (*FLOATS, torch.uint8) if shape == SHAPES[-1] or not INTERPRETED else (torch.float32, torch.uint8):
         check(call("tfp", spikes, window, max_range, out), decoders._tfp._init_fn(spikes, window, max_range, out))
     for dtype in spike_types(shape):
         got = call("tfp", spikes.to(dtype), window, max_range, torch.float32)
@@ -322,9 +322,10 @@ def test_tfp_of_any_numbers():
 
 
 @computes
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(
+    ("shape", "dtype"), [*((s, FLOATS[0]) for s in SHAPES), *((SHAPES[-1], d) for d in FLOATS[1:])]
+)
 @pytest.mark.parametrize("window", [1, 5, 99])
-@pytest.mark.parametrize("dtype", FLOATS)
 def test_tfp_grad(shape, window, dtype):
     any_grad = torch.randn(shape).to(dtype)
     for grad in (any_grad, any_grad[..., :1, :].expand(shape)):
@@ -394,9 +395,14 @@ def known_pixels():
 
 
 @computes
-@pytest.mark.parametrize("which", known_pixels())
-@pytest.mark.parametrize("neighbors", [1, 4, 6])
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize(
+    ("which", "neighbors", "dtype"),
+    [
+        *((which, 4, torch.float64) for which in known_pixels()),
+        *((which, neighbors, torch.float64) for which in ("any", "one") for neighbors in (1, 6)),
+        ("green", 4, torch.float32),
+    ],
+)
 def test_nearest_known(which, neighbors, dtype):
     mask = known_pixels()[which]
     height, width = mask.shape
@@ -552,7 +558,7 @@ def compile_calls():
     stream = torch.zeros(2, 3, 4, 8)
     for x in (stream, torch.zeros(1, 1, 1, 5), torch.zeros(1, 1, 1, 1)):
         planes = x[..., 0, :, :]
-        for dtype in FLOATS:
+        for dtype in FLOATS if x is stream else FLOATS[1:2]:  # what Triton makes of a size, it makes of any type
             wide = torch.promote_types(dtype, torch.float32)
             yield "integrate_fire", x.to(dtype), 0.3, planes.to(wide), dtype
             yield "integrate_fire_grad", x.to(dtype), x.to(dtype), 0.3
@@ -571,8 +577,8 @@ def compile_calls():
     tables = [(torch.zeros(3, 8, dtype=torch.int32), torch.zeros(4, 16, dtype=torch.int32))] * 2
     for wide in FLOATS[:2]:
         yield "nearest_known", torch.zeros(1, 2, 4, 8, dtype=wide), tables, 4
-    for sizes in ((1, 1, 1, 1, 1), (2, 3, 10, 4, 7), (1, 64, 32, 4, 32)):
-        for dtype in FLOATS:
+    for sizes in ((1, 64, 32, 4, 32), (2, 3, 10, 4, 7), (1, 1, 1, 1, 1)):
+        for dtype in FLOATS if sizes[1] == 64 else FLOATS[1:2]:
             values, grad, index, weight, _ = gathering(sizes, dtype, torch.promote_types(dtype, torch.float32))
             for a, b in ((values, grad), (values.mT.contiguous().mT, grad.mT.contiguous().mT)):
                 yield "weighted_gather", a, index, weight

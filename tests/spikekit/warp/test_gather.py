@@ -1,6 +1,6 @@
 """The three bilinear operators of the warp against loops in float64, by every path, layout and dtype."""
 
-from contextlib import ExitStack
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -17,15 +17,10 @@ FLOATS = [torch.float64, torch.float32, torch.bfloat16, torch.float16]
 
 
 @pytest.fixture(params=["torch path", "one piece", "pieces"], autouse=True)
-def path(request, monkeypatch):
-    with ExitStack() as stack:
-        if request.param == "torch path":
-            for op in OPERATORS:
-                stack.enter_context(op.set_kernel_enabled("cpu", enabled=False))
-        if request.param == "pieces":
-            monkeypatch.setattr(
-                cpu_warp, "_pieces", lambda length, width: (slice(i, i + 3) for i in range(0, length, 3))
-            )
+def path(request, monkeypatch, without_kernels):
+    if request.param == "pieces":
+        monkeypatch.setattr(cpu_warp, "_pieces", lambda length, width: (slice(i, i + 3) for i in range(0, length, 3)))
+    with without_kernels(*OPERATORS) if request.param == "torch path" else nullcontext():
         yield
 
 

@@ -1,6 +1,6 @@
 """The search of known pixels: closed form and general path against brute force in whole numbers, tables, caches."""
 
-from contextlib import ExitStack
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -46,10 +46,8 @@ def check(flow, mask, neighbors=4):
 
 
 @pytest.fixture(params=["closed form", "general"])
-def path(request):
-    with ExitStack() as stack:
-        if request.param == "general":
-            stack.enter_context(nearest_known.set_kernel_enabled("cpu", enabled=False))
+def path(request, without_kernels):
+    with without_kernels(nearest_known) if request.param == "general" else nullcontext():
         yield request.param
 
 
