@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from functools import cache, wraps
+from functools import wraps
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -55,11 +55,11 @@ def register_kernel(op: Any, device: str) -> Callable[[Callable[..., Any]], None
 
 def compiler_kept_out(function: Callable[..., Any]) -> Callable[..., Any]:
     """As ``torch.compiler.disable``, which imports the compiler even for those who compile nothing."""
-    disabled = cache(lambda: torch.compiler.disable(function))
+    disabled = torch._disable_dynamo(function)  # imports it when it is called
 
     @wraps(function)
     def run(*args: Any, **options: Any) -> Any:
-        return (disabled() if "torch._dynamo" in sys.modules else function)(*args, **options)
+        return (disabled if "torch._dynamo" in sys.modules else function)(*args, **options)
 
     return run
 

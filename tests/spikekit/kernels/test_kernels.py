@@ -5,7 +5,7 @@ import torch
 
 import spikekit as sk
 from spikekit.decoders import dense as decoders
-from spikekit.kernels import cpu
+from spikekit.kernels import compiler_kept_out, cpu
 from spikekit.sensor import integrate_fire as sensor
 
 OPERATORS = {
@@ -65,6 +65,20 @@ def test_the_kernel_is_what_runs(name, args, monkeypatch, without_kernels):
         OPERATORS[name](*args)
     with without_kernels(*OPERATORS.values()):
         OPERATORS[name](*args)
+
+
+def test_the_compiler_is_kept_out():
+    traced = []
+
+    def inside(x):
+        traced.append(torch.compiler.is_compiling())
+        return x + 1
+
+    for function in (inside, compiler_kept_out(inside)):
+        torch.compiler.reset()
+        compiled = torch.compile(lambda x, function=function: function(2 * x), backend="eager")
+        assert [compiled(LIGHT).equal(2 * LIGHT + 1) for _ in range(2)] == [True, True]
+    assert traced == [True, True, False, False]
 
 
 @pytest.mark.parametrize("dtype", FLOATS)
