@@ -18,9 +18,10 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 
 def pytest_collection_finish():
-    """The garbage collector need not look through thousands of tests and all that they import, again and again."""
+    """The garbage collector need not look through thousands of tests and all that they import, nor as often."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(10_000, 20, 100)
 
 
 def pytest_sessionfinish():

@@ -39,7 +39,7 @@ ANY = {*FLOATS, *BITS}
 FLOAT32, FLOAT64 = {torch.float32}, {torch.float64}
 SENSOR = """
     light 0 everywhere; light at the threshold; light one ulp below the threshold; light 1e-12 of the threshold;
-    light 1e6 thresholds; a step from dark to saturated in one clip; constant light over 1,000,000 clocks;
+    light 1e6 thresholds; a step from dark to saturated in one clip;
     light below 0: a debt; light NaN: silent from then on; light +Inf: fires, and is empty;
     light -Inf: silent from then on; threshold 1e6; gradient at the ends of [0, threshold]; chunks equal the whole
 """
@@ -77,6 +77,7 @@ def split(names):
 
 REQUIRED = [
     *[("spike_integrate_fire", extreme, set(FLOATS)) for extreme in split(SENSOR)],
+    ("spike_integrate_fire", "constant light over 1,000,000 clocks", FLOAT32 | FLOAT64),
     ("spike_integrate_fire", "threshold 1e-6", set(FLOATS[:3])),
     ("spike_integrate_fire", "threshold 1e-6 (1e6 is no float16)", set(FLOATS[3:])),
     ("spike_integrate_fire", "1000 x 1000 x 400 stream", FLOAT32),

@@ -42,12 +42,11 @@ def version(package):
 
 
 @pytest.mark.skipif(INTERPRETED, reason="this is the interpreter")
-@pytest.mark.parametrize("which", ["not slow", pytest.param("slow", marks=pytest.mark.slow)])
-def test_by_the_interpreter(which):
+def test_by_the_interpreter():
     if version(triton) < (3, 7) and version(np) >= (2, 4):
         pytest.skip("the interpreter of this Triton does not know this NumPy")
     run = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", which, __file__],
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", __file__],
         env={**os.environ, "TRITON_INTERPRET": "1"},
         capture_output=True,
         text=True,
@@ -221,7 +220,6 @@ def test_any_value_but_0_is_a_spike():
 
 
 @computes
-@pytest.mark.slow
 def test_long_clips(monkeypatch):
     """A frame takes the interpreter two milliseconds: it sees a shorter clip, with the same types."""
     for frames, dtype in ((32766, torch.int16), (32767, torch.int32)):
