@@ -89,6 +89,7 @@ def test_old_imports_work_before_anything_else_is_imported():
     ],
 )
 def test_old_commands_run(old, new, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")  # not as wide as the terminal, for either
     said = python("-m", old, "--help")
     assert said.returncode == 0, said.stderr
     monkeypatch.setattr(sys, "argv", [new, "--help"])

@@ -48,7 +48,8 @@ def custom_operator(name: str, plain: Callable[..., Any], fake: Callable[..., An
 def register_kernel(op: Any, device: str) -> Callable[[Callable[..., Any]], None]:
     """Run a custom operator by the decorated function on a type of device.
 
-    The operator's own ``register_kernel`` would import the compiler at the first call, which takes a second or two.
+    The operator's own ``register_kernel`` would import the compiler at the first call, which takes a second or two. It
+    also looks, at every call, whether a result shares memory with an argument, which must not be; here a test does.
     """
     return lambda kernel: torch.library.impl(f"spikekit::{op._name}", device, compiler_kept_out(kernel))
 
