@@ -25,7 +25,8 @@ from lightning_modules.signatures import takes
 from spikekit import bayer_mask, demosaic, flow_warp_idw, linear_motion, split_colors, tfp_at
 from spikekit.warp.bayer_warp import bayer_warp_idw
 
-_SEARCHED = 1 << 19  # positions that are searched in one go
+_SEARCHED = 1 << 19  # positions that are searched in one go on a CPU, whose cache is small
+_SEARCHED_ELSEWHERE = 1 << 25  # where a launch costs more
 
 _MOTION_FUSIONS = {"joint": joint_motion, "independent": independent_motion, "assembled": assembled_motion}
 _RECONSTRUCTIONS = {"correlated": ColorCorrelation, "separate": SeparateColors, "early": EarlyFusion}
@@ -199,7 +200,8 @@ class CSCSR(Network):
             pixels = self._enlarge(features, mask)
             return flow_warp_idw(pixels.flatten(1, 2), offsets[:, 0], mask, **how).reshape(pixels.shape)
         # a few time points after the others: what the search needs on the way is many times its result
-        few = max(1, _SEARCHED // (offsets.shape[-2] * offsets.shape[-1]))
+        searched = _SEARCHED if features.device.type == "cpu" else _SEARCHED_ELSEWHERE
+        few = max(1, searched // (offsets.shape[-2] * offsets.shape[-1]))
         pixels = [
             flow_warp_idw(self._enlarge(part, mask), offset, mask, **how)
             for part, offset in zip(features.flatten(0, 1).split(few), offsets.flatten(0, 1).split(few), strict=True)

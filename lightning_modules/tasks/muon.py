@@ -20,22 +20,23 @@ def orthogonalized(matrix: Tensor) -> Tensor:
     Singular values that are much smaller than the largest, a thousandth or less, stay smaller.
 
     Args:
-        matrix: (M, N).
+        matrix: (*, M, N).
 
     Returns:
-        (M, N), near to :math:`U V^T` where the matrix is :math:`U S V^T`; zeros where it is zero.
+        (*, M, N), near to :math:`U V^T` where the matrix is :math:`U S V^T`; zeros where it is zero.
 
     Example:
         >>> torch.linalg.svdvals(orthogonalized(torch.diag(torch.tensor([3.0, 2.0, 1.0])))).round(decimals=1)
         tensor([1.1000, 0.7000, 0.7000])
     """
-    wide = matrix.mT if matrix.shape[0] > matrix.shape[1] else matrix
-    wide = wide / wide.norm().clamp(min=torch.finfo(wide.dtype).tiny)
+    tall = matrix.shape[-2] > matrix.shape[-1]
+    wide = matrix.mT if tall else matrix
+    wide = wide / wide.norm(dim=(-2, -1), keepdim=True).clamp(min=torch.finfo(wide.dtype).tiny)
     first, third, fifth = _QUINTIC
     for _ in range(_REPEATS):
         gram = wide @ wide.mT
         wide = first * wide + (third * gram + fifth * gram @ gram) @ wide
-    return wide.mT if matrix.shape[0] > matrix.shape[1] else wide
+    return wide.mT if tall else wide
 
 
 class MuonWithAdam(torch.optim.Optimizer):
@@ -99,20 +100,30 @@ class MuonWithAdam(torch.optim.Optimizer):
             with torch.enable_grad():
                 loss = closure()
         for group in self.param_groups:
+            alike: dict[Any, list[Tensor]] = {}
             for parameter in group["params"]:
-                if parameter.grad is not None:
-                    matrix = parameter.ndim > 1 and min(parameter.flatten(1).shape) > 3
-                    change = self._muon(parameter, group) if matrix else self._adam(parameter, group)
+                if parameter.grad is None:
+                    continue
+                if parameter.ndim > 1 and min(parameter.flatten(1).shape) > 3:
+                    alike.setdefault((parameter.shape, parameter.dtype, parameter.device), []).append(parameter)
+                else:
+                    parameter.add_(self._adam(parameter, group), alpha=-group["lr"])
+            for parameters in alike.values():  # a GPU takes longer to start an operation than to do it for all of them
+                for parameter, change in zip(parameters, self._muon(parameters, group), strict=True):
                     parameter.add_(change, alpha=-group["lr"])
         return loss
 
-    def _muon(self, parameter: Tensor, group: dict[str, Any]) -> Tensor:
-        state = self.state[parameter]
-        if not state:
-            state["momentum"] = torch.zeros_like(parameter)
-        state["momentum"].lerp_(parameter.grad, 1 - group["momentum"])
-        ahead = parameter.grad.lerp(state["momentum"], group["momentum"]).flatten(1)  # Nesterov's
-        return (0.2 * math.sqrt(max(ahead.shape)) * orthogonalized(ahead)).reshape(parameter.shape)
+    def _muon(self, parameters: list[Tensor], group: dict[str, Any]) -> Tensor:
+        """Changes of weights of one shape."""
+        for parameter in parameters:
+            if not self.state[parameter]:
+                self.state[parameter]["momentum"] = torch.zeros_like(parameter)
+            self.state[parameter]["momentum"].lerp_(parameter.grad, 1 - group["momentum"])
+        momenta = [self.state[parameter]["momentum"] for parameter in parameters]
+        gradients = [parameter.grad for parameter in parameters]
+        ahead = torch.stack(gradients).lerp(torch.stack(momenta), group["momentum"])  # Nesterov's
+        matrices = ahead.flatten(2)
+        return (0.2 * math.sqrt(max(matrices.shape[1:])) * orthogonalized(matrices)).reshape(ahead.shape)
 
     def _adam(self, parameter: Tensor, group: dict[str, Any]) -> Tensor:
         state, (first, second) = self.state[parameter], group["betas"]

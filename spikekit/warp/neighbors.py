@@ -227,9 +227,12 @@ def _(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, T
 
 
 def _on_gpu(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
-    if steps:
+    if steps & (steps - 1):  # a third has no end in binary, so that a search might decide ties otherwise than the table
         return _nearest_known(flow, mask, neighbors, steps)
-    return gpu_kernel("nearest_known")(flow, products_of(mask, neighbors), neighbors)
+    # a GPU searches sooner than it reads a table
+    wanted = _rounded(flow.double(), steps)[0] if steps else flow
+    index, weight = gpu_kernel("nearest_known")(wanted, products_of(mask, neighbors), neighbors)
+    return index, weight.to(flow.dtype)
 
 
 register_on_gpu(nearest_known, _on_gpu)

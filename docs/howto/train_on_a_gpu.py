@@ -1,0 +1,204 @@
+"""Train a network for films on one GPU: first what sees a clip, then what mixes the key frames.
+
+Processes make scenes and estimate their motion; the GPU keeps the latest of them and trains on each a few times, since
+it takes more clips than they can make. A batch has single clips and clips of films, all turned at random.
+
+    python docs/howto/train_on_a_gpu.py cscsr_huge_film_fast_x4 DIR -o new.safetensors
+"""
+
+import argparse
+import math
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import multiprocessing as mp
+
+from lightning_modules.data.loading import end_when_orphaned
+from lightning_modules.data.pictures import folder_pictures
+from lightning_modules.data.stills import StillClips
+from lightning_modules.motion import ClassicalFlow
+from lightning_modules.networks import RecurrentCSCSR
+from lightning_modules.storage.pretrained import Weights, read_weights, settings_of, write_weights
+from lightning_modules.tasks.muon import MuonWithAdam
+
+KEYS, PATTERN = 5, "RGGB"
+#: by frames of a clip: clocks between key frames (0: a single clip), motion and bend of the scenes, share of a batch
+SCENES = {
+    41: [(0, 5, 1.5, 0.4), (8, 5, 0.6, 0.35), (20, 3, 0.3, 0.25)],
+    101: [(0, 8, 1.5, 0.4), (8, 8, 1.5, 0.35), (20, 6, 0.8, 0.25)],
+}
+CYCLE = 0, 0, 1, 0, 2  # kinds of scenes, as a process makes them one after the other
+
+
+def clip_options(settings: dict, args: argparse.Namespace) -> list[dict]:
+    """Return the arguments of StillClips for every kind of scene."""
+    frames = settings["frames"]
+    shared = {"scale": settings["scale"], "frames": frames, "flow_times": (5, frames - 6), "alpha": args.alpha}
+    shared |= {"patch": args.patch, "rotation": 2.0, "brightness": tuple(args.brightness), "seed": args.seed}
+    return [
+        shared | {"key_frames": KEYS if every else 1, "every": every or 20, "motion": motion, "bend": bend}
+        for every, motion, bend, _ in SCENES[frames]
+    ]
+
+
+def make_scenes(number: int, out: mp.Queue, pictures: list[Path], options: list[dict]) -> None:
+    """Put scenes of all kinds into a queue, for ever: kind, spikes (K, N, h, w), truth and flows."""
+    torch.set_num_threads(1)
+    end_when_orphaned()
+    estimate, kinds = ClassicalFlow(), [StillClips(pictures, **given) for given in options]
+    index = number << 32
+    while True:
+        for kind in CYCLE:
+            clip = kinds[kind][index]
+            spikes, rgb = (clip[name].reshape(-1, *clip[name].shape[-3:]) for name in ("spikes", "rgb"))
+            spikes = spikes.reshape(len(rgb), -1, *spikes.shape[-2:])
+            frames = spikes.shape[1]
+            flow = torch.stack(estimate(spikes, (5, frames // 2, frames - 6), PATTERN), dim=1)
+            out.put((kind, *(part.numpy() for part in (spikes, rgb.half(), flow.half()))))
+            index += 1
+
+
+class Kept:
+    """The latest scenes of one kind, on the device."""
+
+    def __init__(self, most: int, device: str) -> None:
+        self.most, self.device, self.made, self.parts = most, device, 0, []
+
+    def add(self, *parts: np.ndarray) -> None:
+        """Keep a scene in place of the oldest."""
+        new = [torch.from_numpy(part) for part in parts]
+        self.parts = self.parts or [part.new_empty(self.most, *part.shape, device=self.device) for part in new]
+        for kept, part in zip(self.parts, new, strict=True):
+            kept[self.made % self.most].copy_(part)
+        self.made += 1
+
+    def draw(self, count: int, rng: np.random.Generator, film: bool) -> list[torch.Tensor]:
+        """Spikes, truth and flows of so many scenes (B, K, ...), or of one clip of each (B, ...)."""
+        scenes = rng.integers(min(self.made, self.most), size=count)
+        clips = () if film else (rng.integers(self.parts[0].shape[1], size=count),)
+        return [kept[scenes, *clips] for kept in self.parts]
+
+
+def turned(spikes, rgb, flow, rng):
+    """Backwards in time or transposed, neither of which changes the Bayer phase RGGB; light as float32."""
+    if rng.uniform() < 0.5:
+        films = [1] if spikes.ndim == 5 else []
+        spikes, rgb, flow = spikes.flip([*films, -3]), rgb.flip(films), flow.flip([*films, -4])
+    if rng.uniform() < 0.5:
+        spikes, rgb, flow = spikes.mT, rgb.mT, flow.mT.flip(-3)
+    return spikes, rgb.float(), flow.float()
+
+
+def widened(source: str, width: int | None, alpha: float) -> RecurrentCSCSR:
+    """Return the network of some weights, with more channels, which nothing hears yet, where the colours are one."""
+    weights = read_weights(source)
+    settings = {name: value for name, value in weights.settings.items() if name != "class"}
+    network = RecurrentCSCSR(**settings | {"alpha": alpha} | ({"end_width": width} if width else {}), steps=0)
+    state = network.state_dict()
+    for name, old in weights.tensors.items():
+        new = state[name]
+        if new.shape != old.shape:
+            new[: len(old)] = 0
+        new[tuple(slice(side) for side in old.shape)] = old.float()
+    network.load_state_dict(state)
+    network.scale_picture(settings["alpha"] / alpha)
+    return network
+
+
+def optimizers(parameters: list[torch.Tensor], lr: float) -> list[torch.optim.Optimizer]:
+    """Muon for layers, Adam for the rest, in one launch on a GPU."""
+    layers = [p for p in parameters if p.ndim > 1 and min(p.flatten(1).shape) > 3]
+    rest = [p for p in parameters if not any(p is layer for layer in layers)]
+    return [MuonWithAdam(layers, lr=lr), torch.optim.Adam(rest, lr=lr, betas=(0.9, 0.99), fused=True)]
+
+
+def train(parameters, loss_of, steps, lr, what) -> None:
+    """Take so many steps, the rate rising over a hundred of them and falling along a cosine."""
+    both, mean, start = optimizers(parameters, lr), None, time.monotonic()
+    for n in range(steps):
+        for group in (group for optimizer in both for group in optimizer.param_groups):
+            group["lr"] = lr * (0.503 + 0.5 * math.cos(math.pi * n / steps)) * min(1, (n + 1) / 100)
+        loss = loss_of()
+        loss.backward()
+        for optimizer in both:
+            optimizer.step()
+            optimizer.zero_grad()
+        mean = loss.detach() if mean is None else mean.lerp(loss.detach(), 0.02)
+        if not (n + 1) % 100 or n + 1 == steps:
+            print(f"{what}: {n + 1} of {steps} steps, {time.monotonic() - start:.0f} s, loss {mean:.5f}", flush=True)
+
+
+def main() -> None:
+    """Train, and write the weights."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("weights", help="of a network for films to begin with: a name of the package, or a file")
+    parser.add_argument("pictures", type=Path, help="folder of training pictures")
+    parser.add_argument("-o", "--output", default="new.safetensors")
+    parser.add_argument("--steps", type=int, default=4300, help="of clips")
+    parser.add_argument("--film-steps", type=int, default=500, help="of films, the rest being frozen")
+    parser.add_argument("--width", type=int, help="channels where the colours are one, instead of those of the weights")
+    parser.add_argument("--batch", type=int, default=24, help="clips in a step")
+    parser.add_argument("--patch", type=int, default=48, help="side of a clip in sensor pixels")
+    parser.add_argument("--lr", type=float, default=5e-4)
+    parser.add_argument("--alpha", type=float, default=0.6)
+    parser.add_argument("--brightness", type=float, nargs=2, default=(0.3, 1.2))
+    parser.add_argument("--workers", type=int, default=12, help="processes that make scenes")
+    parser.add_argument("--kept", type=int, default=6000, help="scenes of each kind on the GPU")
+    parser.add_argument("--seed", type=int, default=1)
+    args = parser.parse_args()
+    torch.manual_seed(args.seed)
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    network = widened(args.weights, args.width, args.alpha)
+    options = clip_options(network.settings, args)
+    context = mp.get_context("spawn")
+    queue, pictures = context.Queue(4 * args.workers), folder_pictures(args.pictures)
+    for number in range(args.workers):
+        context.Process(target=make_scenes, args=(number, queue, pictures, options), daemon=True).start()
+    kinds = SCENES[network.config.frames]
+    kept = [Kept(args.kept, device) for _ in kinds]
+
+    def keep() -> None:
+        while True:
+            kind, *parts = queue.get()
+            kept[kind].add(*parts)
+
+    threading.Thread(target=keep, daemon=True).start()
+    network.to(device).to(memory_format=torch.channels_last)
+    torch.backends.cudnn.benchmark = True
+    rng = np.random.default_rng(args.seed)
+    while min(scenes.made for scenes in kept) < min(40, args.batch):
+        time.sleep(0.2)
+
+    def loss_of_clips():
+        counts = [max(1, round(args.batch * share)) for *_, share in kinds]
+        parts = [scenes.draw(count, rng, film=False) for scenes, count in zip(kept, counts, strict=True)]
+        spikes, rgb, flow = turned(*map(torch.cat, zip(*parts, strict=True)), rng)
+        with torch.autocast(device, torch.bfloat16):
+            return F.l1_loss(network(spikes, flow), rgb)
+
+    def loss_of_films():
+        kind = int(rng.integers(1, len(kinds)))
+        spikes, rgb, flow = turned(*kept[kind].draw(max(1, args.batch // KEYS), rng, film=True), rng)
+        future = (KEYS - 1) * int(rng.integers(2))
+        with torch.autocast(device, torch.bfloat16):
+            films = network.film(spikes, flow, every=kinds[kind][0], future=future)
+        if not future:
+            return F.l1_loss(films[0][:, 1:], rgb[:, 1:])
+        return (F.l1_loss(films[0][:, :-1], rgb[:, :-1]) + F.l1_loss(films[1], rgb)) / 2
+
+    parts = ("clips", loss_of_clips, args.steps, False), ("films", loss_of_films, args.film_steps, True)
+    for what, loss_of, steps, mixing in parts:
+        for name, parameter in network.named_parameters():
+            parameter.requires_grad_(name.startswith("fusion.") == mixing)
+        train([p for p in network.parameters() if p.requires_grad], loss_of, steps, args.lr, what)
+    print("scenes made:", [scenes.made for scenes in kept])
+    tensors = {name: value.cpu().half() for name, value in network.state_dict().items()}
+    write_weights(Weights(Path(args.output), settings_of(network), {}, tensors), args.output)
+
+
+if __name__ == "__main__":
+    main()
