@@ -21,7 +21,9 @@ import torch
 from torch import nn
 
 import spikekit as sk
-from spikekit import extremes
+from lightning_modules.networks import RecurrentCSCSR
+from lightning_modules.storage.pretrained import Weights, read_weights, settings_of, write_weights
+from spikekit import extremes, write_picture
 from spikekit.cli.command import main
 from spikekit.extremes.table import Measured
 
@@ -240,6 +242,29 @@ def built(tmp_path_factory):
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return folder / "pages"
+
+
+@pytest.mark.slow
+def test_the_script_for_a_gpu_trains(tmp_path):
+    network = RecurrentCSCSR(scale=2, width=8, representation_width=8, features=1, stages=1, end_blocks=1, skip=True)
+    write_weights(Weights(tmp_path, settings_of(network), {}, network.state_dict()), tmp_path / "old.safetensors")
+    for n in range(2):
+        write_picture(tmp_path / "pictures" / f"{n}.png", torch.rand(3, 80, 90))
+    small = {"steps": 3, "film-steps": 2, "batch": 5, "patch": 12, "workers": 1, "kept": 4, "width": 10, "lr": 1e-2}
+    script = [sys.executable, DOCS / "howto" / "train_on_a_gpu.py", "old.safetensors", "pictures"]
+    script += [part for name, value in small.items() for part in (f"--{name}", str(value))]
+    done = subprocess.run(script, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"clips: 3 of 3 steps, .*films: 2 of 2 steps, ", done.stdout, flags=re.DOTALL)
+    old, new = network.state_dict(), read_weights(tmp_path / "new.safetensors")
+    assert new.settings["end_width"] == 10
+    assert new.settings["alpha"] == 0.6
+    for name, value in new.tensors.items():
+        assert value.isfinite().all(), name
+        before = old[name].half() if "rgb" not in name else old[name] * 0.4 / 0.6
+        assert not torch.equal(value[tuple(slice(side) for side in before.shape)], before.half()), (
+            f"{name} has learned nothing"
+        )
 
 
 @pytest.mark.slow

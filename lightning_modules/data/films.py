@@ -335,7 +335,7 @@ class FilmScenes(ClipScenes):
         cache: folder where simulated clips are kept, found again by the content of their frames, by all settings and
             by the code of the simulator. It is never emptied: delete it, or files in it, at any time. Null for none.
         batch_size: training clips in a batch; everything else goes one by one.
-        workers: processes that make clips. Null takes one less than there are cores, eight at most.
+        workers: processes that make clips. Null takes one less than there are cores, sixteen at most.
         seed: where chance begins. The same seed gives the same clips, whatever the number of workers.
     """
 

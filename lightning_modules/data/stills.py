@@ -290,7 +290,7 @@ class StillScenes(ClipScenes):
         train_clips: training clips in an epoch. They are new in every epoch.
         val_clips: validation clips, the same every time; also those of ``test``.
         batch_size: clips in a batch.
-        workers: processes that make clips. Null takes one less than there are cores, eight at most: one core is left
+        workers: processes that make clips. Null takes one less than there are cores, sixteen at most: one core is left
             to training.
         seed: where chance begins. The same seed gives the same clips, whatever the number of workers.
     """

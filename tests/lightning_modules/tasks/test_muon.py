@@ -53,6 +53,25 @@ def test_a_convolution_is_the_matrix_of_its_output_channels():
     assert torch.allclose(_steps(MuonWithAdam([last]), last, gradients).flatten(1), expected, atol=1e-6)
 
 
+def test_layers_of_one_shape_do_not_see_each_other():
+    torch.manual_seed(0)
+    shapes = [(8, 4, 3, 3), (8, 4, 3, 3), (6, 8), (8, 4, 3, 3), (8, 6), (5,)]
+    start = [torch.randn(shape) for shape in shapes]
+    gradients = [[10.0**n * torch.randn(shape) for n, shape in enumerate(shapes)] for _ in range(3)]
+    together, alone = ([nn.Parameter(one.clone()) for one in start] for _ in range(2))
+    optimizers = [MuonWithAdam(together, lr=1e-2), *(MuonWithAdam([one], lr=1e-2) for one in alone)]
+    for step in gradients:
+        for parameters in (together, alone):
+            for parameter, gradient in zip(parameters, step, strict=True):
+                parameter.grad = gradient.clone()
+        together[1].grad = alone[1].grad = None  # one that does not learn
+        for optimizer in optimizers:
+            optimizer.step()
+    assert torch.equal(together[1], start[1])
+    for one, other in zip(together, alone, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
+
+
 @pytest.mark.parametrize("shape", [(7,), (16, 3), (3, 16, 3, 3), ()])
 def test_biases_and_layers_of_three_channels_are_left_to_adam(shape):
     torch.manual_seed(0)
