@@ -37,10 +37,10 @@ class ErrorModel:
 
     flat: float = 12.0
     grainy: float = 1.7
-    blurred: float = 0.25
+    blurred: float = 0.26
     still: float = 0.18
-    textured: float = 0.085
-    moved: float = 0.00125
+    textured: float = 0.07
+    moved: float = 0.00078
     faint: float = 1.3e-5
 
     def __post_init__(self) -> None:
