@@ -100,10 +100,17 @@ def test_films_have_a_table_of_their_own(table):
         choose(4, "fastest", film=True)
 
 
-@pytest.mark.parametrize("scale", [2, 3, 4])
-def test_a_film_is_made_by_a_network_for_films(scale):
+@pytest.mark.parametrize(
+    ("scale", "expected"),
+    [
+        (2, ("cscsr_huge_film_fast_x2", "cscsr_huge_x2")),
+        (3, ("cscsr_large_film_x3", "cscsr_large_x3")),
+        (4, ("cscsr_huge_film_fast_x4", "cscsr_huge_x4")),
+    ],
+)
+def test_a_film_is_made_by_a_network_for_films(scale, expected):
     film, picture = (choose(scale, "balanced", film=film).preset for film in (True, False))
-    assert [film.weights, picture.weights] == [f"cscsr_large_film_x{scale}", f"cscsr_large_x{scale}"]
+    assert (film.weights, picture.weights) == expected
     assert isinstance(film.build(), RecurrentCSCSR)
 
 
@@ -198,7 +205,7 @@ def test_a_recording_says_how_much_room_there_is(longer, total, frame, expected)
     assert f"\n{count} {'picture' if count == 1 else 'pictures'}, " in said
 
 
-@pytest.mark.parametrize(("every", "name"), [(41, "cscsr_large_film_x4"), (42, "cscsr_large_x4")])
+@pytest.mark.parametrize(("every", "name"), [(41, "cscsr_huge_film_fast_x4"), (42, "cscsr_huge_x4")])
 @pytest.mark.parametrize("output", ["film.mp4", "pictures"])
 def test_pictures_that_know_each_other_are_a_film(tmp_path, every, name, output):
     write_spikes(tmp_path / "recording.npz", torch.zeros(200, 6, 6, dtype=torch.uint8))
