@@ -20,10 +20,10 @@ def orthogonalized(matrix: Tensor) -> Tensor:
     Singular values that are much smaller than the largest, a thousandth or less, stay smaller.
 
     Args:
-        matrix: (*, M, N).
+        matrix: :math:`(*, M, N)`.
 
     Returns:
-        (*, M, N), near to :math:`U V^T` where the matrix is :math:`U S V^T`; zeros where it is zero.
+        :math:`(*, M, N)`, near to :math:`U V^T` where the matrix is :math:`U S V^T`; zeros where it is zero.
 
     Example:
         >>> torch.linalg.svdvals(orthogonalized(torch.diag(torch.tensor([3.0, 2.0, 1.0])))).round(decimals=1)
