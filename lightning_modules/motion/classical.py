@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from itertools import groupby
 
 import torch
 from kornia.filters import filter2d_separable, gaussian_blur2d, get_gaussian_kernel1d
@@ -81,13 +80,13 @@ class ClassicalFlow(MotionEstimator):
             expected = f"(B, N, H, W) of at least 2 x 2 pixels, with frames before and after the middle, {middle}"
             raise ValueError(f"spikes: expected {expected}, got {tuple(spikes.shape)}")
         bayer_pattern(pattern)
-        runs = [(window, len(list(clips))) for window, clips in groupby(map(_window, spikes))]
-        parts = spikes.split([count for _, count in runs])  # clips that need one window are seen at once
+        alike = clips_by_window(spikes)  # clips that need one window are seen at once
         velocities = [
-            self._of_window(part, middle, window, pattern, by_site)
-            for part, (window, _) in zip(parts, runs, strict=True)
+            self._of_window(spikes if len(alike) == 1 else spikes[clips], middle, window, pattern, by_site)
+            for window, clips in alike.items()
         ]
-        before, after = torch.cat(velocities, dim=-5).unbind(dim=-4)
+        order = torch.tensor([clip for clips in alike.values() for clip in clips], device=spikes.device).argsort()
+        before, after = torch.cat(velocities, dim=-5).index_select(-5, order).unbind(dim=-4)
         return before * (first - middle), after * (last - middle)
 
     def _of_window(self, spikes: Tensor, middle: int, window: int, pattern: str, by_site: bool) -> Tensor:
@@ -125,11 +124,16 @@ class ClassicalFlow(MotionEstimator):
         return f"attachment={self.attachment}, warps={self.warps}"
 
 
-def _window(clip: Tensor) -> int:
-    """Window of the means of a clip (N, H, W), in frames."""
-    rate = clip.mean(dtype=torch.float32).clamp(min=1 / clip.numel()).item()
-    longest = _LONGEST * max((_LIGHT / rate) ** 0.5, 1)
-    return 2 * max(int(min((len(clip) - 1) // 6, longest / 2)), 1) + 1
+def clips_by_window(spikes: Tensor) -> dict[int, list[int]]:
+    """Windows of the means of clips (B, N, H, W), in frames, and which clips have each."""
+    frames, found = spikes.shape[1], {}
+    wide = torch.float32 if spikes.is_floating_point() else None
+    for clip, fired in enumerate(spikes.flatten(1).sum(dim=1, dtype=wide).tolist()):
+        rate = max(fired, 1) / spikes[0].numel()
+        longest = _LONGEST * max((_LIGHT / rate) ** 0.5, 1)
+        window = 2 * max(int(min((frames - 1) // 6, longest / 2)), 1) + 1
+        found.setdefault(window, []).append(clip)
+    return found
 
 
 def _decode(spikes: Tensor, middle: int, window: int) -> tuple[Tensor, Tensor]:
