@@ -128,7 +128,7 @@ def clips_by_window(spikes: Tensor) -> dict[int, list[int]]:
     """Windows of the means of clips (B, N, H, W), in frames, and which clips have each."""
     frames, found = spikes.shape[1], {}
     wide = torch.float32 if spikes.is_floating_point() else None
-    for clip, fired in enumerate(spikes.flatten(1).sum(dim=1, dtype=wide).tolist()):
+    for clip, fired in enumerate(spikes.flatten(1).sum(dim=1, dtype=wide).cpu().tolist()):
         rate = max(fired, 1) / spikes[0].numel()
         longest = _LONGEST * max((_LIGHT / rate) ** 0.5, 1)
         window = 2 * max(int(min((frames - 1) // 6, longest / 2)), 1) + 1
