@@ -16,6 +16,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import multiprocessing as mp
+from torch.optim.lr_scheduler import LambdaLR
 
 from lightning_modules.data.loading import end_when_orphaned
 from lightning_modules.data.pictures import folder_pictures
@@ -109,24 +110,16 @@ def widened(source: str, width: int | None, alpha: float) -> RecurrentCSCSR:
     return network
 
 
-def optimizers(parameters: list[torch.Tensor], lr: float) -> list[torch.optim.Optimizer]:
-    """Muon for layers, Adam for the rest, in one launch on a GPU."""
-    layers = [p for p in parameters if p.ndim > 1 and min(p.flatten(1).shape) > 3]
-    rest = [p for p in parameters if not any(p is layer for layer in layers)]
-    return [MuonWithAdam(layers, lr=lr), torch.optim.Adam(rest, lr=lr, betas=(0.9, 0.99), fused=True)]
-
-
 def train(parameters, loss_of, steps, lr, what) -> None:
     """Take so many steps, the rate rising over a hundred of them and falling along a cosine."""
-    both, mean, start = optimizers(parameters, lr), None, time.monotonic()
+    optimizer, mean, start = MuonWithAdam(parameters, lr=lr), None, time.monotonic()
+    rate = LambdaLR(optimizer, lambda n: (0.503 + 0.5 * math.cos(math.pi * n / max(steps, 1))) * min(1, (n + 1) / 100))
     for n in range(steps):
-        for group in (group for optimizer in both for group in optimizer.param_groups):
-            group["lr"] = lr * (0.503 + 0.5 * math.cos(math.pi * n / steps)) * min(1, (n + 1) / 100)
         loss = loss_of()
         loss.backward()
-        for optimizer in both:
-            optimizer.step()
-            optimizer.zero_grad()
+        optimizer.step()
+        optimizer.zero_grad()
+        rate.step()
         mean = loss.detach() if mean is None else mean.lerp(loss.detach(), 0.02)
         if not (n + 1) % 100 or n + 1 == steps:
             print(f"{what}: {n + 1} of {steps} steps, {time.monotonic() - start:.0f} s, loss {mean:.5f}", flush=True)
@@ -153,6 +146,9 @@ def main() -> None:
     torch.manual_seed(args.seed)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     network = widened(args.weights, args.width, args.alpha)
+    if network.config.frames not in SCENES or network.pattern != PATTERN:
+        got = f"{network.config.frames} and {network.pattern}"
+        parser.error(f"weights: expected those of clips of 41 or 101 frames, behind {PATTERN}, got {got}")
     options = clip_options(network.settings, args)
     context = mp.get_context("spawn")
     queue, pictures = context.Queue(4 * args.workers), folder_pictures(args.pictures)

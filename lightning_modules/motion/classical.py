@@ -80,7 +80,7 @@ class ClassicalFlow(MotionEstimator):
             expected = f"(B, N, H, W) of at least 2 x 2 pixels, with frames before and after the middle, {middle}"
             raise ValueError(f"spikes: expected {expected}, got {tuple(spikes.shape)}")
         bayer_pattern(pattern)
-        alike = clips_by_window(spikes)  # clips that need one window are seen at once
+        alike = _clips_by_window(spikes)  # clips that need one window are seen at once
         velocities = [
             self._of_window(spikes if len(alike) == 1 else spikes[clips], middle, window, pattern, by_site)
             for window, clips in alike.items()
@@ -124,7 +124,7 @@ class ClassicalFlow(MotionEstimator):
         return f"attachment={self.attachment}, warps={self.warps}"
 
 
-def clips_by_window(spikes: Tensor) -> dict[int, list[int]]:
+def _clips_by_window(spikes: Tensor) -> dict[int, list[int]]:
     """Windows of the means of clips (B, N, H, W), in frames, and which clips have each."""
     frames, found = spikes.shape[1], {}
     wide = torch.float32 if spikes.is_floating_point() else None

@@ -141,14 +141,14 @@ def test_the_less_light_the_longer_are_the_means(frames, rate, window):
     clip = torch.zeros(frames, 20, 20)
     clip.flatten()[: round(rate * clip.numel())] = 1
     for dtype in (torch.uint8, torch.bool, torch.bfloat16, torch.float64):
-        assert classical.clips_by_window(clip.to(dtype)[None]) == {window: [0]}
+        assert classical._clips_by_window(clip.to(dtype)[None]) == {window: [0]}
 
 
 def test_every_clip_of_a_batch_is_seen_by_its_own_light():
     dark = moving((0.2, 0.1), frames=101, alpha=0.05)
     bright = moving((0.2, 0.1), frames=101, alpha=0.8)
     both = torch.cat([dark, bright, moving((-0.2, 0.1), frames=101, alpha=0.05)])
-    (longer, first), (shorter, second) = classical.clips_by_window(both).items()
+    (longer, first), (shorter, second) = classical._clips_by_window(both).items()
     assert longer > shorter
     assert (first, second) == ([0, 2], [1])
     for estimate in (ClassicalFlow(), ClassicalFlow().channel_flows):
