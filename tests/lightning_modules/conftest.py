@@ -1,3 +1,5 @@
+import multiprocessing
+import os
 from pathlib import Path
 
 import numpy as np
@@ -5,11 +7,31 @@ import pytest
 import torch
 from skimage import io
 
+from lightning_modules.__main__ import main
+
 
 @pytest.fixture
 def configs():
     """The folder of configurations, which is not part of the installed packages."""
     return Path(__file__).parents[2] / "configs"
+
+
+@pytest.fixture(name="forked")
+def _forked():
+    """``lightning`` in a process of its own, which has imported all that this one has; another would take seconds."""
+
+    def quietly(words):
+        nothing = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nothing, 1)
+        os.dup2(nothing, 2)
+        main([*map(str, words)])
+
+    def start(words):
+        process = multiprocessing.get_context("fork").Process(target=quietly, args=(words,))
+        process.start()
+        return process
+
+    return start
 
 
 @pytest.fixture(name="convolutions")

@@ -109,16 +109,15 @@ def test_resumed_run_equals_an_unbroken_one(trained, overlay, configs, tmp_path,
     assert any(not before[name].equal(value) for name, value in unbroken["state_dict"].items())
 
 
-def _killed(args, seen, moment):
-    """Run a command and kill it, a moment after ``seen`` says so; return what processes it had started by then."""
-    command = [sys.executable, "-m", "lightning_modules", *map(str, args)]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        while process.poll() is None and not seen():
-            time.sleep(0.002)
-        time.sleep(moment)
-        children = Path(f"/proc/{process.pid}/task/{process.pid}/children")  # Linux has it
-        started = children.read_text().split() if children.exists() else []
-        process.kill()
+def _killed(process, seen, moment):
+    """Kill a process a moment after ``seen`` says so; return what processes it had started by then."""
+    while process.is_alive() and not seen():
+        time.sleep(0.002)
+    time.sleep(moment)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")  # Linux has it
+    started = children.read_text().split() if children.exists() else []
+    process.kill()
+    process.join()
     return [int(pid) for pid in started]
 
 
@@ -139,14 +138,14 @@ def _alive(pid):
 
 
 @pytest.mark.slow
-def test_a_training_that_is_killed_goes_on(trained, overlay, configs, tmp_path):
+def test_a_training_that_is_killed_goes_on(trained, overlay, configs, tmp_path, forked):
     """What lies there under its name is whole, no worker stays, and the weights are those of an unbroken training."""
     folder = tmp_path / "checkpoints"
     args = ["fit", "-c", configs / "x4.yaml", "-c", overlay, "-o", tmp_path]
     for moment, pattern in ((0.01, "*.ckpt"), (0.0, ".*.part")):
         again = ["--ckpt_path", "last"] if any(folder.glob("*.ckpt")) else ["--data.workers", "1"]
         seen, before = partial(_files, folder, pattern), _files(folder, pattern)
-        started = _killed([*args, *again], lambda seen=seen, before=before: seen() - before, moment)
+        started = _killed(forked([*args, *again]), lambda seen=seen, before=before: seen() - before, moment)
         assert started or "--data.workers" not in again or sys.platform != "linux"
         for path in folder.glob("*.ckpt"):
             read_checkpoint(path)
@@ -164,12 +163,12 @@ def test_a_training_that_is_killed_goes_on(trained, overlay, configs, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_prediction_that_is_killed_leaves_whole_pictures(tmp_path):
+def test_a_prediction_that_is_killed_leaves_whole_pictures(tmp_path, forked):
     write_spikes(tmp_path / "a.npz", (torch.rand(70, 40, 40) < 0.3).to(torch.uint8))
     words = ["predict", "--model.weights", "cscsr_tiny_x4", "--data", "Recording", "--data.path", tmp_path / "a.npz"]
     out = tmp_path / "out"
     for moment in (0.0, 0.02, 0.1):
-        _killed([*words, "-o", out], lambda: any(out.glob(".*.part")) or any(out.glob("*.png")), moment)
+        _killed(forked([*words, "-o", out]), lambda: any(out.glob(".*.part")) or any(out.glob("*.png")), moment)
         for path in out.glob("*.png"):
             assert read_picture(path).shape == (3, 160, 160)
     assert any(path.name != ".predict.lock" for path in out.iterdir())

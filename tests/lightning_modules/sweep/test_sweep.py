@@ -4,7 +4,6 @@ import csv
 import fcntl
 import json
 import re
-import signal
 import statistics
 import subprocess
 import sys
@@ -235,20 +234,21 @@ def test_trials_of_other_settings_are_refused(swept, change, message):
 
 
 @pytest.mark.slow
-def test_a_killed_sweep_goes_on_and_ends_as_an_unbroken_one(typed, overlays, tmp_path):
+def test_a_killed_sweep_goes_on_and_ends_as_an_unbroken_one(typed, overlays, tmp_path, monkeypatch, forked):
     settings = ["data.train_clips=24", "data.val_clips=1", "model.network.features=1,2"]  # epochs of 12 steps
     sets = [word for setting in settings for word in ("--set", setting)]
     command = [*typed, "-c", str(overlays / "cosine.yaml"), *sets, "--steps", "20", "-o", str(tmp_path / "broken")]
     first, second = (tmp_path / "broken" / f"features={features}" for features in (1, 2))
-    words = [sys.executable, "-m", "lightning_modules", *command, "--every", "0.01"]
-    sweep = subprocess.Popen(words, stdout=subprocess.DEVNULL)
+    with monkeypatch.context() as patch:
+        patch.setitem(cli._ENGINES, "local", engines.run_locally)
+        sweep = forked([*command, "--every", "0.01"])
     until = time.monotonic() + 200
     while not (first / "checkpoints" / "last.ckpt").is_file():
-        assert sweep.poll() is None
+        assert sweep.is_alive()
         assert time.monotonic() < until
         time.sleep(0.02)
-    sweep.send_signal(signal.SIGKILL)  # and nobody tells the trial
-    sweep.wait()
+    sweep.kill()  # and nobody tells the trial
+    sweep.join()
     time.sleep(2)
     reached = (first / "checkpoints" / "last.ckpt").stat().st_mtime_ns
     assert 1 <= weights(first)["global_step"] < 20

@@ -5,7 +5,6 @@ import json
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -264,19 +263,19 @@ def test_a_network_that_carries_on_is_the_same_in_two_processes(carries_on, tmp_
 
 
 @pytest.mark.slow
-def test_a_killed_film_goes_on(words, tmp_path):
-    words = [*words, tmp_path / "film.mp4", "--data.every", 1]
-    with subprocess.Popen(command(words), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        begin = time.monotonic()
-        while not any((tmp_path / "film.mp4.frames").glob("*.png")) and time.monotonic() < begin + 120:
-            time.sleep(0.01)
-        process.send_signal(signal.SIGKILL)
+def test_a_killed_film_goes_on(words, tmp_path, forked):
+    words = [*words, str(tmp_path / "film.mp4"), "--data.every", "1"]
+    process, begin = forked(words), time.monotonic()
+    while not any((tmp_path / "film.mp4.frames").glob("*.png")) and time.monotonic() < begin + 120:
+        time.sleep(0.01)
+    process.kill()
+    process.join()
     left = pictures(tmp_path / "film.mp4.frames")
     assert 0 < len(left) < 59
     assert not (tmp_path / "film.mp4").exists()
     for path in (tmp_path / "film.mp4.frames").glob("*.png"):
         assert read_picture(path).shape == (3, 24, 32)
-    run(words)
+    main(words)
     assert len(read_video(tmp_path / "film.mp4")) == 59
     assert sorted(path.name for path in tmp_path.iterdir()) == ["clip.npz", "film.mp4"]
 
