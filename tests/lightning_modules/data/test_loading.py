@@ -12,15 +12,18 @@ import torch
 
 from lightning_modules.data.loading import FreshClips, OwnPart, load_clips
 
+QUICKLY = "from lightning_modules.quick_import import import_lightning; import_lightning()"
+
 # A clip is larger than a pipe: its worker waits for somebody to take it.
-LOAD = """
+LOAD = f"""
+{QUICKLY}
 import os, torch
 from lightning_modules.data.loading import load_clips
 class Clips(torch.utils.data.Dataset):
     def __len__(self): return 100
-    def __getitem__(self, index): return {"pid": torch.tensor(os.getpid()), "rgb": torch.zeros(1 << 20)}
+    def __getitem__(self, index): return dict(pid=torch.tensor(os.getpid()), rgb=torch.zeros(1 << 20))
 clips = iter(load_clips(Clips(), 1, 2))
-print(*{int(next(clips)["pid"]) for _ in range(8)}, flush=True)
+print(*set(int(next(clips)["pid"]) for _ in range(8)), flush=True)
 input()
 """
 
@@ -51,15 +54,17 @@ def test_workers_end_with_a_killed_run():
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signals")
 def test_a_process_of_several_ends_with_the_first():
-    started = """
+    started = f"""
+{QUICKLY}
 from lightning_modules.cli import command
 command.run(None, lambda *_, **__: print("begun", flush=True) or input())
 """
-    first = """
+    first = f"""
+{QUICKLY}
 import os, subprocess, sys
 from lightning_modules.cli import command
 command.run(None, lambda *_, **__: None)
-subprocess.run([sys.executable, "-c", sys.argv[1]], env={**os.environ, "LOCAL_RANK": "1"})
+subprocess.run([sys.executable, "-c", sys.argv[1]], env=dict(os.environ, LOCAL_RANK="1"))
 """
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     earlier = {**os.environ, "SPIKEKIT_FIRST_PROCESS": str(os.getpid())}  # as a run in this process would leave it
