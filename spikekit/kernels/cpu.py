@@ -82,7 +82,7 @@ def integrate_fire(light: Tensor, threshold: float, charge: Tensor, dtype: torch
 def _integrate_tile(light: np.ndarray, theta: np.floating, charge: np.ndarray, spikes: np.ndarray) -> np.ndarray:
     charge = charge.copy()
     full, rest = np.empty_like(charge), np.empty_like(charge)
-    bits = np.dtype(f"u{charge.itemsize}")
+    full_bits, rest_bits, charge_bits = (a.view(f"u{a.itemsize}") for a in (full, rest, charge))
     fired = np.empty(charge.shape, bool)
     with np.errstate(invalid="ignore", over="ignore"):
         for light_t, spikes_t in zip(light, spikes, strict=True):
@@ -91,7 +91,7 @@ def _integrate_tile(light: np.ndarray, theta: np.floating, charge: np.ndarray, s
             np.copyto(spikes_t, fired)
             np.subtract(full, theta, out=rest)
             # The smaller of the two as unsigned integers: `rest` where it is not negative, else `full`.
-            np.minimum(full.view(bits), rest.view(bits), out=charge.view(bits))
+            np.minimum(full_bits, rest_bits, out=charge_bits)
             if not charge.max() < theta:  # NaN comes this way as well
                 over = charge >= theta
                 several = full[over]
