@@ -16,6 +16,7 @@ from time import perf_counter
 from typing import Any, NoReturn
 
 import torch
+import yaml
 from jsonargparse import ArgumentParser
 from pytorch_lightning import Callback, LightningDataModule, LightningModule, Trainer
 from pytorch_lightning.callbacks import LearningRateMonitor, ModelCheckpoint
@@ -239,6 +240,12 @@ class Command(LightningCLI):
             raise InputError(str(error)) from error
         if rank_zero_only.rank == 0:
             print(f"{config.output}: {subcommand} took {duration(perf_counter() - begin)}")
+
+    def _dump_config(self) -> None:
+        # as it is there, without looking a second time at what parse_args has looked at
+        if not hasattr(self, "config_dump"):
+            text = self.parser.dump(self.config, skip_link_targets=False, skip_none=False, skip_validation=True)
+            self.config_dump = yaml.safe_load(text)[self.subcommand]
 
     def instantiate_classes(self) -> None:  # noqa: D102
         config = self.config[self.subcommand]

@@ -26,7 +26,7 @@ class Rehearsal(Command):
 
 def resolved(command: Rehearsal) -> dict[str, Any]:
     """Return the whole configuration of a verb, as plain values."""
-    return yaml.safe_load(command.parser.dump(command.config, skip_none=False))[command.verb]
+    return yaml.safe_load(command.parser.dump(command.config, skip_none=False, skip_validation=True))[command.verb]
 
 
 def mistake(error: Exception, args: Sequence[str], names: Sequence[str]) -> str:
