@@ -33,9 +33,9 @@ SPIKES = [torch.bool, torch.uint8, torch.int8, torch.int16, torch.int64, *FLOATS
 SHAPES = [(1, 1, 1), (2, 7, 1), (2, 2, 3, 3, 4), (17, 3, 4), (5, 23, 29)]  # 23 * 29 pixels are more than a block
 
 
-def spike_types(shape):
-    """All of them in the largest shape; the interpreter is slow."""
-    return SPIKES if shape == SHAPES[-1] or not INTERPRETED else SPIKES[:1]
+def types(every, shape, first=True):
+    """All of them in the largest shape, with the first of other options; the interpreter is slow."""
+    return every if (shape == SHAPES[-1] and first) or not INTERPRETED else every[:1]
 
 
 def version(package):
@@ -205,7 +205,7 @@ def of_pixels(function, *streams):
 def test_spike_interval(shape):
     spikes = random_spikes(shape, torch.bool)
     expected = of_pixels(interval_loop, spikes)
-    for dtype in SPIKES:
+    for dtype in types(SPIKES, shape):
         got = call("spike_interval", spikes.to(dtype))
         assert got.dtype is torch.int16
         check(got.double(), expected)
@@ -244,11 +244,11 @@ def test_long_clips(monkeypatch):
 def test_tfi(shape, max_range):
     spikes = random_spikes(shape, torch.uint8)
     exact = max_range / of_pixels(interval_loop, spikes)
-    for out in FLOATS:
+    for out in types(FLOATS, shape, max_range == 0.1):
         got = call("tfi", spikes, max_range, out)
         check(got, decoders._tfi._init_fn(spikes, max_range, out))
         check(got.double(), exact, rtol=2 * torch.finfo(out).eps, atol=0)
-    for dtype in spike_types(shape):
+    for dtype in types(SPIKES, shape, max_range == 0.1):
         check(call("tfi", spikes.to(dtype), max_range, torch.float32), exact.float(), rtol=1.2e-7, atol=0)
     check(call("tfi", spikes, max_range, torch.uint8), decoders._tfi._init_fn(spikes, max_range, torch.uint8))
 
@@ -299,9 +299,9 @@ def window_loop(values, window, max_range, adjoint=False):
 def test_tfp(shape, window, max_range):
     spikes = random_spikes(shape, torch.uint8)
     exact = of_pixels(lambda stream: window_loop(stream, window, max_range), spikes)
-    for out in (*FLOATS, torch.uint8) if shape == SHAPES[-1] or not INTERPRETED else (torch.float32, torch.uint8):
+    for out in (torch.uint8, *types([*FLOATS[1:], FLOATS[0]], shape, window == 3)):
         check(call("tfp", spikes, window, max_range, out), decoders._tfp._init_fn(spikes, window, max_range, out))
-    for dtype in spike_types(shape):
+    for dtype in types(SPIKES, shape, window == 3):
         got = call("tfp", spikes.to(dtype), window, max_range, torch.float32)
         check(got, exact.float(), rtol=2.4e-7, atol=0)
     check(call("tfp", spikes.double(), window, max_range, torch.float64), exact, rtol=1e-15, atol=0)
