@@ -1,5 +1,6 @@
 import multiprocessing
 import os
+import socket
 from pathlib import Path
 
 import numpy as np
@@ -20,18 +21,36 @@ def configs():
 def _forked():
     """``lightning`` in a process of its own, which has imported all that this one has; another would take seconds."""
 
-    def quietly(words):
+    def quietly(words, environment):
+        os.environ.update(environment)
         nothing = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nothing, 1)
         os.dup2(nothing, 2)
         main([*map(str, words)])
 
-    def start(words):
-        process = multiprocessing.get_context("fork").Process(target=quietly, args=(words,))
+    def start(words, **environment):
+        process = multiprocessing.get_context("fork").Process(target=quietly, args=(words, environment))
         process.start()
         return process
 
     return start
+
+
+@pytest.fixture(name="in_two_processes")
+def _in_two_processes(forked):
+    """A run of two processes, which are told of each other as Lightning, or a cluster, tells those that it starts."""
+
+    def run(words):
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = str(free.getsockname()[1])
+        words = [*words, "--trainer.devices", 2, "--trainer.strategy", "ddp"]
+        address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
+        for process in [forked(words, LOCAL_RANK=str(rank), **address) for rank in range(2)]:
+            process.join()
+            assert process.exitcode == 0
+
+    return run
 
 
 @pytest.fixture(name="convolutions")

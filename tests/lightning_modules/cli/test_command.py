@@ -216,7 +216,8 @@ def test_a_finished_run_is_not_written_over(trained, overlay, configs):
     before = weights(trained)["state_dict"]
     with pytest.raises(SystemExit, match="holds a run already"):
         main(["fit", "-c", str(configs / "x4.yaml"), "-c", str(overlay), "-o", str(trained)])
-    assert all(weights(trained)["state_dict"][name].equal(value) for name, value in before.items())
+    after = weights(trained)["state_dict"]
+    assert all(after[name].equal(value) for name, value in before.items())
 
 
 @pytest.mark.parametrize(

@@ -167,27 +167,19 @@ def test_a_program_of_torch_takes_any_even_size(tmp_path, program):
         torch.testing.assert_close(run(spikes, flow), network(spikes, flow), rtol=0, atol=1e-4)
 
 
-# Without what writes ONNX, and with more to write than is written at once.
-KILLED = """
-import sys, torch
-from lightning_modules.inference import export
-from lightning_modules.__main__ import main
-export._check_onnx = lambda: None
-export._program = lambda *_: None
-export._onnx = lambda *_: bytes(300_000_000)
-export.exported = lambda *_: export.ClassicalDecoder()
-main(["export", "ClassicalDecoder", "--still", "--format", "onnx", "-o", sys.argv[1]])
-"""
-
-
 @pytest.mark.slow
-def test_an_export_that_is_killed_leaves_what_was_there(tmp_path):
+def test_an_export_that_is_killed_leaves_what_was_there(tmp_path, monkeypatch, forked):
+    """Without what writes ONNX, and with more to write than is written at once."""
     (tmp_path / "a.onnx").write_bytes(b"old")
-    with subprocess.Popen([sys.executable, "-c", KILLED, tmp_path / "a.onnx"], stdout=subprocess.DEVNULL) as process:
-        while process.poll() is None and not any(path.stat().st_size for path in tmp_path.glob(".*.part")):
-            time.sleep(0.001)
-        process.kill()
-    assert process.returncode == -signal.SIGKILL
+    for name, value in (("_check_onnx", None), ("_program", None), ("_onnx", bytes(300_000_000))):
+        monkeypatch.setattr(export, name, lambda *_, value=value: value)
+    monkeypatch.setattr(export, "exported", lambda *_: ClassicalDecoder())
+    process = forked(["export", "ClassicalDecoder", "--still", "--format", "onnx", "-o", tmp_path / "a.onnx"])
+    while process.is_alive() and not any(path.stat().st_size for path in tmp_path.glob(".*.part")):
+        time.sleep(0.001)
+    process.kill()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
     assert (tmp_path / "a.onnx").read_bytes() == b"old"
 
 

@@ -256,9 +256,9 @@ def test_a_film_of_interpolated_pictures_goes_on_where_it_was_stopped_and_has_pa
 
 
 @pytest.mark.slow
-def test_a_network_that_carries_on_is_the_same_in_two_processes(carries_on, tmp_path):
+def test_a_network_that_carries_on_is_the_same_in_two_processes(carries_on, tmp_path, in_two_processes):
     main([*carries_on, str(tmp_path / "one"), "--model.future", "1"])
-    run(carries_on, tmp_path / "two", "--model.future", 1, "--trainer.devices", 2)
+    in_two_processes([*carries_on, tmp_path / "two", "--model.future", 1])
     assert pictures(tmp_path / "one") == pictures(tmp_path / "two")
 
 
@@ -281,14 +281,14 @@ def test_a_killed_film_goes_on(words, tmp_path, forked):
 
 
 @pytest.mark.slow
-def test_two_processes_make_what_one_makes(words, tmp_path):
+def test_two_processes_make_what_one_makes(words, tmp_path, in_two_processes):
     main([*words, str(tmp_path / "one")])
     main([*words, str(tmp_path / "one.mp4")])
     run(words, tmp_path / "two", "--trainer.devices", 2)
     assert pictures(tmp_path / "one") == pictures(tmp_path / "two")
     shutil.move(tmp_path / "two", tmp_path / "two.mp4.frames")
     (tmp_path / "two.mp4.frames" / "frame_000040.png").unlink()  # fewer pictures than processes
-    run(words, tmp_path / "two.mp4", "--trainer.devices", 2)
+    in_two_processes([*words, tmp_path / "two.mp4"])
     assert len(read_video(tmp_path / "two.mp4")) == 6
     assert (tmp_path / "two.mp4").read_bytes() == (tmp_path / "one.mp4").read_bytes()
 

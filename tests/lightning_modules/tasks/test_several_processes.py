@@ -27,14 +27,15 @@ def trained(output):
 
 
 @pytest.mark.slow
-def test_two_processes_train_as_one_with_twice_the_batch(tmp_path, monkeypatch):
+def test_two_processes_train_as_one_with_twice_the_batch(tmp_path, monkeypatch, in_two_processes):
     (tmp_path / "tiny.yaml").write_text(TINY)
     words = ["fit", "-c", CONFIGS / "x2.yaml", "-c", CONFIGS / "quick.yaml", "-c", tmp_path / "tiny.yaml"]
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    two = ["-o", tmp_path / "two", "--trainer.devices", 2, "--trainer.strategy", "ddp", "--data.batch_size", 2]
-    for steps in (["--trainer.max_steps", 3], ["--trainer.max_steps", 4, "--ckpt_path", "last"]):
-        line = [sys.executable, "-m", "lightning_modules", *words, *two, *steps]
-        subprocess.run([*map(str, line)], check=True, stdout=subprocess.DEVNULL)
+    two = [*words, "-o", tmp_path / "two", "--data.batch_size", 2, "--trainer.max_steps"]
+    in_two_processes([*two, 3])
+    devices = ["--trainer.devices", 2, "--trainer.strategy", "ddp"]
+    line = [sys.executable, "-m", "lightning_modules", *two, 4, "--ckpt_path", "last", *devices]
+    subprocess.run([*map(str, line)], check=True, stdout=subprocess.DEVNULL)
     main([*map(str, [*words, "-o", tmp_path / "one", "--trainer.max_steps", 4, "--data.batch_size", 4])])
     (ours, step, score), (theirs, theirs_step, theirs_score) = trained(tmp_path / "two"), trained(tmp_path / "one")
     assert step == theirs_step == 4
