@@ -213,8 +213,10 @@ def as_allowed(case):
     return replace(case, measure=measure)
 
 
-#: what the copied conf.py ends with: the table of extremes, whose rows have tests of their own, is not measured again
+#: what the copied conf.py ends with: the table of extremes, whose rows have tests of their own, is not measured again,
+#: and figures are small
 PRINTED = """
+plot_formats = [("png", 40)]
 _run = _spikekit
 
 

@@ -353,12 +353,12 @@ def test_steps_are_timed_whole(batches, monkeypatch, tmp_path):
 
 @pytest.mark.slow
 def test_time_ends_training(typed, overlays, tmp_path):
-    main([*typed, "--time", "00:00:02", "--set", "data.val_clips=1", "-o", str(tmp_path / "constant")])
+    main([*typed, "--time", "00:00:01", "--set", "data.val_clips=1", "-o", str(tmp_path / "constant")])
     assert not (tmp_path / "constant" / "tiny" / "plan.yaml").exists()
     checkpoint = weights(tmp_path / "constant" / "tiny")
     elapsed = checkpoint["callbacks"]["Timer"]["time_elapsed"]["train"]
     assert checkpoint["global_step"] >= 1
-    assert elapsed >= 2
+    assert elapsed >= 1
 
     cosine = [typed[1], typed[3], overlays / "cosine.yaml"]
     [trial] = make_trials(cosine, [], [], [], {"seconds": 3600}, tmp_path)

@@ -3,6 +3,7 @@ import torch
 
 from lightning_modules.networks import CSCSR
 from lightning_modules.storage.shipped import list_pretrained
+from lightning_modules.trade import halo
 from lightning_modules.trade.adaptive import main
 from lightning_modules.trade.halo import measure_halo
 
@@ -14,6 +15,8 @@ SHIPPED = [weights for weights in list_pretrained() if weights.scale and "_film_
 def test_shipped_networks_see_no_further_than_their_halo(weights, monkeypatch):
     """In float32, whose roundings are a hundredth of the bound; the next test is of what the command does."""
     monkeypatch.setattr(torch.nn.Module, "double", torch.nn.Module.float)
+    if weights.size.startswith(("large", "huge")):  # of which a smaller clip, too, shows a halo that is 2 too small
+        monkeypatch.setattr(halo, "_TILE", 32)
     network = CSCSR.from_pretrained(weights.name)
     assert network.halo == weights.halo <= CSCSR.halo
     assert measure_halo(network, start=network.halo) == network.halo

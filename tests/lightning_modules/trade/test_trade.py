@@ -365,7 +365,7 @@ MISTAKES = [
     (["--setting", "a: --model.tile '8"], "cannot be read (No closing quotation)"),
     (["--setting", "a:", "--setting", "a: --model.tile 8"], "two settings are called 'a'"),
     (["--setting", "a: --model.network.widht 3"], "did you mean model.network.width?"),
-    (["--setting", "a: --model.tile 3"], "a: tile: expected an even number"),
+    (["--setting", "good:", "--setting", "a: --model.tile 3"], "a: tile: expected an even number"),
     (["--setting", "a: --ckpt_path nowhere.ckpt"], "a: nowhere.ckpt: no such checkpoint"),
     (["--setting", "a: --data.motion 9"], "a: data.motion: expected 3.0, the same scenes for all, got 9.0"),
     (["--setting", "a: --model.network.scale 2"], "a: data.scale: expected 4, the same scenes for all, got 2"),
@@ -382,7 +382,7 @@ MISTAKES = [
 def test_mistakes_are_one_line_before_anything_runs(words, said, shared, tmp_path, monkeypatch):
     monkeypatch.setattr(cli, "measure", lambda *_: pytest.fail("something was run"))
     with pytest.raises(SystemExit) as stopped:
-        main(["trade", *shared, "--setting", "good:", "-o", str(tmp_path / "out"), *words])
+        main(["trade", *shared, "-o", str(tmp_path / "out"), *words])
     assert said in str(stopped.value)
     assert "\n" not in str(stopped.value)
     assert not (tmp_path / "out").exists()
