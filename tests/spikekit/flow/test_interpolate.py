@@ -127,15 +127,15 @@ def test_the_simple_ones():
 
 
 @pytest.mark.parametrize(("x", "y"), [(1.0, 0.5), (-2.0, 1.0), (4.5, -3.5), (10.0, 8.0)])
-@pytest.mark.parametrize("tau", [0.25, 0.5, 0.8])
-def test_known_translation(x, y, tau):
+def test_known_translation(x, y):
     scene = panning(x, y)
     between = FlowInterpolation(shrink=1)(*ends(scene))
-    truth = scene.rgb(20 * tau)
-    blend = psnr(Blend()(*ends(scene)).at(tau), truth)
-    made = psnr(between.at(tau), truth)
-    assert made > (45 if abs(x) < 8 else 29)
-    assert made > blend + 4
+    for tau in (0.25, 0.5, 0.8):
+        truth = scene.rgb(20 * tau)
+        blend = psnr(Blend()(*ends(scene)).at(tau), truth)
+        made = psnr(between.at(tau), truth)
+        assert made > (45 if abs(x) < 8 else 29), tau
+        assert made > blend + 4, tau
     inner = (slice(None), slice(24, -24), slice(24, -24))
     for flow, sign in ((between.forward, 1), (between.backward, -1)):
         assert flow.shape == (2, 96, 112)

@@ -110,7 +110,7 @@ def test_each_is_the_derivative_of_the_others(channels):
         (Dot.apply, (values, grad, index)),
     ]:
         assert gradcheck(function, args)
-        assert gradgradcheck(function, args)
+        assert gradgradcheck(function, args, fast_mode=True)  # what is linear in each is wrong in a random direction
 
 
 def test_gradient_of_what_is_asked_for_only():
