@@ -5,7 +5,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from lightning_modules.networks import CSCSR, cscsr
 from lightning_modules.networks.static_scene import WORTH_IT, rest_response
 
-TINY = {"width": 4, "representation_width": 4, "features": 2, "stages": 1, "blocks": 1, "end_blocks": 1}
+TINY = {"stride": 10, "width": 4, "representation_width": 4, "features": 2, "stages": 1, "blocks": 1, "end_blocks": 1}
 SIZES = (WORTH_IT, WORTH_IT), (WORTH_IT + 1, WORTH_IT + 2), (WORTH_IT + 4, WORTH_IT + 3)
 PATTERNS = ["RGGB", "BGGR", "GRBG", "GBRG"]
 SETTINGS = [{}, {"scale": 4, "refinement": False}, {"neighbors": 1}]
