@@ -9,7 +9,6 @@ from lightning_modules.inference.tiles import forward_in_tiles
 from lightning_modules.networks import CSCSR
 from lightning_modules.storage.error_model import ErrorModel
 from lightning_modules.storage.shipped import shipped_weights
-from lightning_modules.trade import error_fit
 from lightning_modules.trade.adaptive import main, rows, scenes
 from lightning_modules.trade.error_fit import _envelope, make_clips
 from spikekit import psnr
@@ -54,13 +53,6 @@ def test_factors_stay_above_what_they_are_fitted_to():
     assert factor > 1.2  # the plain fit is 1
 
 
-@pytest.fixture(name="_small")
-def _small_fixture(monkeypatch):
-    """Clips of half the size."""
-    monkeypatch.setattr(error_fit, "_SIZE", (64, 96))
-
-
-@pytest.mark.usefixtures("_small")
 def test_fitted_constants_keep_the_tolerance_on_clips_that_were_not_fitted(tmp_path, capsys):
     name = "cscsr_tiny_x4"
     file = tmp_path / "tiny.safetensors"
@@ -75,7 +67,6 @@ def test_fitted_constants_keep_the_tolerance_on_clips_that_were_not_fitted(tmp_p
     assert fitted != ErrorModel()
 
 
-@pytest.mark.usefixtures("_small")
 def test_shipped_constants_keep_the_tolerance_in_tiles():
     """Not the cells one by one, but what predict does."""
     network = CSCSR.from_pretrained("cscsr_tiny_x4")
