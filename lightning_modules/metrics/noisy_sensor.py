@@ -22,6 +22,7 @@ from spikekit import SensorNoise, SpikeSensor, correct_spikes, demosaic, psnr, t
 from spikekit.sensor.calibrate import calibrate, find_defects
 from spikekit.sensor.calibration import Calibration
 from spikekit.sensor.pixel_rates import PixelRates
+from spikekit.sensor.scene_calibration import calibrate_in_motion, count_segments, segment_length
 from spikekit.tables import table
 
 ALPHA, PATTERN, FRAMES, PATCH = 0.25, "BGGR", 401, 80
@@ -52,14 +53,19 @@ def measure(picture: Path, network: CSCSR, seed: int) -> dict[str, list[float]]:
     ideal = SpikeSensor(SensorNoise(photons=NOISE.photons), seed=seed).expose(light)
     flat = sensor.expose(torch.full((1000, *light.shape[1:]), 0.6 * ALPHA))
     dark = sensor.expose(torch.zeros(2000, *light.shape[1:]))
+    rates = PixelRates.of([spikes])
+    defects = find_defects(rates, PATTERN).calibration
+    segments = count_segments([spikes], segment_length(rates.rate.mean().item()))
+    moved = calibrate_in_motion(segments, defects, PATTERN)
     calibrations = {
         "none": None,
-        "from the scene": find_defects(PixelRates.of([spikes]), PATTERN).calibration,
-        "flat and dark": calibrate(_halves(flat), _halves(dark), PATTERN).calibration,
+        "from the scene: dead and hot pixels": defects,
+        "from the scene in motion": moved.calibration if moved else defects,
+        "from a flat and a dark recording": calibrate(_halves(flat), _halves(dark), PATTERN).calibration,
     }
     truth = {middle: scene.rgb(middle).float() for middle in _MIDDLES}
     scores = {name: _scores(spikes, truth, network, known) for name, known in calibrations.items()}
-    return scores | {"an ideal sensor": _scores(ideal, truth, network, None)}
+    return scores | {"none, an ideal sensor": _scores(ideal, truth, network, None)}
 
 
 def _halves(spikes: Tensor) -> tuple[PixelRates, PixelRates]:

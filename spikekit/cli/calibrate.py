@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+from torch import Tensor
 
 from spikekit.arguments import UsageError
 from spikekit.color.cfa import PATTERNS
@@ -13,9 +17,16 @@ from spikekit.io.failures import writing
 from spikekit.io.files import iter_spikes
 from spikekit.io.recording import Recording, open_recording, own_calibration
 from spikekit.progress import progress
-from spikekit.sensor.calibrate import calibrate, find_defects
-from spikekit.sensor.calibration import DEAD, HOT
+from spikekit.sensor.calibrate import Measured, calibrate, find_defects
+from spikekit.sensor.calibration import DEAD, HOT, WORKS, Calibration
 from spikekit.sensor.pixel_rates import PixelRates
+from spikekit.sensor.scene_calibration import (
+    LEAST_SEGMENTS,
+    MOST_SEGMENTS,
+    calibrate_in_motion,
+    count_segments,
+    segment_length,
+)
 
 _LEAST_FRAMES = 100
 _CHUNK = 1 << 24  # pixels that are counted at a time
@@ -26,8 +37,8 @@ def run(args: argparse.Namespace) -> None:
 
     With --flat, a recording of an evenly lit wall out of focus, every pixel gets a gain; with --dark, one with the cap
     on, a dark rate; with both, defects show best. A few thousand frames each are enough. What is uneven about the wall
-    or the lens counts as the sensor's. Without either, FILE itself shows dead and hot pixels, and no more: gain cannot
-    be told from the texture of a scene.
+    or the lens counts as the sensor's. Without either, FILE itself shows dead and hot pixels; and where its scene moves
+    across the sensor, other pixels say what each should have seen, which shows gains and dark rates as well.
 
     decode, view, info and lightning predict correct by NAME.calibration.safetensors beside NAME.dat, or by another with
     --calibration.
@@ -43,15 +54,19 @@ def run(args: argparse.Namespace) -> None:
     seen = {name: _halves(other) for name, other in (others or {"scene": recording}).items()}
     try:
         if others:
-            found = calibrate(seen.get("flat"), seen.get("dark"), recording.pattern)
+            found, said = calibrate(seen.get("flat"), seen.get("dark"), recording.pattern), None
         else:
             found = find_defects(seen["scene"][0] + seen["scene"][1], recording.pattern)
+            moved, said = _in_motion(recording, seen["scene"][0] + seen["scene"][1], found.calibration)
+            found = moved or found
     except ValueError as error:
         raise ValueError(f"{(args.flat or args.dark or args.file)}: {error}") from error
     known = found.calibration
     with writing(output):
         write_calibration(output, known.flip() if recording.flip else known)
-    works = known.defects == 0
+    works = known.defects == WORKS
+    if said:
+        print(f"gain         {said}")
     if found.gain_error is not None:
         print(f"gain         {known.gain[works].std():.2%} apart, each known to {found.gain_error:.2%}")
     if found.dark_error is not None:
@@ -68,22 +83,37 @@ def _of(args: argparse.Namespace, path: Path) -> argparse.Namespace:
 
 
 def _halves(recording: Recording) -> tuple[PixelRates, PixelRates]:
-    frames, (height, width) = recording.frames, recording.stored
+    frames, half = recording.frames, recording.frames // 2
     if frames < _LEAST_FRAMES:
         raise ValueError(f"{recording.path}: expected at least {_LEAST_FRAMES} frames to count, got {frames}")
-    chunk, half = max(1, min(_CHUNK // (height * width), 500)), frames // 2
-    halves = []
     with progress(what=recording.path.name, total=frames) as bar:
-        for start, count in ((0, half), (half, frames - half)):
-            reads = {"flip": recording.flip, "start": start, "frames": count, "chunk": chunk}
+        first, second = (
+            PixelRates.of(_parts(recording, start, count, bar)) for start, count in ((0, half), (half, frames - half))
+        )
+    return first, second
 
-            def parts(reads=reads):
-                for part in iter_spikes(recording.path, height, width, **reads):
-                    bar.update(len(part))
-                    yield recording.prepare(part)
 
-            halves.append(PixelRates.of(parts()))
-    return halves[0], halves[1]
+def _parts(recording: Recording, start: int, frames: int, bar: Any) -> Iterator[Tensor]:
+    """Read some frames in chunks (T_i, H, W)."""
+    height, width = recording.stored
+    chunk = max(1, min(_CHUNK // (height * width), 500))
+    for part in iter_spikes(
+        recording.path, height, width, flip=recording.flip, start=start, frames=frames, chunk=chunk
+    ):
+        bar.update(len(part))
+        yield recording.prepare(part)
+
+
+def _in_motion(recording: Recording, rates: PixelRates, known: Calibration) -> tuple[Measured | None, str | None]:
+    """Measure gains and dark rates in a scene that moves, or say why not."""
+    length = segment_length(rates.rate[known.defects == WORKS].mean().item())
+    least, frames = LEAST_SEGMENTS * length, min(recording.frames, MOST_SEGMENTS * length)
+    if frames < least:
+        return None, f"not measured: that takes {least} frames of a scene that moves, got {frames}"
+    with progress(what="segments counted", total=frames) as bar:
+        segments = count_segments(_parts(recording, 0, frames, bar), length)
+    found = calibrate_in_motion(segments, known, recording.pattern)
+    return found, None if found else f"not measured: too little moves in the first {frames} frames"
 
 
 def _check_output(output: Path) -> None:

@@ -12,7 +12,13 @@ def test_the_better_a_sensor_is_known_the_better_are_its_pictures(tmp_path, monk
     noisy_sensor.main()
     head, _, *rows = ([cell.strip() for cell in line.split("|")[1:-1]] for line in capsys.readouterr().out.splitlines())
     assert head == ["waves.png", "TFI", "TFP 13, order 3", "cscsr_tiny_x4"]
-    assert [row[0] for row in rows] == ["none", "from the scene", "flat and dark", "an ideal sensor"]
+    assert [row[0] for row in rows] == [
+        "none",
+        "from the scene: dead and hot pixels",
+        "from the scene in motion",
+        "from a flat and a dark recording",
+        "none, an ideal sensor",
+    ]
     for scores in zip(*(map(float, row[1:]) for row in rows), strict=True):
         assert list(scores) == sorted(scores)
         assert scores[2] > scores[0] + 3

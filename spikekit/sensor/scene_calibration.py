@@ -1,0 +1,244 @@
+"""Gains of the pixels of a sensor from any scene that moves across it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import torch
+from kornia.filters import filter2d_separable
+from torch import Tensor
+
+from spikekit.check import check_planes
+from spikekit.color.cfa import bayer_mask
+from spikekit.color.demosaic import demosaic
+from spikekit.flow.tvl1 import tvl1_flow
+from spikekit.progress import progress
+from spikekit.sensor.calibrate import Measured
+from spikekit.sensor.calibration import WORKS, Calibration, colors
+from spikekit.warp.warp import flow_warp
+
+MOST_SEGMENTS = 100  #: of a recording are enough, and what memory is for
+LEAST_SEGMENTS = 12  #: in fewer, hardly anything has moved
+_SHORTEST, _LONGEST = 20, 200  # frames of a segment
+_SPIKES = 2  # that a pixel fires in a segment, at least, as far as the longest allows
+
+_NEAR, _FAR = 3.0, 8.0  # pixels that a point has moved before another pixel sees it, and when it may look different
+_SOURCES = 16  # segments before and after one, that say what it should see
+_PATH = 8.0  # pixels of a scene that a pixel has to see before gain is told from texture
+_SHARE = 0.25  # of the pixels, at least, that have seen that much
+_AGREE = 0.3  # correlation of both halves of a recording, below which they do not say the same
+_LEAST_COUNT = 3  # segments of a half that say something about a pixel
+_LEAST_GAIN = 0.1  # less is a dead pixel
+_ROUNDS = 2
+_ATTACHMENT = 120.0  # of the flow to pictures in firing rates
+_GREY = torch.tensor([[0.25, 0.5, 0.25]])  # each pixel the mean of the Bayer cells that it is part of
+
+
+class Segments(NamedTuple):
+    """Counts of the spikes of every pixel in segments of a recording that follow each other without a gap.
+
+    Args:
+        counts: (J, H, W), uint8.
+        frames: how many each of them is long.
+    """
+
+    counts: Tensor
+    frames: int
+
+
+def segment_length(rate: float) -> int:
+    """Return how many frames a segment has where pixels fire so often in a frame."""
+    return min(max(_SHORTEST, math.ceil(_SPIKES / max(rate, 1e-9))), _LONGEST)
+
+
+def count_segments(chunks: Iterable[Tensor], frames: int) -> Segments:
+    """Count spikes in segments of so many frames; what is left over at the end does not count.
+
+    Args:
+        chunks: (T_i, H, W) of one recording, in order.
+        frames: of a segment, 1 to 255.
+
+    Raises:
+        ValueError: fewer frames than a segment has, or a segment of another length.
+
+    Example:
+        >>> count_segments([torch.ones(30, 1, 1), torch.zeros(15, 1, 1)], 20).counts.flatten().tolist()
+        [20, 10]
+    """
+    if not 1 <= frames <= 255:
+        raise ValueError(f"frames: expected 1 to 255, got {frames}")
+    counts, partial, seen = [], None, 0
+    for chunk in chunks:
+        check_planes("chunks", chunk, 3, "(T, H, W)")
+        fired = chunk != 0
+        while len(fired):
+            part, fired = fired.split([(taken := min(frames - seen, len(fired))), len(fired) - taken])
+            partial = part.sum(0) if partial is None else partial + part.sum(0)
+            seen += taken
+            if seen == frames:
+                counts.append(partial.byte())
+                partial, seen = None, 0
+    if not counts:
+        raise ValueError(f"chunks: expected at least {frames} frames, got {seen}")
+    return Segments(torch.stack(counts), frames)
+
+
+def calibrate_in_motion(segments: Segments, known: Calibration, pattern: str | None = None) -> Measured | None:
+    r"""Measure gains in a recording of any scene that moves.
+
+    .. math:: e_h = \overline{r - \hat I}_h \approx (g - 1) \, \overline{\hat I}_h, \quad h = 1, 2, \qquad
+        \sigma_g^2 = \frac{\mathrm{E}\, e_1 e_2}{\mathrm{E}\, \overline{\hat I}_1 \overline{\hat I}_2}
+
+    Convention:
+        Where the scene moves, a pixel is told what it should see by pixels that saw the same before and after: the
+        rates of up to 16 segments on either side, demosaiced and moved along the motion, of which those count that have
+        moved by 3 to 8 pixels. What a pixel fires more or less than that, on average over half a recording, is its gain
+        if it shows in both halves, and the scene's texture if it shows in one. So what both halves have in common says
+        how far gains are apart, and what they differ by, how exact they are; a pixel gets the most likely gain, given
+        both. Motion is that of TV-L1 between segments, added up. All of it is done twice, the second time with the
+        pixels corrected.
+
+        Gains stay 1 where less than 8 pixels of the scene have passed a pixel, and everywhere if that is so for three
+        quarters of the pixels or if the halves correlate by less than 0.3. Dark rates are not told from gains: a pixel
+        of much leak in little light is given a larger gain.
+
+    Args:
+        segments: counts, at least 12 of them.
+        known: the dead and hot pixels, see :func:`spikekit.sensor.calibrate.find_defects`.
+        pattern: Bayer phase; ``None`` for a grey sensor.
+
+    Returns:
+        What was measured, or ``None`` where too little moves, or the halves of the recording do not agree.
+
+    Raises:
+        ValueError: too few segments, or pixels of another size than ``known``.
+
+    Reference:
+        Registration-based non-uniformity correction: Hardie, Hayat, Armstrong and Yasuda, Scene-based nonuniformity
+        correction with video sequences and registration, Applied Optics 39(8), 2000.
+    """
+    counts = segments.counts
+    check_planes("segments", counts, 3, "(J, H, W)")
+    if len(counts) < LEAST_SEGMENTS or tuple(counts.shape[1:]) != known.size:
+        expected = f"at least {LEAST_SEGMENTS} segments of {known.size[0]} x {known.size[1]} pixels"
+        raise ValueError(f"segments: expected {expected}, got {tuple(counts.shape)}")
+    works = known.defects == WORKS
+    planes = [torch.from_numpy(plane) & works for plane in colors(known.size, pattern)]
+    measured = Measured(known)
+    with progress(what="motion and gains", total=2 * _ROUNDS * len(counts)) as bar:
+        for _ in range(_ROUNDS):
+            halves = _Halves(len(counts), known.size)
+            for number, (light, right) in enumerate(_expected(segments, measured.calibration, pattern, bar.update)):
+                halves.add(number, counts[number] / segments.frames, light, right & works, planes)
+            found = _most_likely(halves, works, planes, known)
+            if found is None:
+                return None
+            measured = found
+    return measured
+
+
+class _Halves:
+    """Means over both halves of a recording: what a pixel should see, and by how much more often it fires."""
+
+    def __init__(self, segments: int, size: tuple[int, int]) -> None:
+        self.segments = segments
+        self.count, self.light, self.excess = torch.zeros(3, 2, *size, dtype=torch.float64)
+
+    def add(self, number: int, rate: Tensor, light: Tensor, right: Tensor, planes: list[Tensor]) -> None:
+        """Add a segment: its rates, what light was expected, and at which pixels."""
+        for plane in planes:
+            seen = plane & right
+            light[plane] *= rate[seen].sum() / light[seen].sum().clamp(min=1e-9)
+        half = 2 * number // self.segments
+        self.count[half] += right
+        self.light[half] += light * right
+        self.excess[half] += (rate - light) * right
+
+
+def _expected(segments: Segments, known: Calibration, pattern: str | None, done) -> Iterator[tuple[Tensor, Tensor]]:
+    """What every segment should see, (H, W), as other pixels saw it, and where anyone did."""
+    count, size = len(segments.counts), known.size
+
+    def light(number: int) -> Tensor:
+        return known.correct(segments.counts[number] / segments.frames, pattern)
+
+    place = _places(light, count, pattern is not None, done)
+    passed = torch.stack([part.mean(0) for part in place.tensor_split(4)])
+    enough = (passed.amax(0) - passed.amin(0)).norm(dim=0) * 4 / 3 >= _PATH
+    mask = None if pattern is None else bayer_mask(*size, pattern)
+    pictures: dict[int, Tensor] = {}
+    for number in range(count):
+        rate, (total, sources) = segments.counts[number] / segments.frames, torch.zeros(2, *size)
+        near = range(max(number - _SOURCES, 0), min(number + _SOURCES + 1, count))
+        pictures = {n: pictures[n] if n in pictures else _colored(light(n), pattern) for n in near}
+        for n in near:
+            flow = place[n] - place[number]
+            far = flow.norm(dim=0)
+            use = enough & (far >= _NEAR) & (far <= _FAR) & _inside(flow)
+            if use.any():
+                seen = flow_warp(pictures[n], flow)
+                seen = use * (seen[0] if mask is None else (seen * mask).sum(0))
+                lamp = (rate * use).sum() / seen.sum().clamp(min=1e-9)  # the light of the whole scene may change
+                total += lamp * seen
+                sources += use
+        yield (total / sources.clamp(min=1)).clamp(min=0), sources > 0
+        done()
+
+
+def _places(light, count: int, color: bool, done) -> Tensor:
+    """How far what each pixel sees has moved since the first segment, (J, 2, H, W), in pixels."""
+
+    def grey(number: int) -> Tensor:
+        plane = light(number)
+        return filter2d_separable(plane[None, None], _GREY, _GREY, "reflect")[0, 0] if color else plane
+
+    pictures = [grey(0), grey(0), grey(1)]
+    velocity = []
+    for number in range(count):
+        span = min(number + 1, count - 1) - max(number - 1, 0)
+        ends = torch.stack([pictures[0], pictures[2] * (pictures[0].mean() / pictures[2].mean().clamp(min=1e-9))])[None]
+        times = torch.tensor([[max(number - 1, 0) - number, min(number + 1, count - 1) - number]]) / span
+        velocity.append(tvl1_flow(ends, times, torch.full_like(ends[:, 0], _ATTACHMENT))[0] / span)
+        pictures = [*pictures[1:], grey(number + 2) if number + 2 < count else pictures[2]]
+        done()
+    steps = torch.stack(velocity)
+    return torch.cat([torch.zeros_like(steps[:1]), (steps[1:] + steps[:-1]).cumsum(0) / 2])
+
+
+def _colored(light: Tensor, pattern: str | None) -> Tensor:
+    return light[None] if pattern is None else demosaic(light, pattern)
+
+
+def _inside(flow: Tensor) -> Tensor:
+    height, width = flow.shape[-2:]
+    x, y = flow[0] + torch.arange(width), flow[1] + torch.arange(height)[:, None]
+    return (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+
+
+def _most_likely(halves: _Halves, works: Tensor, planes: list[Tensor], known: Calibration) -> Measured | None:
+    """Gains, given what both halves of a recording say."""
+    from scipy.optimize import nnls
+
+    used = works & (halves.count >= _LEAST_COUNT).all(0)
+    if used.sum() < _SHARE * works.sum():
+        return None
+    light, excess = (part[:, used] / halves.count[:, used] for part in (halves.light, halves.excess))
+    common = excess.prod(0).mean()
+    if common < _AGREE * excess.square().mean():
+        return None
+    spread = common / light.prod(0).mean()
+    # dark pixels are less exact, relative to their light
+    terms = torch.stack([light.square().mean(0), torch.ones_like(light[0])], dim=1)
+    weight = 1 / terms.sum(1, keepdim=True).sub(1).add(terms[:, 0].mean())
+    differ = excess.diff(dim=0).square().mT / 2
+    shape, floor = nnls((terms * weight).numpy(), (differ * weight).flatten().numpy())[0]
+    error = shape * light.square() + floor + 1e-12
+    certain = (light.square() / error).sum(0) + 1 / spread
+    gain = torch.ones(known.size)
+    gain[used] += ((light * excess / error).sum(0) / certain).float()
+    gain = gain.clamp(min=_LEAST_GAIN)
+    for plane in planes:
+        gain[plane] /= gain[plane].mean()
+    return Measured(Calibration(gain, known.dark, known.defects), certain.reciprocal().mean().sqrt().item())

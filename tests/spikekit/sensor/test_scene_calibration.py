@@ -1,0 +1,146 @@
+"""A sensor measured by a scene that moves across it: found where it can be, and never invented."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch.testing import assert_close
+
+from spikekit import SensorNoise, SpikeSensor, bayer_mask, demosaic, psnr, tfp_at
+from spikekit.sensor.calibrate import find_defects
+from spikekit.sensor.calibration import DEAD, HOT, WORKS, Calibration
+from spikekit.sensor.pixel_rates import PixelRates
+from spikekit.sensor.scene_calibration import Segments, calibrate_in_motion, count_segments, segment_length
+
+SIZE, FRAMES = (44, 56), 480
+
+
+def chance(seed):
+    return torch.Generator().manual_seed(seed)
+
+
+def pictures(motion, times, size=SIZE):
+    """A blurred texture (T, 3, H, W), of colours that go together as those of scenes do; it moves by (x, y) a frame."""
+    margin = 48
+    shape = (1, 3, size[0] + 2 * margin, size[1] + 2 * margin)
+    big = torch.rand(shape, generator=chance(0))
+    big = F.avg_pool2d(F.pad(0.8 * big[:, :1] + 0.2 * big, (3, 3, 3, 3), "reflect"), 7, 1)
+    big = ((big - big.mean()) * 5 + 0.5).clamp(0.05, 1)
+    y, x = torch.meshgrid(*(torch.arange(n) + margin for n in size), indexing="ij")
+
+    def place(centre, n):
+        return 2 * (centre + 0.5) / n - 1
+
+    return torch.cat(
+        [
+            F.grid_sample(
+                big,
+                torch.stack([place(x - t * motion[0], shape[3]), place(y - t * motion[1], shape[2])], -1)[None],
+                mode="bilinear",
+                align_corners=False,
+            )
+            for t in times
+        ]
+    )
+
+
+def raw(rgb, pattern):
+    return rgb.mean(1) if pattern is None else (rgb * bayer_mask(*rgb.shape[-2:], pattern)).sum(1)
+
+
+@pytest.fixture(name="truth", scope="module")
+def _truth():
+    """Gains 6 % apart, dark rates, and a few pixels that do not work."""
+    gain = 1 + 0.06 * torch.randn(SIZE, generator=chance(1)).clamp(-3, 3)
+    dark = 0.004 * (1 + 0.4 * torch.randn(SIZE, generator=chance(2))).clamp(0, 2)
+    lot = torch.rand(SIZE, generator=chance(3))
+    defects = ((lot < 0.005) * DEAD + (lot > 0.995) * HOT).byte()
+    gain[defects != WORKS], dark[defects != WORKS] = 1, 0
+    return Calibration(gain, dark, defects)
+
+
+@pytest.fixture(name="recording", scope="module")
+def _recording(truth):
+    """Record a scene in motion, by the phase of the sensor."""
+    rgb = pictures((0.05, -0.03), range(FRAMES))
+    sensor = SpikeSensor(SensorNoise(photons=3000, calibration=truth), seed=4)
+    return rgb, {pattern: sensor.expose(0.25 * raw(rgb, pattern)) for pattern in (None, "BGGR", "GRBG")}
+
+
+def measured(spikes, pattern, known=None):
+    known = known or find_defects(PixelRates.of([spikes]), pattern).calibration
+    return calibrate_in_motion(count_segments(spikes.split(70), 20), known, pattern)
+
+
+def alike(found, expected, works):
+    return torch.corrcoef(torch.stack([found[works], expected[works]]))[0, 1].item()
+
+
+@pytest.mark.parametrize("pattern", [None, "BGGR", "GRBG"])
+def test_gains_are_found(truth, recording, pattern):
+    found = measured(recording[1][pattern], pattern)
+    known, works = found.calibration, truth.defects == WORKS
+    assert known.defects.equal(truth.defects)
+    assert alike(known.gain, truth.gain, works) > 0.75
+    error = (known.gain - truth.gain)[works].std().item()
+    assert error < 0.035
+    assert 0.5 * error < found.gain_error < 1.5 * error, "it knows how exact it is"
+    assert found.dark_error is None
+    assert not known.dark.any()
+    colours = bayer_mask(*SIZE, pattern).bool() if pattern else torch.ones(1, *SIZE).bool()
+    # where nothing was measured, gains are 1 as well
+    assert_close(
+        torch.stack([known.gain[c & works].mean() for c in colours]), torch.ones(len(colours)), atol=1e-4, rtol=0
+    )
+
+
+def test_pictures_get_better(recording):
+    rgb, spikes = recording[0], recording[1]["BGGR"]
+
+    def quality(known):
+        light = known.correct(tfp_at(spikes.float(), 240, 13, order=3), "BGGR")
+        return psnr((demosaic(light, "BGGR") / 0.25).clamp(0, 1), rgb[240]).item()
+
+    defects = find_defects(PixelRates.of([spikes]), "BGGR").calibration
+    assert quality(measured(spikes, "BGGR").calibration) > quality(defects) + 1
+
+
+def test_an_ideal_sensor_stays_one():
+    spikes = SpikeSensor(SensorNoise(photons=3000), seed=5).expose(
+        0.25 * raw(pictures((0.05, -0.03), range(FRAMES)), "BGGR")
+    )
+    assert measured(spikes, "BGGR") is None
+
+
+@pytest.mark.parametrize("motion", [(0.0, 0.0), (0.006, 0.004)], ids=["rest", "slow"])
+def test_texture_at_rest_is_no_gain(truth, motion):
+    light = 0.25 * raw(pictures(motion, range(FRAMES)), "BGGR")
+    assert measured(SpikeSensor(SensorNoise(calibration=truth), seed=6).expose(light), "BGGR") is None
+
+
+def test_light_that_flickers(truth, recording):
+    lamp = 1 + 0.3 * torch.sin(torch.arange(FRAMES) * 2 * torch.pi / 160)
+    light = 0.2 * raw(recording[0], "BGGR") * lamp[:, None, None]
+    known = measured(SpikeSensor(SensorNoise(calibration=truth), seed=7).expose(light), "BGGR").calibration
+    assert alike(known.gain, truth.gain, truth.defects == WORKS) > 0.8
+
+
+@pytest.mark.parametrize("chunk", [1, 7, 45, 100])
+def test_counts_do_not_depend_on_the_chunks(chunk):
+    spikes = torch.rand(100, 3, 4, generator=chance(8)) < 0.3
+    found = count_segments(spikes.split(chunk), 30)
+    assert found.frames == 30
+    assert found.counts.equal(spikes[:90].reshape(3, 30, 3, 4).sum(1).byte())
+
+
+def test_segments_are_as_long_as_light_requires():
+    assert [segment_length(rate) for rate in (0.5, 0.1, 0.05, 0.02, 0.0)] == [20, 20, 40, 100, 200]
+
+
+def test_what_is_refused():
+    ideal = Calibration(torch.ones(4, 4), torch.zeros(4, 4), torch.zeros(4, 4, dtype=torch.uint8))
+    with pytest.raises(ValueError, match=r"segments: expected at least 12 segments of 4 x 4 pixels, got \(11, 4, 4\)"):
+        calibrate_in_motion(Segments(torch.zeros(11, 4, 4, dtype=torch.uint8), 20), ideal)
+    with pytest.raises(ValueError, match="chunks: expected at least 20 frames, got 19"):
+        count_segments([torch.zeros(19, 4, 4)], 20)
+    with pytest.raises(ValueError, match="frames: expected 1 to 255, got 0"):
+        count_segments([torch.zeros(19, 4, 4)], 0)
