@@ -28,7 +28,7 @@ _NEAR, _FAR = 3.0, 8.0  # pixels that a point has moved before another pixel see
 _SOURCES = 16  # segments before and after one, that say what it should see
 _PATH = 8.0  # pixels of a scene that a pixel has to see before gain is told from texture
 _SHARE = 0.25  # of the pixels, at least, that have seen that much
-_AGREE = 0.3  # correlation of both halves of a recording, below which they do not say the same
+_AGREE = 0.4  # correlation of both halves of a recording, below which they do not say the same
 _LEAST_COUNT = 3  # segments of a half that say something about a pixel
 _LEAST_GAIN = 0.1  # less is a dead pixel
 _ROUNDS = 2
@@ -101,7 +101,7 @@ def calibrate_in_motion(segments: Segments, known: Calibration, pattern: str | N
         pixels corrected.
 
         Gains stay 1 where less than 8 pixels of the scene have passed a pixel, and everywhere if that is so for three
-        quarters of the pixels or if the halves correlate by less than 0.3. Dark rates are not told from gains: a pixel
+        quarters of the pixels or if the halves correlate by less than 0.4. Dark rates are not told from gains: a pixel
         of much leak in little light is given a larger gain.
 
     Args:
