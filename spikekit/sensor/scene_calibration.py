@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from kornia.filters import filter2d_separable
 from torch import Tensor
 
@@ -24,12 +25,13 @@ LEAST_SEGMENTS = 12  #: in fewer, hardly anything has moved
 _SHORTEST, _LONGEST = 20, 200  # frames of a segment
 _SPIKES = 2  # that a pixel fires in a segment, at least, as far as the longest allows
 
-_NEAR, _FAR = 3.0, 8.0  # pixels that a point has moved before another pixel sees it, and when it may look different
+_FAR = 8.0  # pixels; what has moved further may look different
 _SOURCES = 16  # segments before and after one, that say what it should see
-_PATH = 8.0  # pixels of a scene that a pixel has to see before gain is told from texture
+_PATH = 4.0  # pixels of a scene that a pixel has to see before gain is told from texture
 _SHARE = 0.25  # of the pixels, at least, that have seen that much
 _AGREE = 0.4  # correlation of both halves of a recording, below which they do not say the same
 _LEAST_COUNT = 3  # segments of a half that say something about a pixel
+_AROUND = 15  # side of the window of a pixel's neighbours, in pixels
 _LEAST_GAIN = 0.1  # less is a dead pixel
 _ROUNDS = 2
 _ATTACHMENT = 120.0  # of the flow to pictures in firing rates
@@ -93,14 +95,14 @@ def calibrate_in_motion(segments: Segments, known: Calibration, pattern: str | N
 
     Convention:
         Where the scene moves, a pixel is told what it should see by pixels that saw the same before and after: the
-        rates of up to 16 segments on either side, demosaiced and moved along the motion, of which those count that have
-        moved by 3 to 8 pixels. What a pixel fires more or less than that, on average over half a recording, is its gain
+        rates of up to 16 segments on either side, demosaiced and moved along the motion, as far as that is 8 pixels at
+        most. What a pixel fires more or less than that, on average over half a recording, is its gain
         if it shows in both halves, and the scene's texture if it shows in one. So what both halves have in common says
-        how far gains are apart, and what they differ by, how exact they are; a pixel gets the most likely gain, given
-        both. Motion is that of TV-L1 between segments, added up. All of it is done twice, the second time with the
-        pixels corrected.
+        how far gains are apart, and what they differ by, how exact they are, for pixels of a brightness and for those
+        of a neighbourhood; a pixel gets the most likely gain, given both. Motion is that of TV-L1 between segments, added up. All of it is done twice, the second time with the pixels
+        corrected.
 
-        Gains stay 1 where less than 8 pixels of the scene have passed a pixel, and everywhere if that is so for three
+        Gains stay 1 where less than 4 pixels of the scene have passed a pixel, and everywhere if that is so for three
         quarters of the pixels or if the halves correlate by less than 0.4. Dark rates are not told from gains: a pixel
         of much leak in little light is given a larger gain.
 
@@ -131,7 +133,7 @@ def calibrate_in_motion(segments: Segments, known: Calibration, pattern: str | N
         for _ in range(_ROUNDS):
             halves = _Halves(len(counts), known.size)
             for number, (light, right) in enumerate(_expected(segments, measured.calibration, pattern, bar.update)):
-                halves.add(number, counts[number] / segments.frames, light, right & works, planes)
+                halves.add(number, counts[number] / segments.frames, light, right & works)
             found = _most_likely(halves, works, planes, known)
             if found is None:
                 return None
@@ -146,18 +148,17 @@ class _Halves:
         self.segments = segments
         self.count, self.light, self.excess = torch.zeros(3, 2, *size, dtype=torch.float64)
 
-    def add(self, number: int, rate: Tensor, light: Tensor, right: Tensor, planes: list[Tensor]) -> None:
+    def add(self, number: int, rate: Tensor, light: Tensor, right: Tensor) -> None:
         """Add a segment: its rates, what light was expected, and at which pixels."""
-        for plane in planes:
-            seen = plane & right
-            light[plane] *= rate[seen].sum() / light[seen].sum().clamp(min=1e-9)
         half = 2 * number // self.segments
         self.count[half] += right
         self.light[half] += light * right
         self.excess[half] += (rate - light) * right
 
 
-def _expected(segments: Segments, known: Calibration, pattern: str | None, done) -> Iterator[tuple[Tensor, Tensor]]:
+def _expected(
+    segments: Segments, known: Calibration, pattern: str | None, done: Callable[[], object]
+) -> Iterator[tuple[Tensor, Tensor]]:
     """What every segment should see, (H, W), as other pixels saw it, and where anyone did."""
     count, size = len(segments.counts), known.size
 
@@ -175,8 +176,7 @@ def _expected(segments: Segments, known: Calibration, pattern: str | None, done)
         pictures = {n: pictures[n] if n in pictures else _colored(light(n), pattern) for n in near}
         for n in near:
             flow = place[n] - place[number]
-            far = flow.norm(dim=0)
-            use = enough & (far >= _NEAR) & (far <= _FAR) & _inside(flow)
+            use = enough & (flow.norm(dim=0) <= _FAR) & _inside(flow)
             if use.any():
                 seen = flow_warp(pictures[n], flow)
                 seen = use * (seen[0] if mask is None else (seen * mask).sum(0))
@@ -187,7 +187,7 @@ def _expected(segments: Segments, known: Calibration, pattern: str | None, done)
         done()
 
 
-def _places(light, count: int, color: bool, done) -> Tensor:
+def _places(light: Callable[[int], Tensor], count: int, color: bool, done: Callable[[], object]) -> Tensor:
     """How far what each pixel sees has moved since the first segment, (J, 2, H, W), in pixels."""
 
     def grey(number: int) -> Tensor:
@@ -231,14 +231,23 @@ def _most_likely(halves: _Halves, works: Tensor, planes: list[Tensor], known: Ca
     spread = common / light.prod(0).mean()
     # dark pixels are less exact, relative to their light
     terms = torch.stack([light.square().mean(0), torch.ones_like(light[0])], dim=1)
-    weight = 1 / terms.sum(1, keepdim=True).sub(1).add(terms[:, 0].mean())
-    differ = excess.diff(dim=0).square().mT / 2
-    shape, floor = nnls((terms * weight).numpy(), (differ * weight).flatten().numpy())[0]
-    error = shape * light.square() + floor + 1e-12
-    certain = (light.square() / error).sum(0) + 1 / spread
-    gain = torch.ones(known.size)
-    gain[used] += ((light * excess / error).sum(0) / certain).float()
-    gain = gain.clamp(min=_LEAST_GAIN)
+    weight = 1 / (terms[:, :1] + terms[:, 0].mean())
+    differ = torch.zeros_like(halves.count[0])
+    differ[used] = excess.diff(dim=0)[0].square() / 2
+    shape, floor = nnls((terms * weight).numpy(), (differ[used] * weight[:, 0]).numpy())[0]
+    error = (shape * light.square() + floor).maximum(_mean_around(differ, used)[used])
+    certain = (light.square() / error.clamp(min=1e-12)).sum(0) + 1 / spread
+    gain = torch.zeros_like(differ)
+    gain[used] = (light * excess / error.clamp(min=1e-12)).sum(0) / certain
+    gain = (1 + gain).clamp(min=_LEAST_GAIN).float()
     for plane in planes:
         gain[plane] /= gain[plane].mean()
     return Measured(Calibration(gain, known.dark, known.defects), certain.reciprocal().mean().sqrt().item())
+
+
+def _mean_around(values: Tensor, where: Tensor) -> Tensor:
+    """Means (H, W) over the pixels of a window that count."""
+    total, count = (
+        F.avg_pool2d(plane[None, None], _AROUND, 1, _AROUND // 2)[0, 0] for plane in (values * where, where.to(values))
+    )
+    return total / count.clamp(min=1e-9)
