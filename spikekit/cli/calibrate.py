@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> None:
     With --flat, a recording of an evenly lit wall out of focus, every pixel gets a gain; with --dark, one with the cap
     on, a dark rate; with both, defects show best. A few thousand frames each are enough. What is uneven about the wall
     or the lens counts as the sensor's. Without either, FILE itself shows dead and hot pixels; and where its scene moves
-    across the sensor, other pixels say what each should have seen, which shows gains and dark rates as well.
+    across the sensor, other pixels say what each should have seen, which shows gains as well.
 
     decode, view, info and lightning predict correct by NAME.calibration.safetensors beside NAME.dat, or by another with
     --calibration.
@@ -105,7 +105,7 @@ def _parts(recording: Recording, start: int, frames: int, bar: Any) -> Iterator[
 
 
 def _in_motion(recording: Recording, rates: PixelRates, known: Calibration) -> tuple[Measured | None, str | None]:
-    """Measure gains and dark rates in a scene that moves, or say why not."""
+    """Measure gains in a scene that moves, or say why not."""
     length = segment_length(rates.rate[known.defects == WORKS].mean().item())
     least, frames = LEAST_SEGMENTS * length, min(recording.frames, MOST_SEGMENTS * length)
     if frames < least:
@@ -113,7 +113,7 @@ def _in_motion(recording: Recording, rates: PixelRates, known: Calibration) -> t
     with progress(what="segments counted", total=frames) as bar:
         segments = count_segments(_parts(recording, 0, frames, bar), length)
     found = calibrate_in_motion(segments, known, recording.pattern)
-    return found, None if found else f"not measured: too little moves in the first {frames} frames"
+    return found, None if found else f"not measured in {frames} frames: too little moves, or gains are all but equal"
 
 
 def _check_output(output: Path) -> None:

@@ -96,11 +96,11 @@ def calibrate_in_motion(segments: Segments, known: Calibration, pattern: str | N
     Convention:
         Where the scene moves, a pixel is told what it should see by pixels that saw the same before and after: the
         rates of up to 16 segments on either side, demosaiced and moved along the motion, as far as that is 8 pixels at
-        most. What a pixel fires more or less than that, on average over half a recording, is its gain
-        if it shows in both halves, and the scene's texture if it shows in one. So what both halves have in common says
-        how far gains are apart, and what they differ by, how exact they are, for pixels of a brightness and for those
-        of a neighbourhood; a pixel gets the most likely gain, given both. Motion is that of TV-L1 between segments, added up. All of it is done twice, the second time with the pixels
-        corrected.
+        most. What a pixel fires more or less than that, on average over half a recording, is its gain if it shows in
+        both halves, and the scene's texture if it shows in one. So what both halves have in common says how far gains
+        are apart, and what they differ by, how exact they are, for pixels of a brightness and for those of a
+        neighbourhood; a pixel gets the most likely gain, given both. Motion is that of TV-L1 between segments, added
+        up. All of it is done twice, the second time with the pixels corrected.
 
         Gains stay 1 where less than 4 pixels of the scene have passed a pixel, and everywhere if that is so for three
         quarters of the pixels or if the halves correlate by less than 0.4. Dark rates are not told from gains: a pixel
@@ -112,7 +112,8 @@ def calibrate_in_motion(segments: Segments, known: Calibration, pattern: str | N
         pattern: Bayer phase; ``None`` for a grey sensor.
 
     Returns:
-        What was measured, or ``None`` where too little moves, or the halves of the recording do not agree.
+        What was measured, or ``None`` where too little moves or the halves of the recording do not agree, as those of
+        an ideal sensor do not.
 
     Raises:
         ValueError: too few segments, or pixels of another size than ``known``.
@@ -194,17 +195,18 @@ def _places(light: Callable[[int], Tensor], count: int, color: bool, done: Calla
         plane = light(number)
         return filter2d_separable(plane[None, None], _GREY, _GREY, "reflect")[0, 0] if color else plane
 
-    pictures = [grey(0), grey(0), grey(1)]
-    velocity = []
+    place, before = torch.zeros(count, 2, *light(0).shape), 0
     for number in range(count):
-        span = min(number + 1, count - 1) - max(number - 1, 0)
-        ends = torch.stack([pictures[0], pictures[2] * (pictures[0].mean() / pictures[2].mean().clamp(min=1e-9))])[None]
-        times = torch.tensor([[max(number - 1, 0) - number, min(number + 1, count - 1) - number]]) / span
-        velocity.append(tvl1_flow(ends, times, torch.full_like(ends[:, 0], _ATTACHMENT))[0] / span)
-        pictures = [*pictures[1:], grey(number + 2) if number + 2 < count else pictures[2]]
+        start, end = max(number - 1, 0), min(number + 1, count - 1)
+        ends = torch.stack([grey(start), grey(end)])
+        ends[1] *= ends[0].mean() / ends[1].mean().clamp(min=1e-9)
+        times = torch.tensor([[start - number, end - number]]) / (end - start)
+        velocity = tvl1_flow(ends[None], times, torch.full_like(ends[:1], _ATTACHMENT))[0] / (end - start)
+        if number:
+            place[number] = place[number - 1] + (before + velocity) / 2
+        before = velocity
         done()
-    steps = torch.stack(velocity)
-    return torch.cat([torch.zeros_like(steps[:1]), (steps[1:] + steps[:-1]).cumsum(0) / 2])
+    return place
 
 
 def _colored(light: Tensor, pattern: str | None) -> Tensor:
