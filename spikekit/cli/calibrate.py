@@ -11,6 +11,13 @@ from torch import Tensor
 
 from spikekit.arguments import UsageError
 from spikekit.color.cfa import PATTERNS
+from spikekit.flow.scene_calibration import (
+    LEAST_SEGMENTS,
+    MOST_SEGMENTS,
+    calibrate_in_motion,
+    count_segments,
+    segment_length,
+)
 from spikekit.io import recording as recordings
 from spikekit.io.calibration import ENDING, read_calibration, write_calibration
 from spikekit.io.failures import writing
@@ -20,13 +27,6 @@ from spikekit.progress import progress
 from spikekit.sensor.calibrate import Measured, calibrate, find_defects
 from spikekit.sensor.calibration import DEAD, HOT, WORKS, Calibration
 from spikekit.sensor.pixel_rates import PixelRates
-from spikekit.sensor.scene_calibration import (
-    LEAST_SEGMENTS,
-    MOST_SEGMENTS,
-    calibrate_in_motion,
-    count_segments,
-    segment_length,
-)
 
 _LEAST_FRAMES = 100
 _CHUNK = 1 << 24  # pixels that are counted at a time

@@ -8,7 +8,7 @@ import pytest
 ASIDE = """
 import sys
 from lightning_modules import SuperResolution
-import torch, lightning_modules.data
+import torch
 from lightning_modules.networks import CSCSR
 picture = SuperResolution.from_pretrained(4, "balanced")(torch.ones(1, 41, 16, 16))
 print(*sys.modules)

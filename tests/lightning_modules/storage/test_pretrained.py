@@ -297,6 +297,7 @@ def test_the_list_of_weights_says_what_the_networks_are(configs):
         "large_film",
         "huge_film",
         "huge_long_film",
+        "huge_long_film",
     ]
     for weights in listed:
         found = read_weights(weights.name)
