@@ -25,6 +25,7 @@ LEAST_SEGMENTS = 12  #: in fewer, hardly anything has moved
 _SHORTEST, _LONGEST = 20, 200  # frames of a segment
 _SPIKES = 2  # that a pixel fires in a segment, at least, as far as the longest allows
 
+_LEAST_SIDE = 3  # pixels, of a sensor that something can be seen to move across
 _FAR = 8.0  # pixels; what has moved further may look different
 _SOURCES = 16  # segments before and after one, that say what it should see
 _PATH = 4.0  # pixels of a scene that a pixel has to see before gain is told from texture
@@ -128,13 +129,15 @@ def calibrate_in_motion(segments: Segments, known: Calibration, pattern: str | N
         expected = f"at least {LEAST_SEGMENTS} segments of {known.size[0]} x {known.size[1]} pixels"
         raise ValueError(f"segments: expected {expected}, got {tuple(counts.shape)}")
     works = known.defects == WORKS
+    if min(known.size) < _LEAST_SIDE:
+        return None
     planes = [torch.from_numpy(plane) & works for plane in colors(known.size, pattern)]
     measured = Measured(known)
     with progress(what="motion and gains", total=2 * _ROUNDS * len(counts)) as bar:
         for _ in range(_ROUNDS):
             halves = _Halves(len(counts), known.size)
-            for number, (light, right) in enumerate(_expected(segments, measured.calibration, pattern, bar.update)):
-                halves.add(number, counts[number] / segments.frames, light, right & works)
+            for number, (light, seen) in enumerate(_expected(segments, measured.calibration, pattern, bar.update)):
+                halves.add(number, counts[number] / segments.frames, light, seen & works)
             found = _most_likely(halves, works, planes, known)
             if found is None:
                 return None
@@ -149,12 +152,12 @@ class _Halves:
         self.segments = segments
         self.count, self.light, self.excess = torch.zeros(3, 2, *size, dtype=torch.float64)
 
-    def add(self, number: int, rate: Tensor, light: Tensor, right: Tensor) -> None:
+    def add(self, number: int, rate: Tensor, light: Tensor, seen: Tensor) -> None:
         """Add a segment: its rates, what light was expected, and at which pixels."""
         half = 2 * number // self.segments
-        self.count[half] += right
-        self.light[half] += light * right
-        self.excess[half] += (rate - light) * right
+        self.count[half] += seen
+        self.light[half] += light * seen
+        self.excess[half] += (rate - light) * seen
 
 
 def _expected(
@@ -228,7 +231,7 @@ def _most_likely(halves: _Halves, works: Tensor, planes: list[Tensor], known: Ca
         return None
     light, excess = (part[:, used] / halves.count[:, used] for part in (halves.light, halves.excess))
     common = excess.prod(0).mean()
-    if common < _AGREE * excess.square().mean():
+    if not common > _AGREE * excess.square().mean():  # nor where nothing fires
         return None
     spread = common / light.prod(0).mean()
     # dark pixels are less exact, relative to their light

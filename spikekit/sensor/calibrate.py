@@ -106,7 +106,8 @@ def find_defects(scene: PixelRates, pattern: str | None = None) -> Measured:
     Convention:
         A pixel is dead if it fires less than a tenth as often as the median of the pixels of its colour around it,
         which fire at least ten times, and hot if it fires at nearly every clock where they do so at less than half.
-        Gains stay 1: from a scene alone they cannot be told from its texture.
+        Gains stay 1: at rest they cannot be told from the texture of the scene; where it moves, see
+        :func:`spikekit.flow.scene_calibration.calibrate_in_motion`.
 
     Args:
         scene: rates of a recording.

@@ -1,6 +1,7 @@
 """``spikekit calibrate``: measured, kept beside the recording, and used by the commands that make pictures."""
 
 import os
+import re
 import resource
 from argparse import Namespace
 from pathlib import Path
@@ -95,6 +96,22 @@ def test_a_scene_alone_tells_defects(capsys, truth):
         "gain         not measured in 300 frames: too little moves, or gains are all but equal\n"
         in capsys.readouterr().out
     )
+
+
+def test_a_scene_in_motion_tells_gains(capsys, truth):
+    y, x, t = torch.meshgrid(torch.arange(24), torch.arange(32), torch.arange(400), indexing="ij")
+    across, down = x - 0.06 * t, y - 0.04 * t
+    light = 0.25 + sum(
+        0.03 * torch.sin(across * u + down * v + n)
+        for n, (u, v) in enumerate([(0.3, 0.1), (-0.2, 0.5), (0.7, -0.4), (0.1, 0.8)])
+    )
+    sensor = SpikeSensor(SensorNoise(calibration=truth))
+    write("moving.dat", sensor.expose(light.movedim(-1, 0)), flip=True)
+    assert main(["calibrate", "moving.dat", *HOW]) == 0
+    assert re.search(r"^gain +\d\.\d+% apart, each known to \d\.\d+%$", capsys.readouterr().out, re.MULTILINE)
+    found, works = read_calibration(f"moving{ENDING}").flip(), truth.defects == 0
+    assert found.defects.equal(truth.defects)
+    assert torch.corrcoef(torch.stack([found.gain[works], truth.gain[works]]))[0, 1] > 0.8
 
 
 @pytest.mark.parametrize(

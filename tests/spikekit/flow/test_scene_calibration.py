@@ -87,7 +87,6 @@ def test_gains_are_found(truth, recording, pattern):
     assert found.dark_error is None
     assert not known.dark.any()
     colours = bayer_mask(*SIZE, pattern).bool() if pattern else torch.ones(1, *SIZE).bool()
-    # where nothing was measured, gains are 1 as well
     assert_close(
         torch.stack([known.gain[c & works].mean() for c in colours]), torch.ones(len(colours)), atol=1e-4, rtol=0
     )
@@ -141,6 +140,15 @@ def test_counts_do_not_depend_on_the_chunks(chunk):
     found = count_segments(spikes.split(chunk), 30)
     assert found.frames == 30
     assert found.counts.equal(spikes[:90].reshape(3, 30, 3, 4).sum(1).byte())
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 2), (3, 3), (5, 40)])
+@pytest.mark.parametrize("pattern", [None, "BGGR"])
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_where_nothing_can_be_seen_to_move(size, pattern, share):
+    spikes = torch.rand(260, *size, generator=chance(10)) < share
+    ideal = Calibration(torch.ones(size), torch.zeros(size), torch.zeros(size, dtype=torch.uint8))
+    assert measured(spikes, pattern, ideal) is None
 
 
 def test_segments_are_as_long_as_light_requires():
