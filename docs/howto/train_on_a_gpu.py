@@ -1,22 +1,22 @@
-"""Train a network for films on one GPU: first what sees a clip, then what mixes the key frames.
+"""Train a network for films on one GPU: first on clips, then on films; in these the mixing of key frames, or all.
 
 Processes make scenes and estimate their motion; the GPU keeps the latest of them and trains on each a few times, since
 it takes more clips than they can make. A batch has single clips and clips of films, all turned at random.
 
-    python docs/howto/train_on_a_gpu.py cscsr_huge_film_fast_x4 DIR -o new.safetensors
+    python docs/howto/train_on_a_gpu.py cscsr_huge_film_fast_x4 DIR --steps 0 --film-steps 4000 --all -o new.safetensors
 """
 
 import argparse
 import math
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import multiprocessing as mp
-from torch.optim.lr_scheduler import LambdaLR
 
 from lightning_modules.data.loading import end_when_orphaned
 from lightning_modules.data.pictures import folder_pictures
@@ -29,10 +29,10 @@ from lightning_modules.tasks.muon import MuonWithAdam
 KEYS, PATTERN = 5, "RGGB"
 #: by frames of a clip: clocks between key frames (0: a single clip), motion and bend of the scenes, share of a batch
 SCENES = {
-    41: [(0, 5, 1.5, 0.4), (8, 5, 0.6, 0.35), (20, 3, 0.3, 0.25)],
+    41: [(0, 5, 1.5, 0.4), (8, 6, 1.2, 0.35), (20, 5, 0.8, 0.25)],
     101: [(0, 8, 1.5, 0.4), (8, 8, 1.5, 0.35), (20, 6, 0.8, 0.25)],
 }
-CYCLE = 0, 0, 1, 0, 2  # kinds of scenes, as a process makes them one after the other
+CYCLE = 0, 1, 0, 2  # kinds of scenes, as a process makes them one after the other
 
 
 def clip_options(settings: dict, args: argparse.Namespace) -> list[dict]:
@@ -68,13 +68,18 @@ class Kept:
 
     def __init__(self, most: int, device: str) -> None:
         self.most, self.device, self.made, self.parts = most, device, 0, []
+        # a stream of its own: a scene does not wait for the steps that the GPU has yet to take
+        self.stream = torch.cuda.Stream() if device == "cuda" else None
 
     def add(self, *parts: np.ndarray) -> None:
         """Keep a scene in place of the oldest."""
         new = [torch.from_numpy(part) for part in parts]
         self.parts = self.parts or [part.new_empty(self.most, *part.shape, device=self.device) for part in new]
-        for kept, part in zip(self.parts, new, strict=True):
-            kept[self.made % self.most].copy_(part)
+        with torch.cuda.stream(self.stream):
+            for kept, part in zip(self.parts, new, strict=True):
+                kept[self.made % self.most].copy_(part)
+            if self.stream:
+                self.stream.synchronize()
         self.made += 1
 
     def draw(self, count: int, rng: np.random.Generator, film: bool) -> list[torch.Tensor]:
@@ -94,14 +99,22 @@ def turned(spikes, rgb, flow, rng):
     return spikes, rgb.float(), flow.float()
 
 
-def widened(source: str, width: int | None, alpha: float) -> RecurrentCSCSR:
-    """Return the network of some weights, with more channels, which nothing hears yet, where the colours are one."""
+def widened(source: str, alpha: float, **sizes: int | None) -> RecurrentCSCSR:
+    """Return the network of some weights, wider or deeper, but with the same pictures.
+
+    Nothing hears the new channels yet, and new residual blocks change nothing.
+    """
     weights = read_weights(source)
     settings = {name: value for name, value in weights.settings.items() if name != "class"}
-    network = RecurrentCSCSR(**settings | {"alpha": alpha} | ({"end_width": width} if width else {}), steps=0)
+    sizes = {name: size for name, size in sizes.items() if size}
+    network = RecurrentCSCSR(**settings | {"alpha": alpha} | sizes, steps=0)
     state = network.state_dict()
-    for name, old in weights.tensors.items():
-        new = state[name]
+    for name, new in state.items():
+        old = weights.tensors.get(name)
+        if old is None:
+            if ".body.2." in name:  # the last convolution of a residual block
+                new.zero_()
+            continue
         if new.shape != old.shape:
             new[: len(old)] = 0
         new[tuple(slice(side) for side in old.shape)] = old.float()
@@ -110,19 +123,29 @@ def widened(source: str, width: int | None, alpha: float) -> RecurrentCSCSR:
     return network
 
 
-def train(parameters, loss_of, steps, lr, what) -> None:
-    """Take so many steps, the rate rising over a hundred of them and falling along a cosine."""
-    optimizer, mean, start = MuonWithAdam(parameters, lr=lr), None, time.monotonic()
-    rate = LambdaLR(optimizer, lambda n: (0.503 + 0.5 * math.cos(math.pi * n / max(steps, 1))) * min(1, (n + 1) / 100))
-    for n in range(steps):
+def save(network: RecurrentCSCSR, path: str) -> None:
+    """Write the weights in half precision."""
+    tensors = {name: value.cpu().half() for name, value in network.state_dict().items()}
+    write_weights(Weights(Path(path), settings_of(network), {}, tensors), path)
+
+
+def train(parameters, loss_of, steps, seconds, lr, what, keep) -> None:
+    """Take so many steps, or as many as there is time for; the rate rises over a hundred and falls along a cosine."""
+    optimizer, mean, start, n = MuonWithAdam(parameters, lr=lr), None, time.monotonic(), 0
+    while n < steps and (share := max(n / steps, (time.monotonic() - start) / seconds)) < 1:
+        for group in optimizer.param_groups:
+            group["lr"] = lr * (0.503 + 0.5 * math.cos(math.pi * share)) * min(1, (n + 1) / 100)
         loss = loss_of()
         loss.backward()
         optimizer.step()
         optimizer.zero_grad()
-        rate.step()
         mean = loss.detach() if mean is None else mean.lerp(loss.detach(), 0.02)
-        if not (n + 1) % 100 or n + 1 == steps:
-            print(f"{what}: {n + 1} of {steps} steps, {time.monotonic() - start:.0f} s, loss {mean:.5f}", flush=True)
+        n += 1
+        if not n % 100 or n == steps:
+            print(f"{what}: {n} of {steps} steps, {time.monotonic() - start:.0f} s, loss {mean:.5f}", flush=True)
+        if not n % 500:
+            keep()
+    print(f"{what}: {n} steps, {time.monotonic() - start:.0f} s")
 
 
 def main() -> None:
@@ -132,9 +155,12 @@ def main() -> None:
     parser.add_argument("pictures", type=Path, help="folder of training pictures")
     parser.add_argument("-o", "--output", default="new.safetensors")
     parser.add_argument("--steps", type=int, default=4300, help="of clips")
-    parser.add_argument("--film-steps", type=int, default=500, help="of films, the rest being frozen")
+    parser.add_argument("--film-steps", type=int, default=500, help="of films")
+    parser.add_argument("--all", action="store_true", help="films, and some single clips with them, train all weights")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="that the steps on films may take")
     parser.add_argument("--width", type=int, help="channels where the colours are one, instead of those of the weights")
-    parser.add_argument("--batch", type=int, default=24, help="clips in a step")
+    parser.add_argument("--fusion-blocks", type=int, help="residual blocks where key frames meet, likewise")
+    parser.add_argument("--batch", type=int, default=24, help="clips in a step, singly or in films")
     parser.add_argument("--patch", type=int, default=48, help="side of a clip in sensor pixels")
     parser.add_argument("--lr", type=float, default=5e-4)
     parser.add_argument("--alpha", type=float, default=0.6)
@@ -145,7 +171,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.manual_seed(args.seed)
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    network = widened(args.weights, args.width, args.alpha)
+    network = widened(args.weights, args.alpha, end_width=args.width, fusion_blocks=args.fusion_blocks)
     if network.config.frames not in SCENES or network.pattern != PATTERN:
         got = f"{network.config.frames} and {network.pattern}"
         parser.error(f"weights: expected those of clips of 41 or 101 frames, behind {PATTERN}, got {got}")
@@ -165,6 +191,7 @@ def main() -> None:
     threading.Thread(target=keep, daemon=True).start()
     network.to(device).to(memory_format=torch.channels_last)
     torch.backends.cudnn.benchmark = True
+    torch.set_float32_matmul_precision("high")
     rng = np.random.default_rng(args.seed)
     while min(scenes.made for scenes in kept) < min(40, args.batch):
         time.sleep(0.2)
@@ -186,14 +213,20 @@ def main() -> None:
             return F.l1_loss(films[0][:, 1:], rgb[:, 1:])
         return (F.l1_loss(films[0][:, :-1], rgb[:, :-1]) + F.l1_loss(films[1], rgb)) / 2
 
-    parts = ("clips", loss_of_clips, args.steps, False), ("films", loss_of_films, args.film_steps, True)
-    for what, loss_of, steps, mixing in parts:
+    def loss_of_all():
+        spikes, rgb, flow = turned(*kept[0].draw(max(1, args.batch // KEYS), rng, film=False), rng)
+        with torch.autocast(device, torch.bfloat16):
+            return F.l1_loss(network(spikes, flow), rgb) / 2 + loss_of_films()
+
+    film_loss = loss_of_all if args.all else loss_of_films
+    parts = ("clips", loss_of_clips, args.steps, math.inf), ("films", film_loss, args.film_steps, 60 * args.minutes)
+    for what, loss_of, steps, seconds in parts:
         for name, parameter in network.named_parameters():
-            parameter.requires_grad_(name.startswith("fusion.") == mixing)
-        train([p for p in network.parameters() if p.requires_grad], loss_of, steps, args.lr, what)
+            parameter.requires_grad_(name.startswith("fusion.") == (what == "films") or (what == "films" and args.all))
+        learning = [p for p in network.parameters() if p.requires_grad]
+        train(learning, loss_of, steps, seconds, args.lr, what, partial(save, network, args.output))
     print("scenes made:", [scenes.made for scenes in kept])
-    tensors = {name: value.cpu().half() for name, value in network.state_dict().items()}
-    write_weights(Weights(Path(args.output), settings_of(network), {}, tensors), args.output)
+    save(network, args.output)
 
 
 if __name__ == "__main__":

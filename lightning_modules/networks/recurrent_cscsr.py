@@ -202,6 +202,15 @@ class RecurrentCSCSR(CSCSR):
             last = twice[-1]
         return [torch.stack(pictures, dim=1) for pictures in ([earlier, final] if future else [final])]
 
+    @torch.no_grad()
+    def scale_picture(self, factor: float) -> None:  # noqa: D102
+        super().scale_picture(factor)
+        # key frames meet as before: what is read of pictures, and what is added to them
+        picture = 3 * self.scale**2
+        self.fusion.neighbor.weight[:, :picture] /= factor
+        self.fusion.rest.weight[:picture] *= factor
+        self.fusion.rest.bias[:picture] *= factor
+
     def features(self, spikes: Tensor, flow: Tensor | None) -> Tensor:
         """Return the features of a clip's key frame, from this clip alone.
 

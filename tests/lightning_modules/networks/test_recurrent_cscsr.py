@@ -7,6 +7,7 @@ from lightning_modules.inference.film import film
 from lightning_modules.inference.film_reader import FilmReader
 from lightning_modules.networks import CSCSR, ClassicalDecoder, RecurrentCSCSR
 from lightning_modules.networks.recurrent_cscsr import read_forward, read_from_end
+from lightning_modules.storage.pretrained import Weights, settings_of, write_weights
 from spikekit import flow_warp
 
 TINY = {"scale": 2, "width": 8, "representation_width": 8, "features": 1, "stages": 1, "end_blocks": 1, "skip": True}
@@ -57,6 +58,15 @@ def test_the_first_key_frame_is_that_of_a_single_clip_and_the_others_are_not(net
     pictures, single = network(spikes[None], flow[None])[0], network(spikes, flow)
     torch.testing.assert_close(pictures[0], single[0])
     assert ((pictures[1:] - single[1:]).abs().amax(dim=(1, 2, 3)) > 1e-3).all()
+
+
+def test_a_film_of_another_gain_is_the_same_film_brighter(network, clips, tmp_path):
+    torch.nn.init.normal_(network.fusion.rest.bias, std=0.05)
+    write_weights(Weights(tmp_path, settings_of(network), {}, network.state_dict()), tmp_path / "film.safetensors")
+    brighter = CSCSR.from_pretrained(tmp_path / "film.safetensors", alpha=0.1)
+    spikes, flow = clips
+    expected = network(spikes[None], flow[None], future=4) * 4
+    torch.testing.assert_close(brighter(spikes[None], flow[None], future=4), expected, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("future", [0, 1, 2, 4])
@@ -129,6 +139,8 @@ def test_what_is_too_far_away_is_not_asked(network, clips):
         ("large_long_film", 2_661_574, 0, 3.02),
         ("huge_film", 4_180_390, 0, 4.54),
         ("huge_long_film", 4_206_310, 0, 4.56),
+        ("huge_deep_film", 4_549_670, 4, 5.65),
+        ("huge_long_deep_film", 4_575_590, 0, 4.89),
     ],
 )
 def test_parameters_and_work_of_sizes_for_films(configs, size, parameters, future, mmac):

@@ -295,8 +295,8 @@ def test_the_list_of_weights_says_what_the_networks_are(configs):
         "huge_long",
         "huge_long",
         "large_film",
-        "huge_film",
-        "huge_long_film",
+        "huge_deep_film",
+        "huge_long_deep_film",
         "huge_long_film",
     ]
     for weights in listed:
