@@ -10,7 +10,7 @@ from lightning_modules.storage.shipped import list_pretrained
 from spikekit.tables import table
 
 _LEGEND = """
-MMAC/pixel: million multiplications by sensor pixel, of a picture or of an estimate of motion. Kodak, Vid4: PSNR in dB
+MMAC/px: million multiplications by sensor pixel, of a picture or of an estimate of motion. Kodak, Vid4: PSNR in dB
 of 24 stills in motion, and of foliage and walk at 20 clocks a frame, both at alpha 0.4; to be compared at one scale."""
 
 
@@ -35,5 +35,5 @@ def models(args: Sequence[str]) -> None:
         cells = [one.name, one.scale and f"x{one.scale}", one.size, f"{one.parameters:,}", f"{one.macs / 1e6:.2f}"]
         scores = [score and f"{score:.2f}" for score in (one.kodak, one.vid4)]
         rows.append([*cells, *scores, f"{one.path.stat().st_size / 1e6:.1f}"])
-    print(table(["weights", "scale", "size", "parameters", "MMAC/pixel", "Kodak", "Vid4", "MB"], rows))
+    print(table(["weights", "scale", "size", "parameters", "MMAC/px", "Kodak", "Vid4", "MB"], rows))
     print(_LEGEND)

@@ -40,7 +40,7 @@ class ErrorModel:
     blurred: float = 0.26
     still: float = 0.18
     textured: float = 0.07
-    moved: float = 0.00078
+    moved: float = 0.00068
     faint: float = 1.3e-5
 
     def __post_init__(self) -> None:

@@ -337,7 +337,7 @@ def test_models_lists_the_weights_of_the_package(capsys):
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 120
     head, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|"))
-    assert head == ["weights", "scale", "size", "parameters", "MMAC/pixel", "Kodak", "Vid4", "MB"]
+    assert head == ["weights", "scale", "size", "parameters", "MMAC/px", "Kodak", "Vid4", "MB"]
     assert [row[0] for row in rows] == [weights.name for weights in list_pretrained()]
     assert ["cscsr_tiny_x4", "x4", "tiny", "300,963", "0.36", "27.95", "23.51"] in [row[:-1] for row in rows]
 
