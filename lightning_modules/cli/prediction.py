@@ -17,6 +17,7 @@ from lightning_modules.cli.arguments import WEIGHTS, behind_configurations, give
 from lightning_modules.cli.errors import InputError, UsageError
 from lightning_modules.data import RecordingClips
 from lightning_modules.inference.presets import SPEEDS, Choice, Preset, choose
+from lightning_modules.storage.shipped import list_pretrained
 from lightning_modules.tasks.predictions import PictureProgress, Predictions, file_identity, is_film, is_picture
 from spikekit import __version__
 from spikekit.decoders.methods import DECODERS
@@ -133,6 +134,8 @@ def _choice(args: Sequence[str]) -> tuple[Preset, str]:
     if speed:
         ideal = choose(scale, speed, None, clips.size, film, clips.recording.frames, white)
         said += _longer(ideal, choice, clips)
+    if "calibration" not in recording:
+        said += _uncalibrated(preset, clips, scale, film)
     return preset, "\n".join([*said, *_noise(preset, white)])
 
 
@@ -163,6 +166,17 @@ def _noise(preset: Preset, white: float) -> list[str]:
         f"a white pixel fires {spikes:.1f} times in {preset.clip} frames: a decoder's picture is noisy; --speed fast "
         "and slower ones use a network, which sees less noise"
     ]
+
+
+def _uncalibrated(preset: Preset, clips: RecordingClips, scale: int, film: bool) -> list[str]:
+    """Return a hint where a network sees a camera whose pixels nobody measured; a simulator says its alpha."""
+    if preset.method or clips.recording.alpha is not None or clips.recording.calibration is not None:
+        return []
+    noisy = [weights for weights in list_pretrained(scale) if "noisy" in weights.name]
+    fit = [weights for weights in noisy if weights.frames <= preset.clip and weights.film <= film]
+    best = max(fit, key=lambda one: (one.frames, one.film), default=None)
+    instead = f", or name --model.weights {best.name}" if best else ""
+    return [f"no calibration of this sensor: if it is noisy, run spikekit calibrate {clips.recording.path}{instead}"]
 
 
 def check_output(output: Path, clips: RecordingClips) -> None:

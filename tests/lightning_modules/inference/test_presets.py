@@ -17,7 +17,7 @@ from lightning_modules.inference.presets import SPEEDS, Choice, Preset, choices,
 from lightning_modules.motion import ZeroFlow
 from lightning_modules.networks import CSCSR, ClassicalDecoder, RecurrentCSCSR
 from lightning_modules.tasks.super_resolution import SuperResolution
-from spikekit import read_picture, write_spikes
+from spikekit import Calibration, read_picture, write_calibration, write_spikes
 
 HEADER = ["setting", *Preset.columns(), "psnr", "ratio", "mib", "reference", "height", "width", "failed", "ms"]
 WEIGHTS = {"weights": "tiny.ckpt"}
@@ -203,6 +203,31 @@ def test_a_recording_says_how_much_room_there_is(longer, total, frame, expected)
     name, count = expected
     assert (preset.clip, said.partition(":")[0]) == (101 if name == "longer" else 41, name)
     assert f"\n{count} {'picture' if count == 1 else 'pictures'}, " in said
+
+
+@pytest.mark.parametrize(
+    ("typed", "expected"),
+    [
+        ([], "cscsr_large_noisy_x4"),
+        (["--data.every", "20", "--data.frame", "50:151:20"], "cscsr_huge_long_film_noisy_x4"),
+        (["--data.frame", "100"], "cscsr_huge_long_noisy_x4"),
+        (["--model.network.scale", "2"], ""),
+    ],
+)
+def test_a_camera_that_nobody_measured_is_said(tmp_path, typed, expected):
+    path = tmp_path / "camera.npz"
+    spikes = torch.zeros(201, 6, 6, dtype=torch.uint8)
+    spikes[::10] = 1  # little light
+    write_spikes(path, spikes)
+    asked = ["predict", "--speed", "best", "--data.path", str(path), *typed]
+    hint = f"\nno calibration of this sensor: if it is noisy, run spikekit calibrate {path}"
+    said = prediction._choice(asked)[1]
+    assert said.endswith(hint + (f", or name --model.weights {expected}" if expected else ""))
+    assert hint not in prediction._choice([*asked, "--data.calibration", "none"])[1]
+    assert hint not in prediction._choice([*asked[:2], "fastest", *asked[3:]])[1]
+    ones = torch.ones(6, 6)
+    write_calibration(tmp_path / "camera.calibration.safetensors", Calibration(ones, 0 * ones, 0 * ones.byte()))
+    assert hint not in prediction._choice(asked)[1]
 
 
 @pytest.mark.parametrize(("every", "name"), [(41, "cscsr_huge_film_fast_x4"), (42, "cscsr_huge_x4")])
