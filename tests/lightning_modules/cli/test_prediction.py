@@ -17,7 +17,7 @@ def test_a_decoder_of_a_dark_recording_is_said_to_be_noisy(white, speed, hint, t
     preset, said = _choice(["predict", "--data", "Recording", "--data.path", str(tmp_path / "a.npz"), "--speed", speed])
     assert bool(preset.method) == (speed == "fastest")
     assert ("a white pixel fires 3.0 times in 41 frames" in said) == hint
-    assert ("noisy" in said) == hint
+    assert ("picture is noisy" in said) == hint
 
 
 @pytest.mark.parametrize(
