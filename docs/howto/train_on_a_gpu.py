@@ -7,6 +7,7 @@ it takes more clips than they can make. A batch has single clips and clips of fi
 """
 
 import argparse
+import json
 import math
 import threading
 import time
@@ -25,6 +26,7 @@ from lightning_modules.motion import ClassicalFlow
 from lightning_modules.networks import RecurrentCSCSR
 from lightning_modules.storage.pretrained import Weights, read_weights, settings_of, write_weights
 from lightning_modules.tasks.muon import MuonWithAdam
+from spikekit import SensorNoise
 
 KEYS, PATTERN = 5, "RGGB"
 #: by frames of a clip: clocks between key frames (0: a single clip), motion and bend of the scenes, share of a batch
@@ -40,6 +42,7 @@ def clip_options(settings: dict, args: argparse.Namespace) -> list[dict]:
     frames = settings["frames"]
     shared = {"scale": settings["scale"], "frames": frames, "flow_times": (5, frames - 6), "alpha": args.alpha}
     shared |= {"patch": args.patch, "rotation": 2.0, "brightness": tuple(args.brightness), "seed": args.seed}
+    shared["noise"] = SensorNoise(**args.noise) if args.noise else None
     return [
         shared | {"key_frames": KEYS if every else 1, "every": every or 20, "motion": motion, "bend": bend}
         for every, motion, bend, _ in SCENES[frames]
@@ -165,6 +168,7 @@ def main() -> None:
     parser.add_argument("--lr", type=float, default=5e-4)
     parser.add_argument("--alpha", type=float, default=0.6)
     parser.add_argument("--brightness", type=float, nargs=2, default=(0.3, 1.2))
+    parser.add_argument("--noise", type=json.loads, help="of the sensor, such as '{\"photons\": 3000}'; a random share of it")
     parser.add_argument("--workers", type=int, default=12, help="processes that make scenes")
     parser.add_argument("--kept", type=int, default=6000, help="scenes of each kind on the GPU")
     parser.add_argument("--seed", type=int, default=1)

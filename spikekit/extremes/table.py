@@ -14,6 +14,7 @@ FLOATS = (torch.float64, torch.float32, *HALVES)
 BITS = (torch.bool, torch.uint8)
 
 Limit = float | Callable[[torch.dtype], float]
+Bound = tuple[Limit, str]
 
 
 class Measured(NamedTuple):
@@ -39,6 +40,12 @@ class On(NamedTuple):
 
 Measure = Callable[[On], Measured | Iterable[Measured]]
 Tensors = Tensor | Sequence[Tensor]
+Pairs = Sequence[tuple[Tensor, Tensor]]
+# residual interpolation divides by squares of differences, which makes 1e2 to 1e5 ulp of float32's own rounding
+_SUMMED = {
+    **dict.fromkeys(("flow_warp", "flow_warp_idw", "upsample_flow", "linear_motion"), 16.0),
+    **dict.fromkeys(("demosaic_residual", "demosaic_along_motion"), 4096.0),
+}
 _WORSE = ("-", "finite", "Inf", "NaN")
 
 
@@ -79,6 +86,7 @@ class Case:
         values: which outcome of the values is right.
         gradients: which outcome of the gradients is right; bool and uint8 have none.
         slow: takes seconds.
+        on_gpu: the limit and the bound on a GPU, where they are others.
     """
 
     operator: str
@@ -90,11 +98,13 @@ class Case:
     values: str
     gradients: str
     slow: bool
+    on_gpu: Bound | None = None
 
     def row(self, dtype: torch.dtype, device: torch.device | str = "cpu") -> Row:
         """Measure, and compare with what is allowed; an exception that is not expected is a row that fails."""
         device = torch.device(device)
-        limit = self.limit(dtype) if callable(self.limit) else self.limit
+        limit, bound = (self.limit, self.bound) if device.type == "cpu" or not self.on_gpu else self.on_gpu
+        limit = limit(dtype) if callable(limit) else limit
         trouble = ""
         try:
             measured = self.measure(On(dtype, device))
@@ -107,7 +117,7 @@ class Case:
         expected = self.values, self.gradients if dtype.is_floating_point else "-"
         right = measured.error <= limit and (measured.values, measured.gradients) == expected
         return Row(
-            self.operator, self.extreme, short(dtype), device.type, measured.error, limit, self.bound,
+            self.operator, self.extreme, short(dtype), device.type, measured.error, limit, bound,
             measured.values, measured.gradients, right, trouble,
         )  # fmt: skip
 
@@ -126,11 +136,13 @@ class Cases(list[Case]):
         values: str = "finite",
         gradients: str = "finite",
         slow: bool = False,
+        on_gpu: Bound | None = None,
     ) -> Callable[[Measure], Measure]:
         """Add the decorated ``measure(on)``, see :class:`Case`."""
 
         def add(measure: Measure) -> Measure:
-            self.append(Case(operator, extreme, tuple(dtypes), measure, limit, bound, values, gradients, slow))
+            some = tuple(dtypes)
+            self.append(Case(operator, extreme, some, measure, limit, bound, values, gradients, slow, on_gpu))
             return measure
 
         return add
@@ -155,6 +167,35 @@ def differ(got: Tensor, expected: Tensor) -> float:
     if got.shape != expected.shape:
         return float("inf")
     return float(((got != expected) & ~(got.isnan() & expected.isnan())).sum())
+
+
+def of_largest(got: Tensor, expected: Tensor) -> float:
+    """Return the worst error in ulp of the largest number that is expected."""
+    if got.shape != expected.shape or not expected.numel():
+        return differ(got, expected)
+    expected = expected.detach().double().cpu()
+    return ulps(got, expected, expected.abs().max().expand(expected.shape))
+
+
+def apart(values: Pairs, gradients: Pairs, device: torch.device) -> float:
+    """Count the elements that are not the same number, in the worst pair of tensors.
+
+    A GPU may add up gradients in any order: there the error is theirs in ulp of the largest, and infinite where values
+    are not the same.
+    """
+    if device.type == "cpu":
+        return worst(0.0, *(differ(*pair) for pair in [*values, *gradients]))
+    if any(differ(*pair) for pair in values):
+        return float("inf")
+    return worst(0.0, *(of_largest(*pair) for pair in gradients))
+
+
+def sums_on_gpu(operator: str) -> Bound | None:
+    """Return the bound of :func:`apart` on a GPU where the gradients of an operator are summed by atomics."""
+    if operator not in _SUMMED:
+        return None
+    limit = _SUMMED[operator]
+    return limit, f"values bit for bit, gradients {limit:g} ulp of the largest: the order of sums is free"
 
 
 def ulps(got: Tensor, exact: Tensor, scale: Tensor | None = None) -> float:

@@ -12,7 +12,19 @@ from torch import Tensor
 
 import spikekit as sk
 from spikekit.extremes import reference
-from spikekit.extremes.table import FLOATS, Cases, Measured, On, differ, measured, outcome_of, rounded_once, ulps
+from spikekit.extremes.table import (
+    FLOATS,
+    Cases,
+    Measured,
+    On,
+    apart,
+    differ,
+    measured,
+    outcome_of,
+    rounded_once,
+    sums_on_gpu,
+    ulps,
+)
 
 CASES = Cases()
 
@@ -160,12 +172,13 @@ def _none_known(on: On) -> Measured:
 CASES.add(_OP, "no known pixel", bound="an error", values="ValueError", gradients="-")(_none_known)
 
 
-@CASES.add(_OP, "NaN at unknown pixels is not read")
+@CASES.add(_OP, "NaN at unknown pixels is not read", on_gpu=sums_on_gpu(_OP))
 def _(on: On) -> Iterator[Measured]:
     features, flow = _draw(2, 6, 8), _flows(2, 2**-9, 6, 8)
     for mask in (_green(6, 8), _some(6, 8, 16), _some(6, 8, 2)):
         clean, broken = (_warp(f, flow, mask, on) for f in (features, features.masked_fill(~mask, _NAN)))
-        yield measured(sum(map(differ, broken, clean)), broken[0], broken[1:])
+        pairs = list(zip(broken, clean, strict=True))
+        yield measured(apart(pairs[:1], pairs[1:], on.device), broken[0], broken[1:])
 
 
 _WIDE = 4104

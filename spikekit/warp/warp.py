@@ -29,7 +29,9 @@ def flow_warp(image: Tensor, flow: Tensor) -> Tensor:
     Convention:
         Flow in pixels, order (x, y), x right, y down. Pixel centres are at whole numbers; positions outside the image
         are moved to its border. Coordinates are computed in float32 or wider. NaN flow counts as 0, infinite flow as
-        very far, both with gradient 0. Built on :func:`kornia.geometry.transform.remap`.
+        very far, both with gradient 0. Built on :func:`kornia.geometry.transform.remap`; on a GPU, under
+        ``torch.use_deterministic_algorithms(True)``, on a gather instead: the same up to rounding, with gradients that
+        are the same every time, and those of second order also where ``grid_sample`` of PyTorch has none.
 
     Args:
         image: :math:`(*, C, H, W)`, floating.
@@ -53,8 +55,35 @@ def flow_warp(image: Tensor, flow: Tensor) -> Tensor:
     planes = image.reshape(-1, *image.shape[-3:]).to(wide)
     grid = create_meshgrid(height, width, normalized_coordinates=False, device=flow.device, dtype=wide)
     x, y = (grid + finite(flow.reshape(-1, 2, height, width).to(wide)).movedim(1, -1)).unbind(-1)
-    warped = remap(planes, x, y, mode="bilinear", padding_mode="border", align_corners=True)
+    if image.is_cuda and torch.are_deterministic_algorithms_enabled():
+        warped = _bilinear(planes, x, y)
+    else:
+        warped = remap(planes, x, y, mode="bilinear", padding_mode="border", align_corners=True)
     return warped.to(image.dtype).reshape(image.shape)
+
+
+def _bilinear(planes: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Do what ``remap`` does, with derivatives of any order that are the same every time.
+
+    Args:
+        planes: (B, C, H, W), float32 or wider.
+        x: (B, H, W).
+        y: likewise.
+    """
+    height, width = planes.shape[-2:]
+    (left, right, share), (top, bottom, part) = _between(x, width), _between(y, height)
+    index = torch.stack([row * width + column for row in (top, bottom) for column in (left, right)], dim=1)
+    weight = torch.stack([v * h for v in (1 - part, part) for h in (1 - share, share)], dim=1)
+    return Gather.apply(planes.flatten(2), index.flatten(2), weight.flatten(2)).reshape(planes.shape)
+
+
+def _between(position: Tensor, length: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the pixels before and after a position on an axis, and the share of the latter."""
+    inside = (position > 0) & (position < length - 1)
+    position = torch.where(inside, position, position.detach().clamp(0, length - 1))  # at the border no gradient
+    before = position.detach().floor()
+    first = before.long()
+    return first, (first + 1).clamp(max=length - 1), position - before
 
 
 class FlowWarp(nn.Module):

@@ -9,6 +9,7 @@ from torch._dynamo.testing import CompileCounterWithBackend
 from torch.autograd import gradcheck, gradgradcheck
 
 from spikekit import FlowWarpIdw, bayer_mask, flow_warp, flow_warp_idw
+from spikekit.warp.warp import _bilinear
 
 UNIT = 4096  # the flows below are multiples of 1 / UNIT
 
@@ -481,3 +482,23 @@ def test_odd_steps(steps):
     for call in (lambda: flow_warp_idw(IMAGE, FLOW, MASK, steps=steps), lambda: FlowWarpIdw(steps=steps)):
         with pytest.raises(ValueError, match=r"steps: expected an even number .*, got "):
             call()
+
+
+def test_bilinear_gather_is_flow_warp_with_second_derivatives():
+    image, flow = torch.rand(2, 3, 5, 7).double(), 8 * torch.rand(2, 2, 5, 7).double() - 4
+    flow[0, :, :2] = flow[0, :, :2].round()
+
+    def gathered(image, flow):
+        y, x = torch.meshgrid(torch.arange(5), torch.arange(7), indexing="ij")
+        return _bilinear(image, x + flow[:, 0], y + flow[:, 1])
+
+    leaves = image.requires_grad_(), flow.requires_grad_()
+    assert torch.allclose(gathered(*leaves), flow_warp(*leaves), rtol=0, atol=1e-12)
+    weight = torch.rand(2, 3, 5, 7).double()
+    ours, theirs = (torch.autograd.grad(op(*leaves), leaves, weight) for op in (gathered, flow_warp))
+    off_grid = (flow != flow.round()).all(dim=1, keepdim=True)  # on it the derivative is that of either side
+    assert torch.allclose(ours[0], theirs[0], rtol=0, atol=1e-12)
+    assert torch.allclose(ours[1] * off_grid, theirs[1] * off_grid, rtol=0, atol=1e-12)
+    moved = tuple((leaf.detach() + 0.01 * k).requires_grad_() for k, leaf in enumerate(leaves))
+    assert gradcheck(gathered, moved)
+    assert gradgradcheck(gathered, moved)
