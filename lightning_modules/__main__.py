@@ -12,7 +12,13 @@ from lightning_modules.cli.short_help import VERBS, overview, usage
 from spikekit.completion import OPTION
 
 #: where the verbs that are not Lightning's are
-_OURS = {"sweep": "sweep.cli", "trade": "trade.cli", "export": "cli.export", "models": "cli.models"}
+_OURS = {
+    "sweep": "sweep.cli",
+    "trade": "trade.cli",
+    "adapt": "adaptation.cli",
+    "export": "cli.export",
+    "models": "cli.models",
+}
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -168,7 +168,9 @@ def main() -> None:
     parser.add_argument("--lr", type=float, default=5e-4)
     parser.add_argument("--alpha", type=float, default=0.6)
     parser.add_argument("--brightness", type=float, nargs=2, default=(0.3, 1.2))
-    parser.add_argument("--noise", type=json.loads, help="of the sensor, such as '{\"photons\": 3000}'; a random share of it")
+    parser.add_argument(
+        "--noise", type=json.loads, help="of the sensor, such as '{\"photons\": 3000}'; a random share of it"
+    )
     parser.add_argument("--workers", type=int, default=12, help="processes that make scenes")
     parser.add_argument("--kept", type=int, default=6000, help="scenes of each kind on the GPU")
     parser.add_argument("--seed", type=int, default=1)

@@ -280,7 +280,7 @@ class Command(LightningCLI):
             kwargs["logger"] = TensorBoardLogger(output, name="", version="") if self.subcommand == "fit" else False
         kwargs["plugins"] = [Checkpoints(), *_listed(config.get("plugins"))]
         if config.get("precision") is None:
-            kwargs["precision"] = _precision(config.get("accelerator"))
+            kwargs["precision"] = precision_of(config.get("accelerator"))
         if self.subcommand == "predict":
             precision = kwargs.get("precision", config.get("precision"))
             callbacks = prediction.callbacks(output, self.config_dump, precision, _listed(config.get("callbacks")))
@@ -403,17 +403,23 @@ def _check_agreement(model: Learner, data: LightningDataModule) -> None:
             raise ValueError(f"data.{name}: expected {expected}, as the model has it, got {got}")
 
 
-def _precision(accelerator: str) -> str:
+def precision_of(accelerator: str) -> str:
+    """Return bfloat16 for a GPU that supports it, float32 otherwise."""
     wanted = accelerator in ("auto", "gpu", "cuda") and torch.cuda.is_available() and torch.cuda.is_bf16_supported()
     return "bf16-mixed" if wanted else "32-true"
 
 
-def run(args: Sequence[str] | None, command: type[Command]) -> Command:
-    """Run what was typed after ``lightning``, with one of Lightning's verbs; errors are raised."""
+def without_chatter() -> None:
+    """Let Lightning say nothing that a user cannot act upon."""
     for says in ("pytorch_lightning.utilities.rank_zero", "lightning_fabric.utilities.seed"):
         logging.getLogger(says).setLevel(logging.WARNING)  # tips, and which devices there are
     for nothing_to_do in _NOTHING_TO_DO:
         warnings.filterwarnings("ignore", nothing_to_do)
+
+
+def run(args: Sequence[str] | None, command: type[Command]) -> Command:
+    """Run what was typed after ``lightning``, with one of Lightning's verbs; errors are raised."""
+    without_chatter()
     if not rank_zero_only.rank:
         os.environ[_FIRST] = str(os.getpid())
     elif os.environ.get(_FIRST) == str(os.getppid()):

@@ -12,6 +12,7 @@ VERBS = {
     "predict": "Make colour pictures of a recording.",
     "sweep": "Train and test every combination of overlays, values and seeds.",
     "trade": "Measure the cost and the quality of every setting.",
+    "adapt": "Fine-tune fast weights on a recording, without ground truth.",
     "export": "Write a network for other programs: safetensors, torch.export or ONNX.",
     "models": "List the weights that come with the package.",
 }

@@ -1,0 +1,131 @@
+"""What a network can learn from a recording: the pictures that a slower one makes of it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from lightning_modules.data.recording import RecordingClips
+from lightning_modules.inference.tiles import TILE, forward_in_tiles
+from lightning_modules.networks import Network
+from spikekit.io.whole_file import whole_file
+from spikekit.progress import progress
+
+#: lessons, and how many of them are held out: pictures of the end of the recording
+LESSONS, HELD_OUT = 16, 4
+#: clips of the longer of both networks that a recording has to have room for
+ROOM = 3
+
+_SIDE = 160  # of what a lesson shows, in sensor pixels
+
+
+@dataclass(frozen=True)
+class Lessons:
+    """Clips of a recording, and what the teacher sees in them.
+
+    Args:
+        spikes: (L, N, H, W) uint8, as the student takes them.
+        rgb: pictures of the teacher, (L, 3, s H, s W) float16, in the student's units.
+        flow: motion as the student's estimator sees it; None where it needs none.
+        white: what the student's picture of a white pixel would be.
+    """
+
+    spikes: Tensor
+    rgb: Tensor
+    flow: Tensor | None
+    white: float
+
+    def __len__(self) -> int:
+        return len(self.spikes)
+
+    def part(self, which: slice) -> Lessons:
+        """Return some of them."""
+        flow = None if self.flow is None else self.flow[which]
+        return Lessons(self.spikes[which], self.rgb[which], flow, self.white)
+
+    def write(self, path: Path, identity: dict[str, Any]) -> None:
+        """Write a file that also says what the lessons are of."""
+        tensors = {"spikes": self.spikes, "rgb": self.rgb, "white": torch.tensor(self.white, dtype=torch.float64)}
+        tensors |= {} if self.flow is None else {"flow": self.flow}
+        tensors = {name: value.contiguous() for name, value in tensors.items()}
+        with whole_file(path) as file:
+            file.write(save(tensors, {"lessons": json.dumps(identity)}))
+
+    @classmethod
+    def read(cls, path: Path, identity: dict[str, Any]) -> Lessons:
+        """Read them again.
+
+        Raises:
+            ValueError: a file of something else, or lessons of another adaptation.
+        """
+        try:
+            with safe_open(path, "pt") as file:
+                said = json.loads((file.metadata() or {})["lessons"])
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            made = cls(tensors["spikes"], tensors["rgb"], tensors.get("flow"), tensors["white"].item())
+        except (SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
+            raise ValueError(f"{path}: not the lessons of lightning adapt, or damaged ones") from error
+        for name in identity:
+            if said.get(name) != identity[name]:
+                raise ValueError(
+                    f"{path.parent}: expected the adaptation that began here, with {name} {said.get(name)}, "
+                    f"got {identity[name]}; -o goes elsewhere"
+                )
+        return made
+
+
+def chosen_frames(total: int, frames: int) -> list[int]:
+    """Return which frames lessons are about; no clip of the last ones, which are held out, overlaps another's.
+
+    Args:
+        total: frames of the recording, at least ``ROOM`` clips.
+        frames: of the longest clip.
+
+    Example:
+        >>> chosen_frames(1000, 101)[-5:]
+        [696, 850, 882, 914, 949]
+    """
+    first, last = frames // 2, total - (frames + 1) // 2
+    held_out = last - (last - first) // 5
+    taught = np.linspace(first, held_out - frames, LESSONS - HELD_OUT)
+    return [round(frame) for frame in [*taught, *np.linspace(held_out, last, HELD_OUT)]]
+
+
+def make_lessons(student: Network, teacher: Network, clips: RecordingClips) -> Lessons:
+    """Let the teacher look at a recording.
+
+    Args:
+        student: what is to learn.
+        teacher: of the same scale and Bayer phase.
+        clips: of the recording, of as many frames as the network with the longer ones takes.
+    """
+    chosen = chosen_frames(clips.recording.frames, clips.frames)
+    ratio = teacher.settings["alpha"] / student.settings["alpha"]
+    device, rng = next(teacher.parameters()).device, np.random.default_rng(0)
+    sides = [min(side, _SIDE) // 2 * 2 for side in clips.size]
+    spikes, pictures, flows = [], [], []
+    for item in progress(clips.in_order(chosen), "lessons", len(chosen)):
+        corner = (2 * int(rng.integers((whole - side) // 2 + 1)) for whole, side in zip(clips.size, sides, strict=True))
+        window = tuple(slice(z, z + side) for z, side in zip(corner, sides, strict=True))
+        seen = item["spikes"][None, ..., *window].to(device)
+        pictures.append(forward_in_tiles(teacher, _middle(seen, teacher.frames), TILE).mul(ratio).half().cpu())
+        seen = _middle(seen, student.frames).contiguous()
+        spikes.append(seen.cpu())
+        if student.takes_flow and not student.motion.static:
+            with torch.no_grad():
+                flows.append(student.estimate_flow(seen).cpu())
+    white = clips.white / student.settings["alpha"]
+    return Lessons(torch.cat(spikes), torch.cat(pictures), torch.cat(flows) if flows else None, white)
+
+
+def _middle(spikes: Tensor, frames: int) -> Tensor:
+    start = (spikes.shape[1] - frames) // 2
+    return spikes[:, start : start + frames]

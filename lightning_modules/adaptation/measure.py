@@ -1,0 +1,113 @@
+"""Measure what ``lightning adapt`` is worth where the truth is known.
+
+``python -m lightning_modules.adaptation.measure PICTURES`` prints the table: still pictures in motion, seen by one
+noisy sensor; weights adapted to each recording, and judged on its end and on the end of the next one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from lightning_modules.adaptation.learn import learn
+from lightning_modules.adaptation.lessons import HELD_OUT, chosen_frames, make_lessons
+from lightning_modules.data.pictures import folder_pictures
+from lightning_modules.data.recording import RecordingClips
+from lightning_modules.data.stills import StillClips
+from lightning_modules.inference.export import load_network
+from lightning_modules.inference.predict import predict
+from lightning_modules.metrics.noisy_sensor import NOISE
+from lightning_modules.networks import Network
+from spikekit import SensorNoise, SpikeSensor, psnr, write_spikes
+from spikekit.tables import table
+
+FRAMES, PATCH = 601, 80
+#: displacement of the scenes in half of these frames, in sensor pixels; they take turns
+MOTION = 24.0, 12.0, 6.0
+
+
+@dataclass
+class Seen:
+    """A recording whose truth is known."""
+
+    path: Path
+    alpha: float
+    frames: list[int]
+    truth: list[Tensor]
+
+    def clips(self, frames: int) -> RecordingClips:
+        """Return its clips of so many frames."""
+        return RecordingClips(str(self.path), pattern="RGGB", frames=frames, white=self.alpha)
+
+    def psnr(self, network: Network) -> float:
+        """Return the PSNR in dB of the held-out pictures by a network."""
+        exposure = network.settings["alpha"] / self.alpha
+        clips = self.clips(network.frames).in_order(self.frames)
+        seen = [predict(network, clip["spikes"][None], exposure=exposure)[0] for clip in clips]
+        return torch.stack([psnr(*pair) for pair in zip(seen, self.truth, strict=True)]).mean().item()
+
+
+def record(picture: Path, number: int, noise: SensorNoise, alpha: float, scale: int, frames: int, path: Path) -> Seen:
+    """Let a sensor, always the same, see a still picture in motion; ``frames`` are those of the longest clip."""
+    stills = StillClips(
+        [picture],
+        scale=scale,
+        patch=PATCH,
+        frames=FRAMES,
+        alpha=alpha,
+        motion=MOTION[number % len(MOTION)],
+        brightness=(1.0, 1.0),
+        flow_times=(0,),
+        seed=number,
+        augment=False,
+    )
+    scene = stills.scene(0)
+    write_spikes(path, SpikeSensor(noise, seed=0).expose(scene.light("RGGB", scale=scale, alpha=alpha)))
+    held_out = chosen_frames(FRAMES, frames)[-HELD_OUT:]
+    return Seen(path, alpha, held_out, [scene.rgb(frame).float() for frame in held_out])
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("pictures", help="folder of pictures")
+    parser.add_argument("--weights", default="cscsr_small_x4", help="what is adapted; cscsr_small_x4 if not given")
+    parser.add_argument("--teacher", default="cscsr_huge_long_noisy_x4", help="cscsr_huge_long_noisy_x4 if not given")
+    parser.add_argument(
+        "--noise", type=json.loads, help="of the sensor; that of lightning_modules.metrics.noisy_sensor"
+    )
+    parser.add_argument("--alpha", type=float, default=0.25, help="light of a white pixel per clock; 0.25")
+    parser.add_argument("--count", type=int, default=4, help="how many pictures, evenly from the folder; 4")
+    parser.add_argument("--steps", type=int, default=100, help="100")
+    args = parser.parse_args()
+    noise = NOISE if args.noise is None else SensorNoise(**args.noise)
+    teacher, found = load_network(args.teacher).eval(), folder_pictures(args.pictures)
+    chosen = [found[n * len(found) // args.count] for n in range(args.count)]
+    rows = []
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        longest = max(teacher.frames, load_network(args.weights).frames)
+        shared = noise, args.alpha, teacher.scale, longest
+        seen = [record(path, n, *shared, folder / f"{n}.npz") for n, path in enumerate(chosen)]
+        for n, (one, other) in enumerate(zip(seen, [*seen[1:], seen[0]], strict=True)):
+            student = load_network(args.weights).eval()
+            before = one.psnr(student), other.psnr(student)
+            lessons = make_lessons(student, teacher, one.clips(longest))
+            alike = learn(student, lessons, args.steps, folder / str(n), enable_progress_bar=False)
+            after = one.psnr(student), other.psnr(student)
+            rows.append([before[0], after[0], one.psnr(teacher), *alike, before[1], after[1]])
+    rows.append(torch.tensor(rows).mean(0).tolist())
+    names = [*(path.name for path in chosen), "mean"]
+    head = ["", "before", "after", "teacher", "likeness before", "after", "next recording before", "after"]
+    lines = [[name, *(f"{value:.2f}" for value in row)] for name, row in zip(names, rows, strict=True)]
+    print(table(head, lines))  # noqa: T201
+
+
+if __name__ == "__main__":
+    main()
