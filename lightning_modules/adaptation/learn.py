@@ -23,6 +23,7 @@ from lightning_modules.tasks.super_resolution import SuperResolution
 from spikekit import psnr
 
 _PATCH, _BATCH, _RATE = 40, 4, 1e-3
+_RISING = 10  # steps until the rate is reached; then it falls to 0
 _EVERY = 20  # steps from one checkpoint to the next
 _KNOWN = r".*(no `val_dataloader`|exists and is not empty|not resumable)"  # to Lightning a reason to warn
 
@@ -69,6 +70,10 @@ def likeness(network: Network, lessons: Lessons) -> float:
     return torch.stack(values).mean().item()
 
 
+def _rate(step: int, steps: int) -> float:
+    return min(1, (step + 1) / _RISING) * (1 - step / (steps + 1))
+
+
 def learn(student: Network, lessons: Lessons, steps: int, folder: Path, **trainer: Any) -> tuple[float, float]:
     """Train a network on lessons; it goes on where a training in the folder was interrupted.
 
@@ -84,7 +89,7 @@ def learn(student: Network, lessons: Lessons, steps: int, folder: Path, **traine
     """
     taught, held_out = lessons.part(slice(-HELD_OUT)), lessons.part(slice(-HELD_OUT, None))
     before = likeness(student, held_out)
-    schedule = partial(torch.optim.lr_scheduler.LinearLR, start_factor=1.0, end_factor=0.01, total_iters=steps)
+    schedule = partial(torch.optim.lr_scheduler.LambdaLR, lr_lambda=partial(_rate, steps=steps))
     module = SuperResolution(student, partial(torch.optim.Adam, lr=_RATE), schedule)
     last = ModelCheckpoint(folder, "last", every_n_train_steps=_EVERY, enable_version_counter=False)
     running = Trainer(

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from lightning_modules.adaptation.learn import learn
 from lightning_modules.adaptation.lessons import HELD_OUT, chosen_frames, make_lessons
+from lightning_modules.cli.command import without_chatter
 from lightning_modules.data.pictures import folder_pictures
 from lightning_modules.data.recording import RecordingClips
 from lightning_modules.data.stills import StillClips
@@ -86,6 +87,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=4, help="how many pictures, evenly from the folder; 4")
     parser.add_argument("--steps", type=int, default=100, help="100")
     args = parser.parse_args()
+    without_chatter()
     noise = NOISE if args.noise is None else SensorNoise(**args.noise)
     teacher, found = load_network(args.teacher).eval(), folder_pictures(args.pictures)
     chosen = [found[n * len(found) // args.count] for n in range(args.count)]

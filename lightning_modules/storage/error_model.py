@@ -35,9 +35,9 @@ class ErrorModel:
         ValueError: a constant that is no finite number of 0 or more.
     """
 
-    flat: float = 12.0
+    flat: float = 57.0
     grainy: float = 1.7
-    blurred: float = 0.26
+    blurred: float = 0.48
     still: float = 0.18
     textured: float = 0.07
     moved: float = 0.00068

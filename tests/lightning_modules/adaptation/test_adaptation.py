@@ -1,7 +1,6 @@
 """Fine-tuning on a recording: what a lesson shows, what is held out, what is kept, and how it goes on."""
 
 import copy
-from argparse import Namespace
 
 import pytest
 import torch
@@ -130,7 +129,8 @@ def test_it_goes_on_where_it_was_interrupted(lessons, tmp_path, monkeypatch):
 
 
 def typed(recording, output, *more):
-    return ["adapt", str(recording), "--pattern", "RGGB", "--weights", "cscsr_tiny_x4", "-o", str(output), *more]
+    data = ["--data", "Recording", "--data.path", str(recording), "--data.pattern", "RGGB"]
+    return ["adapt", *data, "--model.weights", "cscsr_tiny_x4", "-o", str(output), *more]
 
 
 def test_the_command(recording, tmp_path, capsys):
@@ -163,12 +163,18 @@ def test_what_gains_nothing_is_not_kept(recording, tmp_path):
 @pytest.mark.parametrize(
     ("more", "expected"),
     [
-        (["--teacher", "cscsr_small_x2"], "--teacher: expected scale 4 of cscsr_tiny_x4, got 2 of cscsr_small_x2"),
+        (
+            ["--teacher", "cscsr_small_x2"],
+            "--teacher: expected scale 4 of the weights that learn, got 2",
+        ),
         (["--teacher", "cscsr_huge_long_x4"], "expected at least 303 frames, 3 clips of 101, got 160"),
         (["--teacher", "ClassicalDecoder"], "--teacher: expected weights, got ClassicalDecoder, which has none"),
-        (["--weights", "ClassicalDecoder"], "--weights: expected a network that learns from single clips"),
-        (["--weights", "cscsr_large_film_x4"], "--weights: expected a network that learns from single clips"),
-        (["--weights", "none"], "none: neither a file of weights nor the name"),
+        (["--model.weights", "ClassicalDecoder"], "--model.weights: expected a network that learns"),
+        (
+            ["--model.weights", "cscsr_large_film_x4"],
+            "--model.weights: expected a network that learns",
+        ),
+        (["--model.weights", "none"], "none: neither a file of weights nor the name"),
     ],
 )
 def test_errors_are_one_line(recording, tmp_path, capsys, more, expected):
@@ -201,8 +207,6 @@ def test_the_teacher_is_the_slowest_for_such_a_sensor(tmp_path, weights, frames,
     if measured is not None:
         planes = torch.ones(6, 6), torch.full((6, 6), measured), torch.zeros(6, 6, dtype=torch.uint8)
         write_calibration(tmp_path / "camera.calibration.safetensors", Calibration(*planes))
-    known = {"height": None, "width": None, "flip": False, "camera": None, "calibration": None, "pattern": None}
-    asked = Namespace(file=path, teacher=None, **known)
-    clips, name = cli._clips_and_teacher(asked, CSCSR.from_pretrained(weights))
+    clips, name = cli.clips_and_teacher({"path": str(path)}, CSCSR.from_pretrained(weights), None)
     assert name == expected
     assert clips.frames == CSCSR.from_pretrained(expected).frames

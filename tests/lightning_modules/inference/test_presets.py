@@ -208,7 +208,7 @@ def test_a_recording_says_how_much_room_there_is(longer, total, frame, expected)
 @pytest.mark.parametrize(
     ("typed", "expected"),
     [
-        ([], "cscsr_large_noisy_x4"),
+        ([], "cscsr_huge_film_noisy_x4"),
         (["--data.every", "20", "--data.frame", "50:151:20"], "cscsr_huge_long_film_noisy_x4"),
         (["--data.frame", "100"], "cscsr_huge_long_noisy_x4"),
         (["--model.network.scale", "2"], ""),

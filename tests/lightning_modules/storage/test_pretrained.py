@@ -290,14 +290,15 @@ def test_the_list_of_weights_says_what_the_networks_are(configs):
         "small",
         "base",
         "large",
-        "large",
+        "huge",
         "huge",
         "huge_long",
         "huge_long",
         "large_film",
         "huge_deep_film",
+        "huge_deep_film",
         "huge_long_deep_film",
-        "huge_long_film",
+        "huge_long_deep_film",
     ]
     for weights in listed:
         found = read_weights(weights.name)
