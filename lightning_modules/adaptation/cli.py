@@ -11,17 +11,18 @@ from typing import Any
 
 import torch
 
-from lightning_modules.adaptation.learn import learn
+from lightning_modules.adaptation.learn import CHECKPOINT, learn
 from lightning_modules.adaptation.lessons import ROOM, Lessons, make_lessons
-from lightning_modules.cli.command import precision_of, without_chatter
+from lightning_modules.cli.command import check_folder, precision_of, without_chatter
 from lightning_modules.cli.errors import InputError, UsageError, VerbParser
 from lightning_modules.cli.folder_lock import locked_folder
 from lightning_modules.data.recording import RecordingClips
 from lightning_modules.inference.export import load_network
 from lightning_modules.networks import Network, RecurrentCSCSR
 from lightning_modules.storage.pretrained import Weights, motion_of, settings_of, write_weights
-from lightning_modules.storage.shipped import list_pretrained
+from lightning_modules.storage.shipped import find_shipped, list_pretrained
 from lightning_modules.tasks.predictions import file_identity
+from spikekit.arguments import UsageError as SpikekitUsageError
 from spikekit.arguments import whole
 from spikekit.color.cfa import PATTERNS
 from spikekit.io.recording import own_calibration
@@ -31,6 +32,7 @@ from spikekit.timing import duration
 LEAST_GAIN = 0.1
 
 _WRITTEN = "adapted.safetensors"
+_LEAST_SIDE = 4  # pixels of a recording
 
 
 def parser() -> argparse.ArgumentParser:
@@ -80,37 +82,55 @@ def adapt(args: Sequence[str]) -> None:
     data = {name.removeprefix("data."): value for name, value in vars(asked).items() if name.startswith("data.")}
     data["flip"] = data["flip"] == "true"
     weights = vars(asked)["model.weights"]
-    begin = perf_counter()
+    begin, written = perf_counter(), asked.output / _WRITTEN
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    with locked_folder(asked.output, "adaptation"):
-        try:
-            student = _student(weights)
-            clips, name = clips_and_teacher(data, student, asked.teacher)
-            path = asked.output / "lessons.safetensors"
-            identity = {"recording": file_identity(data["path"]), "sensor": _sensor(clips, data["calibration"])}
-            identity |= {"weights": weights, "teacher": name, "steps": asked.steps}
-            if path.is_file():
-                lessons = Lessons.read(path, identity)
-            else:
-                lessons = make_lessons(student.to(device), load_network(name).to(device).eval(), clips)
-                lessons.write(path, identity)
-            how = {"precision": precision_of("auto"), "enable_progress_bar": sys.stderr.isatty()}
+    try:
+        check_folder(asked.output)
+        student = _student(weights).to(device)
+        clips, name = clips_and_teacher(data, student, asked.teacher)
+        known = {"recording": _identity(data["path"]), "sensor": _sensor(clips, data["calibration"])}
+        known |= {"weights": _identity(weights), "teacher": _identity(name), "steps": asked.steps}
+        with locked_folder(asked.output, "adaptation"):
+            lessons = _lessons(asked.output, known, student, name, clips)
+            how = {"accelerator": "gpu" if device == "cuda" else "cpu", "precision": precision_of(device)}
+            how["enable_progress_bar"] = sys.stderr.isatty()
             before, after = learn(student, lessons, asked.steps, asked.output, **how)
-        except (OSError, ValueError) as error:
-            raise (UsageError if isinstance(error, UsageError) else InputError)(str(error)) from error
-        said = f"{before:.2f} dB from the held-out pictures of {name} before, {after:.2f} dB after {asked.steps} steps"
-        if after < before + LEAST_GAIN:
-            raise InputError(f"{weights}: {said}: expected {LEAST_GAIN} dB more; use them as they are")
-        written = asked.output / _WRITTEN
-        tensors = student.cpu().state_dict()
-        write_weights(Weights(written, settings_of(student), motion_of(student), tensors), written)
+            said = (
+                f"{before:.2f} dB from the held-out pictures of {name} before, {after:.2f} dB after {asked.steps} steps"
+            )
+            if not after >= before + LEAST_GAIN:
+                raise InputError(f"{said}: expected {LEAST_GAIN} dB more; nothing written, go on using {weights}")
+            tensors = student.cpu().state_dict()
+            write_weights(Weights(written, settings_of(student), motion_of(student), tensors), written)
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:
+        raise (UsageError if isinstance(error, SpikekitUsageError) else InputError)(str(error)) from error
+    except KeyboardInterrupt:
+        raise InputError("adapt: stopped; the same command goes on") from None
     print(f"{said}\n{written}: in {duration(perf_counter() - begin)}; for lightning predict --model.weights {written}")
+
+
+def _lessons(folder: Path, known: dict[str, Any], student: Network, teacher: str, clips: RecordingClips) -> Lessons:
+    """Return the lessons that are in a folder already, or make them."""
+    path = folder / "lessons.safetensors"
+    if path.is_file():
+        return Lessons.read(path, known)
+    if (folder / CHECKPOINT).exists():
+        raise ValueError(f"{folder / CHECKPOINT}: expected the lessons of this training beside it; -o goes elsewhere")
+    device = next(student.parameters()).device
+    lessons = make_lessons(student, load_network(teacher).to(device).eval(), clips)
+    lessons.write(path, known)
+    return lessons
 
 
 def _student(weights: str) -> Network:
     student = load_network(weights)
-    if isinstance(student, RecurrentCSCSR) or not any(True for _ in student.parameters()):
-        raise UsageError(f"--model.weights: expected a network that learns from single clips, got {weights}")
+    learns = any(parameter.requires_grad for parameter in student.parameters())
+    if isinstance(student, RecurrentCSCSR) or not learns or student.settings.get("motion_fusion", "joint") != "joint":
+        raise UsageError(
+            f"--model.weights: expected a network that learns from single clips and one flow, got {weights}"
+        )
     return student.eval()
 
 
@@ -128,6 +148,8 @@ def clips_and_teacher(data: dict[str, Any], student: Network, teacher: str | Non
     """
     data = data | {"crop_to": student.pattern}
     clips = RecordingClips(**data, frames=student.frames)
+    if min(clips.size) < _LEAST_SIDE:
+        raise ValueError(f"{data['path']}: expected at least {_LEAST_SIDE} x {_LEAST_SIDE} pixels, got {clips.size}")
     name = teacher or _slowest(clips, student)
     network = load_network(name)
     if not any(True for _ in network.parameters()):
@@ -159,8 +181,13 @@ def _too_short(clips: RecordingClips, frames: int) -> str:
     return f"{clips.recording.path}: expected {least}, got {clips.recording.frames}"
 
 
-def _sensor(clips: RecordingClips, calibration: str | None) -> list[Any]:
+def _identity(source: str) -> str:
+    """Return what tells a file from another, and from itself after it has changed; the name of shipped weights."""
+    return source if find_shipped(source) or not Path(source).is_file() else str(file_identity(source))
+
+
+def _sensor(clips: RecordingClips, calibration: str | None) -> str:
     """Return what the spikes depend on besides the file."""
     own = own_calibration(clips.recording.path) if calibration is None else Path(calibration)
-    measured = file_identity(own) if own.is_file() else None
-    return [*clips.size, clips.top, clips.left, clips.recording.flip, clips.grey, measured]
+    how = clips.size, clips.top, clips.left, clips.recording.flip, clips.grey, clips.recording.alpha
+    return f"{how}, calibration {file_identity(own) if own.is_file() else 'none'}"

@@ -20,12 +20,17 @@ from lightning_modules.networks import Network
 from lightning_modules.storage.checkpoint import read_checkpoint
 from lightning_modules.tasks.checkpoint_io import Checkpoints
 from lightning_modules.tasks.super_resolution import SuperResolution
+from lightning_modules.tasks.training_state import check_training_state
 from spikekit import psnr
+
+#: what is kept of a training that is interrupted
+CHECKPOINT = "last.ckpt"
 
 _PATCH, _BATCH, _RATE = 40, 4, 1e-3
 _RISING = 10  # steps until the rate is reached; then it falls to 0
 _EVERY = 20  # steps from one checkpoint to the next
-_KNOWN = r".*(no `val_dataloader`|exists and is not empty|not resumable)"  # to Lightning a reason to warn
+# of what Lightning would warn
+_KNOWN = r".*(no `val_dataloader`|exists and is not empty|not resumable|dirpath has changed)"
 
 
 class _Patches(Dataset):
@@ -91,10 +96,12 @@ def learn(student: Network, lessons: Lessons, steps: int, folder: Path, **traine
     before = likeness(student, held_out)
     schedule = partial(torch.optim.lr_scheduler.LambdaLR, lr_lambda=partial(_rate, steps=steps))
     module = SuperResolution(student, partial(torch.optim.Adam, lr=_RATE), schedule)
-    last = ModelCheckpoint(folder, "last", every_n_train_steps=_EVERY, enable_version_counter=False)
+    device = next(student.parameters()).device
+    last = ModelCheckpoint(folder, Path(CHECKPOINT).stem, every_n_train_steps=_EVERY, enable_version_counter=False)
     running = Trainer(
         max_steps=steps,
         max_epochs=-1,
+        devices=1,
         logger=False,
         callbacks=[last],
         plugins=[Checkpoints()],
@@ -102,12 +109,15 @@ def learn(student: Network, lessons: Lessons, steps: int, folder: Path, **traine
         default_root_dir=folder,
         **trainer,
     )
-    checkpoint = folder / "last.ckpt"
-    resumed = str(checkpoint) if checkpoint.is_file() else None
-    seen = _BATCH * read_checkpoint(resumed)["global_step"] if resumed else 0
+    seen, resumed = 0, None
+    if (folder / CHECKPOINT).is_file():
+        resumed = folder / CHECKPOINT
+        checkpoint = read_checkpoint(resumed)
+        check_training_state(checkpoint, resumed)
+        seen = _BATCH * checkpoint["global_step"]
     patches = _Patches(taught, student.pattern, student.scale, _BATCH * steps, seen)
     student.train()
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", _KNOWN)
-        running.fit(module, DataLoader(patches, _BATCH), ckpt_path=resumed)
-    return before, likeness(student.eval(), held_out)
+        running.fit(module, DataLoader(patches, _BATCH), ckpt_path=resumed and str(resumed))
+    return before, likeness(student.to(device).eval(), held_out)

@@ -24,6 +24,7 @@ LESSONS, HELD_OUT = 16, 4
 #: clips of the longer of both networks that a recording has to have room for
 ROOM = 3
 
+_SHORT = 40  # characters that a message can bear
 _SIDE = 160  # of what a lesson shows, in sensor pixels
 
 
@@ -73,12 +74,12 @@ class Lessons:
             made = cls(tensors["spikes"], tensors["rgb"], tensors.get("flow"), tensors["white"].item())
         except (SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
             raise ValueError(f"{path}: not the lessons of lightning adapt, or damaged ones") from error
-        for name in identity:
-            if said.get(name) != identity[name]:
-                raise ValueError(
-                    f"{path.parent}: expected the adaptation that began here, with {name} {said.get(name)}, "
-                    f"got {identity[name]}; -o goes elsewhere"
-                )
+        for name, value in identity.items():
+            if said.get(name) != value:
+                short = len(str(value)) < _SHORT
+                expected, got = (said.get(name), value) if short else ("that", "another")
+                where = f"{expected} of the adaptation in {path.parent}"
+                raise ValueError(f"{name}: expected {where}, got {got}; -o goes elsewhere")
         return made
 
 
@@ -127,5 +128,5 @@ def make_lessons(student: Network, teacher: Network, clips: RecordingClips) -> L
 
 
 def _middle(spikes: Tensor, frames: int) -> Tensor:
-    start = (spikes.shape[1] - frames) // 2
+    start = spikes.shape[1] // 2 - frames // 2
     return spikes[:, start : start + frames]

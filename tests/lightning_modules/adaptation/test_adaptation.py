@@ -14,6 +14,7 @@ from lightning_modules.adaptation.learn import learn, likeness
 from lightning_modules.adaptation.lessons import HELD_OUT, Lessons, chosen_frames, make_lessons
 from lightning_modules.data.recording import RecordingClips
 from lightning_modules.networks import CSCSR
+from lightning_modules.storage.shipped import find_shipped
 from spikekit import Calibration, simulate_spikes, write_calibration, write_spikes
 
 
@@ -133,7 +134,8 @@ def typed(recording, output, *more):
     return ["adapt", *data, "--model.weights", "cscsr_tiny_x4", "-o", str(output), *more]
 
 
-def test_the_command(recording, tmp_path, capsys):
+def test_the_command(recording, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(learning, "_EVERY", 4)
     asked = typed(recording, tmp_path / "out", "--teacher", "cscsr_small_x4", "--steps", "8")
     main(asked)
     written = tmp_path / "out" / "adapted.safetensors"
@@ -145,17 +147,18 @@ def test_the_command(recording, tmp_path, capsys):
     assert any(not torch.equal(a, b) for a, b in zip(adapted.parameters(), shipped.parameters(), strict=True))
     first = written.read_bytes()
     written.unlink()
-    main(asked)  # nothing is left to do
+    monkeypatch.setattr(learning._Patches, "__getitem__", None)
+    main(asked)  # nothing is left to learn
     assert written.read_bytes() == first
     how = ["--data", "Recording", "--data.path", str(recording), "--data.frame", "80", "-o", str(tmp_path / "a.png")]
     main(["predict", "--model.weights", str(written), *how])
     assert (tmp_path / "a.png").is_file()
-    with pytest.raises(SystemExit, match="with steps 8, got 9; -o goes elsewhere"):
+    with pytest.raises(SystemExit, match=r"steps: expected 8 of the adaptation in .*, got 9; -o goes elsewhere"):
         main([*asked[:-1], "9"])
 
 
 def test_what_gains_nothing_is_not_kept(recording, tmp_path):
-    with pytest.raises(SystemExit, match=r"expected 0\.1 dB more; use them as they are"):
+    with pytest.raises(SystemExit, match=r"expected 0\.1 dB more; nothing written, go on using cscsr_tiny_x4"):
         main(typed(recording, tmp_path, "--teacher", "cscsr_tiny_x4", "--steps", "1"))
     assert not (tmp_path / "adapted.safetensors").exists()
 
@@ -174,6 +177,8 @@ def test_what_gains_nothing_is_not_kept(recording, tmp_path):
             ["--model.weights", "cscsr_large_film_x4"],
             "--model.weights: expected a network that learns",
         ),
+        (["--model.weights", "TwoSpanCSCSR"], "--model.weights: expected a network that learns"),
+        (["-o", "out.safetensors"], "-o: expected a folder, got out.safetensors, which ends like a file"),
         (["--model.weights", "none"], "none: neither a file of weights nor the name"),
     ],
 )
@@ -210,3 +215,53 @@ def test_the_teacher_is_the_slowest_for_such_a_sensor(tmp_path, weights, frames,
     clips, name = cli.clips_and_teacher({"path": str(path)}, CSCSR.from_pretrained(weights), None)
     assert name == expected
     assert clips.frames == CSCSR.from_pretrained(expected).frames
+
+
+def test_pictures_that_are_no_numbers_are_not_kept(recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(cli, "learn", lambda *_, **__: (30.0, float("nan")))
+    with pytest.raises(SystemExit, match="nothing written"):
+        main(typed(recording, tmp_path, "--teacher", "cscsr_small_x4"))
+    assert not (tmp_path / "adapted.safetensors").exists()
+
+
+def test_what_lies_in_the_folder_is_of_this_adaptation(recording, lessons, tmp_path, monkeypatch):
+    """Another training, other weights of the same name, another calibration, damaged files."""
+    monkeypatch.setattr(cli, "make_lessons", lambda *_: lessons)
+    monkeypatch.setattr(cli, "learn", lambda *_, **__: (30.0, 31.0))
+    mine, data = tmp_path / "mine.safetensors", tmp_path / "data.npz"
+    mine.write_bytes(find_shipped("cscsr_tiny_x4").path.read_bytes())
+    data.write_bytes(recording.read_bytes())
+    asked = typed(data, tmp_path / "out", "--teacher", "cscsr_small_x4", "--model.weights", str(mine))
+    main(asked)
+    kept = tmp_path / "out" / "lessons.safetensors"
+    whole = kept.read_bytes()
+    planes = torch.ones(28, 24), torch.zeros(28, 24), torch.zeros(28, 24, dtype=torch.uint8)
+    write_calibration(tmp_path / "data.calibration.safetensors", Calibration(*planes))
+    with pytest.raises(SystemExit, match=r"sensor: expected that of the adaptation in .*, got another; "):
+        main(asked)
+    (tmp_path / "data.calibration.safetensors").unlink()
+    mine.write_bytes(mine.read_bytes())
+    with pytest.raises(SystemExit, match="weights: expected that of the adaptation in"):
+        main(asked)
+    kept.write_bytes(whole[:1000])
+    with pytest.raises(SystemExit, match=r"lessons\.safetensors: not the lessons of lightning adapt, or damaged ones"):
+        main(asked)
+    kept.unlink()
+    (tmp_path / "out" / "last.ckpt").write_bytes(b"")
+    with pytest.raises(SystemExit, match=r"last\.ckpt: expected the lessons of this training beside it"):
+        main(asked)
+
+
+def test_a_checkpoint_that_no_training_wrote(lessons, tmp_path):
+    torch.save({"state_dict": {}}, tmp_path / "last.ckpt")
+    with pytest.raises(ValueError, match=r"last\.ckpt: not a checkpoint that training can go on with"):
+        learn(CSCSR.from_pretrained("cscsr_tiny_x4").eval(), lessons, 8, tmp_path, enable_progress_bar=False)
+
+
+def test_interrupted(recording, tmp_path, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "make_lessons", stop)
+    with pytest.raises(SystemExit, match="adapt: stopped; the same command goes on"):
+        main(typed(recording, tmp_path, "--teacher", "cscsr_small_x4"))
