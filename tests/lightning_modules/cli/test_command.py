@@ -279,7 +279,7 @@ def test_what_looks_like_a_file_becomes_no_folder(name, said, tmp_path, decoder)
 def test_every_verb_is_named_where_none_was_typed(typed):
     with pytest.raises(SystemExit) as exit:
         main(typed)
-    verbs = "fit, validate, test, predict, sweep, trade, export, models"
+    verbs = "fit, validate, test, predict, sweep, trade, adapt, export, models"
     got = typed[0] if typed else "none"
     assert str(exit.value) == f"lightning: expected a verb, one of {verbs}, got {got} (see lightning --help)"
 
