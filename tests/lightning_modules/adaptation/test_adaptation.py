@@ -62,6 +62,14 @@ def test_lessons_are_what_the_student_would_see_where_it_is_the_teacher(recordin
     assert likeness(student, worse) < 50
 
 
+@pytest.mark.parametrize(("total", "frames"), [(101, 41), (102, 41), (102, 40), (41, 41)])
+def test_both_networks_see_the_same_moment(total, frames):
+    """That of a clip is its frame ``frames // 2``."""
+    cut = making._middle(torch.arange(total).view(1, -1, 1, 1), frames)
+    assert cut.shape[1] == frames
+    assert cut[0, frames // 2].item() == total // 2
+
+
 def test_patches_keep_place_time_and_motion_together(monkeypatch):
     monkeypatch.setattr(learning, "_PATCH", 8)
     spikes = torch.arange(3 * 12 * 20, dtype=torch.float32).reshape(1, 3, 12, 20)
