@@ -41,8 +41,8 @@ def parser() -> argparse.ArgumentParser:
         prog="lightning adapt",
         description="Fine-tune fast weights on a recording of your camera, without ground truth: they learn from the "
         "pictures that slower weights make of it. The end of the recording is held out, and decides whether the new "
-        "weights are kept. lightning predict --model.weights OUT/adapted.safetensors uses them, also on other "
-        "recordings of the camera.",
+        "weights are kept. lightning predict --model.weights OUT/adapted.safetensors uses them; those of a noisy "
+        "camera also serve its other recordings.",
     )
     add = made.add_argument
     add("--data", choices=["Recording"], help="as lightning predict wants it; may be left out")
