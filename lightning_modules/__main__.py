@@ -51,10 +51,6 @@ def _main(args: Sequence[str] | None) -> None:
 def _run(verb: str, rest: Sequence[str], args: Sequence[str] | None) -> None:
     # Threads of torch that spin while they wait hold up the workers that make clips: before torch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    if verb != "models":  # which needs no torch
-        from lightning_modules.quick_import import import_lightning
-
-        import_lightning()
     if verb == OPTION:
         from lightning_modules.cli.completion import print_completion
 

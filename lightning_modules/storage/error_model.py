@@ -19,7 +19,7 @@ FILE = "scene_activity.json"
 class ErrorModel:
     """Squared errors per squared statistic of a clip, all in units of a white pixel.
 
-    ``python -m lightning_modules.trade.adaptive WEIGHTS --fit`` fits them, to the side that spends more. The defaults
+    ``python benchmarks/tolerance.py WEIGHTS --fit`` fits them, to the side that spends more. The defaults
     are the most careful of all weights of the package, for networks whose own were not measured.
 
     Args:

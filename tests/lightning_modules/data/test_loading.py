@@ -12,11 +12,8 @@ import torch
 
 from lightning_modules.data.loading import FreshClips, OwnPart, load_clips
 
-QUICKLY = "from lightning_modules.quick_import import import_lightning; import_lightning()"
-
 # A clip is larger than a pipe: its worker waits for somebody to take it.
-LOAD = f"""
-{QUICKLY}
+LOAD = """
 import os, torch
 from lightning_modules.data.loading import load_clips
 class Clips(torch.utils.data.Dataset):
@@ -54,13 +51,11 @@ def test_workers_end_with_a_killed_run():
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signals")
 def test_a_process_of_several_ends_with_the_first():
-    started = f"""
-{QUICKLY}
+    started = """
 from lightning_modules.cli import command
 command.run(None, lambda *_, **__: print("begun", flush=True) or input())
 """
-    first = f"""
-{QUICKLY}
+    first = """
 import os, subprocess, sys
 from lightning_modules.cli import command
 command.run(None, lambda *_, **__: None)

@@ -3,7 +3,6 @@ import pytest
 import torch
 from skimage.registration import optical_flow_tvl1
 
-from lightning_modules.motion.__main__ import main
 from spikekit.flow import tvl1
 from spikekit.flow.tvl1 import refine, tvl1_flow
 from spikekit.kernels import loops
@@ -145,21 +144,3 @@ def test_energy_is_as_low_as_that_of_scikit_image(noise):
 def test_no_gradient_is_kept():
     pictures = moved((1.0, 0.0)).requires_grad_()
     assert not tvl1_flow(pictures, FORWARD, steady(pictures)).requires_grad
-
-
-def test_the_comparison_runs(capsys):
-    main(["--clips", "3", "--patch", "32", "--rounds", "1"])
-    table = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
-    errors = {name.strip(): float(error) for name, error, *_ in table[2:]}
-    variants = {"without Numba", "3 warps", "1 warp", "means of 49 frames at most"}
-    assert set(errors) == {"ClassicalFlow", *variants, "scikit-image's TV-L1", "no motion"}
-    assert errors["ClassicalFlow"] == pytest.approx(errors["without Numba"], abs=2e-3)
-    assert errors["ClassicalFlow"] == errors["means of 49 frames at most"]  # 41 frames have no longer ones
-    assert errors["ClassicalFlow"] < 0.5 * errors["no motion"]
-
-
-def test_the_comparison_in_little_light(capsys):
-    main(["--clips", "2", "--patch", "32", "--rounds", "1", "--frames", "101", "--alpha", "0.1"])
-    table = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
-    errors = {name.strip(): float(error) for name, error, *_ in table[2:]}
-    assert errors["ClassicalFlow"] < errors["means of 49 frames at most"]

@@ -1,4 +1,4 @@
-"""``python -m lightning_modules.motion``: error and time of ClassicalFlow and of scikit-image's TV-L1.
+"""Error and time of ClassicalFlow and of scikit-image's TV-L1: ``python benchmarks/motion.py``.
 
 On scenes whose flow is known; all estimators take turns, in one process.
 """
@@ -7,16 +7,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from unittest import mock
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from lightning_modules.data import StillScenes
-from lightning_modules.motion import ClassicalFlow, ZeroFlow, classical
+from lightning_modules.motion import ClassicalFlow, ZeroFlow
 from spikekit.bench import cpu_name, software
-from spikekit.kernels import loops
 from spikekit.tables import table
 from spikekit.timing import interleave, ratio, timer_of
 
@@ -37,25 +35,9 @@ class ScikitImage(ClassicalFlow):
         return torch.from_numpy(np.stack(found)).float()
 
 
-class WithoutNumba(ClassicalFlow):
-    """The same estimator in torch's operations."""
-
-    def _velocities(self, pictures: Tensor, clock: Tensor, attachment: Tensor) -> Tensor:
-        with mock.patch.object(loops, "NUMBA", False):
-            return super()._velocities(pictures, clock, attachment)
-
-
-class ShortMeans(ClassicalFlow):
-    """The same estimator with means as long in little light as in much."""
-
-    def forward(self, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> tuple[Tensor, Tensor]:  # noqa: D102
-        with mock.patch.object(classical, "_LIGHT", 0):
-            return super().forward(spikes, times, pattern)
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(prog="python -m lightning_modules.motion", description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--clips", type=int, default=12, help="scenes")
     parser.add_argument("--patch", type=int, default=48, help="side of a scene, in sensor pixels")
     parser.add_argument("--motion", type=float, default=3.0, help="largest motion, in sensor pixels")
@@ -79,10 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     clips = [data.val_set[index] for index in range(args.clips)]
     estimators = {
         "ClassicalFlow": ClassicalFlow(),
-        "without Numba": WithoutNumba(),
         "3 warps": ClassicalFlow(warps=3),
         "1 warp": ClassicalFlow(warps=1),
-        "means of 49 frames at most": ShortMeans(),
         "scikit-image's TV-L1": ScikitImage(),
         "no motion": ZeroFlow(),
     }
@@ -93,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     threads = torch.get_num_threads()
     timer, counted = timer_of(torch.device("cpu"), threads)
     taken = interleave(runs, args.rounds, timer)
-    print(f"machine  {cpu_name()}, {threads} threads, {counted}, {args.rounds} rounds\n{software()}")  # noqa: T201
+    print(f"machine  {cpu_name()}, {threads} threads, {counted}, {args.rounds} rounds\n{software()}")
     lines = []
     for name, run in runs.items():
         errors = [(got - clip["flow"]).norm(dim=1).mean().item() for got, clip in zip(run(), clips, strict=True)]
@@ -101,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         spread = f"{times_as_long.median:.2f} ({times_as_long.least:.2f} to {times_as_long.most:.2f})"
         milliseconds = 1000 * float(np.median(taken[name])) / len(clips)
         lines.append([name, f"{sum(errors) / len(errors):.3f}", f"{milliseconds:.1f}", spread])
-    print("\n" + table(["estimator", "end-point error (px)", "ms a clip", "time, ratio"], lines))  # noqa: T201
+    print("\n" + table(["estimator", "end-point error (px)", "ms a clip", "time, ratio"], lines))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Measure the benefit of a calibration on a noisy sensor, for decoders and a network.
 
-``python -m lightning_modules.metrics.noisy_sensor PICTURES`` prints the table: still pictures in motion, seen by a BGGR
+``python benchmarks/noisy_sensor.py PICTURES`` prints the table: still pictures in motion, seen by a BGGR
 sensor of another gain than the weights were trained for.
 """
 
@@ -107,7 +107,7 @@ def main() -> None:
             rows[name].append(torch.tensor(scores))
     names = ", ".join(picture.name for picture in chosen)
     lines = [[name, *(f"{value:.2f}" for value in torch.stack(row).mean(0).tolist())] for name, row in rows.items()]
-    print(table([names, "TFI", "TFP 13, order 3", args.weights], lines))  # noqa: T201
+    print(table([names, "TFI", "TFP 13, order 3", args.weights], lines))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""``python -m lightning_modules.cost.exported``: the cost of exported networks compared with the network itself."""
+"""The cost of exported networks compared with the network itself: ``python benchmarks/exported.py WEIGHTS``."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from spikekit.timing import cpu_timer, interleave, ratio
 
 def main(args: Sequence[str] | None = None) -> None:
     """Print size, difference and time of every format, as ratios to the network, in turns in one process and thread."""
-    parser = argparse.ArgumentParser(prog="python -m lightning_modules.cost.exported", description=main.__doc__)
+    parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("weights", nargs="+", help="what lightning export takes")
     parser.add_argument("--side", type=whole(16), default=96, help="of the clip, in sensor pixels; 96")
     parser.add_argument("--rounds", type=whole(1), default=5, help="timings of each; 5")
@@ -37,9 +37,9 @@ def main(args: Sequence[str] | None = None) -> None:
     torch.set_num_threads(1)
     rows = [row for name in asked.weights for row in _rows(name, asked.formats, asked.side, asked.rounds)]
     heading = ["weights", "format", "MiB", "export (s)", "largest difference", "time, network = 1", "ms"]
-    print(table(heading, rows))  # noqa: T201
-    print(f"{asked.side} x {asked.side} sensor pixels, seed 0, {asked.rounds} rounds, one thread of {cpu_name()}")  # noqa: T201
-    print(f"torch {torch.__version__}, ONNX opset {OPSET}")  # noqa: T201
+    print(table(heading, rows))
+    print(f"{asked.side} x {asked.side} sensor pixels, seed 0, {asked.rounds} rounds, one thread of {cpu_name()}")
+    print(f"torch {torch.__version__}, ONNX opset {OPSET}")
 
 
 @torch.no_grad()

@@ -1,6 +1,6 @@
 """Measure what ``lightning adapt`` is worth where the truth is known.
 
-``python -m lightning_modules.adaptation.measure PICTURES`` prints the table: still pictures in motion, seen by one
+``python benchmarks/adaptation.py PICTURES`` prints the table: still pictures in motion, seen by one
 noisy sensor; weights adapted to each recording, and judged on its end and on the end of the next one.
 """
 
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from noisy_sensor import NOISE
 from torch import Tensor
 
 from lightning_modules.adaptation.learn import learn
@@ -23,7 +24,6 @@ from lightning_modules.data.recording import RecordingClips
 from lightning_modules.data.stills import StillClips
 from lightning_modules.inference.export import load_network
 from lightning_modules.inference.predict import predict
-from lightning_modules.metrics.noisy_sensor import NOISE
 from lightning_modules.networks import Network
 from spikekit import SensorNoise, SpikeSensor, psnr, write_spikes
 from spikekit.tables import table
@@ -80,9 +80,7 @@ def main() -> None:
     parser.add_argument("pictures", help="folder of pictures")
     parser.add_argument("--weights", default="cscsr_small_x4", help="what is adapted; cscsr_small_x4 if not given")
     parser.add_argument("--teacher", default="cscsr_huge_long_noisy_x4", help="cscsr_huge_long_noisy_x4 if not given")
-    parser.add_argument(
-        "--noise", type=json.loads, help="of the sensor; that of lightning_modules.metrics.noisy_sensor"
-    )
+    parser.add_argument("--noise", type=json.loads, help="of the sensor; that of noisy_sensor.py")
     parser.add_argument("--alpha", type=float, default=0.25, help="light of a white pixel per clock; 0.25")
     parser.add_argument("--count", type=int, default=4, help="how many pictures, evenly from the folder; 4")
     parser.add_argument("--steps", type=int, default=100, help="100")
@@ -108,7 +106,7 @@ def main() -> None:
     names = [*(path.name for path in chosen), "mean"]
     head = ["", "before", "after", "teacher", "likeness before", "after", "next recording before", "after"]
     lines = [[name, *(f"{value:.2f}" for value in row)] for name, row in zip(names, rows, strict=True)]
-    print(table(head, lines))  # noqa: T201
+    print(table(head, lines))
 
 
 if __name__ == "__main__":

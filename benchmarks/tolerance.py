@@ -1,6 +1,6 @@
 """Measure what a tolerance saves and costs, on scenes whose ground truth is known.
 
-``python -m lightning_modules.trade.adaptive WEIGHTS`` prints the table; with ``--fit`` it fits what the tolerance is
+``python benchmarks/tolerance.py WEIGHTS`` prints the table; with ``--fit`` it fits what the tolerance is
 kept by, the constants of ``WEIGHTS``, writes them beside the weights, and prints what held-out clips lose; with
 ``--halo`` it prints how far around a tile their networks see.
 """
@@ -8,23 +8,23 @@ kept by, the constants of ``WEIGHTS``, writes them beside the weights, and print
 from __future__ import annotations
 
 import argparse
+import copy
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from statistics import mean
 
+import tolerance_fit
 import torch
+from tolerance_fit import Clip, Errors, fit_error_model, loss, make_clips, measure_errors
 from torch import Tensor
 
 from lightning_modules.data.pictures import cached_picture, embedded_pictures, folder_pictures, split_pictures
 from lightning_modules.inference.scene_activity import look, required
-from lightning_modules.inference.tiles import forward_in_tiles
+from lightning_modules.inference.tiles import BLEND, forward_in_tiles
 from lightning_modules.networks import CSCSR, Network
 from lightning_modules.storage.error_model import write_error_model
 from lightning_modules.storage.pretrained import read_weights
-from lightning_modules.trade import error_fit
-from lightning_modules.trade.error_fit import Clip, Errors, fit_error_model, loss, make_clips, measure_errors
-from lightning_modules.trade.halo import measure_halo
 from spikekit import psnr
 from spikekit.arguments import whole
 from spikekit.scenes.analytic import Layer, Motion, Scene
@@ -106,7 +106,7 @@ def fit(sources: Sequence[str], pictures: Sequence[Path], held_out: Sequence[Pat
         for source, path, _ in members:
             model = fit_error_model(fitted[source])
             write_error_model(path, model)
-            for tolerance in error_fit.TOLERANCES:
+            for tolerance in tolerance_fit.TOLERANCES:
                 losses, some, moving = zip(*(loss(clip, model, tolerance) for clip in others[source]), strict=True)
                 shares = f"{mean(losses):.3f} | {mean(some):.0%} | {mean(moving):.0%}"
                 yield f"| {source} | {tolerance:g} | {max(losses):.3f} | {shares} |"
@@ -123,6 +123,41 @@ def _errors(members: Sequence[tuple[str, Path, Network]], clips: Iterable[Clip])
     return found
 
 
+#: what tiles may change in a picture: a hundredth of a step of 8 bits
+BOUND = 0.01 / 255
+
+HALO_TILE = 64
+
+
+@torch.no_grad()
+def measure_halo(network: Network, start: int = 2 * BLEND) -> int:
+    """Return the smallest halo with which tiles give what the whole picture gives, in float64, on a clip of noise.
+
+    Args:
+        network: a network that is run in tiles; it is left as it is.
+        start: the smallest halo that is tried, even.
+
+    Returns:
+        The halo in sensor pixels, even.
+    """
+    network, spikes = copy.deepcopy(network).double(), _noise(network)
+    whole = network(spikes, static=True)
+    for halo in range(start, HALO_TILE, 2):
+        network.halo = halo
+        if (forward_in_tiles(network, spikes, HALO_TILE, static=True) - whole).abs().max() < BOUND:
+            return halo
+    return HALO_TILE
+
+
+def _noise(network: Network) -> Tensor:
+    texture = torch.rand(3, HALO_TILE, 2 * HALO_TILE, generator=torch.Generator().manual_seed(0))
+    view = texture.repeat_interleave(2, 1).repeat_interleave(2, 2)
+    light = Scene([Layer(view)], *view.shape[1:], network.frames).light(
+        network.pattern, scale=2, alpha=network.settings["alpha"]
+    )
+    return simulate_spikes(light, generator=torch.Generator().manual_seed(0))[None]
+
+
 def _tile(text: str) -> int:
     side = whole(0)(text)
     if side % 2:
@@ -132,7 +167,7 @@ def _tile(text: str) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(prog="python -m lightning_modules.trade.adaptive", description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__)
     add = parser.add_argument
     add("weights", nargs="+", help="those of CSCSR: names, files of safetensors or, without --fit, checkpoints")
     add("--pictures", help="folder of pictures; without it, those of scikit-image, held-out ones for the table")
@@ -151,25 +186,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
             (embedded_pictures(), embedded_pictures(held_out=True)) if given is None else split_pictures(given, 0)
         )
         for line in fit(args.weights, shown, others, args.clips):
-            print(line, flush=True)  # noqa: T201
+            print(line, flush=True)
         return
     if args.halo:
         for weights in args.weights:
-            print(f"{weights}: {measure_halo(CSCSR.from_pretrained(weights))}", flush=True)  # noqa: T201
+            print(f"{weights}: {measure_halo(CSCSR.from_pretrained(weights))}", flush=True)
         return
     pictures = embedded_pictures(held_out=True) if given is None else given
     ground, thing = (cached_picture(pictures[i % len(pictures)]) for i in (0, 1))
     _, timer = timer_of(torch.device("cpu"), torch.get_num_threads())
-    print(_LEGEND.format(rounds=args.rounds, timer=timer))  # noqa: T201
+    print(_LEGEND.format(rounds=args.rounds, timer=timer))
     for weights in args.weights:
-        print(f"| {weights} | tolerance | time | network | motion | look | loss |\n|---|---|---|---|---|---|---|")  # noqa: T201
+        print(f"| {weights} | tolerance | time | network | motion | look | loss |\n|---|---|---|---|---|---|---|")
         network = CSCSR.from_pretrained(weights)
         for name, scene in scenes(ground, thing, args.height, args.width, network.scale):
             for value, median, least, most, some, moving, seen, lost in rows(
                 network, scene, args.tolerances, args.tile, args.rounds
             ):
                 shares = f"{median:.2f} ({least:.2f} to {most:.2f}) | {some:.0%} | {moving:.0%} | {seen:.1%}"
-                print(f"| {name} | {value:g} | {shares} | {lost:.3f} |", flush=True)  # noqa: T201
+                print(f"| {name} | {value:g} | {shares} | {lost:.3f} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Measure the cost of errors in the flows of the four sub-streams, joined in the three ways of Table 3: J, D and E.
 
-``python -m lightning_modules.metrics.flow_noise VID4`` prints the table. The flows are those of ``ClassicalFlow``,
+``python benchmarks/flow_noise.py VID4`` prints the table. The flows are those of ``ClassicalFlow``,
 asked for every sub-stream by itself; normal noise is added to each of them, and they are joined as eq. (7) has it (J),
 by colour (D), or side by side (E).
 """
@@ -39,9 +39,7 @@ class NoisyFlow(MotionEstimator):
         self.smooth, self.noise = smooth, 0.0
         self._clip, self._flows = torch.empty(0), ()
 
-    def channel_flows(  # noqa: D102
-        self, spikes: Tensor, times: tuple[int, int, int], pattern: str
-    ) -> tuple[Tensor, Tensor]:
+    def channel_flows(self, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> tuple[Tensor, Tensor]:
         if not (self._clip.shape == spikes.shape and self._clip.equal(spikes)):
             self._clip, self._flows = spikes, ClassicalFlow().channel_flows(spikes, times, pattern)
         generator = torch.Generator().manual_seed(0)
@@ -90,7 +88,7 @@ def main(args: list[str] | None = None) -> None:
     clips = [data.test_set[n] for n in range(len(data.test_set))]
     rows = measure(asked.weights, clips, asked.noises, asked.smooth)
     lines = [[f"{noise:g}", *(f"{of[name]:.2f}" for name in FUSIONS)] for noise, of in rows.items()]
-    print(table(["noise (px)", *FUSIONS], lines))  # noqa: T201
+    print(table(["noise (px)", *FUSIONS], lines))
 
 
 if __name__ == "__main__":
