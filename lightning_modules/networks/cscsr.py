@@ -23,6 +23,7 @@ from lightning_modules.networks.representation import IntervalRepresentation, Sp
 from lightning_modules.networks.static_scene import WORTH_IT, convolve_at_rest, rest_response
 from lightning_modules.signatures import takes
 from spikekit import bayer_mask, demosaic, flow_warp_idw, linear_motion, split_colors, tfp_at
+from spikekit.color.cfa import count_colors
 from spikekit.warp.bayer_warp import bayer_warp_idw
 
 _SEARCHED = 1 << 19  # positions that are searched in one go on a CPU, whose cache is small
@@ -49,9 +50,10 @@ def _representation(config: CSCSRConfig) -> nn.Module:
 
 
 class CSCSR(Network):
-    r"""Super-resolution of a colour picture from a Bayer-pattern spike stream.
+    r"""Super-resolution of a colour picture from a Bayer-pattern spike stream, or of a grey one from a grey stream.
 
-    The middle frame of the clip is reconstructed.
+    The middle frame of the clip is reconstructed. At scale 1 the temporal pixel search finds what the pixels were at
+    other times, and no new ones.
 
     Args:
         *args: fields of :class:`CSCSRConfig`, in its order; ``CSCSR(4)`` is ``CSCSR(scale=4)``.
@@ -69,7 +71,7 @@ class CSCSR(Network):
           the flows from the middle to the first and to the last time point, :math:`(B, 2, 2, H, W)`, in sensor
           pixels, or those of R, G and B, :math:`(B, 3, 2, 2, H, W)`; or ``static=True`` where nothing moves: what
           flows of zeros give, in less time
-        - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
+        - Output: rgb :math:`(B, 3, s H, s W)`, or :math:`(B, 1, s H, s W)` where the pattern is grey, not clamped
 
     Raises:
         ValueError: a field that :class:`CSCSRConfig` refuses, or an odd number of steps.
@@ -100,22 +102,24 @@ class CSCSR(Network):
         self.steps = steps
         sensor = config.resolution == "sensor"
         self.fold = config.scale if sensor else 1
-        self.representation = nn.ModuleList(_representation(config) for _ in range(3))
+        self.colors = count_colors(config.pattern)
+        self.representation = nn.ModuleList(_representation(config) for _ in range(self.colors))
         refine = FeatureRefinement if config.refinement else TimeFusion
         self.refinement = nn.ModuleList(
             refine(len(times), part.features * self.fold**2, config.width) for part in self.representation
         )
-        wider = {} if config.end_width is None else {"end_width": config.end_width}
+        own = {} if config.end_width is None else {"end_width": config.end_width}
+        own |= {"colors": 1} if self.colors == 1 else {}
         reconstruct = _RECONSTRUCTIONS[config.reconstruction]
         self.reconstruction = reconstruct(
-            config.width, config.stages, config.blocks, config.end_blocks, self.fold, **wider
+            config.width, config.stages, config.blocks, config.end_blocks, self.fold, **own
         )
         shapes_only = self.reconstruction.rgb.weight.is_meta
         if not shapes_only:
             self._initialize()
         self._masks: dict[Any, Tensor] = {}
         learned = config.representation == "bssr"
-        foldable = config.search and learned and sensor and config.scale > 1 and not shapes_only
+        foldable = config.search and learned and sensor and config.scale > 1 and self.colors > 1 and not shapes_only
         self._response = rest_response(config.scale, config.pattern, config.neighbors) if foldable else None
         self._responses: dict[Any, Tensor] = {}
 
@@ -140,19 +144,19 @@ class CSCSR(Network):
     def _colors(self, spikes: Tensor, flow: Tensor | None) -> list[Tensor]:
         """Features of R, G and B, refined over time, each (B, width, H, W) at the resolution of the reconstruction."""
         height, width = spikes.shape[-2:]
-        planes = split_colors(spikes, self.pattern)
+        planes, colors = split_colors(spikes, self.pattern), range(self.colors)
         # one colour after the other: high resolution takes memory
         features = (encode(plane) for encode, plane in zip(self.representation, planes, strict=True))
         response = self._response_for(spikes) if flow is None else None
         if response is not None:
-            return list(map(self._at_rest, features, self.refinement, response, range(3)))
-        if self.config.search and is_exporting():
-            pixels = map(self._search_in_graph, features, self._offsets(flow, spikes), range(3))
-        elif self.config.search:
+            return list(map(self._at_rest, features, self.refinement, response, colors))
+        if not self.config.search or (flow is None and self.colors == 1):  # at rest, all pixels of grey are known
+            pixels = (enlarge(part, self.scale) for part in features)
+        elif is_exporting():
+            pixels = map(self._search_in_graph, features, self._offsets(flow, spikes), colors)
+        else:
             offsets = self._offsets(flow, spikes)
             pixels = map(self._search, features, offsets, self._mask(height, width, spikes.device))
-        else:
-            pixels = (enlarge(part, self.scale) for part in features)
         pixels = (fold(part.flatten(1, 2), self.fold) for part in pixels)
         return [refine(part) for refine, part in zip(self.refinement, pixels, strict=True)]
 
@@ -178,13 +182,13 @@ class CSCSR(Network):
     def _offsets(self, flow: Tensor | None, spikes: Tensor) -> Sequence[Tensor]:
         """How far every colour has moved at every time point, each (B, T, 2, s H, s W), T being 1 at rest."""
         if flow is None:
-            return [self._no_offset(spikes)] * 3
+            return [self._no_offset(spikes)] * self.colors
         flow = flow if flow.ndim == 6 else flow.unsqueeze(1)
         first, middle, last = self.flow_times
         offsets = linear_motion(
             flow[:, :, 0], flow[:, :, 1], self.times, first=first, middle=middle, last=last, scale=self.scale
         )
-        return offsets.expand(-1, 3, -1, -1, -1, -1).unbind(1)
+        return offsets.expand(-1, self.colors, -1, -1, -1, -1).unbind(1)
 
     def _no_offset(self, planes: Tensor) -> Tensor:
         height, width = planes.shape[-2:]
