@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
+from functools import lru_cache
 from typing import Any, ClassVar
 
 import torch
@@ -20,11 +21,10 @@ from lightning_modules.networks.network import Network
 from lightning_modules.networks.reconstruction import ColorCorrelation, EarlyFusion, SeparateColors
 from lightning_modules.networks.refinement import FeatureRefinement, TimeFusion
 from lightning_modules.networks.representation import IntervalRepresentation, SpikeRepresentation, WindowMeans
-from lightning_modules.networks.static_scene import WORTH_IT, convolve_at_rest, rest_response
 from lightning_modules.signatures import takes
 from spikekit import bayer_mask, demosaic, flow_warp_idw, linear_motion, split_colors, tfp_at
-from spikekit.color.cfa import count_colors
 from spikekit.warp.bayer_warp import bayer_warp_idw
+from spikekit.warp.site_search import SMALLEST, search_sites, site_table
 
 _SEARCHED = 1 << 19  # positions that are searched in one go on a CPU, whose cache is small
 _SEARCHED_ELSEWHERE = 1 << 25  # where a launch costs more
@@ -49,11 +49,19 @@ def _representation(config: CSCSRConfig) -> nn.Module:
     )
 
 
-class CSCSR(Network):
-    r"""Super-resolution of a colour picture from a Bayer-pattern spike stream, or of a grey one from a grey stream.
+@lru_cache(maxsize=32)
+def _shares(times: tuple[int, ...], flow_times: tuple[int, int, int], device: torch.device) -> Tensor:
+    """Shares of the flows to the first and to the last time point in the motion to every one, (T, 2)."""
+    first, middle, last = flow_times
+    shares = [[max(0.0, (t - middle) / (end - middle)) for end in (first, last)] for t in times]
+    with torch.inference_mode(False):
+        return torch.tensor(shares, device=device)
 
-    The middle frame of the clip is reconstructed. At scale 1 the temporal pixel search finds what the pixels were at
-    other times, and no new ones.
+
+class CSCSR(Network):
+    r"""Super-resolution of a colour picture from a Bayer-pattern spike stream.
+
+    The middle frame of the clip is reconstructed.
 
     Args:
         *args: fields of :class:`CSCSRConfig`, in its order; ``CSCSR(4)`` is ``CSCSR(scale=4)``.
@@ -71,7 +79,7 @@ class CSCSR(Network):
           the flows from the middle to the first and to the last time point, :math:`(B, 2, 2, H, W)`, in sensor
           pixels, or those of R, G and B, :math:`(B, 3, 2, 2, H, W)`; or ``static=True`` where nothing moves: what
           flows of zeros give, in less time
-        - Output: rgb :math:`(B, 3, s H, s W)`, or :math:`(B, 1, s H, s W)` where the pattern is grey, not clamped
+        - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
 
     Raises:
         ValueError: a field that :class:`CSCSRConfig` refuses, or an odd number of steps.
@@ -102,26 +110,19 @@ class CSCSR(Network):
         self.steps = steps
         sensor = config.resolution == "sensor"
         self.fold = config.scale if sensor else 1
-        self.colors = count_colors(config.pattern)
-        self.representation = nn.ModuleList(_representation(config) for _ in range(self.colors))
+        self.representation = nn.ModuleList(_representation(config) for _ in range(3))
         refine = FeatureRefinement if config.refinement else TimeFusion
         self.refinement = nn.ModuleList(
             refine(len(times), part.features * self.fold**2, config.width) for part in self.representation
         )
-        own = {} if config.end_width is None else {"end_width": config.end_width}
-        own |= {"colors": 1} if self.colors == 1 else {}
+        wider = {} if config.end_width is None else {"end_width": config.end_width}
         reconstruct = _RECONSTRUCTIONS[config.reconstruction]
         self.reconstruction = reconstruct(
-            config.width, config.stages, config.blocks, config.end_blocks, self.fold, **own
+            config.width, config.stages, config.blocks, config.end_blocks, self.fold, **wider
         )
-        shapes_only = self.reconstruction.rgb.weight.is_meta
-        if not shapes_only:
+        if not self.reconstruction.rgb.weight.is_meta:
             self._initialize()
         self._masks: dict[Any, Tensor] = {}
-        learned = config.representation == "bssr"
-        foldable = config.search and learned and sensor and config.scale > 1 and self.colors > 1 and not shapes_only
-        self._response = rest_response(config.scale, config.pattern, config.neighbors) if foldable else None
-        self._responses: dict[Any, Tensor] = {}
 
     def _initialize(self) -> None:
         for part in (self.representation, self.refinement, self.reconstruction):
@@ -144,21 +145,39 @@ class CSCSR(Network):
     def _colors(self, spikes: Tensor, flow: Tensor | None) -> list[Tensor]:
         """Features of R, G and B, refined over time, each (B, width, H, W) at the resolution of the reconstruction."""
         height, width = spikes.shape[-2:]
-        planes, colors = split_colors(spikes, self.pattern), range(self.colors)
+        planes = split_colors(spikes, self.pattern)
         # one colour after the other: high resolution takes memory
         features = (encode(plane) for encode, plane in zip(self.representation, planes, strict=True))
-        response = self._response_for(spikes) if flow is None else None
-        if response is not None:
-            return list(map(self._at_rest, features, self.refinement, response, colors))
-        if not self.config.search or (flow is None and self.colors == 1):  # at rest, all pixels of grey are known
-            pixels = (enlarge(part, self.scale) for part in features)
-        elif is_exporting():
-            pixels = map(self._search_in_graph, features, self._offsets(flow, spikes), colors)
-        else:
+        if self._by_sites(spikes, flow):
+            pixels = self._search_sites(features, flow, spikes)
+            return [refine(part) for refine, part in zip(self.refinement, pixels, strict=True)]
+        if self.config.search and is_exporting():
+            pixels = map(self._search_in_graph, features, self._offsets(flow, spikes), range(3))
+        elif self.config.search:
             offsets = self._offsets(flow, spikes)
             pixels = map(self._search, features, offsets, self._mask(height, width, spikes.device))
+        else:
+            pixels = (enlarge(part, self.scale) for part in features)
         pixels = (fold(part.flatten(1, 2), self.fold) for part in pixels)
         return [refine(part) for refine, part in zip(self.refinement, pixels, strict=True)]
+
+    def _by_sites(self, spikes: Tensor, flow: Tensor | None) -> bool:
+        """Whether the temporal pixels of a site can be looked up together, without a derivative in the flow."""
+        config = self.config
+        known = config.search and config.representation == "bssr" and config.neighbors == 4
+        learned = flow is not None and flow.requires_grad and torch.is_grad_enabled()
+        large = min(spikes.shape[-2:]) >= SMALLEST
+        return known and self.fold == self.scale and large and not learned and not is_exporting()
+
+    def _search_sites(self, features: Iterable[Tensor], flow: Tensor | None, spikes: Tensor) -> Iterator[Tensor]:
+        """Temporal pixel search of every colour, (B, T, C, H, W) to (B, T C s^2, H, W)."""
+        height, width = spikes.shape[-2:]
+        moved = spikes.new_zeros(len(spikes), 2, 2, height, width) if flow is None else flow
+        flows = moved.unbind(1) if moved.ndim == 6 else [moved] * 3
+        shares = _shares(self.times, self.flow_times, spikes.device)
+        for color, (part, one) in enumerate(zip(features, flows, strict=True)):
+            odd = height % 2 == 1, width % 2 == 1
+            yield search_sites(part, one, shares, site_table(self.pattern, color, self.scale, odd, spikes.device))
 
     @torch.no_grad()
     def scale_picture(self, factor: float) -> None:  # noqa: D102
@@ -182,13 +201,13 @@ class CSCSR(Network):
     def _offsets(self, flow: Tensor | None, spikes: Tensor) -> Sequence[Tensor]:
         """How far every colour has moved at every time point, each (B, T, 2, s H, s W), T being 1 at rest."""
         if flow is None:
-            return [self._no_offset(spikes)] * self.colors
+            return [self._no_offset(spikes)] * 3
         flow = flow if flow.ndim == 6 else flow.unsqueeze(1)
         first, middle, last = self.flow_times
         offsets = linear_motion(
             flow[:, :, 0], flow[:, :, 1], self.times, first=first, middle=middle, last=last, scale=self.scale
         )
-        return offsets.expand(-1, self.colors, -1, -1, -1, -1).unbind(1)
+        return offsets.expand(-1, 3, -1, -1, -1, -1).unbind(1)
 
     def _no_offset(self, planes: Tensor) -> Tensor:
         height, width = planes.shape[-2:]
@@ -250,21 +269,3 @@ class CSCSR(Network):
                 # the same tensors every time: their tables are kept; at rest, a picture and its sides have three sizes
                 self._masks = dict([*self._masks.items()][-2:]) | {key: mask.unbind(0)}
         return self._masks[key]
-
-    def _response_for(self, spikes: Tensor) -> Tensor | None:
-        """Weights of the search where nothing moves, if they are known and worth using for a picture of this size."""
-        if self._response is None or is_exporting() or min(spikes.shape[-2:]) < WORTH_IT:
-            return None
-        key = spikes.device, torch.promote_types(spikes.dtype, torch.float32)
-        if key not in self._responses:
-            self._responses[key] = self._response.to(*key)
-        return self._responses[key]
-
-    def _at_rest(self, features: Tensor, refine: nn.Module, response: Tensor, color: int) -> Tensor:
-        """Search and refinement of one colour where nothing moves: (B, T, C, H, W) to (B, width, H, W)."""
-
-        def search(planes: Tensor) -> Tensor:
-            mask = self._mask(*planes.shape[-2:], planes.device)[color]
-            return fold(self._search(planes.unsqueeze(1), self._no_offset(planes), mask).flatten(1, 2), self.fold)
-
-        return refine.finish(convolve_at_rest(features.flatten(1, 2), *refine.first(), response, search))

@@ -135,9 +135,10 @@ def _insert(best: list[tuple[Tensor, Tensor]], distance: Tensor, index: Tensor, 
         best.append((distance, index))
 
 
-def _search_and_weigh(
+def search_and_weigh(
     products: list[Product], neighbors: int, width: int, cell: Tensor, part: Tensor
 ) -> tuple[Tensor, Tensor]:
+    """Flat indices of the known pixels nearest to cell + part, (2, n), and their weights: both (neighbors, n)."""
     index = _search(products, neighbors, width, cell, part)
     return index, _weigh(index, width, cell, part)
 
@@ -156,7 +157,7 @@ def table_of(mask: Tensor, neighbors: int, steps: int, dtype: torch.dtype) -> Po
 
 def _search_in(known: np.ndarray, neighbors: int, cell: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
     products = _products((known.tobytes(), *known.shape, "cpu"), neighbors)
-    return _search_and_weigh(products, neighbors, known.shape[1], cell, part)
+    return search_and_weigh(products, neighbors, known.shape[1], cell, part)
 
 
 def _weigh(index: Tensor, width: int, cell: Tensor, part: Tensor) -> Tensor:
@@ -188,7 +189,7 @@ def _nearest_known(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tu
     if steps:
         find = table_of(mask, neighbors, steps, flow.dtype).find
     else:
-        find = partial(_search_and_weigh, products_of(mask, neighbors), neighbors, width)
+        find = partial(search_and_weigh, products_of(mask, neighbors), neighbors, width)
     # double, so that what is nearer does not depend on rounding
     double = torch.float32 if flow.device.type == "mps" else torch.float64
     plane = height * width

@@ -11,7 +11,6 @@ from test_ablations import TINY, clip, variant
 from lightning_modules.inference.tiles import forward_in_tiles
 from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
 from lightning_modules.networks import CSCSR, ClassicalDecoder
-from lightning_modules.networks.static_scene import WORTH_IT
 from lightning_modules.tasks.super_resolution import SuperResolution
 
 DEVICE = pretend.DEVICE
@@ -60,7 +59,7 @@ def test_nothing_is_waited_for():
 def test_at_rest():
     network = CSCSR(3, **TINY, resolution="sensor")
     moved = copy.deepcopy(network).to(DEVICE)
-    spikes, _ = clip(height=WORTH_IT, width=WORTH_IT + 1)
+    spikes, _ = clip(height=16, width=17)
     expected = network(spikes, static=True)
     expected.sum().backward()
     for _ in range(2):

@@ -18,7 +18,7 @@ from spikekit.decoders import dense as decoders
 from spikekit.kernels.layout import is_channels_last
 from spikekit.sensor import integrate_fire as sensor
 from spikekit.warp import neighbors as search
-from spikekit.warp import warp
+from spikekit.warp import site_search, warp
 
 triton = pytest.importorskip("triton", reason="triton is not installed")
 from spikekit.kernels import gpu  # noqa: E402
@@ -643,3 +643,18 @@ def test_compiles(target, monkeypatch, tmp_path):
     assert len(texts) > 100
     for text in texts:
         assert not re.search(r"\bfma\.rn\.f|\bdiv\.(full|approx)", text)
+
+
+@computes
+@pytest.mark.parametrize(("scale", "channels", "size"), [(4, 2, (12, 13)), (1, 3, (13, 12)), (3, 1, (12, 12))])
+def test_the_site_wise_search_and_its_derivative(scale, channels, size):
+    table = site_search.site_table("RGGB", 1, scale, (size[0] % 2 == 1, size[1] % 2 == 1), torch.device("cpu"))
+    shares = torch.tensor([[1.0, 0.0], [0.25, 0.0], [0.0, 1.0]])
+    flow = torch.randn(2, 2, 2, *size) * 3
+    flow[0, 0, 0, 3, 4] = 2.0**30
+    features = torch.randn(2, 3, channels, *size)
+    expected = site_search._search_sites(features, flow, shares, *table.arguments)
+    check(call("search_sites", features, flow, shares, *table.arguments), expected, rtol=0, atol=1e-5)
+    grad = torch.randn_like(expected)
+    expected = site_search._spread_sites(grad, flow, shares, *table.arguments)
+    check(call("spread_sites", grad, flow, shares, *table.arguments), expected, rtol=0, atol=1e-4)

@@ -1,0 +1,324 @@
+r"""The temporal pixel search of eq. (9)-(10), a sensor pixel at a time: a table in place of a search.
+
+Flow is taken once for every sensor pixel, a *site*, and rounded to ``1 / STEPS`` of it. Bilinear enlargement and
+:func:`spikekit.flow_warp_idw` then make the s x s temporal pixels of a site from a few features around the place that
+flow points to. They are linear in these features, and their weights depend on three things alone: on the place in the
+Bayer cell, on the rounded fraction of the flow, and, near a border, on how far away that is. So they are looked up.
+
+.. math:: z_{s y + j,\, s x + i} = \sum_k w_{c k}^{i j} \, x_{b + o_{c k}}, \qquad
+    b = \lfloor (x, y) + \text{flow} \rfloor
+
+with the class c of the place, offsets o and weights w. At borders, where fewer known pixels are near, classes are kept
+at half the resolution of the rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from spikekit.check import wide_dtype
+from spikekit.color.cfa import bayer_mask
+from spikekit.kernels import custom_operator, gpu_kernel, register_kernel, register_on_gpu
+from spikekit.kernels.loops import import_loops
+from spikekit.warp.neighbors import finite, products_of, search_and_weigh
+
+_loops = import_loops("spikekit.kernels.cpu_sites")
+
+STEPS = 32  #: positions per sensor pixel and axis that flow is rounded to
+SMALLEST = 12  #: sensor pixels along an axis from which on both borders have classes of their own
+_NEIGHBORS = 4
+_SIDE = 16  # of the sensor that classes are found on
+_AROUND = 4, 6  # sensor pixels around the base among which the known ones are; where scale is 1, they are further apart
+_CHUNK = 1 << 13  # positions searched at a time: in the cache
+
+
+@dataclass(frozen=True, eq=False)
+class SiteTable:
+    """Weights of the temporal pixels of a site, for one colour of a sensor.
+
+    Args:
+        scale: temporal pixels along each side of a site, s.
+        low: smallest offset from the base of the features that a site away from both borders of an axis is made of.
+        high: the largest.
+        most: features of a class at most.
+        start: (C + 1,), int32: where the features of every class begin.
+        offset: (n, 2), int32: offsets (y, x) from the base.
+        weight: (n, s^2), float32.
+    """
+
+    scale: int
+    low: int
+    high: int
+    most: int
+    start: Tensor
+    offset: Tensor
+    weight: Tensor
+
+    @property
+    def places(self) -> int:
+        """Number of places on an axis: two inside, for even and odd pixels, then those near either border."""
+        return 4 - self.low + self.high
+
+    def place(self, base: Tensor, length: int) -> Tensor:
+        """Classify positions -1 ... ``length`` on an axis; 0 and 1 are away from the borders."""
+        place = torch.where(base < -self.low, base + 3, base & 1)
+        return torch.where(base + self.high >= length, 3 - self.low + length - base, place)
+
+    def classes(self, y: Tensor, x: Tensor, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return bases and classes of positions in steps.
+
+        Args:
+            y: rows, whole, from ``-STEPS`` to ``STEPS * height``.
+            x: columns likewise.
+            height: of the sensor.
+            width: of the sensor.
+
+        Returns:
+            Rows and columns of the bases, and the classes, in the shape of ``y``.
+        """
+        rows, columns = y.div(STEPS, rounding_mode="floor"), x.div(STEPS, rounding_mode="floor")
+        down, right = y - STEPS * rows, x - STEPS * columns
+        i, j = self.place(rows, height), self.place(columns, width)
+        inside = ((2 * i + j) * STEPS + down) * STEPS + right
+        half = STEPS // 2
+        border = 4 * STEPS**2 + ((i * self.places + j) * half + down // 2) * half + right // 2
+        return rows, columns, torch.where((i < 2) & (j < 2), inside, border)
+
+    @property
+    def arguments(self) -> tuple[Any, ...]:
+        """What kernels take of it."""
+        return self.start, self.offset, self.weight, self.scale, self.low, self.high, self.most, STEPS
+
+    def to(self, device: torch.device) -> SiteTable:
+        """Return the table on a device."""
+        parts = {name: getattr(self, name).to(device) for name in ("start", "offset", "weight")}
+        return replace(self, **parts)
+
+
+def _steps_to(moved: Tensor, length: int, axis: int) -> Tensor:
+    """Round where every site is moved to, (T, H, W), in steps; one site beyond a border is like any further."""
+    at = torch.arange(length, device=moved.device) * STEPS
+    at = at.unsqueeze(-1) if axis == -2 else at
+    moved = moved.clamp(-2.0 * length, 2.0 * length)
+    return ((moved * STEPS).round().long() + at).clamp(-STEPS, STEPS * length)
+
+
+@lru_cache(maxsize=24)
+def site_table(pattern: str, color: int, scale: int, odd: tuple[bool, bool], device: torch.device) -> SiteTable:
+    """Make the table of one colour, or return the one that was made before.
+
+    Args:
+        pattern: Bayer phase, or ``"grey"``.
+        color: 0, 1, 2 for R, G, B; 0 for grey.
+        scale: super-resolution factor s.
+        odd: whether height and width of the sensor are odd, as the border at the end is then of another phase.
+        device: where the table is needed.
+    """
+    with torch.inference_mode(False), torch.device("cpu"):  # what is made in inference mode has no gradient later
+        if device.type == "cpu":
+            return _make_table(pattern, color, scale, odd)
+        return site_table(pattern, color, scale, odd, torch.device("cpu")).to(device)
+
+
+def _make_table(pattern: str, color: int, scale: int, odd: tuple[bool, bool]) -> SiteTable:
+    size = _SIDE + odd[0], _SIDE + odd[1]
+    mask = bayer_mask(*size, pattern, scale=scale, dtype=torch.bool)[color]
+    inside, step = [_SIDE // 2, _SIDE // 2 + 1], torch.arange(STEPS)
+    ends = step[[0, 1, STEPS // 2 - 1, STEPS // 2, STEPS // 2 + 1, -2, -1]]
+    # away from both borders of an axis, however near one of the other axis is: there known pixels lie further apart
+    near = [[*inside, -1, 0, 1, length, length - 1, length - 2] for length in size]
+    wide = _weights(mask, size, scale, _steps(near[0], ends), _steps(inside, ends))[1][:, 1]
+    high_ones = _weights(mask, size, scale, _steps(inside, ends), _steps(near[1], ends))[1][:, 0]
+    low, high = int(min(wide.min(), high_ones.min())), int(max(wide.max(), high_ones.max()))
+    axes = [[*inside, *range(-1, -low), *range(length, length - high - 1, -1)] for length in size]
+    found = [
+        _weights(mask, size, scale, _steps(inside, step), _steps(inside, step)),
+        _weights(mask, size, scale, *(_steps(axis, step[::2]) for axis in axes)),
+    ]
+    count, offset, weight = (torch.cat(parts) for parts in zip(*found, strict=True))
+    start = F.pad(count.cumsum(0), (1, 0))
+    return SiteTable(scale, low, high, int(count.max()), start.int(), offset.int(), weight)
+
+
+def _steps(bases: list[int], steps: Tensor) -> Tensor:
+    """(bases, steps) positions on an axis, in steps."""
+    return torch.tensor(bases)[:, None] * STEPS + steps
+
+
+def _weights(
+    mask: Tensor, size: tuple[int, int], scale: int, rows: Tensor, columns: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Weights of all pairs of places on both axes and of all fractions.
+
+    Args:
+        mask: (s H, s W), known temporal pixels.
+        size: H, W.
+        scale: s.
+        rows: (I, S), positions in steps.
+        columns: (J, S).
+
+    Returns:
+        Of the I J S^2 classes: the number of features, (classes,), their offsets, (n, 2), and weights, (n, s^2).
+    """
+    height, width = size
+    sub = torch.arange(scale)
+    # of every temporal pixel of the site, where it is moved to: (I, S, s) and (J, S, s), in temporal pixels
+    y = (rows[..., None] * (scale / STEPS) + sub).double().clamp(-0.5, scale * height - 0.5)
+    x = (columns[..., None] * (scale / STEPS) + sub).double().clamp(-0.5, scale * width - 0.5)
+    places = len(rows), len(columns), rows.shape[1], columns.shape[1]
+    y = y[:, None, :, None, :, None].expand(*places, scale, scale).reshape(-1)
+    x = x[None, :, None, :, None, :].expand(*places, scale, scale).reshape(-1)
+    base_y = (rows[:, 0] // STEPS)[:, None, None, None].expand(places).reshape(-1)
+    base_x = (columns[:, 0] // STEPS)[None, :, None, None].expand(places).reshape(-1)
+    products = products_of(mask, _NEIGHBORS)
+    around, per_site = _AROUND[scale == 1], scale**2
+    side = 2 * around + 1
+    counts, offsets, weights = [], [], []
+    classes = max(1, _CHUNK // per_site)
+    for begin in range(0, len(base_y), classes):
+        part = slice(begin * per_site, (begin + classes) * per_site)
+        at = torch.stack([x[part], y[part]])
+        cell = at.round()
+        index, weight = search_and_weigh(products, _NEIGHBORS, scale * width, cell.long(), at - cell)
+        chunk_y, chunk_x = base_y[begin : begin + classes], base_x[begin : begin + classes]
+        dense = torch.zeros(len(chunk_y), per_site, side * side)
+        # a known temporal pixel is a bilinear mixture of features, as torch.nn.functional.interpolate makes it
+        row, column = index // (scale * width), index % (scale * width)
+        for i, weight_y in _mixture(row, scale, height):
+            for j, weight_x in _mixture(column, scale, width):
+                away_y = i.unflatten(1, (-1, per_site)) - chunk_y[:, None] + around
+                away_x = j.unflatten(1, (-1, per_site)) - chunk_x[:, None] + around
+                amount = (weight * weight_y * weight_x).unflatten(1, (-1, per_site))
+                for k in range(_NEIGHBORS):
+                    # where a mixture has no part in a feature, that may lie outside
+                    where = (away_y[k] * side + away_x[k]).where(amount[k] != 0, 0)
+                    dense.scatter_add_(2, where.unsqueeze(-1), amount[k].float().unsqueeze(-1))
+        used = dense.amax(dim=1) > 1e-7
+        which, tap = used.nonzero(as_tuple=True)
+        counts.append(used.sum(dim=1))
+        offsets.append(torch.stack([tap // side - around, tap % side - around], dim=1))
+        weights.append(dense[which, :, tap])
+    return torch.cat(counts), torch.cat(offsets), torch.cat(weights)
+
+
+def _mixture(pixel: Tensor, scale: int, length: int) -> list[tuple[Tensor, Tensor]]:
+    """The two features on an axis, and their weights, that a temporal pixel is a mixture of."""
+    at = ((pixel + 0.5) / scale - 0.5).clamp(0, length - 1)
+    first = at.floor()
+    share = at - first
+    return [(first.long(), 1 - share), ((first.long() + 1).clamp(max=length - 1), share)]
+
+
+def _taps(flow: Tensor, shares: Tensor, table: SiteTable) -> Iterator[tuple[Tensor, Tensor]]:
+    """Where the features of all sites lie, (B T, H W), and their weights, (B T, H W, s^2), one after another."""
+    height, width = flow.shape[-2:]
+    moved = torch.einsum("tk,bkchw->btchw", shares.to(flow.dtype), flow).flatten(0, 1)
+    y, x = _steps_to(moved[:, 1], height, -2), _steps_to(moved[:, 0], width, -1)
+    rows, columns, classes = table.classes(y, x, height, width)
+    begin, end = table.start[classes].long(), table.start[classes + 1].long()
+    for k in range(table.most):
+        tap = (begin + k).minimum(end - 1)
+        away = table.offset[tap].long()
+        index = (rows + away[..., 0]) * width + columns + away[..., 1]
+        yield index.flatten(1), (table.weight[tap] * (begin + k < end).unsqueeze(-1)).flatten(1, 2)
+
+
+def _search_sites(
+    features: Tensor, flow: Tensor, shares: Tensor, start: Tensor, offset: Tensor, weight: Tensor,
+    scale: int, low: int, high: int, most: int, steps: int,
+) -> Tensor:  # fmt: skip
+    """:func:`search_sites` in plain torch; kernels take the same arguments."""
+    batch, *_, height, width = features.shape
+    table = SiteTable(scale, low, high, most, start, offset, weight)
+    planes = features.flatten(0, 1).flatten(2)
+    result = planes.new_zeros(*planes.shape[:2], scale**2, height * width, dtype=wide_dtype(features))
+    for index, weights in _taps(flow, shares, table):
+        value = planes.gather(2, index.unsqueeze(1).expand_as(planes))
+        result += value.unsqueeze(2) * weights.mT.unsqueeze(1).to(result.dtype)
+    result = result.reshape(batch, -1, height, width).to(features.dtype)
+    return result.contiguous(memory_format=torch.channels_last)
+
+
+def _spread_sites(
+    grad: Tensor, flow: Tensor, shares: Tensor, start: Tensor, offset: Tensor, weight: Tensor,
+    scale: int, low: int, high: int, most: int, steps: int,
+) -> Tensor:  # fmt: skip
+    """Its derivative in the features, (B, T F s^2, H, W) to (B, T, F, H, W), float32 or wider."""
+    height, width = grad.shape[-2:]
+    times = len(shares)
+    table = SiteTable(scale, low, high, most, start, offset, weight)
+    rows = grad.to(wide_dtype(grad)).unflatten(1, (times, -1, scale**2)).flatten(0, 1).flatten(3)
+    result = rows.new_zeros(rows.shape[0], rows.shape[1], height * width)
+    for index, weights in _taps(flow, shares, table):
+        amount = (rows * weights.mT.unsqueeze(1)).sum(dim=2)
+        result.scatter_add_(2, index.unsqueeze(1).expand_as(amount), amount)
+    return result.reshape(-1, times, rows.shape[1], height, width)
+
+
+def _empty_sites(features: Tensor, *others: Any) -> Tensor:
+    batch, times, channels, height, width = features.shape
+    shape = batch, times * channels * others[5] ** 2, height, width
+    return features.new_empty(shape).contiguous(memory_format=torch.channels_last)
+
+
+def _empty_features(grad: Tensor, *others: Any) -> Tensor:
+    batch, channels, height, width = grad.shape
+    times = len(others[1])
+    return grad.new_empty(batch, times, channels // times // others[5] ** 2, height, width, dtype=wide_dtype(grad))
+
+
+def _operator(plain: Callable[..., Tensor], fake: Callable[..., Tensor]) -> Any:
+    name = plain.__name__.removeprefix("_")
+    op = custom_operator(name, plain, fake)
+
+    def on_cpu(first: Tensor, *others: Any) -> Tensor:
+        compiled = _loops is not None and first.dtype in (torch.float32, torch.bfloat16)
+        return (getattr(_loops, name) if compiled else plain)(first, *others)
+
+    def on_gpu(first: Tensor, *others: Any) -> Tensor:
+        return (plain if first.dtype is torch.float64 else gpu_kernel(name))(first, *others)
+
+    register_kernel(op, "cpu")(on_cpu)
+    register_on_gpu(op, on_gpu)
+    return op
+
+
+_gather = _operator(_search_sites, _empty_sites)
+_scatter = _operator(_spread_sites, _empty_features)
+
+
+class _SearchSites(torch.autograd.Function):
+    @staticmethod
+    def forward(features: Tensor, flow: Tensor, shares: Tensor, table: SiteTable) -> Tensor:
+        return _gather(features, flow, shares, *table.arguments)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs[1:3])
+        ctx.table, ctx.dtype = inputs[3], inputs[0].dtype
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
+        return _scatter(grad, *ctx.saved_tensors, *ctx.table.arguments).to(ctx.dtype), None, None, None
+
+
+def search_sites(features: Tensor, flow: Tensor, shares: Tensor, table: SiteTable) -> Tensor:
+    """Temporal pixels of all sites, one time point after another, as channels.
+
+    Args:
+        features: of every time point, (B, T, F, H, W), floating, H and W at least :data:`SMALLEST`.
+        flow: from the middle to the first and to the last time point, (B, 2, 2, H, W), in sensor pixels.
+        shares: of both flows in the motion to every time point, float32, (T, 2).
+        table: of the colour, on the device of the features.
+
+    Returns:
+        (B, T F s^2, H, W), channels last, in the dtype of ``features``; differentiable in these, not in ``flow``.
+    """
+    return _SearchSites.apply(features, finite(flow.detach().float()), shares, table)
