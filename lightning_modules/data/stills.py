@@ -21,8 +21,9 @@ from lightning_modules.data.margin import flow_margin, trim
 from lightning_modules.data.pictures import cached_picture, embedded_pictures, folder_pictures, split_pictures
 from lightning_modules.data.textures import outline_mask, texture
 from lightning_modules.signatures import takes
-from spikekit import bayer_pattern
+from spikekit import bin_to_sensor
 from spikekit.check import check_positive, check_whole
+from spikekit.color.cfa import GREY, cfa_pattern
 from spikekit.scenes import analytic
 from spikekit.scenes.analytic import Layer, Motion, Scene
 from spikekit.scenes.frame_sequence import SIMULATOR_VERSION
@@ -45,7 +46,7 @@ class StillClips(Dataset):
         scale: super-resolution factor: how many view pixels a sensor pixel is wide.
         patch: side of the clip in sensor pixels.
         frames: spike frames of a clip. The truth is the view at frame ``frames // 2``.
-        pattern: Bayer phase of the sensor: RGGB, BGGR, GRBG or GBRG.
+        pattern: Bayer phase of the sensor: RGGB, BGGR, GRBG or GBRG; or grey, whose truth has one channel.
         alpha: light of a white pixel per clock; a threshold of charge is 1.
         motion: largest displacement of the background, at its centre, from the middle frame to the first or last one,
             in sensor pixels. An object moves by up to as much again relative to the background.
@@ -189,6 +190,10 @@ class StillClips(Dataset):
 
     def _picture(self, side: int, rng: np.random.Generator, turn: int | None = None) -> Tensor:
         """A random square out of a picture: ``turn`` says whose turn it is, where pictures take turns."""
+        picture = self._rgb(side, rng, turn)
+        return bin_to_sensor(picture, GREY, scale=1)[None] if self.pattern == GREY else picture
+
+    def _rgb(self, side: int, rng: np.random.Generator, turn: int | None) -> Tensor:
         if self.textures and rng.uniform() < _TEXTURES:
             return texture(side, side, rng)
         if self.augment or turn is None:
@@ -202,7 +207,7 @@ class StillClips(Dataset):
 def _check(clips: StillClips) -> None:
     clips.scale = check_whole("scale", clips.scale)
     check_positive("alpha", clips.alpha)
-    bayer_pattern(clips.pattern)
+    clips.pattern = cfa_pattern(clips.pattern)
     low, high = clips.brightness
     for name, good, expected in (
         ("pictures", len(clips.pictures) > 0, "at least one"),

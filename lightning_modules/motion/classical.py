@@ -9,8 +9,9 @@ from kornia.filters import filter2d_separable, gaussian_blur2d, get_gaussian_ker
 from torch import Tensor
 
 from lightning_modules.motion.estimator import MotionEstimator, split_any_size
-from spikekit import bayer_pattern, flow_warp, tfp_at
+from spikekit import flow_warp, tfp_at
 from spikekit.check import check_planes, check_positive, check_whole
+from spikekit.color.cfa import cfa_pattern, cfa_sites
 from spikekit.flow.tvl1 import tvl1_flow
 from spikekit.kernels import compiler_kept_out
 from spikekit.sensor.quantization_noise import flicker
@@ -79,7 +80,7 @@ class ClassicalFlow(MotionEstimator):
         if not 0 < middle < spikes.shape[1] - 1 or min(spikes.shape[-2:]) < 2:
             expected = f"(B, N, H, W) of at least 2 x 2 pixels, with frames before and after the middle, {middle}"
             raise ValueError(f"spikes: expected {expected}, got {tuple(spikes.shape)}")
-        bayer_pattern(pattern)
+        pattern = cfa_pattern(pattern)
         alike = _clips_by_window(spikes)  # clips that need one window are seen at once
         velocities = [
             self._of_window(spikes if len(alike) == 1 else spikes[clips], middle, window, pattern, by_site)
@@ -94,7 +95,9 @@ class ClassicalFlow(MotionEstimator):
         with torch.autocast(spikes.device.type, enabled=False):
             raw, clock = _decode(spikes, middle, window)
             noise = _noise(window).to(raw)[(raw.mean(dim=1, keepdim=True) * _RATES).long().clamp(0, _RATES - 1)]
+            sites = 1
             if by_site:
+                sites = len(cfa_sites(pattern)[0])
                 raw, noise = (split_any_size(part, pattern).flatten(0, 1) for part in (raw, noise))
             kernel, border = (_BLUR, "replicate") if by_site else (_GREY, "reflect")
             pictures, noise = (
@@ -103,7 +106,7 @@ class ClassicalFlow(MotionEstimator):
             )
             attachment = self.attachment / (1 + noise[:, 0] / _NOISE**2)
             velocities = self._velocities(pictures, clock, attachment)
-        return velocities.unflatten(0, (4, -1)) if by_site else velocities
+        return velocities.unflatten(0, (sites, -1)) if by_site else velocities
 
     def _velocities(self, pictures: Tensor, clock: Tensor, attachment: Tensor) -> Tensor:
         """Velocities before and after the middle, (B, 2, 2, h, w), in pixels a frame, of pictures (B, 3, h, w)."""

@@ -6,19 +6,21 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spikekit import joint_flow, split_bayer, upsample_flow
+from spikekit.color.cfa import GREY, cfa_sites
 
 
 class MotionEstimator(nn.Module):
     r"""Base of the estimators; they implement :meth:`channel_flows`, and ``forward`` where they have a better one.
 
-    ``forward`` averages the flows of the four sub-streams, eq. (7), and brings them to the sensor's resolution.
+    ``forward`` averages the flows of the four sub-streams, eq. (7), and brings them to the sensor's resolution. A grey
+    sensor has one sub-stream, all of its pixels.
 
     Attributes:
         static: nothing ever moves; nobody asks for the flows then.
 
     Shape:
         - Input: spikes :math:`(B, N, H, W)`, any real dtype; the times of the first, the middle and the last time
-          point, in spike frames; the Bayer phase
+          point, in spike frames; the Bayer phase, or ``"grey"``
         - Output: two flows :math:`(B, 2, H, W)` in sensor pixels, middle to first and middle to last
 
     Reference:
@@ -33,12 +35,12 @@ class MotionEstimator(nn.Module):
         Args:
             spikes: (B, N, H, W), any real dtype.
             times: the first, the middle and the last time point, in spike frames.
-            pattern: Bayer phase.
+            pattern: Bayer phase, or ``"grey"``.
 
         Returns:
             Two flows (4, B, 2, h, w), middle to first and middle to last, in pixels of the sub-streams, that is in
             Bayer cells: h and w are half of H and W, rounded up. The sites are in the order of
-            :func:`spikekit.split_bayer`.
+            :func:`spikekit.split_bayer`. Of a grey sensor (1, B, 2, H, W).
         """
         raise NotImplementedError
 
@@ -46,7 +48,8 @@ class MotionEstimator(nn.Module):
         """Estimate the two flows."""
         height, width = spikes.shape[-2:]
         to_first, to_last = self.channel_flows(spikes, times, pattern)
-        return tuple(upsample_flow(joint_flow(flows), 2)[..., :height, :width] for flows in (to_first, to_last))
+        _, side = cfa_sites(pattern)
+        return tuple(upsample_flow(joint_flow(flows), side)[..., :height, :width] for flows in (to_first, to_last))
 
 
 def split_any_size(raw: Tensor, pattern: str) -> Tensor:
@@ -54,10 +57,10 @@ def split_any_size(raw: Tensor, pattern: str) -> Tensor:
 
     Args:
         raw: (B, T, H, W), floating, of at least 2 x 2 pixels.
-        pattern: Bayer phase.
+        pattern: Bayer phase, or ``"grey"``.
 
     Returns:
-        (4, B, T, h, w), h and w being half of H and W, rounded up.
+        (4, B, T, h, w), h and w being half of H and W, rounded up; (1, B, T, H, W) of a grey sensor.
 
     Raises:
         ValueError: less than 2 x 2 pixels.
@@ -65,4 +68,6 @@ def split_any_size(raw: Tensor, pattern: str) -> Tensor:
     height, width = raw.shape[-2:]
     if min(height, width) < 2:
         raise ValueError(f"spikes: expected at least 2 x 2 pixels, got {height} x {width}")
+    if pattern == GREY:
+        return raw.unsqueeze(0)
     return split_bayer(F.pad(raw, (0, width % 2, 0, height % 2), "reflect"), pattern)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from lightning_modules.motion.estimator import MotionEstimator
+from spikekit.color.cfa import cfa_sites
 
 
 class ZeroFlow(MotionEstimator):
@@ -24,6 +25,6 @@ class ZeroFlow(MotionEstimator):
     def channel_flows(  # noqa: D102
         self, spikes: Tensor, times: tuple[int, int, int], pattern: str
     ) -> tuple[Tensor, Tensor]:
-        height, width = spikes.shape[-2:]
-        zero = spikes.new_zeros(4, len(spikes), 2, (height + 1) // 2, (width + 1) // 2, dtype=torch.float32)
+        (height, width), (sites, side) = spikes.shape[-2:], cfa_sites(pattern)
+        zero = spikes.new_zeros(len(sites), len(spikes), 2, -(-height // side), -(-width // side), dtype=torch.float32)
         return zero, zero

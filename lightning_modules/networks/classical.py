@@ -7,8 +7,9 @@ from torch import Tensor
 
 from lightning_modules.motion import ZeroFlow
 from lightning_modules.networks.network import Network
-from spikekit import bayer_pattern, demosaic
+from spikekit import demosaic
 from spikekit.check import check_planes, check_positive, check_whole
+from spikekit.color.cfa import cfa_pattern
 from spikekit.decoders.methods import DECODERS
 
 
@@ -18,7 +19,7 @@ class ClassicalDecoder(Network):
     Args:
         method: the decoder, a name in ``spikekit.decoders.methods.DECODERS``: ``"tfi"`` or ``"tfp"``.
         scale: super-resolution factor.
-        pattern: Bayer phase.
+        pattern: Bayer phase, or ``"grey"``.
         alpha: gain of the camera, what a white pixel receives per clock in thresholds; the result is divided by it.
         window: frames that TFP averages, odd.
         order: how often it does, see :func:`spikekit.tfp`.
@@ -26,7 +27,7 @@ class ClassicalDecoder(Network):
 
     Shape:
         - Input: spikes :math:`(B, N, H, W)`, any real dtype
-        - Output: rgb :math:`(B, 3, s H, s W)`
+        - Output: rgb :math:`(B, 3, s H, s W)`, or :math:`(B, 1, s H, s W)` where the pattern is grey
 
     Example:
         >>> import torch
@@ -56,7 +57,7 @@ class ClassicalDecoder(Network):
         settings = {
             "method": method,
             "scale": scale,
-            "pattern": bayer_pattern(pattern),
+            "pattern": cfa_pattern(pattern),
             "alpha": alpha,
             "window": window,
             "order": check_whole("order", order),

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from spikekit import bayer_pattern
 from spikekit.check import check_positive, check_whole
+from spikekit.color.cfa import cfa_pattern
 
 
 def check_fields(config: Any) -> None:
     """Check every field of a dataclass by its type, and write whole numbers as Python's own.
 
     ``int`` is a whole number, 1 or more; ``float`` a finite number above 0; a ``Literal`` one of its choices; a field
-    called ``pattern`` a Bayer phase. A field that may be None is checked where it is not.
+    called ``pattern`` a Bayer phase, or ``"grey"``. A field that may be None is checked where it is not.
 
     Args:
         config: a dataclass, in its ``__post_init__``.
@@ -38,5 +38,5 @@ def check_fields(config: Any) -> None:
         elif get_origin(hint) is Literal and value not in get_args(hint):
             raise ValueError(f"{name}: expected one of {', '.join(get_args(hint))}, got {value!r}")
         elif name == "pattern":
-            value = bayer_pattern(value)
+            value = cfa_pattern(value)
         object.__setattr__(config, name, value)  # frozen

@@ -23,6 +23,7 @@ from lightning_modules.networks.refinement import FeatureRefinement, TimeFusion
 from lightning_modules.networks.representation import IntervalRepresentation, SpikeRepresentation, WindowMeans
 from lightning_modules.signatures import takes
 from spikekit import bayer_mask, demosaic, flow_warp_idw, linear_motion, split_colors, tfp_at
+from spikekit.color.cfa import count_colors
 from spikekit.warp.bayer_warp import bayer_warp_idw
 from spikekit.warp.site_search import SMALLEST, search_sites, site_table
 
@@ -59,9 +60,10 @@ def _shares(times: tuple[int, ...], flow_times: tuple[int, int, int], device: to
 
 
 class CSCSR(Network):
-    r"""Super-resolution of a colour picture from a Bayer-pattern spike stream.
+    r"""Super-resolution of a colour picture from a Bayer-pattern spike stream, or of a grey one from a grey stream.
 
-    The middle frame of the clip is reconstructed.
+    The middle frame of the clip is reconstructed. At scale 1 the temporal pixel search finds what the pixels were at
+    other times, and no new ones.
 
     Args:
         *args: fields of :class:`CSCSRConfig`, in its order; ``CSCSR(4)`` is ``CSCSR(scale=4)``.
@@ -79,7 +81,7 @@ class CSCSR(Network):
           the flows from the middle to the first and to the last time point, :math:`(B, 2, 2, H, W)`, in sensor
           pixels, or those of R, G and B, :math:`(B, 3, 2, 2, H, W)`; or ``static=True`` where nothing moves: what
           flows of zeros give, in less time
-        - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
+        - Output: rgb :math:`(B, 3, s H, s W)`, or :math:`(B, 1, s H, s W)` where the pattern is grey, not clamped
 
     Raises:
         ValueError: a field that :class:`CSCSRConfig` refuses, or an odd number of steps.
@@ -110,15 +112,17 @@ class CSCSR(Network):
         self.steps = steps
         sensor = config.resolution == "sensor"
         self.fold = config.scale if sensor else 1
-        self.representation = nn.ModuleList(_representation(config) for _ in range(3))
+        self.colors = count_colors(config.pattern)
+        self.representation = nn.ModuleList(_representation(config) for _ in range(self.colors))
         refine = FeatureRefinement if config.refinement else TimeFusion
         self.refinement = nn.ModuleList(
             refine(len(times), part.features * self.fold**2, config.width) for part in self.representation
         )
-        wider = {} if config.end_width is None else {"end_width": config.end_width}
+        own = {} if config.end_width is None else {"end_width": config.end_width}
+        own |= {"colors": 1} if self.colors == 1 else {}
         reconstruct = _RECONSTRUCTIONS[config.reconstruction]
         self.reconstruction = reconstruct(
-            config.width, config.stages, config.blocks, config.end_blocks, self.fold, **wider
+            config.width, config.stages, config.blocks, config.end_blocks, self.fold, **own
         )
         if not self.reconstruction.rgb.weight.is_meta:
             self._initialize()
@@ -145,19 +149,19 @@ class CSCSR(Network):
     def _colors(self, spikes: Tensor, flow: Tensor | None) -> list[Tensor]:
         """Features of R, G and B, refined over time, each (B, width, H, W) at the resolution of the reconstruction."""
         height, width = spikes.shape[-2:]
-        planes = split_colors(spikes, self.pattern)
+        planes, colors = split_colors(spikes, self.pattern), range(self.colors)
         # one colour after the other: high resolution takes memory
         features = (encode(plane) for encode, plane in zip(self.representation, planes, strict=True))
         if self._by_sites(spikes, flow):
             pixels = self._search_sites(features, flow, spikes)
             return [refine(part) for refine, part in zip(self.refinement, pixels, strict=True)]
-        if self.config.search and is_exporting():
-            pixels = map(self._search_in_graph, features, self._offsets(flow, spikes), range(3))
-        elif self.config.search:
+        if not self.config.search or (flow is None and self.colors == 1):  # at rest, all pixels of grey are known
+            pixels = (enlarge(part, self.scale) for part in features)
+        elif is_exporting():
+            pixels = map(self._search_in_graph, features, self._offsets(flow, spikes), colors)
+        else:
             offsets = self._offsets(flow, spikes)
             pixels = map(self._search, features, offsets, self._mask(height, width, spikes.device))
-        else:
-            pixels = (enlarge(part, self.scale) for part in features)
         pixels = (fold(part.flatten(1, 2), self.fold) for part in pixels)
         return [refine(part) for refine, part in zip(self.refinement, pixels, strict=True)]
 
@@ -166,6 +170,7 @@ class CSCSR(Network):
         config = self.config
         known = config.search and config.representation == "bssr" and config.neighbors == 4
         learned = flow is not None and flow.requires_grad and torch.is_grad_enabled()
+        known = known and not (flow is None and self.colors == 1)  # then nothing is searched
         large = min(spikes.shape[-2:]) >= SMALLEST
         return known and self.fold == self.scale and large and not learned and not is_exporting()
 
@@ -173,7 +178,7 @@ class CSCSR(Network):
         """Temporal pixel search of every colour, (B, T, C, H, W) to (B, T C s^2, H, W)."""
         height, width = spikes.shape[-2:]
         moved = spikes.new_zeros(len(spikes), 2, 2, height, width) if flow is None else flow
-        flows = moved.unbind(1) if moved.ndim == 6 else [moved] * 3
+        flows = moved.unbind(1) if moved.ndim == 6 else [moved] * self.colors
         shares = _shares(self.times, self.flow_times, spikes.device)
         for color, (part, one) in enumerate(zip(features, flows, strict=True)):
             odd = height % 2 == 1, width % 2 == 1
@@ -201,13 +206,13 @@ class CSCSR(Network):
     def _offsets(self, flow: Tensor | None, spikes: Tensor) -> Sequence[Tensor]:
         """How far every colour has moved at every time point, each (B, T, 2, s H, s W), T being 1 at rest."""
         if flow is None:
-            return [self._no_offset(spikes)] * 3
+            return [self._no_offset(spikes)] * self.colors
         flow = flow if flow.ndim == 6 else flow.unsqueeze(1)
         first, middle, last = self.flow_times
         offsets = linear_motion(
             flow[:, :, 0], flow[:, :, 1], self.times, first=first, middle=middle, last=last, scale=self.scale
         )
-        return offsets.expand(-1, 3, -1, -1, -1, -1).unbind(1)
+        return offsets.expand(-1, self.colors, -1, -1, -1, -1).unbind(1)
 
     def _no_offset(self, planes: Tensor) -> Tensor:
         height, width = planes.shape[-2:]

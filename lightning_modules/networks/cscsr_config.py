@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from lightning_modules.networks.configuration import check_fields
+from spikekit.color.cfa import GREY
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,7 @@ class CSCSRConfig:
         frames: spike frames N of a clip, odd.
         window: spike frames that a time point sees, odd.
         stride: spike frames between two time points; must divide frames - window.
-        pattern: Bayer phase of the streams.
+        pattern: Bayer phase of the streams; ``"grey"`` where all pixels see the same: there is one colour then.
         width: channels of refinement and reconstruction.
         representation_width: channels of the spike representation, at sensor resolution.
         features: channels of every time point that are warped.
@@ -53,7 +54,7 @@ class CSCSRConfig:
     Raises:
         ValueError: sizes that do not fit each other, an unknown choice, or choices that would have no effect:
             ``global_perception=False`` without BSSR, a ``motion_fusion`` without search, an ``end_width`` of separate
-            colours.
+            colours; another ``motion_fusion`` or ``reconstruction`` than the default of a single colour.
 
     Example:
         >>> CSCSRConfig(scale=2).times
@@ -98,6 +99,11 @@ class CSCSRConfig:
         if self.motion_fusion != "joint" and not self.search:
             raise ValueError(
                 f"motion_fusion: expected joint without search, which asks for no motion, got {self.motion_fusion}"
+            )
+        if self.pattern == GREY and (self.motion_fusion, self.reconstruction) != ("joint", "correlated"):
+            got = f"{self.motion_fusion} and {self.reconstruction}"
+            raise ValueError(
+                f"motion_fusion, reconstruction: expected joint and correlated for the one colour of grey, got {got}"
             )
         if self.end_width is not None and self.reconstruction == "separate":
             raise ValueError(f"end_width: separate colours are never fused, expected none, got {self.end_width}")

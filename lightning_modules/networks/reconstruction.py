@@ -10,16 +10,17 @@ from lightning_modules.networks.layers import conv, res_blocks
 
 
 class ToRgb(nn.Conv2d):
-    """3 x 3 convolution to the three colours, never in half precision, which would round the picture itself.
+    """3 x 3 convolution to the colours, never in half precision, which would round the picture itself.
 
     Args:
         inputs: channels of the features.
         enlarge: sub-pixels that every pixel is divided into, along each side (Shi et al., CVPR 2016).
         groups: 3 where every colour has features of its own.
+        colors: of the picture.
     """
 
-    def __init__(self, inputs: int, enlarge: int = 1, groups: int = 1) -> None:
-        super().__init__(inputs, 3 * enlarge**2, 3, padding=1, groups=groups)
+    def __init__(self, inputs: int, enlarge: int = 1, groups: int = 1, colors: int = 3) -> None:
+        super().__init__(inputs, colors * enlarge**2, 3, padding=1, groups=groups)
         self.enlarge = enlarge
 
     def forward(self, x: Tensor) -> Tensor:  # noqa: D102
@@ -37,6 +38,8 @@ class ColorFusion(nn.Sequential):
 class ColorCorrelation(nn.Module):
     """CCR (section 4.4, Fig. 6 a): the colours are refined side by side and fused after every stage.
 
+    A single colour, of a grey sensor, has as many residual blocks, and one fusion behind them.
+
     Args:
         width: channels, of every colour and inside.
         stages: how often the colours are fused.
@@ -44,23 +47,35 @@ class ColorCorrelation(nn.Module):
         end_blocks: residual blocks after the last fusion.
         enlarge: how many times larger the picture is than the features.
         end_width: channels after the last fusion; when not given, ``width``.
+        colors: how many there are.
 
     Shape:
-        - Input: features of R, G and B, each :math:`(B, width, H, W)`
-        - Output: rgb :math:`(B, 3, enlarge H, enlarge W)`
+        - Input: features of every colour, each :math:`(B, width, H, W)`
+        - Output: rgb :math:`(B, colors, enlarge H, enlarge W)`
     """
 
     def __init__(
-        self, width: int, stages: int, blocks: int, end_blocks: int, enlarge: int = 1, end_width: int | None = None
+        self,
+        width: int,
+        stages: int,
+        blocks: int,
+        end_blocks: int,
+        enlarge: int = 1,
+        end_width: int | None = None,
+        colors: int = 3,
     ) -> None:
         super().__init__()
         end_width = end_width or width
-        self.refine = nn.ModuleList(nn.ModuleList(res_blocks(width, blocks) for _ in range(3)) for _ in range(stages))
-        inputs = [3 * width] + [4 * width] * (stages - 1)
+        if colors == 1:
+            stages, blocks = 1, stages * blocks
+        self.refine = nn.ModuleList(
+            nn.ModuleList(res_blocks(width, blocks) for _ in range(colors)) for _ in range(stages)
+        )
+        inputs = [colors * width] + [(colors + 1) * width] * (stages - 1)
         outputs = [width] * (stages - 1) + [end_width]
         self.fuse = nn.ModuleList(map(ColorFusion, inputs, outputs))
         self.end = res_blocks(end_width, end_blocks)
-        self.rgb = ToRgb(end_width, enlarge)
+        self.rgb = ToRgb(end_width, enlarge, colors=colors)
 
     def features(self, colors: list[Tensor]) -> Tensor:
         """Features of all colours that the picture is made of, (B, end_width, H, W)."""

@@ -135,7 +135,7 @@ class RecurrentCSCSR(CSCSR):
         config = self.config
         self.fusion = StateFusion(
             config.end_width or config.width,
-            3 * self.scale**2,
+            self.colors * self.scale**2,
             config.memory,
             config.fusion_width,
             config.fusion_blocks,
@@ -206,7 +206,7 @@ class RecurrentCSCSR(CSCSR):
     def scale_picture(self, factor: float) -> None:  # noqa: D102
         super().scale_picture(factor)
         # key frames meet as before: what is read of pictures, and what is added to them
-        picture = 3 * self.scale**2
+        picture = self.colors * self.scale**2
         self.fusion.neighbor.weight[:, :picture] /= factor
         self.fusion.rest.weight[:picture] *= factor
         self.fusion.rest.bias[:picture] *= factor
@@ -233,7 +233,7 @@ class RecurrentCSCSR(CSCSR):
             neighbors: states of its neighbours, moved to where they are in it.
 
         Returns:
-            (B, 3 s^2 + memory, H, W)
+            (B, 3 s^2 + memory, H, W), or (B, s^2 + memory, H, W) of a grey sensor
         """
         rgb = self.reconstruction.rgb(features)
         if self.config.skip:
@@ -245,7 +245,7 @@ class RecurrentCSCSR(CSCSR):
         return torch.cat([picture, nothing], dim=1)
 
     def _parted(self, state: Tensor) -> list[Tensor]:
-        return state.tensor_split([3 * self.scale**2], dim=1)
+        return state.tensor_split([self.colors * self.scale**2], dim=1)
 
     def picture(self, state: Tensor) -> Tensor:
         """Return the picture of a state, (B, 3, s H, s W)."""

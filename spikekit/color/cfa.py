@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
-from kornia.color import CFA
+from kornia.color import CFA, rgb_to_grayscale
 from torch import Tensor, nn
 
 from spikekit.check import check_planes, check_whole
 
 #: Bayer phases by name, read along the rows of the top-left 2 x 2 cell.
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
+
+#: The pattern of a sensor without colour filters, whose pixels all see the same.
+GREY = "grey"
 
 _PATTERN_OF_CFA = {CFA.BG: "RGGB", CFA.RG: "BGGR", CFA.GB: "GRBG", CFA.GR: "GBRG"}
 
@@ -39,6 +44,63 @@ def bayer_pattern(pattern: str | CFA) -> str:
     return name
 
 
+def cfa_pattern(pattern: str | CFA) -> str:
+    """Return the name of a Bayer phase, or ``"grey"``, of a sensor without colour filters.
+
+    Args:
+        pattern: as for :func:`bayer_pattern`, or ``"grey"``.
+
+    Returns:
+        One of :data:`PATTERNS`, or :data:`GREY`.
+
+    Raises:
+        ValueError: none of these.
+
+    Example:
+        >>> cfa_pattern("grey"), cfa_pattern("rggb")
+        ('grey', 'RGGB')
+    """
+    if isinstance(pattern, str) and pattern.lower() == GREY:
+        return GREY
+    try:
+        return bayer_pattern(pattern)
+    except ValueError:
+        names = ", ".join((*PATTERNS, GREY))
+        raise ValueError(f"pattern: expected one of {names} or a kornia.color.CFA, got {pattern!r}") from None
+
+
+def count_colors(pattern: str | CFA) -> int:
+    """Return how many colours a sensor sees: 3 through a Bayer filter, 1 where it is grey.
+
+    Raises:
+        ValueError: the pattern is unknown, see :func:`cfa_pattern`.
+
+    Example:
+        >>> count_colors("GBRG"), count_colors("grey")
+        (3, 1)
+    """
+    return 1 if cfa_pattern(pattern) == GREY else 3
+
+
+def cfa_sites(pattern: str | CFA) -> tuple[tuple[tuple[int, int, int], ...], int]:
+    """Return ``(colour, row, column)`` of the pixels of one cell of a colour filter array, and the cell's side.
+
+    Args:
+        pattern: see :func:`cfa_pattern`.
+
+    Returns:
+        Those of :func:`bayer_sites` and 2; a cell of a grey sensor is a single pixel.
+
+    Raises:
+        ValueError: the pattern is unknown.
+
+    Example:
+        >>> cfa_sites("grey")
+        (((0, 0, 0),), 1)
+    """
+    return (((0, 0, 0),), 1) if cfa_pattern(pattern) == GREY else (bayer_sites(pattern), 2)
+
+
 def bayer_sites(pattern: str | CFA) -> tuple[tuple[int, int, int], ...]:
     """Return ``(colour, row, column)`` of R, G1, G2 and B in the 2 x 2 cell; colour is 0, 1, 2 for R, G, B.
 
@@ -63,11 +125,13 @@ def bayer_sites(pattern: str | CFA) -> tuple[tuple[int, int, int], ...]:
 
 
 class PatternModule(nn.Module):
-    """Base of the modules whose only option is the Bayer phase, see :func:`bayer_pattern`."""
+    """Base of the modules whose only option is the pattern, see :func:`cfa_pattern`."""
+
+    bayer_only: ClassVar[bool] = False  #: whether a grey sensor makes no sense
 
     def __init__(self, pattern: str | CFA = "RGGB") -> None:
         super().__init__()
-        self.pattern = bayer_pattern(pattern)
+        self.pattern = bayer_pattern(pattern) if self.bayer_only else cfa_pattern(pattern)
 
     def extra_repr(self) -> str:  # noqa: D102
         return f"pattern={self.pattern!r}"
@@ -82,7 +146,7 @@ def bayer_mask(
     device: torch.device | str | None = None,
     dtype: torch.dtype | None = None,
 ) -> Tensor:
-    r"""Which pixels of a Bayer sensor are known, colour by colour, optionally after upsampling.
+    r"""Which pixels of a sensor are known, colour by colour, optionally after upsampling.
 
     .. math:: M_C(x, y) = [\text{the sensor's pixel } (\lfloor x / s \rfloor, \lfloor y / s \rfloor)
         \text{ sees the colour } C]
@@ -90,18 +154,20 @@ def bayer_mask(
     Convention:
         Planes are R, G, B. One known sensor pixel becomes a block of ``scale`` x ``scale`` known pixels. The three
         planes add up to one everywhere. The pattern begins at the top left, pixel (0, 0), whatever the size; with an
-        odd size the last cell is cut. A constant: there is no gradient.
+        odd size the last cell is cut. Every pixel of a grey sensor is known, in the one plane that there is. A
+        constant: there is no gradient.
 
     Args:
         height: rows of the sensor.
         width: columns of the sensor.
-        pattern: Bayer phase, see :func:`bayer_pattern`.
+        pattern: Bayer phase or ``"grey"``, see :func:`cfa_pattern`.
         scale: super-resolution factor.
         device: where to put the mask.
         dtype: its type; torch's default type when not given.
 
     Returns:
-        Zeros and ones of shape :math:`(3, scale \cdot height, scale \cdot width)`.
+        Zeros and ones of shape :math:`(3, scale \cdot height, scale \cdot width)`, or :math:`(1, ...)` where the
+        sensor is grey.
 
     Raises:
         TypeError: ``dtype`` is not a type of torch.
@@ -120,10 +186,11 @@ def bayer_mask(
         raise TypeError(f"dtype: expected a type of torch, got {dtype!r}")
     scale = check_whole("scale", scale)
     height, width = check_whole("height", height), check_whole("width", width)
-    rows = torch.arange(scale * height, device=device) // scale % 2
-    columns = torch.arange(scale * width, device=device) // scale % 2
-    planes: list[Tensor | None] = [None, None, None]
-    for colour, row, column in bayer_sites(pattern):
+    sites, side = cfa_sites(pattern)
+    rows = torch.arange(scale * height, device=device) // scale % side
+    columns = torch.arange(scale * width, device=device) // scale % side
+    planes: list[Tensor | None] = [None] * count_colors(pattern)
+    for colour, row, column in sites:
         site = (rows == row)[:, None] & (columns == column)[None, :]
         plane = planes[colour]
         planes[colour] = site if plane is None else plane | site
@@ -135,7 +202,7 @@ class BayerMask(nn.Module):
 
     Shape:
         - Input: any tensor :math:`(*, H, W)`; only its size, device and dtype are read.
-        - Output: :math:`(3, scale \cdot H, scale \cdot W)`.
+        - Output: :math:`(3, scale \cdot H, scale \cdot W)`, or :math:`(1, ...)` where the sensor is grey.
 
     Example:
         >>> BayerMask("GRBG", scale=2)(torch.zeros(1, 41, 4, 6)).shape
@@ -145,7 +212,7 @@ class BayerMask(nn.Module):
     def __init__(self, pattern: str | CFA = "RGGB", *, scale: int = 1) -> None:
         super().__init__()
         self.scale = check_whole("scale", scale)
-        self.pattern = bayer_pattern(pattern)
+        self.pattern = cfa_pattern(pattern)
 
     def forward(self, raw: Tensor) -> Tensor:  # noqa: D102
         check_planes("raw", raw, 2, "(*, H, W)")
@@ -157,18 +224,19 @@ class BayerMask(nn.Module):
 
 
 def mosaic(rgb: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
-    r"""Keep, at every pixel, the one colour that a Bayer sensor sees there.
+    r"""Keep, at every pixel, what a sensor sees there: one colour through a Bayer filter, else the luminance.
 
     .. math:: R(x, y) = I_{C(x, y)}(x, y)
 
     Convention:
         C(x, y) is the colour of :func:`bayer_mask`. Values are copied, in any real dtype, as by
         :func:`kornia.color.rgb_to_raw`, whose channel axis is dropped. The two colours that are not seen do not matter,
-        NaN included, and their gradient is 0; that of the seen one is passed on.
+        NaN included, and their gradient is 0; that of the seen one is passed on. A grey sensor sees what
+        :func:`bin_to_sensor` says.
 
     Args:
         rgb: colour image :math:`(*, 3, H, W)`; odd sizes are legal.
-        pattern: Bayer phase, see :func:`bayer_pattern`.
+        pattern: Bayer phase or ``"grey"``, see :func:`cfa_pattern`.
 
     Returns:
         The mosaic :math:`(*, H, W)`, in the dtype of ``rgb``.
@@ -204,7 +272,7 @@ class Mosaic(PatternModule):
 
 
 def bin_to_sensor(rgb: Tensor, pattern: str | CFA = "RGGB", *, scale: int) -> Tensor:
-    r"""Average a high-resolution picture to the mosaic of a Bayer sensor with ``scale`` times coarser pixels.
+    r"""Average a high-resolution picture to what a sensor with ``scale`` times coarser pixels sees.
 
     .. math:: R(x, y) = \frac{1}{s^2} \sum_{0 \le a, b < s} I_{C(x, y)}(s x + a, s y + b)
 
@@ -213,39 +281,51 @@ def bin_to_sensor(rgb: Tensor, pattern: str | CFA = "RGGB", *, scale: int) -> Te
         colour C(x, y) only. The sum runs in float32 or wider. The gradient of a picture pixel is :math:`1 / s^2` of
         its sensor pixel's in that colour, and 0 in the other two.
 
+        A grey sensor sees the luminance of Rec. 601, :math:`0.299 R + 0.587 G + 0.114 B` of the values as they are
+        encoded, which is how the grey recordings that the field simulates were made; or a picture that has but one
+        channel, as it is.
+
     Args:
-        rgb: colour image :math:`(*, 3, H, W)`, H and W multiples of ``scale``.
-        pattern: Bayer phase of the sensor, see :func:`bayer_pattern`.
+        rgb: colour image :math:`(*, 3, H, W)`, H and W multiples of ``scale``; :math:`(*, 1, H, W)` is taken by a
+            grey sensor, too.
+        pattern: Bayer phase of the sensor or ``"grey"``, see :func:`cfa_pattern`.
         scale: how many picture pixels a sensor pixel is wide.
 
     Returns:
-        The mosaic :math:`(*, H / s, W / s)`, in the dtype of ``rgb`` (integer pictures need ``scale=1``).
+        The mosaic :math:`(*, H / s, W / s)`, in the dtype of ``rgb`` (integer pictures need ``scale=1``, and a sensor
+        that sees colours, or one channel).
 
     Raises:
-        TypeError: ``rgb`` is not a tensor of real numbers, or not a floating-point one where ``scale`` is above 1.
+        TypeError: ``rgb`` is not a tensor of real numbers, or not a floating-point one where it is to be averaged.
         ValueError: no three channels, a size that ``scale`` does not divide, a scale below 1, an unknown pattern.
 
     Example:
         >>> bin_to_sensor(torch.arange(48.0).reshape(3, 4, 4), scale=2).tolist()
         [[2.5, 20.5], [26.5, 44.5]]
+        >>> bin_to_sensor(torch.tensor([1.0, 0.5, 0.0]).reshape(3, 1, 1), "grey", scale=1)
+        tensor([[0.5925]])
 
     Reference:
         Dong et al., CVPR 2024, section 5.1: "accumulate signals of 4 pixels to generate the signal of one target
         pixel in the x2 case ... the 4 pixels come from one of the channels".
     """
     scale = check_whole("scale", scale)
-    check_planes("rgb", rgb, 3, "(*, 3, H, W)", floating=scale > 1)
+    sites, side = cfa_sites(pattern)
+    luminance = side == 1 and isinstance(rgb, Tensor) and rgb.ndim >= 3 and rgb.shape[-3] == 3
+    shape = "(*, 1 or 3, H, W)" if side == 1 else "(*, 3, H, W)"
+    check_planes("rgb", rgb, 3, shape, floating=scale > 1 or luminance)
     channels, height, width = rgb.shape[-3:]
-    if channels != 3 or height % scale or width % scale:
+    if channels not in ((1, 3) if side == 1 else (3,)) or height % scale or width % scale:
         multiples = f" with H and W multiples of {scale}" if scale > 1 else ""
-        raise ValueError(f"rgb: expected (*, 3, H, W){multiples}, got {tuple(rgb.shape)}")
+        raise ValueError(f"rgb: expected {shape}{multiples}, got {tuple(rgb.shape)}")
     wide = torch.promote_types(rgb.dtype, torch.float32)
-    raw = rgb.new_empty(*rgb.shape[:-3], height // scale, width // scale)
-    for colour, row, column in bayer_sites(pattern):
-        plane, step = rgb[..., colour, :, :], 2 * scale
+    dtype, rgb = rgb.dtype, rgb_to_grayscale(rgb.to(wide)) if luminance else rgb
+    raw = rgb.new_empty(*rgb.shape[:-3], height // scale, width // scale, dtype=dtype)
+    for colour, row, column in sites:
+        plane, step = rgb[..., colour, :, :], side * scale
         seen = _sum([plane[..., scale * row + a :: step, :] for a in range(scale)], wide)
         seen = _sum([seen[..., scale * column + b :: step] for b in range(scale)], wide)
-        raw[..., row::2, column::2] = seen / scale**2 if scale > 1 else seen
+        raw[..., row::side, column::side] = seen / scale**2 if scale > 1 else seen
     return raw
 
 
@@ -269,7 +349,7 @@ class BinToSensor(nn.Module):
     def __init__(self, pattern: str | CFA = "RGGB", *, scale: int) -> None:
         super().__init__()
         self.scale = check_whole("scale", scale)
-        self.pattern = bayer_pattern(pattern)
+        self.pattern = cfa_pattern(pattern)
 
     def forward(self, rgb: Tensor) -> Tensor:  # noqa: D102
         return bin_to_sensor(rgb, self.pattern, scale=self.scale)
@@ -279,21 +359,21 @@ class BinToSensor(nn.Module):
 
 
 def split_colors(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
-    r"""Split a mosaic, or a stream of mosaics, into three full-size ones that hold one colour each and 0 elsewhere.
+    r"""Split a mosaic, or a stream of mosaics, into full-size ones that hold one colour each and 0 elsewhere.
 
     .. math:: S^C = M_C \, S, \quad C \in \{R, G, B\}
 
     Convention:
         M is the mask of :func:`bayer_mask`. The colour is the **first** axis of the result, so that
         ``red, green, blue = split_colors(spikes)`` leaves time at -3. Their sum is the input. The gradient of a pixel
-        is that of its own colour's plane.
+        is that of its own colour's plane. A grey sensor has one colour.
 
     Args:
         raw: mosaic or spike stream :math:`(*, H, W)`, any dtype.
-        pattern: Bayer phase, see :func:`bayer_pattern`.
+        pattern: Bayer phase or ``"grey"``, see :func:`cfa_pattern`.
 
     Returns:
-        :math:`(3, *, H, W)`, in the dtype of ``raw``.
+        :math:`(3, *, H, W)`, or :math:`(1, *, H, W)` where the sensor is grey, in the dtype of ``raw``.
 
     Raises:
         TypeError: ``raw`` is not a tensor of real numbers.
@@ -308,6 +388,8 @@ def split_colors(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
         Dong et al., CVPR 2024, section 4.2.
     """
     check_planes("raw", raw, 2, "(*, H, W)")
+    if count_colors(pattern) == 1:
+        return raw[None].clone()
     colors = raw.new_zeros(3, *raw.shape)
     for colour, row, column in bayer_sites(pattern):
         colors[colour, ..., row::2, column::2] = raw[..., row::2, column::2]
@@ -378,6 +460,8 @@ class SplitBayer(PatternModule):
         torch.Size([4, 2, 41, 4, 3])
     """
 
+    bayer_only = True
+
     def forward(self, raw: Tensor) -> Tensor:  # noqa: D102
         return split_bayer(raw, self.pattern)
 
@@ -428,6 +512,8 @@ class MergeBayer(PatternModule):
         >>> MergeBayer()(torch.ones(4, 41, 4, 3)).shape
         torch.Size([41, 8, 6])
     """
+
+    bayer_only = True
 
     def forward(self, planes: Tensor) -> Tensor:  # noqa: D102
         return merge_bayer(planes, self.pattern)

@@ -8,7 +8,7 @@ from kornia.color import CFA
 from torch import Tensor
 
 from spikekit.check import check_planes
-from spikekit.color.cfa import PatternModule, bayer_mask, bayer_sites
+from spikekit.color.cfa import PatternModule, bayer_mask, bayer_sites, count_colors
 
 # Malvar, He and Cutler (2004), Fig. 2, in eighths: the estimate at the centre.
 _GREEN = [[0, 0, -1, 0, 0], [0, 0, 2, 0, 0], [-1, 2, 4, 2, -1], [0, 0, 2, 0, 0], [0, 0, -1, 0, 0]]
@@ -36,10 +36,10 @@ def demosaic(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
 
     Args:
         raw: mosaic :math:`(*, H, W)`, floating, H and W at least 3; odd sizes are legal.
-        pattern: Bayer phase, see :func:`spikekit.bayer_pattern`.
+        pattern: Bayer phase, see :func:`spikekit.bayer_pattern`; of ``"grey"`` there is nothing to fill in.
 
     Returns:
-        The picture :math:`(*, 3, H, W)`, in the dtype of ``raw``.
+        The picture :math:`(*, 3, H, W)`, or :math:`(*, 1, H, W)` of a grey sensor, in the dtype of ``raw``.
 
     Raises:
         TypeError: ``raw`` is not a floating-point tensor.
@@ -54,6 +54,8 @@ def demosaic(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
         ICASSP 2004. kornia's ``raw_to_rgb`` interpolates bilinearly.
     """
     known = wide_mosaics(raw)[:, None]
+    if count_colors(pattern) == 1:
+        return raw.unsqueeze(-3).clone()
     height, width = raw.shape[-2:]
     filters = known.new_tensor([_GREEN, _SAME_ROW, _SAME_COLUMN, _DIAGONAL])[:, None] / 8
     with torch.autocast(raw.device.type, enabled=False):

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from kornia.color import CFA
 from torch import Tensor
 
-from spikekit.color.cfa import PatternModule, bayer_mask
+from spikekit.color.cfa import PatternModule, bayer_mask, count_colors
 from spikekit.color.demosaic import wide_mosaics
 
 _RADIUS = 5  # of the guided filter's windows
@@ -42,10 +42,10 @@ def demosaic_residual(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
 
     Args:
         raw: mosaic :math:`(*, H, W)`, floating, H and W at least 3; odd sizes are legal.
-        pattern: Bayer phase, see :func:`spikekit.bayer_pattern`.
+        pattern: Bayer phase, see :func:`spikekit.bayer_pattern`; of ``"grey"`` there is nothing to fill in.
 
     Returns:
-        The picture :math:`(*, 3, H, W)`, in the dtype of ``raw``.
+        The picture :math:`(*, 3, H, W)`, or :math:`(*, 1, H, W)` of a grey sensor, in the dtype of ``raw``.
 
     Raises:
         TypeError: ``raw`` is not a floating-point tensor.
@@ -60,6 +60,8 @@ def demosaic_residual(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
         the two floors are ours; so is that nothing is clamped on the way.
     """
     known = wide_mosaics(raw)
+    if count_colors(pattern) == 1:
+        return raw.unsqueeze(-3).clone()
     height, width = raw.shape[-2:]
     red, green, blue = bayer_mask(height, width, pattern, device=raw.device, dtype=torch.bool)
     greens = interpolate_green(known, green)

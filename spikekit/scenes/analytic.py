@@ -11,8 +11,8 @@ import torch.nn.functional as F
 from kornia.color import CFA
 from torch import Tensor
 
-from spikekit.check import check_picture, check_positive, check_whole
-from spikekit.color.cfa import bayer_sites
+from spikekit.check import check_planes, check_positive, check_whole
+from spikekit.color.cfa import bin_to_sensor, cfa_sites
 
 _CHUNK = 1 << 16  # positions sampled at a time: what they need stays in the cache
 
@@ -64,7 +64,7 @@ class Layer:
     """A picture in motion: the background of a scene, or an object in front of it.
 
     Args:
-        picture: ``rgb`` (3, h, w), float32 or float64.
+        picture: ``rgb`` (3, h, w), float32 or float64; (1, h, w) of a scene that only grey sensors see.
         motion: how it moves.
         position: (x, y) of the picture's pixel (0, 0) in the view, at the middle of the clip.
         mask: (h, w), how much of the object there is, 0 to 1; 0 beyond its border. ``None`` for a background, which
@@ -84,7 +84,9 @@ class Layer:
     mask: Tensor | None = None
 
     def __post_init__(self) -> None:
-        check_picture("picture", self.picture, "(3, h, w)")
+        check_planes("picture", self.picture, 3, "(3, h, w)", floating=True)
+        if self.picture.ndim != 3 or len(self.picture) not in (1, 3):
+            raise ValueError(f"picture: expected (3, h, w), or (1, h, w) of grey, got {tuple(self.picture.shape)}")
         if self.picture.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"picture: expected float32 or float64, got {self.picture.dtype}")
         size = tuple(self.picture.shape[1:])
@@ -93,7 +95,7 @@ class Layer:
             raise ValueError(f"mask: expected {size}, got {got}")
 
     def _planes(self) -> tuple[Tensor, complex]:
-        """The planes to sample, and the position of their corner; an object gets a mask as fourth plane, and a rim."""
+        """The planes to sample, and the position of their corner; an object gets a mask as last plane, and a rim."""
         if self.mask is None:
             return self.picture, complex(*self.position)
         picture = F.pad(self.picture, (1, 1, 1, 1), "replicate")
@@ -134,7 +136,7 @@ def _sample(
 
 
 class Scene:
-    r"""A stack of pictures in motion, seen by a colour spike camera.
+    r"""A stack of pictures in motion, seen by a spike camera.
 
     Convention:
         The view has high-resolution pixels, centres at whole numbers. The scene is the bilinear interpolant of its
@@ -142,7 +144,8 @@ class Scene:
         middle, clock ``frames // 2``, every motion is the identity: there the view shows the pictures' own pixels,
         and this is the ground truth. Objects lie over each other in the order given, the last on top.
 
-        A sensor pixel averages the s x s view pixels of its own colour, see :func:`spikekit.bin_to_sensor`; the
+        A sensor pixel averages the s x s view pixels of its own colour, or their luminance where the sensor is grey,
+        see :func:`spikekit.bin_to_sensor`; the
         sensor pixel (x, y) is centred at (s x + (s - 1) / 2, s y + (s - 1) / 2) of the view.
 
     Args:
@@ -152,7 +155,8 @@ class Scene:
         frames: clocks of the clip.
 
     Raises:
-        ValueError: no layer, a background with a mask, an object without one, sizes below 1.
+        ValueError: no layer, a background with a mask, an object without one, pictures of 1 and of 3 channels, sizes
+            below 1.
 
     Example:
         >>> picture = torch.rand(3, 40, 40)
@@ -168,6 +172,9 @@ class Scene:
     def __init__(self, layers: Sequence[Layer], height: int, width: int, frames: int = 41) -> None:
         if not layers or layers[0].mask is not None or any(layer.mask is None for layer in layers[1:]):
             raise ValueError("layers: expected a background without a mask, then objects with one")
+        self.channels = len(layers[0].picture)
+        if any(len(layer.picture) != self.channels for layer in layers):
+            raise ValueError("layers: expected pictures of one number of channels, got some of 1 and some of 3")
         if height < 1 or width < 1 or frames < 1:
             raise ValueError(f"height, width, frames: expected at least 1, got {height}, {width}, {frames}")
         self.layers = list(layers)
@@ -182,10 +189,10 @@ class Scene:
             clock: any; whole numbers from 0 to ``frames - 1`` are what the sensor sees.
 
         Returns:
-            ``rgb`` of shape (3, height, width).
+            ``rgb`` of shape (3, height, width), or (1, height, width) where the pictures have one channel.
         """
         rows, columns = self._axis(self.height), self._axis(self.width)
-        return self._render([0, 1, 2], rows, columns, self._tau([clock]))[0]
+        return self._render([*range(self.channels)], rows, columns, self._tau([clock]))[0]
 
     def light(self, pattern: str | CFA = "RGGB", *, scale: int, alpha: float = 1.0) -> Tensor:
         """Return the light that arrives at the sensor at every clock.
@@ -194,7 +201,7 @@ class Scene:
         only the one colour that the sensor sees there.
 
         Args:
-            pattern: Bayer phase, see :func:`spikekit.bayer_pattern`.
+            pattern: Bayer phase, see :func:`spikekit.bayer_pattern`, or ``"grey"``.
             scale: how many view pixels a sensor pixel is wide; it divides the view.
             alpha: light of a white pixel per clock.
 
@@ -202,21 +209,27 @@ class Scene:
             ``light`` of shape (frames, height / scale, width / scale).
 
         Raises:
-            ValueError: an unknown pattern, a scale that does not divide the view, an alpha that is not above 0.
+            ValueError: an unknown pattern, or a Bayer phase for pictures of one channel; a scale that does not divide
+                the view, an alpha that is not above 0.
         """
         height, width = self._sensor(scale)
         check_positive("alpha", alpha)
+        sites, side = cfa_sites(pattern)
+        if self.channels == 1 and side > 1:
+            raise ValueError(f"pattern: expected grey for pictures of one channel, got {pattern}")
         light = self.layers[0].picture.new_empty(self.frames, height, width)
-        for colour, row, column in bayer_sites(pattern):
-            rows = self._axis(self.height).reshape(height, scale)[row::2].flatten()
-            columns = self._axis(self.width).reshape(width, scale)[column::2].flatten()
+        for colour, row, column in sites:
+            colours = [colour] if side > 1 else [*range(self.channels)]
+            rows = self._axis(self.height).reshape(height, scale)[row::side].flatten()
+            columns = self._axis(self.width).reshape(width, scale)[column::side].flatten()
             if 0 in (len(rows), len(columns)):
                 continue
             chunk = max(1, _CHUNK // (len(rows) * len(columns)))
             for start in range(0, self.frames, chunk):
                 clocks = range(start, min(start + chunk, self.frames))
-                seen = self._render([colour], rows, columns, self._tau(clocks))[:, 0]
-                light[start : clocks.stop, row::2, column::2] = F.avg_pool2d(seen, scale)
+                seen = self._render(colours, rows, columns, self._tau(clocks))
+                seen = seen[:, 0] if side > 1 else bin_to_sensor(seen, pattern, scale=1)
+                light[start : clocks.stop, row::side, column::side] = F.avg_pool2d(seen, scale)
         return light * alpha
 
     def flow(self, clock: float, *, scale: int) -> Tensor:
@@ -245,7 +258,7 @@ class Scene:
             turn, shift = layer.motion._turn_and_shift(self._tau([clock]))
             moves = turn * here + shift - here
             if layer.mask is not None:
-                seen = _sample(planes[3:], corner, *still, rows, columns, "border")[0, 0] >= 0.5
+                seen = _sample(planes[-1:], corner, *still, rows, columns, "border")[0, 0] >= 0.5
                 moves = torch.where(seen, moves, moved)
             moved = moves
         return torch.stack([moved.real, moved.imag]).to(self.layers[0].picture.dtype) / scale
@@ -274,7 +287,7 @@ class Scene:
             box = _touched(planes, corner, turn, shift, rows, columns)
             part = view[(..., *box)]
             if part.numel():
-                picked = planes[[*colours, 3]]
+                picked = planes[[*colours, -1]]
                 found = _sample(picked, corner, turn, shift, rows[box[0]], columns[box[1]], "border")
                 part.lerp_(found[:, :-1], found[:, -1:].expand(part.shape))
         return view

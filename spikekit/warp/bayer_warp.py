@@ -6,7 +6,7 @@ import torch
 from kornia.color import CFA
 from torch import Tensor
 
-from spikekit.color.cfa import bayer_sites
+from spikekit.color.cfa import cfa_sites
 from spikekit.warp.neighbors import finite
 
 _NEIGHBORS = 4
@@ -22,8 +22,8 @@ def bayer_warp_idw(features: Tensor, flow: Tensor, pattern: str | CFA, color: in
     Args:
         features: (B, C, s H, s W), floating.
         flow: (B, 2, s H, s W), in pixels of the features.
-        pattern: Bayer phase.
-        color: 0, 1, 2 for R, G, B.
+        pattern: Bayer phase, or ``"grey"``.
+        color: 0, 1, 2 for R, G, B; 0 for grey.
         scale: pixels s of the features that a sensor pixel is wide.
         steps: positions per pixel and axis that flow is rounded to, even.
 
@@ -40,10 +40,12 @@ def bayer_warp_idw(features: Tensor, flow: Tensor, pattern: str | CFA, color: in
         for axis, length, shape in ((0, width, (1, -1)), (1, height, (-1, 1)))
     )
     keys = []
-    for colour, row, column in bayer_sites(pattern):
+    sites, side = cfa_sites(pattern)
+    for colour, row, column in sites:
         if colour != color:
             continue
-        rows, columns = _nearest_on_axis(y, height, row, scale, steps), _nearest_on_axis(x, width, column, scale, steps)
+        rows = _nearest_on_axis(y, height, row, side, scale, steps)
+        columns = _nearest_on_axis(x, width, column, side, scale, steps)
         for i in range(_NEIGHBORS):
             for j in range(_NEIGHBORS // (i + 1)):  # so many pixels of these rows and columns are at least as near
                 square = (steps * rows[i] - y).square() + (steps * columns[j] - x).square()
@@ -68,12 +70,12 @@ def _rounded(flow: Tensor, pixel: Tensor, length: int, steps: int) -> Tensor:
     return moved.clamp(min=-(steps // 2)).minimum(torch.full_like(pixel, length - 1) * steps + steps // 2)
 
 
-def _nearest_on_axis(position: Tensor, length: int, site: int, scale: int, steps: int) -> list[Tensor]:
+def _nearest_on_axis(position: Tensor, length: int, site: int, side: int, scale: int, steps: int) -> list[Tensor]:
     """The four known pixels nearest to each position on an axis, nearest first, the lower one among equals."""
     reach = 2 * scale + 8  # as far as the fourth can be, at a border as well
     half = torch.arange(2 * length, device=position.device)  # order does not change between half pixels
     candidates = (half // 2).unsqueeze(1) + torch.arange(-reach, reach + 1, device=position.device)
-    known = (candidates >= 0) & (candidates < length) & (candidates.clamp(min=0) // scale % 2 == site)
+    known = (candidates >= 0) & (candidates < length) & (candidates.clamp(min=0) // scale % side == site)
     away = 2 * candidates - half.unsqueeze(1)
     order = torch.where(known, 2 * away.abs() + (away > 0), 1 << 20)
     found = order.float().topk(_NEIGHBORS, largest=False, sorted=True).indices

@@ -402,3 +402,17 @@ def test_shared_pictures(where):
     clip = data.train_set[0]
     assert clip["rgb"].shape == (3, 192, 192)
     assert cached_picture(data.train_set.pictures[0]).std() > 0.01
+
+
+def test_grey_clips_are_the_luminance_of_the_same_scenes():
+    options = {"scale": 2, "patch": 12, "motion": 2.0}
+    pictures = embedded_pictures()[:2]
+    grey, colour = (StillClips(pictures, pattern=pattern, **options) for pattern in ("grey", "RGGB"))
+    clip = grey[3]
+    assert clip["spikes"].shape == (41, 12, 12)
+    assert clip["rgb"].shape == (1, 24, 24)
+    assert torch.equal(clip["flow"], colour[3]["flow"])
+    luminance = bin_to_sensor(colour[3]["rgb"], "grey", scale=1)
+    torch.testing.assert_close(clip["rgb"][0], luminance, rtol=1e-4, atol=1e-5)
+    light = grey.scene(3).light("grey", scale=2, alpha=0.4)
+    assert (clip["spikes"].float().mean(dim=0) - light.mean(dim=0)).abs().max() <= 1 / 41 + 1e-6

@@ -234,7 +234,7 @@ def test_errors_say_what_was_expected():
     with pytest.raises(ValueError, match=r"mask: expected \(8, 8\), got \(8, 7\)"):
         Layer(picture, mask=torch.ones(8, 7))
     with pytest.raises(ValueError, match=r"picture: expected \(3, h, w\)"):
-        Layer(torch.rand(1, 8, 8))
+        Layer(torch.rand(2, 8, 8))
     with pytest.raises(TypeError, match="float32 or float64"):
         Layer(picture.half())
     with pytest.raises(ValueError, match="zoom: expected"):

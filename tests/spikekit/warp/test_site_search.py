@@ -5,6 +5,7 @@ import torch
 import torch.nn.functional as F
 
 from spikekit import bayer_mask, flow_warp_idw
+from spikekit.color.cfa import count_colors
 from spikekit.warp import site_search
 from spikekit.warp.site_search import STEPS, search_sites, site_table
 
@@ -39,13 +40,13 @@ def searched(features, flow, pattern, color, scale):
 
 
 @pytest.mark.parametrize("scale", [1, 2, 3, 4])
-@pytest.mark.parametrize("pattern", ["RGGB", "GBRG"])
+@pytest.mark.parametrize("pattern", ["RGGB", "GBRG", "grey"])
 @pytest.mark.parametrize("size", [(12, 13), (15, 20)])
 def test_sites_are_the_enlarged_features_searched_along_the_motion_up_to_the_border(scale, pattern, size):
     generator = torch.Generator().manual_seed(scale)
     features = torch.randn(2, 4, 2, *size, dtype=torch.float64, generator=generator)
     flow = rounded_flow(size, generator)
-    for color in range(3):
+    for color in range(count_colors(pattern)):
         table = table_for(size, pattern, color, scale)
         expected = searched(features, flow, pattern, color, scale)
         torch.testing.assert_close(search_sites(features, flow, SHARES, table), expected, rtol=0, atol=1e-5)

@@ -1,0 +1,74 @@
+"""Networks of one colour, for grey sensors."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
+from lightning_modules.networks import CSCSR, ClassicalDecoder, RecurrentCSCSR
+
+TINY = {"width": 8, "representation_width": 8, "features": 2, "stages": 2, "end_blocks": 1, "pattern": "grey"}
+
+
+def _spikes(*size: int) -> torch.Tensor:
+    return (torch.rand(size, generator=torch.Generator().manual_seed(0)) < 0.4).float()
+
+
+@pytest.mark.parametrize("resolution", ["output", "sensor"])
+@pytest.mark.parametrize("scale", [1, 2, 3, 4])
+def test_a_grey_picture_has_one_channel_at_any_scale_and_size(scale, resolution):
+    spikes = _spikes(2, 41, 11, 14)
+    network = CSCSR(scale, resolution=resolution, skip=True, **TINY)
+    flow = torch.randn(2, 2, 2, 11, 14, generator=torch.Generator().manual_seed(1))
+    for picture in (network(spikes), network(spikes, flow), network(spikes, static=True)):
+        assert picture.shape == (2, 1, 11 * scale, 14 * scale)
+    assert ClassicalDecoder(scale=scale, pattern="grey")(spikes).shape == (2, 1, 11 * scale, 14 * scale)
+
+
+@pytest.mark.parametrize("scale", [1, 2])
+def test_static_is_what_flows_of_zeros_give(scale):
+    network, spikes = CSCSR(scale, **TINY).eval(), _spikes(1, 41, 12, 13)
+    still = network(spikes, torch.zeros(1, 2, 2, 12, 13))
+    torch.testing.assert_close(network(spikes, static=True), still)
+
+
+@pytest.mark.parametrize("pattern", ["grey", "RGGB"])
+def test_at_scale_1_what_moved_by_whole_pixels_is_found(pattern):
+    """A clip that moves by two pixels between time points looks like one at rest, where the flow says so."""
+    network = CSCSR(1, **{**TINY, "pattern": pattern, "representation": "spikes", "window": 1, "stride": 10})
+    scene, times = torch.rand(80, 80, generator=torch.Generator().manual_seed(0)), network.times
+    if pattern != "grey":  # a Bayer cell moves by whole cells
+        scene = scene.reshape(40, 2, 40, 2).mean(dim=(1, 3)).repeat_interleave(2, 0).repeat_interleave(2, 1)
+    moving = torch.stack([scene[20:60, 20 - (n // 10 - 2) * 2 :][:, :40] for n in range(41)])[None]
+    resting = scene[20:60, 20:60].expand(1, 41, 40, 40)
+    flow = torch.zeros(1, 2, 2, 40, 40)
+    flow[:, :, 0] = torch.tensor([-4.0, 4.0]).reshape(2, 1, 1)
+    assert times == (0, 10, 20, 30, 40)
+    found, expected = network(moving, flow), network(resting, static=True)
+    torch.testing.assert_close(found[..., 10:-10, 10:-10], expected[..., 10:-10, 10:-10])
+
+
+def test_one_colour_has_the_blocks_of_three_and_a_single_fusion():
+    part = CSCSR(1, **TINY).reconstruction
+    assert len(part.fuse) == 1
+    assert sum(len(branch) for stage in part.refine for branch in stage) == TINY["stages"]
+
+
+def test_grey_has_no_colours_to_treat_apart():
+    for choice in ({"motion_fusion": "assembled"}, {"reconstruction": "early"}):
+        with pytest.raises(ValueError, match="grey"):
+            CSCSR(1, **TINY, **choice)
+
+
+def test_a_film_of_a_grey_sensor():
+    network = RecurrentCSCSR(2, **TINY)
+    assert network(_spikes(1, 3, 41, 12, 10), future=2).shape == (1, 3, 1, 24, 20)
+
+
+@pytest.mark.parametrize("estimator", [ClassicalFlow(), ZeroFlow(), Spike2Flow()], ids=lambda kind: type(kind).__name__)
+def test_motion_is_estimated_on_all_pixels_of_a_grey_sensor(estimator):
+    spikes = _spikes(2, 41, 21, 18)
+    to_first, to_last = estimator(spikes, (5, 20, 35), "grey")
+    assert to_first.shape == to_last.shape == (2, 2, 21, 18)
+    assert estimator.channel_flows(spikes, (5, 20, 35), "grey")[0].shape == (1, 2, 2, 21, 18)

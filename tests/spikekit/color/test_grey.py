@@ -1,0 +1,74 @@
+"""A sensor without colour filters, ``pattern="grey"``, through the operators that take a pattern."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from kornia.color import rgb_to_grayscale
+
+import spikekit as sk
+from spikekit.color.cfa import cfa_pattern, count_colors
+
+FLOAT = torch.float64
+
+
+@pytest.mark.parametrize("scale", [1, 3])
+def test_all_pixels_of_a_grey_sensor_are_known_in_one_plane(scale):
+    assert torch.equal(sk.bayer_mask(5, 4, "grey", scale=scale), torch.ones(1, 5 * scale, 4 * scale))
+    assert sk.BayerMask("grey", scale=scale)(torch.zeros(2, 5, 4)).shape == (1, 5 * scale, 4 * scale)
+
+
+@pytest.mark.parametrize("scale", [1, 2, 3])
+def test_a_grey_sensor_sees_the_mean_luminance_of_a_block(scale):
+    rgb = torch.rand(2, 3, 5 * scale, 7 * scale, dtype=FLOAT)
+    luminance = 0.299 * rgb[:, 0] + 0.587 * rgb[:, 1] + 0.114 * rgb[:, 2]
+    blocks = luminance.reshape(2, 5, scale, 7, scale).mean(dim=(2, 4))
+    torch.testing.assert_close(sk.bin_to_sensor(rgb, "grey", scale=scale), blocks)
+    torch.testing.assert_close(sk.bin_to_sensor(luminance[:, None], "grey", scale=scale), blocks)
+    torch.testing.assert_close(sk.mosaic(rgb, "grey"), rgb_to_grayscale(rgb)[:, 0])
+
+
+def test_a_grey_picture_is_copied_in_any_type():
+    grey = torch.arange(12, dtype=torch.uint8).reshape(1, 3, 4)
+    assert torch.equal(sk.mosaic(grey, "grey"), grey[0])
+    half = torch.rand(3, 4, 4, dtype=torch.bfloat16)
+    assert sk.mosaic(half, "grey").dtype == torch.bfloat16
+    with pytest.raises(TypeError, match="floating-point"):
+        sk.mosaic(torch.zeros(3, 4, 4, dtype=torch.uint8), "grey")
+
+
+def test_of_grey_there_is_nothing_to_split_or_to_fill_in():
+    raw = torch.rand(2, 5, 7)
+    assert torch.equal(sk.split_colors(raw, "grey"), raw[None])
+    assert torch.equal(sk.demosaic(raw, "grey"), raw[:, None])
+    assert torch.equal(sk.demosaic_residual(raw, "grey"), raw[:, None])
+    for module in (sk.SplitColors("grey"), sk.Demosaic("grey"), sk.Mosaic("GREY"), sk.BinToSensor("grey", scale=2)):
+        assert module.pattern == "grey"
+
+
+def test_the_gradient_of_grey_light_is_that_of_its_luminance():
+    rgb = torch.rand(1, 3, 4, 4, dtype=FLOAT, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda rgb: sk.bin_to_sensor(rgb, "grey", scale=2), (rgb,))
+
+
+@pytest.mark.parametrize("operator", [sk.split_bayer, sk.SplitBayer(), sk.bayer_sites, sk.bayer_pattern])
+def test_what_needs_a_bayer_cell_refuses_grey(operator):
+    given = [torch.zeros(2, 2)] if operator is sk.split_bayer else []
+    call = type(operator) if isinstance(operator, torch.nn.Module) else operator
+    with pytest.raises(ValueError, match=r"pattern: expected one of RGGB.*got 'grey'"):
+        call(*given, "grey")
+
+
+def test_patterns_are_counted_and_named():
+    assert [count_colors(pattern) for pattern in ("grey", "Grey", "bggr")] == [1, 1, 3]
+    with pytest.raises(ValueError, match=r"RGGB, BGGR, GRBG, GBRG, grey.*got 'gray'"):
+        cfa_pattern("gray")
+
+
+@pytest.mark.parametrize("steps", [None, 16])
+def test_whole_flow_copies_pixels_of_a_grey_sensor(steps):
+    features = torch.rand(1, 3, 9, 8)
+    flow = torch.zeros(1, 2, 9, 8)
+    flow[:, 0], flow[:, 1] = 2, -1
+    moved = sk.flow_warp_idw(features, flow, sk.bayer_mask(9, 8, "grey")[0], steps=steps)
+    assert torch.equal(moved[..., 1:, :6], features[..., :-1, 2:])
