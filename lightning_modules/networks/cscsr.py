@@ -34,6 +34,18 @@ _MOTION_FUSIONS = {"joint": joint_motion, "independent": independent_motion, "as
 _RECONSTRUCTIONS = {"correlated": ColorCorrelation, "separate": SeparateColors, "early": EarlyFusion}
 
 
+def one_a_clip(name: str, value: float | Tensor, clips: Tensor) -> Tensor:
+    """Return a number, or one for every clip, (B,), so that it can be multiplied with them, (B, 1, ...).
+
+    Raises:
+        ValueError: another shape.
+    """
+    value = torch.as_tensor(value, dtype=clips.dtype, device=clips.device)
+    if value.shape not in ((), (len(clips),)):
+        raise ValueError(f"{name}: expected a number or ({len(clips)},), one a clip, got {tuple(value.shape)}")
+    return value.reshape(-1, *[1] * (clips.ndim - 1)).expand(len(clips), *[1] * (clips.ndim - 1))
+
+
 def _representation(config: CSCSRConfig) -> nn.Module:
     """Features of the time points of one colour."""
     if config.representation == "spikes":
@@ -47,6 +59,7 @@ def _representation(config: CSCSRConfig) -> nn.Module:
         config.representation_width,
         config.features,
         config.global_perception,
+        config.noise,
     )
 
 
@@ -80,11 +93,13 @@ class CSCSR(Network):
         - Input: spikes :math:`(B, N, H, W)`, zeros and ones, any real dtype, any H and W of at least 3; optionally
           the flows from the middle to the first and to the last time point, :math:`(B, 2, 2, H, W)`, in sensor
           pixels, or those of R, G and B, :math:`(B, 3, 2, 2, H, W)`; or ``static=True`` where nothing moves: what
-          flows of zeros give, in less time
+          flows of zeros give, in less time; optionally ``alpha``, the gain of the camera, and ``noise``, the level of
+          its noise, 0 for an ideal sensor and 1 for the one of training, both a number or :math:`(B,)`
         - Output: rgb :math:`(B, 3, s H, s W)`, or :math:`(B, 1, s H, s W)` where the pattern is grey, not clamped
 
     Raises:
-        ValueError: a field that :class:`CSCSRConfig` refuses, or an odd number of steps.
+        ValueError: a field that :class:`CSCSRConfig` refuses, or an odd number of steps; a ``noise`` that the network
+            was not trained to be told.
 
     Example:
         >>> network = CSCSR(scale=2, width=8, representation_width=8, features=1, stages=1, end_blocks=1)
@@ -120,6 +135,7 @@ class CSCSR(Network):
         )
         own = {} if config.end_width is None else {"end_width": config.end_width}
         own |= {"colors": 1} if self.colors == 1 else {}
+        own |= {"noise": True} if config.noise else {}
         reconstruct = _RECONSTRUCTIONS[config.reconstruction]
         self.reconstruction = reconstruct(
             config.width, config.stages, config.blocks, config.end_blocks, self.fold, **own
@@ -140,18 +156,38 @@ class CSCSR(Network):
         if self.config.skip:
             nn.init.zeros_(self.reconstruction.rgb.weight)
 
-    def forward(self, spikes: Tensor, flow: Tensor | None = None, static: bool = False) -> Tensor:  # noqa: D102
+    def forward(  # noqa: D102
+        self,
+        spikes: Tensor,
+        flow: Tensor | None = None,
+        static: bool = False,
+        alpha: float | Tensor | None = None,
+        noise: float | Tensor | None = None,
+    ) -> Tensor:
         self.check_spikes(spikes)
         spikes = spikes.to(self.reconstruction.rgb.weight.dtype)
-        rgb = self.reconstruction(self._colors(spikes, self.resolve_flow(spikes, flow, static)))
-        return rgb + self._base(spikes) if self.config.skip else rgb
+        told = self._told(noise, spikes)
+        rgb = self.reconstruction(self._colors(spikes, self.resolve_flow(spikes, flow, static), **told), **told)
+        return self._exposed(rgb + self._base(spikes) if self.config.skip else rgb, alpha)
 
-    def _colors(self, spikes: Tensor, flow: Tensor | None) -> list[Tensor]:
+    def _told(self, noise: float | Tensor | None, spikes: Tensor) -> dict[str, Tensor]:
+        """The level of the noise as an argument, (B, 1, 1, 1), or none; of clips (B, N, H, W)."""
+        if noise is None:
+            return {}
+        if not self.config.noise:
+            raise ValueError(f"noise: expected none, as the network was not trained to be told of it, got {noise}")
+        return {"noise": one_a_clip("noise", noise, spikes)}
+
+    def _exposed(self, rgb: Tensor, alpha: float | Tensor | None) -> Tensor:
+        """Pictures (B, ..., C, H, W) of cameras whose gain is known."""
+        return rgb if alpha is None else rgb * (self.config.alpha / one_a_clip("alpha", alpha, rgb))
+
+    def _colors(self, spikes: Tensor, flow: Tensor | None, **told: Tensor) -> list[Tensor]:
         """Features of R, G and B, refined over time, each (B, width, H, W) at the resolution of the reconstruction."""
         height, width = spikes.shape[-2:]
         planes, colors = split_colors(spikes, self.pattern), range(self.colors)
         # one colour after the other: high resolution takes memory
-        features = (encode(plane) for encode, plane in zip(self.representation, planes, strict=True))
+        features = (encode(plane, **told) for encode, plane in zip(self.representation, planes, strict=True))
         if self._by_sites(spikes, flow):
             pixels = self._search_sites(features, flow, spikes)
             return [refine(part) for refine, part in zip(self.refinement, pixels, strict=True)]

@@ -32,8 +32,9 @@ class CSCSRConfig:
         end_width: channels after the last fusion; when not given, ``width``.
         skip: learn what to add to a smooth, enlarged TFP picture instead of the picture itself. The paper has no
             such skip; with it training starts where the classical decoder ends.
-        alpha: gain of the camera, what a white pixel receives per clock in thresholds. The skip divides by it; weights
-            trained with another are adapted when they are loaded.
+        alpha: gain of the camera, what a white pixel receives per clock in thresholds, of clips that come without one:
+            the picture is light, divided by it. Weights trained with another are adapted when they are loaded.
+        noise: whether the network is told how noisy the sensor is.
         neighbors: known pixels that the temporal pixel search weighs.
         representation: features of a time point: ``"bssr"`` learns them; ``"spikes"``, without BSSR (A), averages the
             spikes of the window; ``"interval"`` (C) takes the inverse of the spike interval. These two have no weights
@@ -54,7 +55,8 @@ class CSCSRConfig:
     Raises:
         ValueError: sizes that do not fit each other, an unknown choice, or choices that would have no effect:
             ``global_perception=False`` without BSSR, a ``motion_fusion`` without search, an ``end_width`` of separate
-            colours; another ``motion_fusion`` or ``reconstruction`` than the default of a single colour.
+            colours; ``noise`` without BSSR or correlated colours; another ``motion_fusion`` or ``reconstruction`` than
+            the default of a single colour.
 
     Example:
         >>> CSCSRConfig(scale=2).times
@@ -75,6 +77,7 @@ class CSCSRConfig:
     end_width: int | None = None
     skip: bool = False
     alpha: float = 0.4
+    noise: bool = False
     neighbors: int = 4
     representation: Literal["bssr", "spikes", "interval"] = "bssr"
     global_perception: bool = True
@@ -100,6 +103,9 @@ class CSCSRConfig:
             raise ValueError(
                 f"motion_fusion: expected joint without search, which asks for no motion, got {self.motion_fusion}"
             )
+        if self.noise and (self.representation, self.reconstruction) != ("bssr", "correlated"):
+            got = f"{self.representation} and {self.reconstruction}"
+            raise ValueError(f"noise: expected representation bssr and reconstruction correlated with it, got {got}")
         if self.pattern == GREY and (self.motion_fusion, self.reconstruction) != ("joint", "correlated"):
             got = f"{self.motion_fusion} and {self.reconstruction}"
             raise ValueError(

@@ -61,6 +61,28 @@ def res_blocks(width: int, count: int) -> nn.Sequential:
     return nn.Sequential(*(ResBlock(width) for _ in range(count)))
 
 
+class NoiseLevel(nn.Module):
+    """What the level of the sensor's noise changes: gain and shift of every channel, nothing at level 0.
+
+    One layer of FiLM (Perez et al., AAAI 2018), linear in the level. Before it is trained it changes nothing.
+
+    Args:
+        width: channels.
+
+    Shape:
+        - Input: features :math:`(B, width, H, W)`, levels :math:`(B, 1, 1, 1)`, or None for 0
+        - Output: as the features
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.gain = nn.Parameter(torch.zeros(width, 1, 1))
+        self.shift = nn.Parameter(torch.zeros(width, 1, 1))
+
+    def forward(self, features: Tensor, level: Tensor | None) -> Tensor:  # noqa: D102
+        return features if level is None else features * (1 + level * self.gain) + level * self.shift
+
+
 def start_pixel_by_pixel(part: nn.Module) -> None:
     """Initialize convolutions: orthogonal centre taps, small ones around (Xiao et al., ICML 2018).
 

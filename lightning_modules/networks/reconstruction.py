@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lightning_modules.networks.layers import conv, res_blocks
+from lightning_modules.networks.layers import NoiseLevel, conv, res_blocks
 
 
 class ToRgb(nn.Conv2d):
@@ -48,9 +48,11 @@ class ColorCorrelation(nn.Module):
         enlarge: how many times larger the picture is than the features.
         end_width: channels after the last fusion; when not given, ``width``.
         colors: how many there are.
+        noise: be told the level of the sensor's noise.
 
     Shape:
-        - Input: features of every colour, each :math:`(B, width, H, W)`
+        - Input: features of every colour, each :math:`(B, width, H, W)`; perhaps the level of the noise,
+          :math:`(B, 1, 1, 1)`
         - Output: rgb :math:`(B, colors, enlarge H, enlarge W)`
     """
 
@@ -63,6 +65,7 @@ class ColorCorrelation(nn.Module):
         enlarge: int = 1,
         end_width: int | None = None,
         colors: int = 3,
+        noise: bool = False,
     ) -> None:
         super().__init__()
         end_width = end_width or width
@@ -74,19 +77,21 @@ class ColorCorrelation(nn.Module):
         inputs = [colors * width] + [(colors + 1) * width] * (stages - 1)
         outputs = [width] * (stages - 1) + [end_width]
         self.fuse = nn.ModuleList(map(ColorFusion, inputs, outputs))
+        self.noise = NoiseLevel(end_width) if noise else None
         self.end = res_blocks(end_width, end_blocks)
         self.rgb = ToRgb(end_width, enlarge, colors=colors)
 
-    def features(self, colors: list[Tensor]) -> Tensor:
+    def features(self, colors: list[Tensor], noise: Tensor | None = None) -> Tensor:
         """Features of all colours that the picture is made of, (B, end_width, H, W)."""
         fused: list[Tensor] = []
         for refine, fuse in zip(self.refine, self.fuse, strict=True):
             colors = [branch(color) for branch, color in zip(refine, colors, strict=True)]
             fused = [fuse(torch.cat(colors + fused, dim=1))]
-        return fused[0] + self.end(fused[0])
+        known = fused[0] if noise is None else self.noise(fused[0], noise)
+        return known + self.end(known)
 
-    def forward(self, colors: list[Tensor]) -> Tensor:  # noqa: D102
-        return self.rgb(self.features(colors))
+    def forward(self, colors: list[Tensor], noise: Tensor | None = None) -> Tensor:  # noqa: D102
+        return self.rgb(self.features(colors, noise))
 
 
 class SeparateColors(nn.Module):

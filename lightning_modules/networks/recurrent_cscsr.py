@@ -142,7 +142,14 @@ class RecurrentCSCSR(CSCSR):
         )
 
     def forward(
-        self, spikes: Tensor, flow: Tensor | None = None, static: bool = False, every: int = 20, future: int = 0
+        self,
+        spikes: Tensor,
+        flow: Tensor | None = None,
+        static: bool = False,
+        every: int = 20,
+        future: int = 0,
+        alpha: float | Tensor | None = None,
+        noise: float | Tensor | None = None,
     ) -> Tensor:
         """Return the picture of a clip, or those of a film.
 
@@ -152,14 +159,24 @@ class RecurrentCSCSR(CSCSR):
             static: nothing moves, instead of a flow.
             every: clocks between two key frames.
             future: key frames that a picture may wait for; see :meth:`film`.
+            alpha: see :class:`CSCSR`; of films, one a film.
+            noise: likewise.
         """
         if spikes.ndim == 5:
-            return self.film(spikes, flow, static, every, future)[-1]
+            return self.film(spikes, flow, static, every, future, alpha, noise)[-1]
         self.check_spikes(spikes)
-        return self.picture(self.advance(self.features(spikes, self.resolve_flow(spikes, flow, static)), spikes))
+        features = self.features(spikes, self.resolve_flow(spikes, flow, static), noise)
+        return self._exposed(self.picture(self.advance(features, spikes)), alpha)
 
     def film(
-        self, spikes: Tensor, flow: Tensor | None = None, static: bool = False, every: int = 20, future: int = 0
+        self,
+        spikes: Tensor,
+        flow: Tensor | None = None,
+        static: bool = False,
+        every: int = 20,
+        future: int = 0,
+        alpha: float | Tensor | None = None,
+        noise: float | Tensor | None = None,
     ) -> list[Tensor]:
         """Return the pictures of a film, as they are after every time that it was read.
 
@@ -172,6 +189,8 @@ class RecurrentCSCSR(CSCSR):
             static: nothing moves, instead of a flow.
             every: clocks between two key frames.
             future: key frames that a picture may wait for.
+            alpha: see :class:`CSCSR`; a number or (B,).
+            noise: likewise.
 
         Returns:
             rgb (B, K, 3, s H, s W), once or, with a ``future``, twice: the last is the best.
@@ -183,7 +202,9 @@ class RecurrentCSCSR(CSCSR):
         clips = spikes.flatten(0, 1)
         self.check_spikes(clips)
         flow = self.resolve_flow(clips, None if flow is None else flow.flatten(0, 1), static)
-        features = self.features(clips, flow).unflatten(0, spikes.shape[:2])
+        if isinstance(noise, Tensor) and noise.ndim:
+            noise = noise.repeat_interleave(spikes.shape[1])
+        features = self.features(clips, flow, noise).unflatten(0, spikes.shape[:2])
         flow = None if flow is None else flow.unflatten(0, spikes.shape[:2])
 
         def meet(n: int, before: Tensor | None, after: Tensor | None) -> Tensor:
@@ -200,7 +221,8 @@ class RecurrentCSCSR(CSCSR):
             earlier += map(self.picture, once or twice)
             final += map(self.picture, twice)
             last = twice[-1]
-        return [torch.stack(pictures, dim=1) for pictures in ([earlier, final] if future else [final])]
+        readings = [earlier, final] if future else [final]
+        return [self._exposed(torch.stack(pictures, dim=1), alpha) for pictures in readings]
 
     @torch.no_grad()
     def scale_picture(self, factor: float) -> None:  # noqa: D102
@@ -211,18 +233,20 @@ class RecurrentCSCSR(CSCSR):
         self.fusion.rest.weight[:picture] *= factor
         self.fusion.rest.bias[:picture] *= factor
 
-    def features(self, spikes: Tensor, flow: Tensor | None) -> Tensor:
+    def features(self, spikes: Tensor, flow: Tensor | None, noise: float | Tensor | None = None) -> Tensor:
         """Return the features of a clip's key frame, from this clip alone.
 
         Args:
             spikes: (B, N, H, W).
             flow: (B, 2, 2, H, W), or None where nothing moves.
+            noise: see :class:`CSCSR`.
 
         Returns:
             What the picture is made of, (B, width, H, W).
         """
         spikes = spikes.to(self.reconstruction.rgb.weight.dtype)
-        return self.reconstruction.features(self._colors(spikes, flow))
+        told = self._told(noise, spikes)
+        return self.reconstruction.features(self._colors(spikes, flow, **told), **told)
 
     def advance(self, features: Tensor, spikes: Tensor, neighbors: Sequence[Tensor] = ()) -> Tensor:
         """Return the state of a key frame: its picture, as channels, and a memory.

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from kornia.core.utils import is_exporting
 from torch import Tensor, nn
 
-from lightning_modules.networks.layers import ConvBlock, ResBlock, channels_last, conv
+from lightning_modules.networks.layers import ConvBlock, NoiseLevel, ResBlock, channels_last, conv
 from spikekit import tfi, tfi_at
 
 
@@ -23,14 +23,23 @@ class SpikeRepresentation(nn.Module):
         width: channels inside.
         features: channels of the result, for every time point.
         global_perception: look at the whole clip, too (GP).
+        noise: be told the level of the sensor's noise.
 
     Shape:
-        - Input: the spikes of one colour, zero elsewhere, :math:`(B, N, H, W)`
+        - Input: the spikes of one colour, zero elsewhere, :math:`(B, N, H, W)`, and perhaps the level of the noise,
+          :math:`(B, 1, 1, 1)`
         - Output: :math:`(B, T, features, H, W)` with :math:`T = (N - window) / stride + 1`
     """
 
     def __init__(
-        self, frames: int, window: int, stride: int, width: int, features: int, global_perception: bool = True
+        self,
+        frames: int,
+        window: int,
+        stride: int,
+        width: int,
+        features: int,
+        global_perception: bool = True,
+        noise: bool = False,
     ) -> None:
         super().__init__()
         self.window = window
@@ -40,6 +49,7 @@ class SpikeRepresentation(nn.Module):
         self.whole = nn.Sequential(ConvBlock(frames, width), ResBlock(width)) if global_perception else None
         seen = 2 * width if global_perception else width
         self.fuse = nn.Sequential(ConvBlock(seen, width), ResBlock(width), conv(width, features))
+        self.noise = NoiseLevel(width) if noise else None
 
     @torch.no_grad()
     def start_at_the_mean(self) -> None:
@@ -56,7 +66,7 @@ class SpikeRepresentation(nn.Module):
             block.body[-1].weight[0] = 0
         last.weight[1:] *= 0.1
 
-    def forward(self, spikes: Tensor) -> Tensor:  # noqa: D102
+    def forward(self, spikes: Tensor, noise: Tensor | None = None) -> Tensor:  # noqa: D102
         windows = spikes.unfold(1, self.window, self.stride).movedim(-1, 2)
         batch, times = windows.shape[:2]
         local = self.local(channels_last(windows.flatten(0, 1)))
@@ -67,6 +77,8 @@ class SpikeRepresentation(nn.Module):
             # what is seen of the whole clip is the same at all times: it is convolved once, apart
             whole = F.conv2d(self.whole(channels_last(spikes)), weight[1], padding=1)
             seen.unflatten(0, (batch, times)).add_(whole.unsqueeze(1))
+        if noise is not None:
+            seen = self.noise(seen, noise.repeat_interleave(times, dim=0))
         features = last(block(relu(seen))).contiguous()  # planes again, as the search along the motion reads them
         return features.unflatten(0, (batch, times))
 

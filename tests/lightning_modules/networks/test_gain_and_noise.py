@@ -1,0 +1,75 @@
+"""What a network is told of the camera: its gain, and the level of its noise."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from lightning_modules.networks import CSCSR, RecurrentCSCSR
+
+TINY = {"scale": 2, "width": 8, "representation_width": 8, "features": 1, "stages": 1, "end_blocks": 1}
+KINDS = pytest.mark.parametrize("kind", [CSCSR, RecurrentCSCSR])
+
+
+def _network(kind=CSCSR, **settings):
+    torch.manual_seed(0)
+    network = kind(**TINY, skip=True, **settings).eval()
+    for name, parameter in network.named_parameters():  # those that training begins at 0
+        if "noise" in name or "rgb" in name:
+            parameter.data += 0.1 * torch.randn(parameter.shape)
+    return network
+
+
+def _spikes(*size):
+    return (torch.rand(size, generator=torch.Generator().manual_seed(0)) < 0.4).float()
+
+
+@KINDS
+def test_the_picture_is_divided_by_the_gain(kind):
+    network, spikes = _network(kind, alpha=0.5), _spikes(2, 41, 8, 10)
+    picture = network(spikes, static=True)
+    assert torch.equal(network(spikes, static=True, alpha=0.5), picture)
+    torch.testing.assert_close(network(spikes, static=True, alpha=0.1), 5 * picture)
+    each = network(spikes, static=True, alpha=torch.tensor([1.0, 0.05]))
+    torch.testing.assert_close(each, picture * torch.tensor([0.5, 10.0]).reshape(2, 1, 1, 1))
+
+
+@KINDS
+@pytest.mark.parametrize("pattern", ["RGGB", "grey"])
+def test_a_network_is_told_the_noise_of_every_clip(kind, pattern):
+    network, spikes = _network(kind, noise=True, pattern=pattern), _spikes(2, 41, 8, 10)
+    quiet, loud = (network(spikes, static=True, noise=level) for level in (0.0, 1.0))
+    torch.testing.assert_close(network(spikes, static=True), quiet)
+    assert not torch.allclose(quiet, loud, atol=1e-3)
+    each = network(spikes, static=True, noise=torch.tensor([0.0, 1.0]))
+    torch.testing.assert_close(each, torch.stack([quiet[0], loud[1]]))
+
+
+def test_films_are_told_once_a_film():
+    network, films = _network(RecurrentCSCSR, noise=True), _spikes(2, 3, 41, 8, 10)
+    told = {"noise": torch.tensor([0.3, 1.0]), "alpha": torch.tensor([0.2, 0.4])}
+    both = network(films, static=True, future=2, **told)
+    for n in range(2):
+        one = {name: value[n].item() for name, value in told.items()}
+        torch.testing.assert_close(network(films[n : n + 1], static=True, future=2, **one)[0], both[n])
+
+
+def test_before_training_noise_changes_nothing_and_old_weights_fit():
+    torch.manual_seed(0)
+    old = CSCSR(**TINY)
+    new = CSCSR(**TINY, noise=True)
+    missing, unexpected = new.load_state_dict(old.state_dict(), strict=False)
+    assert missing
+    assert all("noise" in name for name in missing)
+    assert not unexpected
+    spikes = _spikes(1, 41, 8, 10)
+    assert torch.equal(new(spikes, static=True, noise=1.0), old(spikes, static=True))
+
+
+def test_what_a_network_cannot_be_told():
+    with pytest.raises(ValueError, match="noise: expected none"):
+        _network()(_spikes(1, 41, 8, 10), static=True, noise=0.5)
+    with pytest.raises(ValueError, match=r"alpha: expected a number or \(2,\).*got \(3,\)"):
+        _network()(_spikes(2, 41, 8, 10), static=True, alpha=torch.ones(3))
+    with pytest.raises(ValueError, match="noise: expected representation bssr"):
+        CSCSR(noise=True, representation="spikes")
