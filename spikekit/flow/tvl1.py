@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from spikekit.kernels import loops
+from spikekit.kernels import gpu_kernel, loops
+from spikekit.kernels.graphs import Replayed
 from spikekit.warp import flow_warp
 
 SMOOTHINGS, ROUNDS = 2, 10  # steps towards a smooth flow in a round, and rounds in a warp
@@ -44,22 +47,37 @@ def tvl1_flow(
     Reference:
         Zach, Pock and Bischof, A duality based approach for realtime TV-L1 optical flow, DAGM 2007.
     """
-    size = pictures.shape[-2:]
-    sizes = [size]
+    given = [part for part in (pictures, times.to(pictures), attachment, start) if part is not None]
+    return (_replayed if pictures.is_cuda else _estimate)(warps, *given)
+
+
+def _estimate(warps: int, pictures: Tensor, times: Tensor, attachment: Tensor, start: Tensor | None = None) -> Tensor:
+    sizes = [pictures.shape[-2:]]
     while start is None and min(sizes[-1]) >= 2 * _SMALLEST:
         sizes.append(tuple((side + 1) // 2 for side in sizes[-1]))
     levels = [torch.cat([pictures, attachment[:, None]], dim=1)]
     for smaller in sizes[1:]:
         levels.append(F.interpolate(levels[-1], smaller, mode="bilinear", antialias=True))
     flow = pictures.new_zeros(len(pictures), 2, *sizes[-1]) if start is None else start
-    compiled = loops.import_loops("spikekit.flow.cpu_tvl1") if pictures.device.type == "cpu" else None
-    improve = refine if compiled is None else compiled.refine
     for level in reversed(levels):
         if flow.shape[-2:] != level.shape[-2:]:
-            ratio = flow.new_tensor([new / old for new, old in zip(level.shape[:1:-1], flow.shape[:1:-1], strict=True)])
-            flow = F.interpolate(flow, level.shape[-2:], mode="bilinear") * ratio.reshape(2, 1, 1)
-        flow = improve(level[:, :2], times, level[:, 2] * COUPLING, flow, warps)
+            (height, width), (old_height, old_width) = level.shape[-2:], flow.shape[-2:]
+            flow = F.interpolate(flow, level.shape[-2:], mode="bilinear")
+            flow = torch.stack([flow[:, 0] * (width / old_width), flow[:, 1] * (height / old_height)], dim=1)
+        flow = _improve(level[:, :2], times, level[:, 2] * COUPLING, flow, warps)
     return flow
+
+
+#: a GPU waits for the launches of an estimate, not for its work
+_replayed = Replayed(_estimate)
+
+
+def _improve(pictures: Tensor, times: Tensor, limit: Tensor, flow: Tensor, warps: int) -> Tensor:
+    if pictures.is_cuda and pictures.dtype is torch.float32 and find_spec("triton") is not None:
+        constants = ROUNDS, SMOOTHINGS, STEP, STEP / COUPLING
+        return gpu_kernel("tvl1_level")(pictures, times, limit, flow, warps, *constants)
+    compiled = loops.import_loops("spikekit.flow.cpu_tvl1") if pictures.device.type == "cpu" else None
+    return (refine if compiled is None else compiled.refine)(pictures, times, limit, flow, warps)
 
 
 def refine(pictures: Tensor, times: Tensor, limit: Tensor, flow: Tensor, warps: int) -> Tensor:

@@ -18,6 +18,7 @@ from torch import Tensor
 from spikekit.check import wide_dtype
 from spikekit.kernels.gpu_parts import launch, my_pixels, store
 from spikekit.kernels.gpu_sites import search_sites, spread_sites  # noqa: F401
+from spikekit.kernels.gpu_tvl1 import tvl1_level  # noqa: F401
 from spikekit.kernels.gpu_warp import nearest_known, weighted_dot, weighted_gather, weighted_scatter  # noqa: F401
 
 _BLOCK = 512  # pixels of a program: four a thread, so that a thread reads four bytes or more at a time

@@ -15,6 +15,7 @@ import pytest
 import torch
 
 from spikekit.decoders import dense as decoders
+from spikekit.flow import tvl1
 from spikekit.kernels.layout import is_channels_last
 from spikekit.sensor import integrate_fire as sensor
 from spikekit.warp import neighbors as search
@@ -658,3 +659,16 @@ def test_the_site_wise_search_and_its_derivative(scale, channels, size):
     grad = torch.randn_like(expected)
     expected = site_search._spread_sites(grad, flow, shares, *table.arguments)
     check(call("spread_sites", grad, flow, shares, *table.arguments), expected, rtol=0, atol=1e-4)
+
+
+@computes
+def test_a_level_of_tvl1():
+    """The torch path in float32 is the reference; orders of sums differ."""
+    clips, height, width = 2, 17, 20
+    smooth = torch.nn.functional.avg_pool2d(torch.rand(clips, 3, height + 8, width + 8), 9, 1)
+    pictures = torch.cat([smooth[:, :1], smooth[:, :1].roll((1, 1), (2, 3)) + 0.01 * smooth[:, 1:2]], dim=1)
+    times, limit = torch.tensor([[-0.5, 0.5], [0.0, 1.0]]), 20 * smooth[:, 2]
+    flow = torch.randn(clips, 2, height, width)
+    constants = tvl1.ROUNDS, tvl1.SMOOTHINGS, tvl1.STEP, tvl1.STEP / tvl1.COUPLING
+    expected = tvl1.refine(pictures, times, limit, flow, 2)
+    check(call("tvl1_level", pictures, times, limit, flow, 2, *constants), expected, rtol=0, atol=1e-3)

@@ -1,0 +1,66 @@
+"""CUDA graphs of functions whose launches take a GPU longer than their work."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from threading import RLock
+
+import torch
+from torch import Tensor
+
+_CAPTURE = RLock()  # one capture at a time in a process
+
+
+class Replayed:
+    """A function of tensors on a GPU that is captured once for every set of sizes, and replayed from then on.
+
+    The first call with some sizes runs as it is, so that kernels are compiled and libraries have chosen theirs; the
+    second captures. No gradient. Results are copies, and calls from several threads wait for each other.
+
+    Args:
+        function: of one hashable argument and tensors, without effects, and that never waits for the GPU.
+        most: sizes whose graphs, and their memory, are kept.
+    """
+
+    def __init__(self, function: Callable[..., Tensor], most: int = 8) -> None:
+        self.function, self.most = function, most
+        self._graphs: OrderedDict[Hashable, _Graph | None] = OrderedDict()
+        self._lock = RLock()
+
+    @torch.no_grad()
+    def __call__(self, argument: Hashable, *tensors: Tensor) -> Tensor:
+        """Run the function, or replay its graph."""
+        if torch.cuda.is_current_stream_capturing():
+            return self.function(argument, *tensors)
+        key = argument, tensors[0].device, *((part.shape, part.dtype) for part in tensors)
+        with self._lock:
+            if key not in self._graphs:
+                self._graphs[key] = None
+                if len(self._graphs) > self.most:
+                    self._graphs.popitem(last=False)
+                return self.function(argument, *tensors)
+            self._graphs.move_to_end(key)
+            graph = self._graphs[key]
+            if graph is None:
+                graph = self._graphs[key] = _Graph(self.function, argument, tensors)
+            return graph.replay(tensors)
+
+
+class _Graph:
+    def __init__(self, function: Callable[..., Tensor], argument: Hashable, tensors: tuple[Tensor, ...]) -> None:
+        self.graph, self.done = torch.cuda.CUDAGraph(), torch.cuda.Event()
+        with _CAPTURE, torch.inference_mode(False), torch.no_grad(), torch.cuda.device(tensors[0].device):
+            self.inputs = [torch.empty_like(part, memory_format=torch.contiguous_format) for part in tensors]
+            torch.cuda.synchronize()
+            with torch.cuda.graph(self.graph, capture_error_mode="thread_local"):
+                self.output = function(argument, *self.inputs)
+
+    def replay(self, tensors: tuple[Tensor, ...]) -> Tensor:
+        self.done.wait()  # another stream may still read the last result
+        for kept, part in zip(self.inputs, tensors, strict=True):
+            kept.copy_(part)
+        self.graph.replay()
+        result = self.output.clone()
+        self.done.record()
+        return result
