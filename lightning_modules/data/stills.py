@@ -58,7 +58,10 @@ class StillClips(Dataset):
         brightness: darkest and brightest exposure. Truth and light of a clip are both multiplied by one number between.
         photons: photons that make one threshold, for photon noise; null for none.
         noise: instead, what a sensor adds, such as ``{photons: 3000, gain_spread: 0.06}``; a clip with ``augment``, as
-            training clips are, has a random share of it: a network learns sensors from the ideal to this one.
+            training clips are, has a random share of it: a network learns sensors from the ideal to this one. The
+            share is the clip's ``noise``.
+        gains: lowest and highest alpha of clips with ``augment``, all orders of magnitude between alike; it is the
+            clip's ``alpha``. Null for one alpha.
         flow_times: frames to which the flow from the middle frame is given; with 41 frames and a window of 11, 5 and 35
             are the centres of the first and of the last window.
         key_frames: clips that follow each other, of one scene, for a network that makes films.
@@ -90,6 +93,7 @@ class StillClips(Dataset):
     brightness: tuple[float, float] = (0.5, 1.0)
     photons: float | None = None
     noise: SensorNoise | None = None
+    gains: tuple[float, float] | None = None
     flow_times: tuple[int, int] = (5, 35)
     key_frames: int = 1
     every: int = 20
@@ -102,6 +106,7 @@ class StillClips(Dataset):
 
     def __post_init__(self) -> None:
         self.pictures, self.brightness = list(self.pictures), tuple(self.brightness)
+        self.gains = self.gains and tuple(self.gains)
         self.flow_times, self.margin = tuple(self.flow_times), flow_margin(self.patch, self.flow_patch)
         _check(self)
         self.clocks = self.frames + (self.key_frames - 1) * self.every
@@ -113,8 +118,12 @@ class StillClips(Dataset):
         """Return a clip: ``spikes`` uint8 (N, H, W), ``rgb`` (3, s h, s w) and ``flow`` (times, 2, h, w) float32.
 
         H and W are h and w, those of the patch, unless motion is to be estimated on more. Several key frames K have
-        ``spikes`` (K, N, H, W), ``rgb`` (K, 3, s h, s w) and ``every``, and no flow.
+        ``spikes`` (K, N, H, W), ``rgb`` (K, 3, s h, s w) and ``every``, and no flow. The gain is ``alpha``, where there
+        are ``gains``, and the level of the noise ``noise``, where there is any.
         """
+        return self._camera(index) | self._clip(index)
+
+    def _clip(self, index: int) -> dict[str, Tensor]:
         if self.cache is None:
             return self._cut(self._make(index))
         packed = self.cache.packed(clip_key(source=self._source, index=index), lambda: self._make(index))
@@ -144,14 +153,26 @@ class StillClips(Dataset):
     def _cut(self, clip: dict[str, Tensor]) -> dict[str, Tensor]:
         return cut_key_frames(clip, self.key_frames, self.frames, self.every)
 
+    def _camera(self, index: int) -> dict[str, Tensor]:
+        """Gain and level of the noise of a clip, where they are not always the same."""
+        rng = self._rng(index, "spikes")
+        rng.integers(2**63)  # of the charge
+        told = {}
+        if self.noise is not None:
+            told["noise"] = torch.tensor(1 - rng.uniform() if self.augment else 1.0)
+        if self.gains is not None:
+            low, high = np.log(self.gains)
+            told["alpha"] = torch.tensor(np.exp(rng.uniform(low, high)) if self.augment else self.alpha)
+        return {name: value.float() for name, value in told.items()}
+
     def spikes(self, index: int, scene: Scene) -> Tensor:
         """Return what the sensor makes of the scene of a clip, uint8 (clocks, H, W)."""
-        light = scene.light(self.pattern, scale=self.scale, alpha=self.alpha)
-        rng = self._rng(index, "spikes")
-        generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
+        camera = self._camera(index)
+        light = scene.light(self.pattern, scale=self.scale, alpha=float(camera.get("alpha", self.alpha)))
+        generator = torch.Generator().manual_seed(int(self._rng(index, "spikes").integers(2**63)))
         noise = self.noise or SensorNoise(photons=self.photons)
         if self.noise and self.augment:
-            noise = noise.scaled(1 - rng.uniform())
+            noise = noise.scaled(float(camera["noise"]))
         return simulate_spikes(light, noise=noise, generator=generator)
 
     def scene(self, index: int) -> Scene:
@@ -223,6 +244,11 @@ def _check(clips: StillClips) -> None:
         ("every", clips.every >= 1, "at least 1 clock"),
         ("flow_times", all(0 <= t < clips.frames for t in clips.flow_times), f"clocks in [0, {clips.frames})"),
         ("photons", clips.photons is None or 1 <= clips.photons < math.inf, "1 or more, or null for no noise"),
+        (
+            "gains",
+            clips.gains is None or (len(clips.gains) == 2 and 0 < clips.gains[0] <= clips.gains[1] < math.inf),
+            "two numbers 0 < low <= high, or null",
+        ),
         ("photons", None in (clips.photons, clips.noise), "those of the noise instead"),
         ("seed", clips.seed >= 0, "0 or more"),
         ("length", clips.length >= 1, "at least 1 clip"),

@@ -108,6 +108,7 @@ class SuperResolution(Learner):
         self.interpolated = check_interpolated(network, interpolated)
         self.done: Callable[[float], object] | None = None  # told how far a picture is, see predict
         self._film_pictures: FilmPictures | None = None
+        self._told = ["alpha", "noise"] if network.settings.get("noise") else ["alpha"]  # what it hears of the camera
         if isinstance(network, RecurrentCSCSR) and (psnr_tolerance or self_ensemble > 1):
             got = f"{psnr_tolerance} and {self_ensemble}"
             raise ValueError(
@@ -212,12 +213,14 @@ class SuperResolution(Learner):
         A film that was read from its end is the mirror image of one that is read but once: both learn.
         """
         spikes = batch["spikes"]
+        told = {name: batch[name] for name in self._told if name in batch}
         if "every" not in batch:
-            return [self.network(spikes, flow)]
+            return [self.network(spikes, flow, **told)]
         if isinstance(self.network, RecurrentCSCSR):
-            return self.network.film(spikes, flow, every=int(batch["every"][0]), future=self.future)
+            return self.network.film(spikes, flow, every=int(batch["every"][0]), future=self.future, **told)
         flow = None if flow is None else flow.flatten(0, 1)
-        return [self.network(spikes.flatten(0, 1), flow).unflatten(0, spikes.shape[:2])]
+        told = {name: value.repeat_interleave(spikes.shape[1]) for name, value in told.items()}
+        return [self.network(spikes.flatten(0, 1), flow, **told).unflatten(0, spikes.shape[:2])]
 
     def validation_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:  # noqa: D102
         rgb = self._pictures(batch)[-1]

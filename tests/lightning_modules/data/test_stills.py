@@ -416,3 +416,20 @@ def test_grey_clips_are_the_luminance_of_the_same_scenes():
     torch.testing.assert_close(clip["rgb"][0], luminance, rtol=1e-4, atol=1e-5)
     light = grey.scene(3).light("grey", scale=2, alpha=0.4)
     assert (clip["spikes"].float().mean(dim=0) - light.mean(dim=0)).abs().max() <= 1 / 41 + 1e-6
+
+
+def test_training_clips_say_the_gain_and_the_noise_of_their_camera():
+    options = {"patch": 12, "scale": 1, "noise": SensorNoise(photons=1000), "gains": (0.03, 1.0)}
+    clips = StillClips(embedded_pictures()[:2], **options, length=200)
+    gains = torch.stack([clips[n]["alpha"] for n in range(40)])
+    assert gains.min() >= 0.03
+    assert gains.max() <= 1
+    assert 0.25 < ((gains < 0.17).float().mean()) < 0.75  # half of them below the geometric mean
+    for n in range(3):
+        light = clips.scene(n).light(scale=1, alpha=clips[n]["alpha"].item())
+        assert abs(clips[n]["spikes"].float().mean() - light.clamp(max=1).mean()) < 0.05
+        assert 0 < clips[n]["noise"] <= 1
+    fixed = StillClips(embedded_pictures()[:2], **options, augment=False)
+    assert fixed[0]["alpha"] == torch.tensor(fixed.alpha)
+    assert fixed[0]["noise"] == 1
+    assert StillClips(embedded_pictures()[:2], patch=12)[0].keys() == {"spikes", "rgb", "flow"}
