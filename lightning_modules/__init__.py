@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
 from importlib import import_module
-from importlib.machinery import ModuleSpec
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -18,21 +14,6 @@ __all__ = ["CSCSR", "SuperResolution", "list_pretrained"]
 
 # where what the package offers is
 _HOME = {"CSCSR": "networks", "SuperResolution": "tasks.super_resolution", "list_pretrained": "storage.shipped"}
-
-
-class _OldNames:
-    """Asks spikekit where a module with an old name is now; only then, because this imports torch."""
-
-    @staticmethod
-    def find_spec(name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> ModuleSpec | None:
-        if not name.startswith("lightning_modules."):
-            return None
-        from spikekit._renamed import RenamedModules
-
-        return RenamedModules.find_spec(name)
-
-
-sys.meta_path.append(_OldNames)
 
 
 def __getattr__(name: str) -> Any:

@@ -6,9 +6,6 @@ from pathlib import Path
 
 import pytest
 
-import lightning_modules
-import spikekit
-
 ROOT = Path(__file__).parents[1]
 PACKAGES = "spikekit", "lightning_modules"
 MODULES = {
@@ -123,13 +120,6 @@ UNWHOLE = {
     "spikekit.bench.plain": 1,  # in a temporary folder
     "lightning_modules.cli.processes": 1,  # a log, which grows
 }
-
-
-def test_a_package_names_what_it_offers_and_nothing_else():
-    for package in (spikekit, lightning_modules):
-        assert not [name for name in dir(package) if name != "__version__" and name not in package.__all__]
-        assert all(hasattr(package, name) for name in dir(package))
-    assert {"CSCSR", "SuperResolution", "list_pretrained"} <= {*dir(lightning_modules)}
 
 
 def test_files_are_written_whole():

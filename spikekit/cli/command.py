@@ -10,7 +10,7 @@ from contextlib import suppress
 from importlib import import_module
 from typing import Any, NoReturn
 
-from spikekit import __version__
+from spikekit._version import __version__
 from spikekit.arguments import UsageError, one_line
 from spikekit.completion import OPTION, completion
 from spikekit.standard_output import BROKEN_PIPE, stop_printing

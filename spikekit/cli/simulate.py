@@ -132,11 +132,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     said = "share of the spikes that may change by not modelling more"
     model.add_argument(
         "--spike-tolerance",
-        "--tolerance",
         dest="tolerance",
         type=positive,
         metavar="SHARE",
-        help=f"{said}; {Settings.tolerance} if not given; --tolerance is its old name",
+        help=f"{said}; {Settings.tolerance} if not given",
     )
     option("step", positive, "PIXELS", "largest displacement between latent frames, in sensor pixels", model)
     said = "what makes latent frames: package.module.Class, or package.module.Class(name=value)"

@@ -1,6 +1,5 @@
 """From spikes back to light."""
 
-from spikekit._renamed import moved
 from spikekit.decoders.calibrated import correct_spikes
 from spikekit.decoders.chunked import decode_in_chunks
 from spikekit.decoders.dense import SpikeInterval, Tfi, Tfp, spike_interval, tfi, tfp
@@ -22,6 +21,3 @@ __all__ = [
     "tfp_at",
     "unpack_spikes",
 ]
-
-_DENSE = "cast_light", "check_window", "interval_dtype"
-__getattr__ = moved(__name__, dict.fromkeys(_DENSE, "spikekit.decoders.dense"))

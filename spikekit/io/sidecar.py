@@ -54,7 +54,7 @@ class Sidecar:
 
 def versions() -> dict[str, str]:
     """Return the versions of what a stream depends on."""
-    from spikekit import __version__
+    from spikekit._version import __version__
 
     return {
         "spikekit": __version__,

@@ -12,7 +12,6 @@ import torch.nn.functional as F
 from kornia.color import CFA
 from torch import Tensor
 
-from spikekit._renamed import renamed_argument
 from spikekit.check import check_positive, check_whole
 from spikekit.color.cfa import bin_to_sensor, mosaic
 from spikekit.flow.fields import upsample_flow
@@ -139,7 +138,6 @@ class SceneProfile:
             max((one.flicker for one in every), key=abs),
         )
 
-    @renamed_argument("tolerance", "spike_tolerance")
     def plan(
         self,
         *,
@@ -164,7 +162,7 @@ class SceneProfile:
             :meth:`spikekit.SensorNoise.required`.
 
         Args:
-            spike_tolerance: share of the spikes that may change, by each decision; ``tolerance`` is its old name.
+            spike_tolerance: share of the spikes that may change, by each decision.
             step: displacement between two latent frames, in sensor pixels.
             noise: the sensor's sources of noise.
             frames: clocks of a clip, over which noise adds up.
@@ -210,7 +208,6 @@ class SceneProfile:
         return Plan(steps - 1, region, noise, tuple(because))
 
 
-@renamed_argument("tolerance", "spike_tolerance")
 def profile_interval(
     first: Tensor,
     second: Tensor,
@@ -245,7 +242,7 @@ def profile_interval(
         pattern: Bayer phase of the sensor, see :func:`spikekit.bayer_pattern`.
         alpha: light of a white pixel per clock.
         clocks: T, clocks of the interval.
-        spike_tolerance: share of the spikes that may change; ``tolerance`` is its old name.
+        spike_tolerance: share of the spikes that may change.
         motion: what finds it, a call like that of an interpolation; ``FlowInterpolation(shrink=1)`` by default, because
             Bayer cells are small already.
 

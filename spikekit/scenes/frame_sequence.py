@@ -11,7 +11,6 @@ import torch.nn.functional as F
 from kornia.color import CFA
 from torch import Tensor
 
-from spikekit._renamed import renamed_argument
 from spikekit.check import check_picture, check_positive, check_whole
 from spikekit.color.cfa import bayer_pattern, bin_to_sensor
 from spikekit.flow.interpolate import Blend, FlowInterpolation, Still
@@ -54,8 +53,7 @@ class Film:
         clocks: clocks from one frame to the next.
         interpolation: what makes latent frames; :class:`spikekit.FlowInterpolation` by default.
         plan: what is modelled, in every interval; ``Plan.everything(clocks)`` for all there is.
-        spike_tolerance: share of the spikes that may change by not modelling more, see :meth:`SceneProfile.plan`;
-            ``tolerance`` is its old name.
+        spike_tolerance: share of the spikes that may change by not modelling more, see :meth:`SceneProfile.plan`.
         step: displacement between latent frames in sensor pixels, likewise.
         motion: what finds motion for the profile, see ``spikekit.scenes.adaptive_sampling.profile_interval``.
 
@@ -79,7 +77,6 @@ class Film:
         Dong et al., CVPR 2024, section 5.1.
     """
 
-    @renamed_argument("tolerance", "spike_tolerance")
     def __init__(
         self,
         frames: Sequence[Tensor],

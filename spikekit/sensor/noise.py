@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spikekit._renamed import renamed_argument
 from spikekit.check import check_whole
 from spikekit.sensor.calibration import DEAD, HOT, WORKS, Calibration
 
@@ -209,7 +208,6 @@ class SensorNoise:
         share = sum(((2 * clock + 1) * growing).minimum(most).mean().item() for clock in range(frames)) / frames
         return SpikeChange(frames * error.mean().item(), share)
 
-    @renamed_argument("tolerance", "spike_tolerance")
     def required(self, light: float, frames: int, spike_tolerance: float) -> SensorNoise:
         """Leave only the sources that may change more than a share of the bits, see :meth:`spike_changes`.
 
@@ -218,7 +216,7 @@ class SensorNoise:
         Args:
             light: mean light per clock, in thresholds.
             frames: clocks of the clip.
-            spike_tolerance: the share; ``tolerance`` is its old name.
+            spike_tolerance: the share.
 
         Returns:
             This noise without the rest.

@@ -481,16 +481,6 @@ def test_installed_command():
     assert script.load() is main
 
 
-@pytest.mark.parametrize("words", [["--help"], ["--version"]])
-def test_answers_at_once(words):
-    """Modules are counted, not time: no verb is imported that nobody asked for, and neither torch nor NumPy."""
-    code = f"from spikekit.cli.command import main; import sys; main({words}); print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    imported = set(done.stdout.splitlines()[-1].split())
-    assert not {"torch", "numpy", "kornia"} & imported
-    assert len(imported) < 160
-
-
 def test_cameras(capsys):
     assert main(["cameras"]) == 0
     lines = capsys.readouterr().out.splitlines()
