@@ -208,7 +208,7 @@ class CSCSR(Network):
         learned = flow is not None and flow.requires_grad and torch.is_grad_enabled()
         known = known and not (flow is None and self.colors == 1)  # then nothing is searched
         large = min(spikes.shape[-2:]) >= SMALLEST
-        return known and self.fold == self.scale and large and not learned and not is_exporting()
+        return known and self.fold == self.scale and large and not learned and not (is_exporting() or torch.jit.is_tracing())
 
     def _search_sites(self, features: Iterable[Tensor], flow: Tensor | None, spikes: Tensor) -> Iterator[Tensor]:
         """Temporal pixel search of every colour, (B, T, C, H, W) to (B, T C s^2, H, W)."""

@@ -12,6 +12,8 @@ from torch import Tensor, nn
 from lightning_modules.networks.layers import ConvBlock, NoiseLevel, ResBlock, channels_last, conv
 from spikekit import tfi, tfi_at
 
+_PIXELS = 1 << 16  # of all time points that a CPU takes at once
+
 
 class SpikeRepresentation(nn.Module):
     """BSSR of one colour (section 4.2, Fig. 4): features of every time point, from its window and the whole clip.
@@ -68,19 +70,28 @@ class SpikeRepresentation(nn.Module):
 
     def forward(self, spikes: Tensor, noise: Tensor | None = None) -> Tensor:  # noqa: D102
         windows = spikes.unfold(1, self.window, self.stride).movedim(-1, 2)
-        batch, times = windows.shape[:2]
-        local = self.local(channels_last(windows.flatten(0, 1)))
-        (fuse, relu), block, last = self.fuse
-        weight = fuse.weight.split(local.shape[1], dim=1)
-        seen = F.conv2d(local, weight[0], fuse.bias, padding=1)
+        everywhere = None
         if self.whole is not None:
             # what is seen of the whole clip is the same at all times: it is convolved once, apart
-            whole = F.conv2d(self.whole(channels_last(spikes)), weight[1], padding=1)
-            seen.unflatten(0, (batch, times)).add_(whole.unsqueeze(1))
+            _, weight = self.fuse[0][0].weight.chunk(2, dim=1)
+            everywhere = F.conv2d(self.whole(channels_last(spikes)), weight, padding=1).unsqueeze(1)
+        few = windows.shape[1]
+        if spikes.device.type == "cpu" and not torch.is_grad_enabled():
+            few = max(1, _PIXELS // spikes[:, 0].numel())  # time points at once, so that they stay in the cache
+        parts = [self._features(part, everywhere, noise) for part in windows.split(few, dim=1)]
+        return torch.cat(parts, dim=1)
+
+    def _features(self, windows: Tensor, everywhere: Tensor | None, noise: Tensor | None) -> Tensor:
+        """Features (B, T, features, H, W) of some time points, given their windows (B, T, window, H, W)."""
+        batch, times = windows.shape[:2]
+        (fuse, relu), block, last = self.fuse
+        local = self.local(channels_last(windows.flatten(0, 1)))
+        seen = F.conv2d(local, fuse.weight[:, : local.shape[1]], fuse.bias, padding=1)
+        if everywhere is not None:
+            seen.unflatten(0, (batch, times)).add_(everywhere)
         if noise is not None:
             seen = self.noise(seen, noise.repeat_interleave(times, dim=0))
-        features = last(block(relu(seen))).contiguous()  # planes again, as the search along the motion reads them
-        return features.unflatten(0, (batch, times))
+        return last(block(relu(seen))).unflatten(0, (batch, times))
 
 
 class WindowMeans(nn.Module):
