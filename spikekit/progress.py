@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from tqdm import tqdm
+if TYPE_CHECKING:
+    from tqdm import tqdm
 
 #: seconds after which progress is shown: what takes less is over before it can be read
 AFTER = 0.5
@@ -27,4 +28,6 @@ def progress(things: Iterable[Any] | None = None, what: str = "", total: float |
         >>> [n * n for n in progress(range(3), "squares")]
         [0, 1, 4]
     """
+    from tqdm import tqdm
+
     return tqdm(things, what, total, **{"disable": None, "leave": False, "delay": AFTER, **how})

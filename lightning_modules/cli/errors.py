@@ -11,6 +11,7 @@ from typing import NoReturn
 
 from spikekit.arguments import UsageError as SpikekitUsageError
 from spikekit.arguments import one_line
+from spikekit.extras import remedy
 from spikekit.standard_output import BROKEN_PIPE, FULL, stop_printing
 
 
@@ -84,6 +85,8 @@ def as_one_line() -> Iterator[None]:
             raise SystemExit(BROKEN_PIPE) from error
         raise Ended(f"lightning: {one_line(error)}", 1) from error
     except Exception as error:
+        if isinstance(error, ModuleNotFoundError) and (line := remedy(error)):
+            raise Ended(f"lightning: {line}", 1) from error
         if not isinstance(error, _of_users()):
             raise
         # what a worker of a loader raises comes with its traceback, whose last line it is

@@ -13,6 +13,7 @@ from typing import Any, NoReturn
 from spikekit._version import __version__
 from spikekit.arguments import UsageError, one_line
 from spikekit.completion import OPTION, completion
+from spikekit.extras import remedy
 from spikekit.standard_output import BROKEN_PIPE, stop_printing
 
 #: what every verb does, the module whose ``add_arguments`` and ``run`` it is, and an example
@@ -58,6 +59,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(error, BrokenPipeError):
             return BROKEN_PIPE
         print(f"spikekit: standard output: {one_line(error)}", file=sys.stderr)
+        return 1
+    except ModuleNotFoundError as error:
+        if not (line := remedy(error)):
+            raise
+        print(f"spikekit: {line}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 130

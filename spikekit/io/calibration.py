@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
-
 from spikekit.arguments import one_line
 from spikekit.io.failures import no_pipe
 from spikekit.io.images import MOST_PIXELS
@@ -41,6 +38,8 @@ def write_calibration(path: str | Path, calibration: Calibration) -> None:
     """
     if Path(path).suffix != ".safetensors":
         raise ValueError(f"{path}: expected a name that ends in .safetensors")
+    from safetensors.torch import save
+
     planes = {name: getattr(calibration, name).contiguous() for name in _PLANES}
     with whole_file(path) as file:
         file.write(save(planes, {"kind": _KIND}))
@@ -64,6 +63,8 @@ def read_calibration(path: str | Path) -> Calibration:
         Traceback (most recent call last):
         ValueError: street.calibration.safetensors: not a calibration that can be read (No such file or directory...
     """
+    from safetensors import SafetensorError, safe_open
+
     try:
         with safe_open(no_pipe(path), "pt") as file:
             kind = (file.metadata() or {}).get("kind")

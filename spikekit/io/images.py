@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from kornia.color import hsv_to_rgb
-from kornia_rs.io import read_image_png_u16
 from torch import Tensor
 
 from spikekit.arguments import one_line
@@ -85,6 +84,8 @@ def _pixels(path: str | Path) -> np.ndarray:
         _check_pixels(picture.height * picture.width)
         if head.startswith(b"\x89PNG") and head[24:] in (b"\x10\x02", b"\x10\x06"):
             # 16 bits in colour, of which Pillow would keep 8
+            from kornia_rs.io import read_image_png_u16
+
             return read_image_png_u16(str(path), "rgb" if head[25] == 2 else "rgba")
         if picture.mode == "I" and picture.format == "PNG":  # 16 bits, as older versions of Pillow say it
             return np.asarray(picture).astype(np.uint16)

@@ -1,0 +1,85 @@
+"""What is declared is what is imported; without the extra, operators work and commands say what they lack."""
+
+import ast
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from spikekit.extras import LEARN
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+IMPORTED_AS = {"pillow": "PIL", "scikit-image": "skimage", "pyyaml": "yaml", "nvidia-ml-py": "pynvml"}
+
+
+def declared(requirements):
+    names = [re.match(r"[\w.-]+", text)[0] for text in requirements]
+    return {IMPORTED_AS.get(name, name.replace("-", "_")) for name in names} - {"spikekit"}
+
+
+def imported():
+    """Return the packages that an import statement names anywhere in the two packages."""
+    found = set()
+    for path in [*ROOT.glob("spikekit/**/*.py"), *ROOT.glob("lightning_modules/**/*.py")]:
+        if "bench" in path.parts:
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                found |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+                found.add(node.module.partition(".")[0])
+    return found - set(sys.stdlib_module_names) - {"spikekit", "lightning_modules"}
+
+
+def test_every_package_that_is_imported_is_declared_and_the_other_way_round():
+    extras = PROJECT["optional-dependencies"]
+    of_users = declared([*PROJECT["dependencies"], *(text for name in extras for text in extras[name])])
+    brought_by = {"lightning_fabric"}  # by pytorch_lightning
+    assert imported() - brought_by <= of_users
+    needed = declared([*PROJECT["dependencies"], *extras["learn"], *extras["fast"], *extras["video"]])
+    # the logger of Lightning imports tensorboard
+    assert needed - {"tensorboard"} <= imported()
+    assert declared(extras["learn"]) - {"kornia_rs"} | brought_by == LEARN  # kornia itself needs kornia_rs
+
+
+WITHOUT = """
+import sys
+
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {missing}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+
+sys.meta_path.insert(0, Missing())
+"""
+
+
+def without_the_extra(code):
+    program = WITHOUT.format(missing=LEARN) + code
+    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=False)
+
+
+def test_operators_need_no_extra():
+    done = without_the_extra("import torch, spikekit\nprint(spikekit.tfi(torch.ones(9, 4, 4)).sum().item())")
+    assert done.stdout == "144.0\n", done.stderr
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "from spikekit.cli.command import main\nsys.exit(main(['cameras']))",
+        "from lightning_modules.__main__ import main\nmain(['fit', '-c', 'x4'])",
+    ],
+    ids=["spikekit", "lightning"],
+)
+def test_a_command_without_the_extra_names_it_in_one_line(code):
+    done = without_the_extra(code)
+    assert done.returncode == 1
+    assert "spikekit[learn]" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
