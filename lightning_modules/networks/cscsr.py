@@ -204,11 +204,13 @@ class CSCSR(Network):
     def _by_sites(self, spikes: Tensor, flow: Tensor | None) -> bool:
         """Whether the temporal pixels of a site can be looked up together, without a derivative in the flow."""
         config = self.config
-        known = config.search and config.representation == "bssr" and config.neighbors == 4
+        if flow is None and self.colors == 1:  # all pixels are known, and nothing is searched
+            return False
         learned = flow is not None and flow.requires_grad and torch.is_grad_enabled()
-        known = known and not (flow is None and self.colors == 1)  # then nothing is searched
-        large = min(spikes.shape[-2:]) >= SMALLEST
-        return known and self.fold == self.scale and large and not learned and not (is_exporting() or torch.jit.is_tracing())
+        if learned or is_exporting() or torch.jit.is_tracing():
+            return False
+        known = config.search and config.representation == "bssr" and config.neighbors == 4
+        return known and self.fold == self.scale and min(spikes.shape[-2:]) >= SMALLEST
 
     def _search_sites(self, features: Iterable[Tensor], flow: Tensor | None, spikes: Tensor) -> Iterator[Tensor]:
         """Temporal pixel search of every colour, (B, T, C, H, W) to (B, T C s^2, H, W)."""

@@ -76,7 +76,7 @@ class SpikeRepresentation(nn.Module):
             _, weight = self.fuse[0][0].weight.chunk(2, dim=1)
             everywhere = F.conv2d(self.whole(channels_last(spikes)), weight, padding=1).unsqueeze(1)
         few = windows.shape[1]
-        if spikes.device.type == "cpu" and not torch.is_grad_enabled():
+        if spikes.device.type == "cpu" and not (torch.is_grad_enabled() or torch.jit.is_tracing()):
             few = max(1, _PIXELS // spikes[:, 0].numel())  # time points at once, so that they stay in the cache
         parts = [self._features(part, everywhere, noise) for part in windows.split(few, dim=1)]
         return torch.cat(parts, dim=1)
