@@ -21,9 +21,8 @@ from lightning_modules.inference.export import (
     load_network,
 )
 from spikekit.arguments import whole
-from spikekit.bench import cpu_name
 from spikekit.tables import table
-from spikekit.timing import cpu_timer, interleave, ratio
+from spikekit.timing import cpu_name, cpu_timer, interleave, ratio
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -14,9 +14,8 @@ from torch import Tensor
 
 from lightning_modules.data import StillScenes
 from lightning_modules.motion import ClassicalFlow, ZeroFlow
-from spikekit.bench import cpu_name, software
 from spikekit.tables import table
-from spikekit.timing import interleave, ratio, timer_of
+from spikekit.timing import cpu_name, interleave, ratio, software, timer_of
 
 
 class ScikitImage(ClassicalFlow):

@@ -1,20 +1,21 @@
-"""Timing: several functions in turn in one process, with their memory and the bandwidth floor."""
+"""Timing: several functions in turn in one process, with their memory, and what it all ran on."""
 
 from __future__ import annotations
 
 import ctypes
 import math
+import platform
 import re
 import statistics
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
 
 Run = Callable[[], object]
 
@@ -121,14 +122,20 @@ def ratio(times: Sequence[float], reference: Sequence[float]) -> Ratio:
     return Ratio(statistics.median(ratios), min(ratios), max(ratios))
 
 
-def floor_run(read: float, written: float, device: torch.device) -> Run:
-    """Return a run that reads so many bytes once and writes so many bytes once, in memory that is already there."""
-    source, target = (torch.ones(math.ceil(size / 4), device=device) for size in (read, written))
+def cpu_name() -> str:
+    """Return what the processor calls itself."""
+    with suppress(OSError, AttributeError):
+        return re.search(r"^model name\s*:\s*(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)[1]  # type: ignore[index]
+    return platform.processor() or platform.machine()
 
-    def run() -> tuple[Tensor, Tensor]:
-        return source.sum(), target.fill_(1)
 
-    return run
+def software() -> str:
+    """Return, as a line, what times depend on."""
+    try:
+        numba = f"Numba {version('numba')}"
+    except PackageNotFoundError:
+        numba = "no Numba"
+    return f"torch    {torch.__version__}, {numba}, Python {platform.python_version()}, {platform.system()}"
 
 
 def peak_memory(run: Run, device: torch.device) -> float | None:

@@ -10,8 +10,6 @@ import shutil
 import subprocess
 import sys
 import typing
-from contextlib import redirect_stdout
-from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
@@ -23,9 +21,8 @@ from torch import nn
 import spikekit as sk
 from lightning_modules.networks import RecurrentCSCSR
 from lightning_modules.storage.pretrained import Weights, read_weights, settings_of, write_weights
-from spikekit import extremes, write_picture
+from spikekit import write_picture
 from spikekit.cli.command import main
-from spikekit.extremes.table import Measured
 
 DOCS = Path(__file__).parents[1] / "docs"
 MADE = {"_build", "gallery", "sg_execution_times.rst"}  # by Sphinx
@@ -203,26 +200,9 @@ def test_quickstart_runs():
     assert failed == 0
 
 
-def as_allowed(case):
-    """A case that measures nothing, and finds what is the largest error allowed, and the right outcome."""
-
-    def measure(on):
-        limit = case.limit(on.dtype) if callable(case.limit) else case.limit
-        return Measured(limit, case.values, case.gradients if on.dtype.is_floating_point else "-")
-
-    return replace(case, measure=measure)
-
-
-#: what the copied conf.py ends with: the table of extremes, whose rows have tests of their own, is not measured again,
-#: and figures are small
+#: what the copied conf.py ends with: figures are small
 PRINTED = """
 plot_formats = [("png", 40)]
-_run = _spikekit
-
-
-def _spikekit(arguments):
-    printed = Path({!r}) / f"{{arguments}}.md"
-    return printed.read_text() if printed.exists() else _run(arguments)
 """
 
 
@@ -233,12 +213,9 @@ def built(tmp_path_factory):
         pytest.importorskip(needed, reason="the docs extra is not installed")
     folder = tmp_path_factory.mktemp("docs")
     shutil.copytree(DOCS, folder / "docs", ignore=shutil.ignore_patterns(*MADE))
-    with pytest.MonkeyPatch.context() as patch, (folder / "extremes --markdown.md").open("w") as file:
-        patch.setattr(extremes, "CASES", [as_allowed(case) for case in extremes.CASES])
-        with redirect_stdout(file):
-            assert main(["extremes", "--markdown"]) == 0
+    shutil.copytree(DOCS.parent / "results", folder / "results")
     with (folder / "docs" / "conf.py").open("a") as file:
-        file.write(PRINTED.format(str(folder)))
+        file.write(PRINTED)
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", "docs", "pages"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(DOCS.parent), os.environ.get("PYTHONPATH", "")])}
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
@@ -300,8 +277,6 @@ def test_docs_build_without_a_warning(built):
     for script in EXAMPLES:
         assert list((built / "_images").glob(f"sphx_glr_{script.stem}_*.png"))
         assert (built / "gallery" / f"{script.stem}.html").is_file()
-    page = (built / "extremes.html").read_text()
-    assert all(f"{operator} on cpu" in page for operator in extremes.operator_names())
 
 
 @pytest.mark.slow

@@ -117,7 +117,6 @@ UNWHOLE = {
     "spikekit.io.formats": 1,  # a member of an archive whose file is whole
     "spikekit.io.video_output": 1,  # FFmpeg, under the name of a whole file's part
     "spikekit.timing": 1,  # a switch of Linux in /proc
-    "spikekit.bench.plain": 1,  # in a temporary folder
     "lightning_modules.cli.processes": 1,  # a log, which grows
 }
 

@@ -13,8 +13,8 @@ from lightning_modules.cost.runner import CannotRunError, Runner
 from lightning_modules.cost.setting import Setting
 from lightning_modules.sweep.state import read_json, write_json
 from lightning_modules.sweep.table import Row
-from spikekit.bench import cpu_name
 from spikekit.progress import progress
+from spikekit.timing import cpu_name
 
 _ROUNDS = 5
 

@@ -15,9 +15,9 @@ from lightning_modules.inference.presets import Preset
 from lightning_modules.metrics.image import why_no_lpips
 from lightning_modules.trade.films import PICTURES
 from lightning_modules.trade.pareto import pareto_front
-from spikekit.bench import cpu_name, software
 from spikekit.io.whole_file import whole_file
 from spikekit.tables import table
+from spikekit.timing import cpu_name, software
 
 #: what the columns mean, for the table and for ``--help``
 COLUMNS = """\

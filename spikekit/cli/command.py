@@ -32,8 +32,6 @@ VERBS = {
     ),
     "view": ("a recording as a picture or a page", "cli.view", "view walk.dat -o walk.html"),
     "cameras": ("the cameras that --camera knows", "cli.cameras", "cameras"),
-    "extremes": ("how exact the operators are at worst", "extremes", "extremes --operator tfi --markdown"),
-    "bench": ("how fast the operators are beside others", "bench", "bench tfi tfp --size small"),
 }
 
 

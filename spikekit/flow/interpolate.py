@@ -146,7 +146,7 @@ class FlowInterpolation:
     Args:
         shrink: how many times smaller the pictures are that flow is estimated on. 2 takes a quarter of the time of 1
             and makes the frames of two films as well, within 0.1 dB; small objects in front lose up to 0.8 dB
-            (``python -m spikekit.bench.interpolation``).
+            (``python benchmarks/interpolation.py``).
 
     Raises:
         ValueError: ``shrink`` is not a whole number, 1 or more.

@@ -7,10 +7,10 @@ import sys
 
 import pytest
 import torch
+from operator_examples import EXAMPLES
 from torch import nn
 
 import spikekit as sk
-from spikekit.examples import EXAMPLES
 
 SPIKES = (torch.rand(2, 9, 4, 6, generator=torch.Generator().manual_seed(1)) < 0.4).double()
 RGB = torch.rand(2, 3, 4, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(2))

@@ -9,8 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
-
-from spikekit.examples import EXAMPLES
+from operator_examples import EXAMPLES
 
 SIZE = (32, 48)
 

@@ -7,8 +7,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from spikekit import psnr, write_picture
-from spikekit.bench import interpolation
+from spikekit import psnr
 from spikekit.flow.interpolate import Between, Blend, FlowInterpolation, Still, _Carried
 from spikekit.io.video import read_video
 from spikekit.scenes.analytic import Layer, Motion, Scene
@@ -285,24 +284,6 @@ def test_the_same_whatever_the_threads():
 
 
 # --- films ------------------------------------------------------------------------------------------------------------
-
-
-def test_the_benchmark(tmp_path):
-    for n in range(7):
-        write_picture(tmp_path / f"{n}.png", torch.full((3, 20, 20), n / 255))
-    triples = list(interpolation.film(tmp_path, 2))
-    assert [[round(frame.mean().item() * 255) for frame in three] for three in triples] == [
-        [0, 1, 2],
-        [2, 3, 4],
-        [4, 5, 6],
-    ]
-    count, scores, seconds = interpolation.measure(iter([interpolation.scene(2, hidden=True)]))
-    assert count == 1
-    assert scores.keys() == seconds.keys() == interpolation.METHODS.keys()
-    assert scores["flow"] > scores["blend"] + 2 > scores["nearest"] + 2
-    first, truth, second = interpolation.scene(0, hidden=False)
-    assert first.equal(truth)
-    assert first.equal(second)
 
 
 @needs_video

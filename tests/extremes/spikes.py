@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 import spikekit as sk
-from spikekit.extremes import reference
-from spikekit.extremes.table import (
+from extremes import reference
+from extremes.table import (
     BITS,
     FLOATS,
     HALVES,

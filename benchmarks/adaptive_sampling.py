@@ -1,6 +1,6 @@
 """Measure the savings and costs of adaptive sampling, on scenes whose light is known.
 
-``python -m spikekit.bench.adaptive_sampling`` prints the table.
+``python benchmarks/adaptive_sampling.py`` prints the table.
 """
 
 from __future__ import annotations
@@ -187,7 +187,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--side", type=int, default=64, help="rows and columns of the sensor")
     add("--scale", type=int, default=4, help="how many pixels of a frame a sensor pixel is wide")
-    add("--spike-tolerance", "--tolerance", type=float, default=0.05, help="share of the spikes that may change")
+    add("--spike-tolerance", type=float, default=0.05, help="share of the spikes that may change")
     add("--step", type=float, default=0.5, help="sensor pixels between latent frames")
     add("--rounds", type=int, default=2, help="timings of each, of which the least counts")
 
@@ -197,10 +197,10 @@ def run(args: argparse.Namespace) -> None:
     settings = {"rounds": args.rounds, "spike_tolerance": args.spike_tolerance, "step": args.step}
     measured = [measure(*each, args.scale, **settings) for each in scenes(args.side, args.scale)]
     title = f"{args.side} x {args.side} sensor pixels, x{args.scale}, {FRAMES} clocks, {CLOCKS} an interval, of "
-    print(f"{title}{_LEGEND}\n{markdown(measured)}")  # noqa: T201
+    print(f"{title}{_LEGEND}\n{markdown(measured)}")
 
 
 if __name__ == "__main__":
-    _parser = argparse.ArgumentParser(prog="python -m spikekit.bench.adaptive_sampling", description=__doc__)
+    _parser = argparse.ArgumentParser(description=__doc__)
     add_arguments(_parser)
     run(_parser.parse_args())

@@ -1,4 +1,4 @@
-"""Quality of latent frames where the truth is known: ``python -m spikekit.bench.interpolation [FILM ...]``.
+"""Quality of latent frames where the truth is known: ``python benchmarks/interpolation.py [FILM ...]``.
 
 In every film, each second frame is left out and interpolated from its two neighbours. In scenes whose motion is known
 exactly, the frame halfway between two frames a given displacement apart is interpolated.
@@ -75,7 +75,7 @@ def measure(triples: Iterator[_Triple]) -> tuple[int, dict[str, float], dict[str
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(prog="python -m spikekit.bench.interpolation", description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("films", nargs="*", type=Path, metavar="FILM", help="folder of pictures, or video file")
     parser.add_argument("--every", type=int, default=6, metavar="N", help="begin at every Nth frame (default: 6)")
     args = parser.parse_args(argv)

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 import spikekit as sk
-from spikekit.extremes import reference
-from spikekit.extremes.table import FLOATS, Cases, Measured, On, differ, measured, rounded_once, state, ulps, worst
+from extremes import reference
+from extremes.table import FLOATS, Cases, Measured, On, differ, measured, rounded_once, state, ulps, worst
 
 CASES = Cases()
 

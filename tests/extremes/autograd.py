@@ -8,11 +8,11 @@ from functools import partial
 from typing import Any
 
 import torch
+from operator_examples import EXAMPLES, Example
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
-from spikekit.examples import EXAMPLES, Example
-from spikekit.extremes.table import Cases, Measured, On, apart, differ, measured, sums_on_gpu
+from extremes.table import Cases, Measured, On, apart, differ, measured, sums_on_gpu
 
 CASES = Cases()
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from operator_examples import EXAMPLES, Example
 from torch import Tensor
 
-from spikekit.examples import EXAMPLES, Example
-from spikekit.extremes.table import Cases, Measured, On, apart, differ, measured, of_largest, sums_on_gpu, worst
+from extremes.table import Cases, Measured, On, apart, differ, measured, of_largest, sums_on_gpu, worst
 
 CASES = Cases()
 

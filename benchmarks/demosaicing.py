@@ -1,6 +1,6 @@
 """Quality of the demosaicings on pictures whose truth is known: of mosaics, and of TFI of simulated films.
 
-``python -m spikekit.bench.demosaicing --pictures FOLDER --films FOLDER`` prints the table.
+``python benchmarks/demosaicing.py --pictures FOLDER --films FOLDER`` prints the table.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def _line(name: str, decibels: Sequence[float]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(prog="python -m spikekit.bench.demosaicing", description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="pictures, whose own mosaics are filled in")
     parser.add_argument("--films", type=Path, metavar="FOLDER", help="a folder of frames for every film")
     parser.add_argument("--clocks", type=int, default=20, help="of the camera from one frame to the next; default 20")
@@ -93,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if asked.pictures is None and asked.films is None:
         parser.error("expected --pictures or --films")
     for line in lines(asked.pictures, asked.films, asked.clocks, asked.alpha):
-        print(line, flush=True)  # noqa: T201
+        print(line, flush=True)
 
 
 if __name__ == "__main__":

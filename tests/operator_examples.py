@@ -1,4 +1,4 @@
-"""The operators with example arguments, for tests, extremes and the benchmark."""
+"""The operators, each with example arguments: the list that tests of what holds for every operator go through."""
 
 from __future__ import annotations
 
