@@ -26,10 +26,19 @@ from lightning_modules.tasks.callbacks import TestReport, ValidationPictures, mi
 from spikekit import psnr, ssim
 from spikekit.decoders.methods import DECODERS
 
+_NO_ERROR = 1e-4  # mean absolute error of a clip below which there is little to gain
+
 
 # no lambda, so that a module can be pickled
 def _adam(parameters: Iterable[nn.Parameter]) -> torch.optim.Adam:
     return torch.optim.Adam(parameters, lr=1e-4)
+
+
+def _loss(rgb: Tensor, batch: dict[str, Tensor]) -> Tensor:
+    """Mean absolute error; for many gains its logarithm, clip by clip, so that little light does not outweigh much."""
+    if "alpha" not in batch:
+        return F.l1_loss(rgb, batch["rgb"])
+    return ((rgb - batch["rgb"]).abs().flatten(1).mean(dim=1) + _NO_ERROR).log().mean()
 
 
 class SuperResolution(Learner):
@@ -191,7 +200,7 @@ class SuperResolution(Learner):
     def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:  # noqa: D102
         batch, flow = self._with_motion(batch)
         pictures = self._pictures(batch, flow)
-        loss = sum(F.l1_loss(rgb, batch["rgb"]) for rgb in pictures) / len(pictures)
+        loss = sum(_loss(rgb, batch) for rgb in pictures) / len(pictures)
         self.log("train/loss", loss)
         self.log("train/psnr", psnr(pictures[-1].detach(), batch["rgb"]).mean(), prog_bar=True)
         return loss

@@ -1,0 +1,150 @@
+"""Judge reconstructions of grey recordings whose truth is known, as the field does on its REDS clips.
+
+``python benchmarks/grey.py FOLDER [WEIGHTS ...]`` prints PSNR and SSIM up to exposure of TFI, TFP, TFP of third order
+and networks, and the seconds that each picture took, and writes them to ``results/grey.csv``. Weights are names or
+files; those for Bayer sensors read the grey stream as if it were one, and a picture larger than the sensor is averaged
+down. FOLDER is searched with all folders in it for recordings with a truth beside them:
+
+- ``spike/NAME_key_idK.dat`` and ``gt/NAME_key_idK.png``, the K-th frame: Spike-Zoo's BASE set as its repository has it;
+- ``NAME.dat``, or with a size as ``NAME_250x400.dat``, and ``NAME_truth_N.png``, frame N counted from 0.
+
+Up to exposure: the picture is multiplied by the one number that brings it nearest to the truth, in least squares.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import re
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from lightning_modules.inference.export import load_network
+from lightning_modules.inference.predict import predict
+from lightning_modules.networks import Network, RecurrentCSCSR
+from spikekit import bin_to_sensor, psnr, read_picture, read_spikes, ssim, tfi_at, tfp_at
+from spikekit.color.cfa import GREY
+from spikekit.tables import table
+
+#: reconstructs a frame of a recording: (T, H, W) and its index to (H, W)
+Method = Callable[[Tensor, int], Tensor]
+
+
+@dataclass
+class Known:
+    """A recording whose truth is known at one of its frames."""
+
+    name: str
+    path: Path
+    frame: int
+    truth: Path
+
+    def read(self, height: int, width: int, flip: bool) -> tuple[Tensor, Tensor]:
+        """Return spikes (T, H, W) and the truth (H, W)."""
+        named = re.search(r"_(\d+)x(\d+)$", self.path.stem)
+        height, width = map(int, named.groups()) if named else (height, width)
+        spikes = read_spikes(self.path, height=height, width=width, flip=flip)
+        truth = read_picture(self.truth)
+        truth = truth if truth.ndim == 2 else bin_to_sensor(truth, GREY, scale=1)
+        if truth.shape != spikes.shape[1:] or not 0 <= self.frame < len(spikes):
+            got = f"{tuple(truth.shape)} and frame {self.frame}"
+            raise SystemExit(f"{self.truth}: expected a frame of {tuple(spikes.shape)} spikes, got {got}")
+        return spikes, truth
+
+
+def recordings(folder: Path) -> Iterator[Known]:
+    """Find the recordings in a folder that have a truth, by name."""
+    for path in sorted(folder.rglob("*.dat")):
+        keyed = re.search(r"_key_id(\d+)$", path.stem)
+        picture = path.parent.parent / "gt" / f"{path.stem}.png"
+        if keyed and picture.exists():
+            yield Known(path.stem[: keyed.start()], path, int(keyed[1]) - 1, picture)
+        name = re.sub(r"_\d+x\d+$", "", path.stem)
+        for truth in sorted(path.parent.glob(f"{name}_truth_*.png")):
+            yield Known(name, path, int(truth.stem.rpartition("_")[2]), truth)
+
+
+def judge(picture: Tensor, truth: Tensor) -> tuple[float, float]:
+    """Return PSNR in dB and SSIM of (H, W), up to exposure."""
+    picture, truth = picture.double(), truth.double()
+    gain = (picture * truth).sum() / picture.square().sum().clamp(min=torch.finfo(torch.float64).tiny)
+    pair = (gain * picture)[None], truth[None]
+    return psnr(*pair).item(), ssim(*pair).item()
+
+
+@torch.inference_mode()
+def by_network(network: Network, every: int, spikes: Tensor, frame: int) -> Tensor:
+    """Reconstruct a frame; a network for films sees the key frames on both sides as well."""
+    half = network.frames // 2
+    film = isinstance(network, RecurrentCSCSR)
+    frames = [frame - every, frame, frame + every] if film else [frame]
+    if frames[0] < half or frames[-1] + half >= len(spikes):
+        raise SystemExit(f"expected {frames[-1] + half + 1} frames of spikes or more, got {len(spikes)}")
+    clips = torch.stack([spikes[n - half : n + half + 1] for n in frames])
+    if film:
+        picture = network(clips[None], every=every, future=len(frames) - 1)[0, 1]
+    else:
+        # as light, which is 1 at most, whatever white is: predict cuts what is brighter
+        picture = predict(network, clips, exposure=network.settings["alpha"])[0]
+    picture = F.avg_pool2d(picture.clamp(min=0), network.scale)
+    return bin_to_sensor(picture, GREY, scale=1)
+
+
+def methods(weights: list[str], every: int) -> dict[str, Method]:
+    """Return the decoders and the networks, by name."""
+    found: dict[str, Method] = {"TFI": tfi_at, "TFP 41": partial(tfp_at, window=41)}
+    found |= {f"TFP {window}, order 3": partial(tfp_at, window=window, order=3) for window in (9, 13)}
+    for name in weights:
+        network = load_network(name).eval()
+        read = "" if network.pattern == GREY else f", as {network.pattern}"
+        shown = name if "/" not in name else Path(name).stem
+        found[f"{shown}{read}{', averaged down' if network.scale > 1 else ''}"] = partial(by_network, network, every)
+    return found
+
+
+def main() -> None:
+    """Print the table and write it."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("folder", type=Path, help="recordings and truths")
+    parser.add_argument("weights", nargs="*", help="names or files of weights")
+    parser.add_argument("--height", type=int, default=250, help="rows of a recording whose name has no size; 250")
+    parser.add_argument("--width", type=int, default=400, help="columns; 400")
+    parser.add_argument("--upright", action="store_true", help="frames are not stored upside down")
+    parser.add_argument("--every", type=int, default=20, help="clocks between the key frames of a film; 20")
+    parser.add_argument("-o", "--output", type=Path, default=Path("results/grey.csv"), help="results/grey.csv")
+    args = parser.parse_args()
+    known = list(recordings(args.folder))
+    if not known:
+        raise SystemExit(f"{args.folder}: expected recordings with a truth, see the head of this file, got none")
+    rows: list[list[str]] = []
+    for name, method in methods(args.weights, args.every).items():
+        scores = []
+        for one in known:
+            spikes, truth = one.read(args.height, args.width, not args.upright)
+            if not scores:
+                method(spikes, one.frame)  # what is compiled the first time is not timed
+            begin = time.perf_counter()
+            picture = method(spikes, one.frame)
+            scores.append([*judge(picture, truth), time.perf_counter() - begin])
+            rows.append([name, one.name, *_written(scores[-1])])
+        rows.append([name, "mean", *_written(torch.tensor(scores, dtype=torch.float64).mean(0).tolist())])
+    head = ["method", "recording", "PSNR (dB)", "SSIM", "seconds"]
+    print(table(head, rows))
+    args.output.parent.mkdir(parents=True, exist_ok=True)
+    with args.output.open("w", newline="") as file:
+        csv.writer(file).writerows([head, *rows])
+
+
+def _written(scores: list[float]) -> list[str]:
+    return [f"{value:.{digits}f}" for value, digits in zip(scores, (2, 4, 3), strict=True)]
+
+
+if __name__ == "__main__":
+    main()

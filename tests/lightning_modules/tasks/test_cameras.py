@@ -1,0 +1,52 @@
+"""Training for cameras of many gains and noises, grey ones among them."""
+
+from __future__ import annotations
+
+import pytest
+import pytorch_lightning as pl
+import torch
+
+from lightning_modules.data.stills import StillScenes
+from lightning_modules.networks import CSCSR, RecurrentCSCSR
+from lightning_modules.tasks.super_resolution import SuperResolution
+from spikekit import SensorNoise
+
+TINY = {"width": 8, "representation_width": 8, "features": 1, "stages": 1, "end_blocks": 1, "noise": True}
+DATA = {"patch": 12, "val_patch": 16, "train_clips": 8, "val_clips": 2, "batch_size": 2, "workers": 0}
+
+
+@pytest.mark.parametrize("pattern", ["grey", "RGGB"])
+@pytest.mark.parametrize(("kind", "key_frames"), [(CSCSR, 1), (CSCSR, 2), (RecurrentCSCSR, 2)])
+def test_a_network_learns_gains_and_noise_at_scale_1(kind, key_frames, pattern, tmp_path):
+    torch.manual_seed(0)
+    cameras = {"gains": (0.1, 1.0), "noise": SensorNoise(photons=500), "pattern": pattern, "key_frames": key_frames}
+    data = StillScenes(scale=1, **DATA, **cameras)
+    network = kind(scale=1, pattern=pattern, **TINY)
+    trainer = pl.Trainer(
+        max_steps=4, accelerator="cpu", logger=False, enable_checkpointing=False, default_root_dir=tmp_path
+    )
+    trainer.fit(SuperResolution(network), data)
+    level = network.reconstruction.noise
+    assert torch.isfinite(trainer.callback_metrics["val/psnr"])
+    assert all(parameter.abs().max() > 0 for parameter in level.parameters())
+
+
+def test_clips_of_little_light_do_not_outweigh_the_others(tmp_path):
+    """Of two clips, one with a hundredth of the light, both errors fall by one share, and not the larger one alone."""
+    torch.manual_seed(0)
+    module = SuperResolution(CSCSR(scale=1, pattern="grey", **TINY))
+    module.log = lambda *_, **__: None
+    spikes = (torch.rand(2, 41, 12, 12) < 0.3).to(torch.uint8)
+    flow = torch.zeros(2, 2, 2, 12, 12)
+    picture = module.network(spikes, flow).detach()
+
+    def gradient_at(error: tuple[float, float]) -> torch.Tensor:
+        """Of the bias that is added to all pictures, when they are off by so much, one up and one down."""
+        off = torch.tensor(error).reshape(2, 1, 1, 1)
+        batch = {"spikes": spikes, "flow": flow, "alpha": torch.full((2,), module.network.config.alpha)}
+        module.zero_grad()
+        module.training_step(batch | {"rgb": picture + off}, 0).backward()
+        return module.network.reconstruction.rgb.bias.grad
+
+    assert gradient_at((0.5, -0.5)).abs() < 1e-4
+    assert gradient_at((0.5, -0.01)) > 0  # the small error pulls its own way harder: to the same share
