@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -20,8 +20,9 @@ from lightning_modules.adaptation.learn import learn
 from lightning_modules.adaptation.lessons import HELD_OUT, chosen_frames, make_lessons
 from lightning_modules.cli.command import without_chatter
 from lightning_modules.data.pictures import folder_pictures
-from lightning_modules.data.recording import RecordingClips
 from lightning_modules.data.stills import StillClips
+from lightning_modules.inference._open import open_recording
+from lightning_modules.inference.clips import RecordingClips
 from lightning_modules.inference.export import load_network
 from lightning_modules.inference.predict import predict
 from lightning_modules.networks import Network
@@ -44,13 +45,13 @@ class Seen:
 
     def clips(self, frames: int) -> RecordingClips:
         """Return its clips of so many frames."""
-        return RecordingClips(str(self.path), pattern="RGGB", frames=frames, white=self.alpha)
+        return RecordingClips(replace(open_recording(self.path), alpha=self.alpha, pattern="RGGB"), frames)
 
     def psnr(self, network: Network) -> float:
         """Return the PSNR in dB of the held-out pictures by a network."""
         exposure = network.settings["alpha"] / self.alpha
         clips = self.clips(network.frames).in_order(self.frames)
-        seen = [predict(network, clip["spikes"][None], exposure=exposure)[0] for clip in clips]
+        seen = [predict(network, clip[None], exposure=exposure)[0] for _, clip in clips.in_order()]
         return torch.stack([psnr(*pair) for pair in zip(seen, self.truth, strict=True)]).mean().item()
 
 

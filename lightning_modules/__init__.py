@@ -6,14 +6,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from lightning_modules.inference.reconstruct import reconstruct
     from lightning_modules.networks import CSCSR
     from lightning_modules.storage.shipped import list_pretrained
     from lightning_modules.tasks.super_resolution import SuperResolution
 
-__all__ = ["CSCSR", "SuperResolution", "list_pretrained"]
+__all__ = ["CSCSR", "SuperResolution", "list_pretrained", "reconstruct"]
 
 # where what the package offers is
-_HOME = {"CSCSR": "networks", "SuperResolution": "tasks.super_resolution", "list_pretrained": "storage.shipped"}
+_HOME = {
+    "CSCSR": "networks",
+    "SuperResolution": "tasks.super_resolution",
+    "list_pretrained": "storage.shipped",
+    "reconstruct": "inference.reconstruct",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -13,6 +13,7 @@ from spikekit.completion import OPTION
 
 #: where the verbs that are not Lightning's are
 _OURS = {
+    "predict": "cli.predict",
     "sweep": "sweep.cli",
     "trade": "trade.cli",
     "adapt": "adaptation.cli",
@@ -51,12 +52,15 @@ def _main(args: Sequence[str] | None) -> None:
 def _run(verb: str, rest: Sequence[str], args: Sequence[str] | None) -> None:
     # Threads of torch that spin while they wait hold up the workers that make clips: before torch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    if "" not in sys.path and os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # where users' own networks are; behind all else, so that it hides nothing
     if verb == OPTION:
         from lightning_modules.cli.completion import print_completion
 
         print_completion("".join(rest), _OURS)
     elif verb in _OURS:
-        getattr(import_module(f"lightning_modules.{_OURS[verb]}"), verb)(rest)
+        with errors.stopped_by_sigterm():
+            getattr(import_module(f"lightning_modules.{_OURS[verb]}"), verb)(rest)
     else:
         from lightning_modules.cli.command import Command, run
 

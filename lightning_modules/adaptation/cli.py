@@ -13,19 +13,20 @@ import torch
 
 from lightning_modules.adaptation.learn import CHECKPOINT, learn
 from lightning_modules.adaptation.lessons import ROOM, Lessons, make_lessons
-from lightning_modules.cli.command import check_folder, precision_of, without_chatter
+from lightning_modules.cli.command import without_chatter
 from lightning_modules.cli.errors import InputError, UsageError, VerbParser
-from lightning_modules.cli.folder_lock import locked_folder
-from lightning_modules.data.recording import RecordingClips
+from lightning_modules.cli.folder_lock import check_folder, locked_folder
+from lightning_modules.cli.predict import RECORDING, add_recording
+from lightning_modules.inference._open import find_model, list_models, open_recording
+from lightning_modules.inference.clips import RecordingClips
 from lightning_modules.inference.export import load_network
+from lightning_modules.inference.output import file_identity
+from lightning_modules.inference.reconstruct import precision_of
 from lightning_modules.networks import Network, RecurrentCSCSR
 from lightning_modules.storage.pretrained import Weights, motion_of, settings_of, write_weights
-from lightning_modules.storage.shipped import find_shipped, list_pretrained
-from lightning_modules.tasks.predictions import file_identity
 from spikekit.arguments import UsageError as SpikekitUsageError
 from spikekit.arguments import whole
-from spikekit.color.cfa import PATTERNS
-from spikekit.io.recording import own_calibration
+from spikekit.io.recording import Recording
 from spikekit.timing import duration
 
 #: dB by which the held-out pictures have to come nearer to the teacher's
@@ -41,23 +42,12 @@ def parser() -> argparse.ArgumentParser:
         prog="lightning adapt",
         description="Fine-tune fast weights on a recording of your camera, without ground truth: they learn from the "
         "pictures that slower weights make of it. The end of the recording is held out, and decides whether the new "
-        "weights are kept. lightning predict --model.weights OUT/adapted.safetensors uses them; those of a noisy "
+        "weights are kept. lightning predict --weights OUT/adapted.safetensors uses them; those of a noisy "
         "camera also serve its other recordings.",
     )
+    add_recording(made)
     add = made.add_argument
-    add("--data", choices=["Recording"], help="as lightning predict wants it; may be left out")
-    add("--data.path", required=True, metavar="FILE", help="the recording, .dat or .npz")
-    add("--data.height", type=whole(1), metavar="H", help="rows of a frame; a .dat without side-car or camera needs it")
-    add("--data.width", type=whole(1), metavar="W", help="columns of a frame; likewise")
-    add("--data.flip", choices=["true", "false"], help="the frames are stored upside down, as real cameras do")
-    add("--data.pattern", choices=[*PATTERNS, "grey"], help="Bayer phase after the flip; RGGB if nothing else is known")
-    add("--data.camera", metavar="NAME", help="instead of all these, what recorded it, see spikekit cameras")
-    add(
-        "--data.calibration",
-        metavar="FILE",
-        help="what spikekit calibrate wrote; that beside FILE if not given; or none",
-    )
-    add("--model.weights", default="cscsr_small_x4", help="what to begin with; cscsr_small_x4 if not given")
+    add("--weights", default="cscsr_small_x4", help="what to begin with; cscsr_small_x4 if not given")
     add(
         "--teacher",
         help="weights to learn from; if not given, the slowest of the package that the recording has room for, those "
@@ -79,20 +69,21 @@ def adapt(args: Sequence[str]) -> None:
     """
     without_chatter()
     asked = parser().parse_args(args)
-    data = {name.removeprefix("data."): value for name, value in vars(asked).items() if name.startswith("data.")}
-    data["flip"] = data["flip"] == "true"
-    weights = vars(asked)["model.weights"]
+    weights = asked.weights
     begin, written = perf_counter(), asked.output / _WRITTEN
     device = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         check_folder(asked.output)
         student = _student(weights).to(device)
-        clips, name = clips_and_teacher(data, student, asked.teacher)
-        known = {"recording": _identity(data["path"]), "sensor": _sensor(clips, data["calibration"])}
+        described = {name: getattr(asked, name) for name in RECORDING}
+        recording = open_recording(asked.file, **described)
+        noisy = asked.calibration != "none" and recording.alpha is None and recording.calibration is None
+        clips, name = clips_and_teacher(recording, student, asked.teacher, noisy)
+        known = {"recording": _identity(str(asked.file)), "sensor": _sensor(clips)}
         known |= {"weights": _identity(weights), "teacher": _identity(name), "steps": asked.steps}
         with locked_folder(asked.output, "adaptation"):
             lessons = _lessons(asked.output, known, student, name, clips)
-            how = {"accelerator": "gpu" if device == "cuda" else "cpu", "precision": precision_of(device)}
+            how = {"accelerator": "gpu" if device == "cuda" else "cpu", "precision": precision_of(torch.device(device))}
             how["enable_progress_bar"] = sys.stderr.isatty()
             before, after = learn(student, lessons, asked.steps, asked.output, **how)
             said = (
@@ -106,9 +97,7 @@ def adapt(args: Sequence[str]) -> None:
         raise
     except (OSError, ValueError) as error:
         raise (UsageError if isinstance(error, SpikekitUsageError) else InputError)(str(error)) from error
-    except KeyboardInterrupt:
-        raise InputError("adapt: stopped; the same command goes on") from None
-    print(f"{said}\n{written}: in {duration(perf_counter() - begin)}; for lightning predict --model.weights {written}")
+    print(f"{said}\n{written}: in {duration(perf_counter() - begin)}; for lightning predict --weights {written}")
 
 
 def _lessons(folder: Path, known: dict[str, Any], student: Network, teacher: str, clips: RecordingClips) -> Lessons:
@@ -128,29 +117,28 @@ def _student(weights: str) -> Network:
     student = load_network(weights)
     learns = any(parameter.requires_grad for parameter in student.parameters())
     if isinstance(student, RecurrentCSCSR) or not learns or student.settings.get("motion_fusion", "joint") != "joint":
-        raise UsageError(
-            f"--model.weights: expected a network that learns from single clips and one flow, got {weights}"
-        )
+        raise UsageError(f"--weights: expected a network that learns from single clips and one flow, got {weights}")
     return student.eval()
 
 
-def clips_and_teacher(data: dict[str, Any], student: Network, teacher: str | None) -> tuple[RecordingClips, str]:
+def clips_and_teacher(
+    recording: Recording, student: Network, teacher: str | None, noisy: bool = True
+) -> tuple[RecordingClips, str]:
     """Return clips as long as the longer of both networks wants them, and the name of the teacher.
 
     Args:
-        data: arguments of RecordingClips.
+        recording: what is learned from.
         student: what learns.
         teacher: what was asked for.
+        noisy: whether the sensor may be noisy.
 
     Raises:
-        spikekit.SpikeFileError: the recording cannot be read.
-        ValueError: it is too short, or the teacher does not fit.
+        ValueError: the recording is too short or too small, or the teacher does not fit.
     """
-    data = data | {"crop_to": student.pattern}
-    clips = RecordingClips(**data, frames=student.frames)
+    clips = RecordingClips(recording, student.frames, crop_to=student.pattern)
     if min(clips.size) < _LEAST_SIDE:
-        raise ValueError(f"{data['path']}: expected at least {_LEAST_SIDE} x {_LEAST_SIDE} pixels, got {clips.size}")
-    name = teacher or _slowest(clips, student)
+        raise ValueError(f"{recording.path}: expected at least {_LEAST_SIDE} x {_LEAST_SIDE} pixels, got {clips.size}")
+    name = teacher or _slowest(recording, student, noisy)
     network = load_network(name)
     if not any(True for _ in network.parameters()):
         raise UsageError(f"--teacher: expected weights, got {name}, which has none")
@@ -159,35 +147,34 @@ def clips_and_teacher(data: dict[str, Any], student: Network, teacher: str | Non
         if here != there:
             raise UsageError(f"--teacher: expected {setting} {here} of the weights that learn, got {there} of {name}")
     frames = max(student.frames, network.frames)
-    if clips.recording.frames < ROOM * frames:
-        raise ValueError(_too_short(clips, frames))
-    return RecordingClips(**data, frames=frames), name
+    if recording.frames < ROOM * frames:
+        raise ValueError(_too_short(recording, frames))
+    return RecordingClips(recording, frames, crop_to=student.pattern), name
 
 
-def _slowest(clips: RecordingClips, student: Network) -> str:
+def _slowest(recording: Recording, student: Network, noisy: bool) -> str:
     """Return the weights that make the best pictures of this recording, as far as one can know."""
-    known, measured = clips.recording.alpha is not None, clips.recording.calibration
-    noisy = not known and (measured is None or not measured.dark.any())
-    room = clips.recording.frames // ROOM
-    fit = [one for one in list_pretrained(student.scale) if not one.film and one.frames <= room]
+    room = recording.frames // ROOM
+    models = list_models(student.scale, student.pattern)
+    fit = [one for one in models if not one.film and one.frames and one.frames <= room]
     if not fit:
-        raise ValueError(_too_short(clips, student.frames))
-    of_sensor = [one for one in fit if ("noisy" in one.name) == noisy] or fit
+        raise ValueError(_too_short(recording, student.frames))
+    of_sensor = [one for one in fit if one.noise == noisy] or fit
     return max(of_sensor, key=lambda one: one.macs).name
 
 
-def _too_short(clips: RecordingClips, frames: int) -> str:
+def _too_short(recording: Recording, frames: int) -> str:
     least = f"at least {ROOM * frames} frames, {ROOM} clips of {frames}"
-    return f"{clips.recording.path}: expected {least}, got {clips.recording.frames}"
+    return f"{recording.path}: expected {least}, got {recording.frames}"
 
 
 def _identity(source: str) -> str:
     """Return what tells a file from another, and from itself after it has changed; the name of shipped weights."""
-    return source if find_shipped(source) or not Path(source).is_file() else str(file_identity(source))
+    return source if find_model(source) or not Path(source).is_file() else str(file_identity(source))
 
 
-def _sensor(clips: RecordingClips, calibration: str | None) -> str:
+def _sensor(clips: RecordingClips) -> str:
     """Return what the spikes depend on besides the file."""
-    own = own_calibration(clips.recording.path) if calibration is None else Path(calibration)
-    how = clips.size, clips.top, clips.left, clips.recording.flip, clips.grey, clips.recording.alpha
-    return f"{how}, calibration {file_identity(own) if own.is_file() else 'none'}"
+    one = clips.recording
+    measured = one.calibration and {name: str(value) for name, value in vars(one.calibration).items()}
+    return f"{clips.size}, {clips.top}, {clips.left}, {one.flip}, {one.pattern}, {one.alpha}, {measured}"

@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from lightning_modules.data.recording import RecordingClips
+from lightning_modules.inference.clips import RecordingClips
 from lightning_modules.inference.tiles import TILE, forward_in_tiles
 from lightning_modules.networks import Network
 from spikekit.io.whole_file import whole_file
@@ -113,10 +113,10 @@ def make_lessons(student: Network, teacher: Network, clips: RecordingClips) -> L
     device, rng = next(teacher.parameters()).device, np.random.default_rng(0)
     sides = [min(side, _SIDE) // 2 * 2 for side in clips.size]
     spikes, pictures, flows = [], [], []
-    for item in progress(clips.in_order(chosen), "lessons", len(chosen)):
+    for _, clip in progress(clips.in_order(chosen), "lessons", len(chosen)):
         corner = (2 * int(rng.integers((whole - side) // 2 + 1)) for whole, side in zip(clips.size, sides, strict=True))
         window = tuple(slice(z, z + side) for z, side in zip(corner, sides, strict=True))
-        seen = item["spikes"][None, ..., *window].to(device)
+        seen = clip[None, ..., *window].to(device)
         pictures.append(forward_in_tiles(teacher, _middle(seen, teacher.frames), TILE).mul(ratio).half().cpu())
         seen = _middle(seen, student.frames).contiguous()
         spikes.append(seen.cpu())

@@ -63,15 +63,15 @@ def with_network_of_weights(args: Sequence[str]) -> list[str]:
     asked, named, alpha = None, None, None
     for _, option, value in options(args):
         if option in ("-c", "--config"):
-            model = _init_args(_part_of(value, "model"))
+            model = inner_arguments(_part_of(value, "model"))
             asked = model.get("weights") or asked
-            network = _init_args(model.get("network"))
+            network = inner_arguments(model.get("network"))
             named = _with_class(network.get("motion")) or named
             alpha = network.get("alpha", alpha)
         elif option in WEIGHTS:
             asked = value
         elif _MOTION.fullmatch(option):
-            named = _with_class(_parsed(value, option)) or named
+            named = _with_class(yaml.safe_load(value)) or named
     if asked in (None, "", "null"):
         return list(args)
     if not isinstance(asked, str):
@@ -101,31 +101,6 @@ def options(args: Sequence[str]) -> Iterator[tuple[int, str, str]]:
         if re.match(r"-[a-z][^=]", word):  # -cFILE
             option, equals, value = word[:2], "=", word[2:]
         yield (n + 1, option, value) if equals else (n + 2, option, args[n + 1] if n + 1 < len(args) else "")
-
-
-def given(args: Sequence[str], key: str) -> dict[str, str]:
-    """Return what arguments say about an object, unparsed; later configurations and options override earlier ones.
-
-    Args:
-        args: verb and arguments of ``lightning``.
-        key: names the object, such as ``model.network``.
-
-    Example:
-        >>> given(["predict", "--data", "Recording", "--data.path=a.dat", "--data.init_args.height", "250"], "data")
-        {'path': 'a.dat', 'height': '250'}
-    """
-    found: dict[str, str] = {}
-    for _, option, value in options(args):
-        name = option.removeprefix("--").replace("init_args.", "")
-        if option in ("-c", "--config"):
-            first, *others = key.split(".")
-            part = _init_args(_part_of(value, first))
-            for inner in others:
-                part = _init_args(part.get(inner))
-            found |= {name: str(value) for name, value in part.items() if value is not None}
-        elif name.startswith(f"{key}."):
-            found[name.removeprefix(f"{key}.")] = value
-    return found
 
 
 def behind_configurations(args: Sequence[str], more: Sequence[str]) -> list[str]:
@@ -182,41 +157,41 @@ def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         yield from flatten(value, f"{prefix}.{key}" if prefix else str(key))
 
 
-def _part_of(config: str, name: str) -> Any:
-    """Return what a configuration says about a part; what is no file, or lacks it, is the parser's affair.
+def read_config(path: str | Path) -> dict[str, Any]:
+    """Return what a configuration says; nothing is built.
 
     Raises:
-        ValueError: a file that is no YAML; the message is one line and names it.
+        ValueError: no file, or no YAML in UTF-8; the message is one line and names it.
     """
+    path = Path(path).expanduser()
     try:
-        no_pipe(config)
+        text = no_pipe(path).read_text(encoding="utf-8")
+        content = yaml.safe_load(text)
     except OSError as error:
-        raise ValueError(f"{config}: {one_line(error)}") from error
-    try:
-        text = Path(config).read_text(encoding="utf-8")
-    except (OSError, ValueError):  # not there, or the configuration itself
-        return None
-    content = _parsed(text, config)
-    if content is None:  # an empty file
-        return None
-    if not isinstance(content, dict):
-        raise ValueError(f"{config}: not a configuration (expected names and values, got {type(content).__name__})")
-    return content.get(name)
-
-
-def _parsed(text: str, name: str) -> Any:
-    try:
-        return yaml.safe_load(text)
+        raise ValueError(f"{path}: {one_line(error)}") from error
     except Exception as error:  # what the parser raises depends on the text
-        raise ValueError(f"{name}: not a configuration ({one_line(error)[:300]})") from error
+        said = "expected UTF-8" if isinstance(error, UnicodeError) else one_line(error)[:300]
+        raise ValueError(f"{path}: not a configuration ({said})") from error
+    if content is not None and not isinstance(content, dict):
+        raise ValueError(f"{path}: not a configuration (expected names and values, got {type(content).__name__})")
+    return content or {}
 
 
-def _init_args(choice: Any) -> dict[str, Any]:
+def inner_arguments(choice: Any) -> dict[str, Any]:
     """Return the arguments of an object in a configuration, which may stand in it without ``init_args``."""
     if not isinstance(choice, dict):
         return {}
     inner = choice.get("init_args")
     return {**choice, **inner} if isinstance(inner, dict) else choice
+
+
+def _part_of(config: str, name: str) -> Any:
+    """Return what a configuration says about a part; what is not there, or text, is the parser's affair."""
+    try:
+        there = bool(config) and Path(config).exists() and not Path(config).is_dir()
+    except (OSError, ValueError):  # a text that no name can be
+        there = False
+    return read_config(config).get(name) if there else None
 
 
 def _with_class(choice: Any) -> dict[str, Any] | None:

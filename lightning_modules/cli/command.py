@@ -10,7 +10,6 @@ import warnings
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from inspect import signature
-from mimetypes import guess_type
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NoReturn
@@ -25,15 +24,12 @@ from pytorch_lightning.loggers import TensorBoardLogger
 from pytorch_lightning.utilities import rank_zero_only
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
 
-from lightning_modules.cli import prediction
-from lightning_modules.cli.arguments import classes_first, flatten, options, whole_counts, with_network_of_weights
+from lightning_modules.cli.arguments import classes_first, flatten, whole_counts, with_network_of_weights
+from lightning_modules.cli.configured import run_checkpoint
 from lightning_modules.cli.errors import InputError, UsageError
-from lightning_modules.cli.folder_lock import FolderError, locked_folder, make_folder
-from lightning_modules.cli.prediction import NO_RECORDING
-from lightning_modules.cli.processes import make_parts
+from lightning_modules.cli.folder_lock import FolderError, check_folder, locked_folder
 from lightning_modules.cli.reasons import reason, suggestion, unknown
-from lightning_modules.cli.renamed_overlays import with_current_overlays
-from lightning_modules.data import FilmScenes, Recording, StillScenes
+from lightning_modules.data import FilmScenes, StillScenes
 from lightning_modules.data.loading import end_when_orphaned
 from lightning_modules.motion import Spike2Flow
 from lightning_modules.networks import CSCSR
@@ -42,13 +38,10 @@ from lightning_modules.storage.pretrained import check_settings
 from lightning_modules.tasks.base import Learner
 from lightning_modules.tasks.checkpoint_io import Checkpoints
 from lightning_modules.tasks.optical_flow import FlowTraining
-from lightning_modules.tasks.predictions import is_film, pictures_folder
 from lightning_modules.tasks.super_resolution import SuperResolution
 from lightning_modules.tasks.training_state import Begun, check_like_fresh, check_training_state, restoring
 from spikekit.arguments import one_line
 from spikekit.io import PictureError, SpikeFileError, VideoError
-from spikekit.io.video import PICTURE_ENDINGS, VIDEO_ENDINGS
-from spikekit.io.video_output import check_film
 from spikekit.io.whole_file import whole_file
 from spikekit.timing import duration
 
@@ -60,7 +53,6 @@ CHOICES = (
     ("model.network", Spike2Flow),
     ("data", StillScenes),
     ("data", FilmScenes),
-    ("data", Recording),
 )
 
 # warnings about the insides of Lightning and jsonargparse, about seeds, and about data that need no processes to read
@@ -77,14 +69,10 @@ _NOTHING_TO_DO = (
 # environment variable: number of the process that starts the others, where a run has several
 _FIRST = "SPIKEKIT_FIRST_PROCESS"
 
-# of what users may take the output for
-_FILE_ENDINGS = (*PICTURE_ENDINGS, *VIDEO_ENDINGS, ".gif", ".html", ".npz", ".dat", ".ckpt", ".safetensors")
-
 _LOADERS = {
     "fit": "train_dataloader",
     "validate": "val_dataloader",
     "test": "test_dataloader",
-    "predict": "predict_dataloader",
 }
 
 
@@ -106,11 +94,8 @@ class Parser(LightningArgumentParser):
             super().error(message, ex)
         if "the following arguments are required: network" in message:
             message = (
-                "expected a network: --speed balanced (predict alone), --model.weights NAME (lightning models lists "
-                "them), or a configuration, -c FILE"
+                "expected a network: --model.weights NAME (lightning models lists them), or a configuration, -c FILE"
             )
-        if "the following arguments are required: predict.data" in message:
-            message = NO_RECORDING
         sys.exit(reason(message))
 
 
@@ -137,7 +122,7 @@ class Command(LightningCLI):
 
     def subcommands(self) -> dict[str, set[str]]:
         """Return only the verb that was typed, because building the parser of every verb takes time."""
-        verbs = LightningCLI.subcommands()
+        verbs = {verb: given for verb, given in LightningCLI.subcommands().items() if verb in _LOADERS}
         return {verb: verbs[verb] for verb in self.typed[:1] if verb in verbs} or verbs
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:  # noqa: D102
@@ -146,8 +131,7 @@ class Command(LightningCLI):
             "--output",
             type=str,
             default="runs",
-            help="Folder of the run: checkpoints, TensorBoard files, config.yaml, tables and pictures; of predict also "
-            "a film, .mp4, .mov, .mkv or .gif, or, of a single frame, a .png.",
+            help="Folder of the run: checkpoints, TensorBoard files, config.yaml, tables and pictures.",
         )
         parser.set_defaults({"model": {"class_path": "SuperResolution"}})
         network = "model.init_args.network.init_args"
@@ -160,10 +144,8 @@ class Command(LightningCLI):
         )
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:  # noqa: D102
-        args, said = classes_first(with_current_overlays(self.typed)), ""
+        args = classes_first(self.typed)
         try:
-            if any(option in ("--speed", "--budget") for _, option, _ in options(args)):
-                args, said = prediction.with_choice(parser, args)
             try:
                 args = with_network_of_weights(args)
             except (OSError, ValueError) as error:
@@ -174,35 +156,22 @@ class Command(LightningCLI):
                 raise
             names = [name.removeprefix("--") for name in option_names(*self._subcommand_parsers.values())]
             meant = suggestion(unknown(self.typed, names), names)
-            if error.code.startswith("data.frames: "):
-                meant = ", the frames of a clip; --data.frame chooses pictures"
             raise UsageError(error.code + (meant or f" (see lightning {self.typed[0]} --help)")) from error
         self.counts = whole_counts(args)
-        if said:
-            print(said, flush=True)
 
     def _parse_ckpt_path(self) -> None:
         """Take no hyper-parameters out of a checkpoint: jsonargparse would build whatever they name."""
 
-    def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> LightningArgumentParser:
-        parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
-        if subcommand == "predict":
-            prediction.add_arguments(parser)
-        return parser
-
     def before_instantiate_classes(self) -> None:
         """Turn ``--ckpt_path best`` and ``last`` into files, and keep a run from being written over."""
         config = self.config[self.subcommand]
-        predicts = self.subcommand == "predict"
-        if predicts and is_film(config.output):
-            check_film(config.output)
-        check_folder(pictures_folder(config.output) if predicts else config.output)
+        check_folder(config.output)
         checkpoints = Path(config.output) / "checkpoints"
         asked = config.get("ckpt_path")
         if asked in ("best", "last"):
-            last, best = checkpoints / "last.ckpt", checkpoints / "best.ckpt"
             # a run that was killed before its first last.ckpt has best.ckpt alone
-            config.ckpt_path = str(last if asked == "last" and (last.is_file() or not best.is_file()) else best)
+            alone = asked == "last" and not (checkpoints / "last.ckpt").is_file() and any(checkpoints.glob("best.ckpt"))
+            config.ckpt_path = str(run_checkpoint(checkpoints, "best" if alone else asked))
         if asked and not Path(config.ckpt_path).is_file():
             raise InputError(f"{config.ckpt_path}: no such checkpoint")
         if asked:
@@ -228,9 +197,6 @@ class Command(LightningCLI):
             if config.ckpt_path:  # before a folder is made and scenes are loaded
                 check_settings(self.model.network, read_checkpoint(config.ckpt_path)["network"], config.ckpt_path)
             with _locked(subcommand, config), restoring(config.ckpt_path, begun):
-                if subcommand == "predict" and config.engine == "ray":
-                    folder = Path(pictures_folder(config.output))
-                    make_parts(self.typed, folder, str(self.trainer.precision), config.jobs)
                 super()._run_subcommand(subcommand)
         except (MisconfigurationException, ModuleNotFoundError) as error:  # of Lightning's, such as a callback's
             raise InputError(one_line(error)) from error
@@ -256,8 +222,6 @@ class Command(LightningCLI):
             # here, so that what is wrong with it is known before anything is written
             _check_verb(self.subcommand, self.model, self.datamodule)
             self.datamodule.setup(self.subcommand)
-            if self.subcommand == "predict":
-                prediction.check_output(Path(config.output), self.datamodule.clips)
             _check_agreement(self.model, self.datamodule)
             if self.subcommand == "fit":
                 chosen = self.config_dump["model"]["init_args"]
@@ -281,12 +245,7 @@ class Command(LightningCLI):
         kwargs["plugins"] = [Checkpoints(), *_listed(config.get("plugins"))]
         if config.get("precision") is None:
             kwargs["precision"] = precision_of(config.get("accelerator"))
-        if self.subcommand == "predict":
-            precision = kwargs.get("precision", config.get("precision"))
-            callbacks = prediction.callbacks(output, self.config_dump, precision, _listed(config.get("callbacks")))
-        else:
-            callbacks = self._callbacks(output)
-        kwargs["callbacks"] = [*_listed(config.get("callbacks")), *callbacks]
+        kwargs["callbacks"] = [*_listed(config.get("callbacks")), *self._callbacks(output)]
         if self.subcommand != "fit":
             self.save_config_callback = None  # config.yaml is the record of the training
         return super().instantiate_trainer(**kwargs)
@@ -311,12 +270,7 @@ def _locked(verb: str, config: Any) -> AbstractContextManager[None]:
         return nullcontext()
     if verb == "fit":
         return locked_folder(config.output, "run")
-    # what is predicted while a training runs may go to its folder; among pictures the file is hidden
-    folder = pictures_folder(config.output) if verb == "predict" else config.output
-    if verb == "predict" and config.part is not None:  # one of several that share it
-        make_folder(folder)
-        return nullcontext()
-    return locked_folder(folder, f"lightning {verb}", f".{verb}.lock")
+    return locked_folder(config.output, f"lightning {verb}", f".{verb}.lock")
 
 
 def option_names(*parsers: ArgumentParser) -> list[str]:
@@ -341,22 +295,6 @@ def _listed(value: Any) -> list[Any]:
     return value if isinstance(value, list) else [] if value is None else [value]
 
 
-def check_folder(output: str | Path) -> None:
-    """Refuse an output that cannot be a folder, or would be a folder that looks like a file.
-
-    Raises:
-        InputError: it is a file, or inside one, or new and ends like a picture, a film or another file.
-    """
-    ending = Path(output).suffix.lower()
-    kind = guess_type(Path(output).name)[0] or ""
-    looks_like_file = ending in _FILE_ENDINGS or kind.startswith(("image/", "video/", "audio/"))
-    if looks_like_file and not Path(output).is_dir():
-        raise UsageError(f"-o: expected a folder, got {output}, which ends like a file, in {ending}")
-    there = next(path for path in (Path(output).absolute(), *Path(output).absolute().parents) if path.exists())
-    if not there.is_dir():
-        raise UsageError(f"-o: expected a folder, got the file {there}")
-
-
 def _check_trainer(trainer: Any) -> None:
     """Settings of Lightning that would leave a run without what the other commands need."""
     if trainer.enable_checkpointing is False:
@@ -366,12 +304,9 @@ def _check_trainer(trainer: Any) -> None:
 
 
 def _check_verb(verb: str, model: Learner, data: LightningDataModule) -> None:
-    if verb == "predict" and type(model).predict_step is LightningModule.predict_step:
-        raise UsageError(f"predict: expected a model that makes pictures, got {type(model).__name__}")
     loader = _LOADERS[verb]
     if getattr(type(data), loader) is getattr(LightningDataModule, loader):
-        scenes = f"{verb}: expected scenes whose truth is known, got {type(data).__name__}"
-        raise UsageError(NO_RECORDING if verb == "predict" else scenes)
+        raise UsageError(f"{verb}: expected scenes whose truth is known, got {type(data).__name__}")
     if verb == "fit" and not any(parameter.requires_grad for parameter in model.network.parameters()):
         raise UsageError(f"fit: expected a network that learns, got {type(model.network).__name__}")
 

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import argparse
 import errno
+import io
+import signal
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NoReturn
@@ -28,7 +31,7 @@ class Ended(SystemExit):
 
     Args:
         line: what is wrong.
-        status: 2 for a command line that cannot be, 1 for all else.
+        status: 2 for a command line that cannot be, 130 and 143 for one that was stopped, 1 for all else.
     """
 
     def __init__(self, line: str, status: int) -> None:
@@ -45,31 +48,56 @@ class VerbParser(argparse.ArgumentParser):
         raise UsageError(f"{self.prog.removeprefix('lightning ')}: {message}")
 
 
-def _of_users() -> tuple[type[Exception], ...]:
+def _of_users() -> tuple[type[BaseException], ...]:
     """Return what is raised where a user made a mistake; importing it takes torch."""
-    from pytorch_lightning.utilities.exceptions import MisconfigurationException
-
     from lightning_modules.cli.folder_lock import FolderError
     from lightning_modules.storage.checkpoint import DivergedError
     from lightning_modules.storage.pretrained import CheckpointMismatchError
     from spikekit import SpikeFileError, VideoError
     from spikekit.io import PictureError
 
-    files = SpikeFileError, PictureError, VideoError, CheckpointMismatchError, FolderError
-    return (
-        InputError,
-        *files,
-        DivergedError,
-        MisconfigurationException,
-    )  # of Lightning, such as a device that is not there
+    known = [InputError, SpikeFileError, PictureError, VideoError, CheckpointMismatchError, FolderError, DivergedError]
+    if "pytorch_lightning" in sys.modules:  # a verb that needs no Trainer does not import it
+        from pytorch_lightning.utilities.exceptions import MisconfigurationException
+
+        known.append(MisconfigurationException)  # such as a device that is not there
+    return tuple(known)
+
+
+class _Terminated(BaseException):
+    """SIGTERM."""
+
+
+def _terminate(*_: object) -> NoReturn:
+    raise _Terminated
+
+
+@contextmanager
+def stopped_by_sigterm() -> Iterator[None]:
+    """End at SIGTERM as at Ctrl-C: files that are being written are removed, and whole ones stay.
+
+    Not for Lightning's verbs: it has a way of its own, which leaves a checkpoint.
+    """
+    if threading.current_thread() is not threading.main_thread():  # nobody else may ask for signals
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, _terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager
 def as_one_line() -> Iterator[None]:
-    """End the program with one line, and no traceback, if the user made a mistake or a disk is full.
+    """End the program with one line, and no traceback, if the user made a mistake, stopped it, or a disk is full.
 
-    Where the reader of standard output is gone, as in ``lightning models | head -1``, it ends without a word.
+    Where the reader of standard output is gone, as in ``lightning models | head -1``, it ends without a word. What the
+    terminal cannot show, such as a file's name, is printed with escapes.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         try:
             yield
@@ -90,5 +118,9 @@ def as_one_line() -> Iterator[None]:
         if not isinstance(error, _of_users()):
             raise
         # what a worker of a loader raises comes with its traceback, whose last line it is
-        said = str(error).strip().splitlines()[-1].split("Error: ", 1)[-1] if "Traceback (" in str(error) else error
+        text = str(error).strip()
+        said = text.splitlines()[-1].split("Error: ", 1)[-1] if "Traceback (" in text else text
         raise Ended(f"lightning: {said}", 2 if isinstance(error, UsageError) else 1) from error
+    except (_Terminated, KeyboardInterrupt) as error:
+        name, status = ("Ctrl-C", 130) if isinstance(error, KeyboardInterrupt) else ("SIGTERM", 143)
+        raise Ended(f"lightning: stopped by {name}; what is whole has been written", status) from None

@@ -5,9 +5,16 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from mimetypes import guess_type
 from pathlib import Path
 
 from filelock import FileLock, Timeout
+
+from lightning_modules.cli.errors import UsageError
+from spikekit.io.video import PICTURE_ENDINGS, VIDEO_ENDINGS
+
+# of what users may take the output for
+_FILE_ENDINGS = (*PICTURE_ENDINGS, *VIDEO_ENDINGS, ".gif", ".html", ".npz", ".dat", ".ckpt", ".safetensors")
 
 
 class FolderError(ValueError):
@@ -16,6 +23,22 @@ class FolderError(ValueError):
 
 class FolderInUseError(FolderError):
     """A folder that another run is using."""
+
+
+def check_folder(output: str | Path) -> None:
+    """Refuse an output that cannot be a folder, or would be a folder that looks like a file.
+
+    Raises:
+        InputError: it is a file, or inside one, or new and ends like a picture, a film or another file.
+    """
+    ending = Path(output).suffix.lower()
+    kind = guess_type(Path(output).name)[0] or ""
+    looks_like_file = ending in _FILE_ENDINGS or kind.startswith(("image/", "video/", "audio/"))
+    if looks_like_file and not Path(output).is_dir():
+        raise UsageError(f"-o: expected a folder, got {output}, which ends like a file, in {ending}")
+    there = next(path for path in (Path(output).absolute(), *Path(output).absolute().parents) if path.exists())
+    if not there.is_dir():
+        raise UsageError(f"-o: expected a folder, got the file {there}")
 
 
 def make_folder(folder: str | Path) -> None:
@@ -51,13 +74,16 @@ def locked_folder(folder: str | Path, what: str, name: str = "lock") -> Iterator
         FolderError: the folder or the file in it cannot be made.
     """
     make_folder(folder)
-    lock = FileLock(Path(folder) / name, timeout=0)
+    path = Path(folder) / name
+    if path.is_symlink() or (path.exists() and not path.is_file()):  # it would be emptied, or waited for
+        raise FolderError(f"-o: {path}: expected the file of a lock, got a link, a pipe or a folder")
+    lock = FileLock(path, timeout=0)
     try:
         lock.acquire()
     except Timeout:
         raise FolderInUseError(f"{folder}: another {what} is at work here; -o goes elsewhere") from None
     except OSError as error:
-        raise FolderError(f"-o: {Path(folder) / name} cannot be written ({error.strerror or error})") from error
+        raise FolderError(f"-o: {path} cannot be written ({error.strerror or error})") from error
     except NotImplementedError:
         pass
     try:

@@ -8,64 +8,49 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from lightning_modules.cli.errors import InputError, UsageError
+from lightning_modules.cli.errors import InputError
 from spikekit.arguments import one_line
 
 _A_MOMENT = 0.2  # seconds
 
 
-def make_parts(typed: Sequence[str], folder: Path, precision: str, jobs: int | None) -> None:
-    """Make all pictures of a recording, in as many parts as are made at once.
-
-    Args:
-        typed: verb and arguments of ``lightning predict``.
-        folder: of the pictures, under the same path for all nodes.
-        precision: the same for all of them, whatever each would choose.
-        jobs: parts at once; as many as there are GPUs, or else nodes, if ``None``.
-
-    Raises:
-        UsageError: a ``--budget``, which every node would measure for itself.
-        InputError: Ray is not installed, or a part failed.
-    """
-    from lightning_modules.cli.arguments import options  # takes torch, which the cluster runs this module without
-
-    if any(option == "--budget" for _, option, _ in options(typed)):
-        raise UsageError("--engine ray: expected --speed or --model.weights, got --budget, which differs by node")
-    if find_spec("ray") is None:
-        raise InputError("predict: --engine ray: Ray is not installed; pip install '.[ray]' in a clone brings it")
-    quiet = ["--engine", "local", "--trainer.enable_progress_bar", "false", "--trainer.precision", precision]
-    logs: list[Path] = []
-
-    def commands(count: int) -> dict[Path, list[str]]:
-        logs.extend(folder.absolute() / f"part_{n}_of_{count}.log" for n in range(1, count + 1))
-        words = ["-m", "lightning_modules.recording_part", *typed, *quiet]
-        return {log: [*words, "--part", f"{n}/{count}"] for n, log in enumerate(logs, 1)}
-
-    for ended in run_commands_on_ray(commands, jobs):
-        for log, reason in ended.items():
-            if reason is not None:
-                raise InputError(f"{log}: {reason}")
-            print(f"{log.stem.replace('_', ' ')} is made", flush=True)
-    for log in logs:
-        log.unlink(missing_ok=True)
-
-
 def run_commands_on_ray(
     commands: Callable[[int], dict[Path, Sequence[str]]], jobs: int | None
 ) -> Iterator[dict[Path, str | None]]:
-    """Run Python on the Ray cluster that ``RAY_ADDRESS`` names or that runs here, else on a Ray of this machine's own.
-
-    It repeatedly yields the commands that ended, with the reason of a failure or ``None``.
+    """Run Python in processes of its own on a Ray cluster, as :func:`calls_on_ray` says.
 
     Args:
         commands: given how many run at once, the arguments of Python by the file that a command's output goes to.
         jobs: commands at once; as many as there are GPUs, or else nodes, if ``None``.
     """
-    import ray
+
+    def calls(count: int) -> dict[Path, tuple[Any, ...]]:
+        return {log: (_run_to_end, log, words, os.getcwd()) for log, words in commands(count).items()}
+
+    return calls_on_ray(calls, jobs)
+
+
+def calls_on_ray(
+    calls: Callable[[int], dict[Any, tuple[Any, ...]]], jobs: int | None
+) -> Iterator[dict[Any, str | None]]:
+    """Call functions on the Ray cluster that ``RAY_ADDRESS`` names or that runs here, else on this machine's own.
+
+    It repeatedly yields the names of the calls that ended, with the reason of a failure: what was returned, or raised.
+
+    Args:
+        calls: given how many run at once, functions and their arguments by name.
+        jobs: calls at once; as many as there are GPUs, or else nodes, if ``None``.
+
+    Raises:
+        InputError: Ray is not installed, or does not start.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        raise InputError("--engine ray: Ray is not installed; pip install 'spikekit[ray]' brings it") from error
 
     try:
         ray.init(log_to_driver=False, include_dashboard=False, logging_level="ERROR")
@@ -75,8 +60,8 @@ def run_commands_on_ray(
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         share = _share(nodes, jobs)
         at_once = jobs or int(sum(node.get("GPU", 0) for node in nodes)) or len(nodes)
-        task = ray.remote(max_retries=0, **share)(_run_to_end)
-        running = {task.remote(log, words, os.getcwd()): log for log, words in commands(at_once).items()}
+        remote = ray.remote(max_retries=0, **share)
+        running = {remote(call).remote(*given): name for name, (call, *given) in calls(at_once).items()}
         while running:
             done, _ = ray.wait(list(running), timeout=_A_MOMENT)
             yield {running.pop(reference): _outcome(ray, reference) for reference in done}
@@ -115,6 +100,8 @@ def _run_to_end(log: Path, words: Sequence[str], there: str) -> str | None:
 def _outcome(ray: Any, reference: Any) -> str | None:
     try:
         return ray.get(reference)
+    except ray.exceptions.RayTaskError as error:
+        return one_line(error.cause)
     except ray.exceptions.RayError as error:
         return f"Ray: {str(error).strip().splitlines()[0]}"
 

@@ -1,7 +1,6 @@
 """Clips to train on, to judge by, and to reconstruct."""
 
 from lightning_modules.data.films import FilmClips, FilmScenes
-from lightning_modules.data.recording import Recording, RecordingClips
 from lightning_modules.data.stills import StillClips, StillScenes
 
-__all__ = ["FilmClips", "FilmScenes", "Recording", "RecordingClips", "StillClips", "StillScenes"]
+__all__ = ["FilmClips", "FilmScenes", "StillClips", "StillScenes"]

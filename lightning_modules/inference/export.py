@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lightning_modules.networks import NETWORKS, ClassicalDecoder, Network, RecurrentCSCSR, TwoSpanCSCSR
+from lightning_modules.networks import NETWORKS, ClassicalDecoder, Network, RecurrentCSCSR
 from lightning_modules.storage.pretrained import read_weights
 from spikekit.io.whole_file import whole_file
 
@@ -23,7 +23,7 @@ FORMATS = {"torch": ".pt2", "onnx": ".onnx"}
 OPSET = 20
 
 #: networks that have no weights of their own, by name
-WITHOUT_WEIGHTS = {kind.__name__: kind for kind in (ClassicalDecoder, TwoSpanCSCSR)}
+WITHOUT_WEIGHTS = {ClassicalDecoder.__name__: ClassicalDecoder}
 
 _TRACED = 32, 44  # sensor pixels, of the clip that the network is followed on
 _SIZES = (32, 44), (20, 16), (24, 48)

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
-from itertools import count
+from itertools import count, islice, pairwise
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from lightning_modules.data.clips_around import clips_around, film_groups
-from lightning_modules.inference.film_pictures import FilmPictures
-from lightning_modules.inference.film_reader import check_future
-from lightning_modules.networks import Network
+from lightning_modules.inference.clips import clips_around, film_groups
+from lightning_modules.inference.predict import predict
+from lightning_modules.inference.tiles import TILE, Box, reach, tiled
+from lightning_modules.networks import Network, RecurrentCSCSR
+from lightning_modules.networks.recurrent_cscsr import read_forward, read_from_end
+from spikekit import flow_warp, linear_motion, upsample_flow
 from spikekit.check import check_planes, check_positive, check_whole
 from spikekit.io.recording import white_rate
 
@@ -48,11 +51,8 @@ def film(
         millisecond at 20 kHz; with chunks of c clocks up to c - 1 more, and by the time that the network takes. The
         first shows clock N // 2. N frames and the present chunk are held, however long the stream.
 
-        A :class:`lightning_modules.networks.RecurrentCSCSR` carries on what it knows of the key frame before. With a
-        ``future`` it makes pictures in groups of ``future + 1``, when the last of them has come: they are up to
-        ``future * every`` clocks later, and better. A group is held meanwhile. With ``interpolated`` pictures between
-        two of the network's, a group has ``interpolated + 1`` times as many pictures and ends with one of the
-        network's. See :class:`lightning_modules.inference.film_pictures.FilmPictures`.
+        With a ``future`` or ``interpolated`` pictures they come in groups, see :class:`FilmMaker`: a picture is then
+        up to ``(future + 1) * (interpolated + 1) - 1`` pictures later, and the group is held meanwhile.
 
         White is the same in all pictures: ``white``, or else what 99.9 % of the pixels of the first clip do not exceed.
 
@@ -61,20 +61,17 @@ def film(
         chunks: spikes (T, H, W) of any lengths, such as :func:`spikekit.iter_spikes` reads with a ``chunk``; they begin
             with the network's Bayer phase.
         every: clocks between two pictures.
-        future: key frames that a picture may wait for.
-        interpolated: pictures between two that the network makes; these are moved there along the motion.
+        future: see :class:`FilmMaker`.
+        interpolated: likewise.
         white: spikes a clock of a pixel that is shown white.
-        how: ``tile``, ``psnr_tolerance``, ``self_ensemble`` and ``static`` of
-            :func:`lightning_modules.inference.predict.predict`; a network that carries on takes ``tile`` and
-            ``static``.
+        how: ``static``, and more arguments of :class:`FilmMaker`.
 
     Returns:
         An iterator over pictures.
 
     Raises:
         TypeError: ``white`` is not a number; when iterated, a chunk that is not a tensor of real numbers.
-        ValueError: an argument is out of range, or a ``future`` for a network that takes every clip by itself; when
-            iterated, a chunk of another shape.
+        ValueError: an argument is out of range; when iterated, a chunk of another shape.
 
     Example:
         >>> import torch
@@ -84,24 +81,23 @@ def film(
         [(20, torch.Size([3, 16, 20])), (40, torch.Size([3, 16, 20])), (60, torch.Size([3, 16, 20]))]
     """
     check_whole("every", every)
-    check_future(network, future)
     if white is not None:
         check_positive("white", white)
     static = how.pop("static", False)
-    pictures = FilmPictures(network, interpolated, **how)
+    maker = FilmMaker(network, future, interpolated, **how)
     clips = clips_around(count(network.frames // 2, every), network.frames, _frames(chunks))
-    groups = film_groups(clips, future, interpolated)
-    return _pictures(network.settings["alpha"], groups, white, partial(pictures, static=static))
+    return _pictures(maker, film_groups(clips, future, interpolated), white, static)
 
 
 def _pictures(
-    alpha: float, groups: Iterable[list[tuple[int, Tensor]]], white: float | None, run: Callable[..., Tensor]
+    maker: FilmMaker, groups: Iterable[list[tuple[int, Tensor]]], white: float | None, static: bool
 ) -> Iterator[FilmFrame]:
     for group in groups:
         clocks, clips = [clock for clock, _ in group], torch.stack([clip for _, clip in group])
         if white is None:
             white = white_rate(clips[0].float().mean(0).cpu())
-        for clock, rgb in zip(clocks, run(clips, clocks, exposure=alpha / white), strict=True):
+        pictures = maker(clips, clocks, static, maker.network.settings["alpha"] / white)
+        for clock, rgb in zip(clocks, pictures, strict=True):
             yield FilmFrame(clock, rgb.clone() if len(group) > 1 else rgb)  # who keeps one does not keep the group
 
 
@@ -111,3 +107,228 @@ def _frames(chunks: Iterable[Tensor]) -> Iterator[Tensor]:
         if chunk.ndim != 3:
             raise ValueError(f"chunks: expected (T, H, W), got {tuple(chunk.shape)}")
         yield from chunk
+
+
+class _Made(NamedTuple):
+    """A picture that the network made, and the motion of its clip."""
+
+    clock: int
+    rgb: Tensor
+    flow: Tensor | None
+
+
+class _Known(NamedTuple):
+    """The state of a :class:`RecurrentCSCSR` at a key frame."""
+
+    clock: int
+    state: Tensor
+
+
+class FilmMaker:
+    r"""Makes the pictures of a film, group by group, and keeps what the next group needs.
+
+    A :class:`lightning_modules.networks.RecurrentCSCSR` carries the state of a key frame on to the next. With a
+    ``future``, groups have ``future + 1`` key frames, which are read from their end first: all but the last then know
+    the one behind them as well. A neighbour helps if it is at most a clip's length away; further away nothing is known
+    of the motion. So a group may come from any other place of the film.
+
+    .. math:: I_n(x) = (1 - a) \, I_l(x + o_l(x)) + a \, I_r(x + o_r(x)), \quad a = \frac{n - l}{r - l}
+
+    is an interpolated picture between those of the clocks l and r, where the offsets o follow the motion of both clips,
+    taken together with the same shares. What comes from outside of one of the two is taken from the other alone.
+
+    Convention:
+        Of every ``interpolated + 1`` clips of a group the network sees the last, and the last of the group. Where the
+        picture before the group is more than a clip's length away, it sees the first as well.
+
+        Where frames are larger than a tile, the state of a key frame waits in half precision: 0.27 GiB at x4 and
+        1000 x 1000 sensor pixels. Pictures change by 0.03 of an 8-bit step (rms).
+
+    Args:
+        network: any of :mod:`lightning_modules.networks`.
+        future: key frames that a picture may wait for, of a network that carries a state on.
+        interpolated: pictures between two that the network makes.
+        tile: side of the tiles in sensor pixels, 0 for none.
+        how: ``psnr_tolerance``, ``self_ensemble`` and ``done`` of :func:`lightning_modules.inference.predict.predict`;
+            a network that carries a state on takes none of them.
+
+    Raises:
+        ValueError: a ``future`` for a network that takes every clip by itself; ``interpolated`` pictures by one that
+            estimates no motion; a negative number of either; what such a network does not take.
+
+    Example:
+        >>> from lightning_modules.networks import CSCSR
+        >>> network = CSCSR(scale=2, width=8, representation_width=8, features=1, stages=1, end_blocks=1)
+        >>> maker = FilmMaker(network, interpolated=1)
+        >>> maker(torch.zeros(2, 41, 12, 10), [20, 23]).shape
+        torch.Size([2, 3, 24, 20])
+    """
+
+    def __init__(self, network: Network, future: int = 0, interpolated: int = 0, tile: int = TILE, **how: Any) -> None:
+        kind = type(network).__name__
+        self.carries_on = isinstance(network, RecurrentCSCSR)
+        for name, number in (("future", future), ("interpolated", interpolated)):
+            if isinstance(number, bool) or not isinstance(number, int) or number < 0:
+                raise ValueError(f"{name}: expected a whole number >= 0, got {number!r}")
+        if future and not self.carries_on:
+            raise ValueError(f"future: expected 0, as {kind} takes every clip by itself, got {future}")
+        if interpolated and not network.takes_flow:
+            raise ValueError(f"interpolated: expected 0, as {kind} estimates no motion of a clip, got {interpolated}")
+        if self.carries_on and (how.get("psnr_tolerance") or how.get("self_ensemble", 1) > 1):
+            raise ValueError(f"psnr_tolerance, self_ensemble: expected 0 and 1 for {kind}, got {how}")
+        self.network, self.future, self.interpolated, self.tile, self._how = network, future, interpolated, tile, how
+        self._last: _Made | None = None
+        self._known: _Known | None = None
+
+    @property
+    def warm_up(self) -> int:
+        """On how many pictures before a group its pictures depend, as far as one can see."""
+        return max(self.network.warm_up, min(self.interpolated, 1)) * (self.interpolated + 1)
+
+    @torch.no_grad()
+    def __call__(
+        self, spikes: Tensor, clocks: Sequence[int], static: bool = False, exposure: float | Tensor = 1.0
+    ) -> Tensor:
+        """Return the pictures of clips that follow each other.
+
+        Args:
+            spikes: (G, N, H, W).
+            clocks: number of the frame in the middle of each, increasing.
+            static: nothing moves.
+            exposure: what pictures are multiplied by before they are clamped, a number or (G, 1, 1, 1).
+
+        Returns:
+            rgb (G, 3, s H, s W), in [0, 1].
+
+        Raises:
+            ValueError: as many clocks as clips, increasing ones, were expected.
+        """
+        if len(clocks) != len(spikes) or any(after <= before for before, after in pairwise(clocks)):
+            raise ValueError(f"clocks: expected {len(spikes)} increasing ones, got {list(clocks)}")
+        if not self.interpolated:
+            return self._made(spikes, list(clocks), None, static, exposure)
+        every, total = self.interpolated + 1, len(clocks)
+        see = partial(self._see, spikes, clocks, static, exposure)
+        known = [self._last]
+        if self._last is None or clocks[0] - self._last.clock > self.network.frames:
+            known = see([0])
+        keys = {*range(every - 1, total, every), total - 1}
+        known += see(sorted(n for n in keys if clocks[n] > known[0].clock))
+        self._last = known[-1]
+        pictures = {made.clock: made.rgb for made in known}
+        for left, right in pairwise(known):
+            between = [clock for clock in clocks if left.clock < clock < right.clock]
+            pictures |= {clock: self._interpolate(left, right, clock) for clock in between}
+        return torch.cat([pictures[clock] for clock in clocks])
+
+    def _made(
+        self, spikes: Tensor, clocks: list[int], flow: Tensor | None, static: bool, exposure: float | Tensor
+    ) -> Tensor:
+        """The network's pictures of clips."""
+        if self.carries_on:
+            return self._carried_on(spikes, clocks, flow, static).mul_(exposure).clamp_(0, 1)
+        return predict(self.network, spikes, flow, static, exposure=exposure, tile=self.tile, **self._how)
+
+    def _see(
+        self, spikes: Tensor, clocks: Sequence[int], static: bool, exposure: float | Tensor, keys: list[int]
+    ) -> list[_Made]:
+        """The network's pictures of some clips of a group, and their motion."""
+        if not keys:
+            return []
+        flows = [self.network.resolve_flow(spikes[n : n + 1], None, static) for n in keys]
+        flow = None if flows[0] is None else torch.cat(flows)
+        light = exposure[keys] if isinstance(exposure, Tensor) and exposure.ndim else exposure
+        at = [clocks[n] for n in keys]
+        rgb = self._made(spikes[keys], at, flow, flow is None, light)
+        # a single motion for all colours
+        joint = [one.mean(dim=1) if one is not None and one.ndim == 6 else one for one in flows]
+        return list(map(_Made, at, rgb.split(1), joint))
+
+    def _interpolate(self, left: _Made, right: _Made, clock: int) -> Tensor:
+        share = (clock - left.clock) / (right.clock - left.clock)
+        if left.flow is None or right.flow is None:
+            return torch.lerp(left.rgb, right.rgb, share)
+        scale, whole = self.network.scale, Box(0, 0, *left.flow.shape[-2:])
+        first, middle, last = self.network.flow_times
+        to_first, to_last = torch.lerp(left.flow, right.flow, share).unbind(1)
+        times = [middle + made.clock - clock for made in (left, right)]
+        offsets = linear_motion(to_first, to_last, times, first=first, middle=middle, last=last)
+
+        def run(box: Box) -> Tensor:
+            near = box.grown(reach(offsets, box, whole, 2), whole)
+            total = weights = 0.0
+            for made, offset, weight in zip((left, right), offsets.unbind(1), (1 - share, share), strict=True):
+                flow = upsample_flow(near.of(offset), scale)
+                inside = _ends_inside(flow, near, whole, scale)
+                weight = weight * torch.where(inside, 1.0, 1e-6)
+                total = total + weight * flow_warp(near.of(made.rgb, scale=scale), flow.to(made.rgb))
+                weights = weights + weight
+            return box.of(total / weights, near[:2], scale)
+
+        return tiled(run, whole, self.tile, lambda _: 0, scale)
+
+    def _carried_on(self, spikes: Tensor, clocks: list[int], flow: Tensor | None, static: bool) -> Tensor:
+        """Pictures of key frames that know their neighbours, (G, 3, s H, s W), not clamped."""
+        network, whole = self.network, Box(0, 0, *spikes.shape[-2:])
+        clips = spikes.split(1)
+        given = [None] * len(clips) if flow is None else flow.split(1)
+        flows = [network.resolve_flow(clip, way, static) for clip, way in zip(clips, given, strict=True)]
+        features = {n: self._features(clip, flows[n], whole) for n, clip in enumerate(clips)}
+
+        def meet(n: int, *around: _Known | None) -> _Known:
+            neighbors = []
+            for known in around:
+                away = known.clock - clocks[n] if known else math.inf
+                if abs(away) <= network.frames:
+                    neighbors.append((known.state, None if flows[n] is None else network.flow_to(flows[n], away)))
+            return _Known(clocks[n], self._advance(features[n], clips[n], neighbors, whole))
+
+        group = range(len(clips))
+        behind = list(islice(read_from_end(group, meet), len(group) - 1))
+        rgb = None
+        for n, known in enumerate(read_forward(group, meet, self._known, behind)):
+            self._known = known
+            del features[n]  # of a large film what a group remembers fills the memory
+            picture = network.picture(known.state)
+            if rgb is None:
+                rgb = picture.new_empty(len(clips), *picture.shape[1:])
+            rgb[n] = picture[0]
+        return rgb.to(self._dtype)
+
+    @property
+    def _dtype(self) -> torch.dtype:
+        return self.network.reconstruction.rgb.weight.dtype
+
+    def _features(self, spikes: Tensor, flow: Tensor | None, whole: Box) -> Tensor:
+        def run(outer: Box) -> Tensor:
+            features = self.network.features(outer.of(spikes), None if flow is None else outer.of(flow))
+            return self._halved(features, whole)
+
+        return tiled(run, whole, self.tile, lambda box: reach(flow, box, whole, self.network.halo))
+
+    def _advance(
+        self, features: Tensor, spikes: Tensor, neighbors: list[tuple[Tensor, Tensor | None]], whole: Box
+    ) -> Tensor:
+        def moved(outer: Box, state: Tensor, way: Tensor | None) -> Tensor:
+            near = outer.grown(reach(way, outer, whole, 2), whole)
+            state = self.network.moved(near.of(state).to(self._dtype), None if way is None else near.of(way))
+            return outer.of(state, near[:2])
+
+        def run(outer: Box) -> Tensor:
+            around = [moved(outer, *neighbor) for neighbor in neighbors]
+            state = self.network.advance(outer.of(features).to(self._dtype), outer.of(spikes), around)
+            return self._halved(state, whole)
+
+        return tiled(run, whole, self.tile, lambda _: self.network.halo)
+
+    def _halved(self, planes: Tensor, whole: Box) -> Tensor:
+        """What waits for its neighbours; where frames are larger than a tile, in half precision: half the memory."""
+        large = 0 < self.tile < max(whole.bottom, whole.right)
+        return planes.half() if large and planes.dtype == torch.float32 else planes
+
+
+def _ends_inside(flow: Tensor, near: Box, whole: Box, scale: int) -> Tensor:
+    """Where a flow (1, 2, h, w) of a box ends inside the picture, (1, 1, h, w)."""
+    rows, columns = (torch.arange(side, device=flow.device) for side in flow.shape[-2:])
+    x, y = flow[:, 0] + columns + scale * near.left, flow[:, 1] + rows[:, None] + scale * near.top
+    return ((x >= 0) & (x <= scale * whole.right - 1) & (y >= 0) & (y <= scale * whole.bottom - 1)).unsqueeze(1)

@@ -13,19 +13,16 @@ from typing import Any, get_args, get_type_hints
 import torch
 
 from lightning_modules import motion as estimators
+from lightning_modules.inference._open import find_model, list_models
 from lightning_modules.inference.predict import predict
 from lightning_modules.inference.tiles import FAR, TILE
-from lightning_modules.networks import CSCSR, ClassicalDecoder, Network, TwoSpanCSCSR
-from lightning_modules.storage.shipped import find_shipped
+from lightning_modules.networks import CSCSR, ClassicalDecoder, Network
 from spikekit.arguments import one_line
 from spikekit.timing import timer_of
 
 _FOLDER = Path(__file__).parents[1] / "weights"
 
 _DECODER = "ClassicalDecoder"
-
-#: networks that are asked for by name, as they need no weights of their own
-_NETWORKS = {_DECODER: ClassicalDecoder, "TwoSpanCSCSR": TwoSpanCSCSR}
 
 #: spike frames of a clip, where nothing else is said
 _FRAMES = 41
@@ -58,7 +55,7 @@ class Preset:
 
     Args:
         weights: those of a network: a name of the package, or a file.
-        network: instead of weights, ``"ClassicalDecoder"`` or ``"TwoSpanCSCSR"``.
+        network: instead of weights, ``"ClassicalDecoder"``.
         method: of the decoder, ``"tfi"`` or ``"tfp"``.
         window: of the decoder.
         order: of the decoder.
@@ -72,7 +69,7 @@ class Preset:
         psnr_tolerance: in dB, see there.
         self_ensemble: number of views, see there.
         interpolated: pictures of a film between two that the network makes, see
-            :class:`lightning_modules.inference.film_pictures.FilmPictures`.
+            :class:`lightning_modules.inference.film.FilmMaker`.
         precision: of the Trainer, such as ``"bf16-mixed"``.
 
     Raises:
@@ -105,9 +102,8 @@ class Preset:
     precision: str | None = None
 
     def __post_init__(self) -> None:
-        if self.network not in (None, *_NETWORKS):
-            named = " or ".join(map(repr, _NETWORKS))
-            raise ValueError(f"network: expected {named}, or weights of another, got {self.network!r}")
+        if self.network not in (None, _DECODER):
+            raise ValueError(f"network: expected {_DECODER!r}, or weights of another, got {self.network!r}")
         if self.network and self.weights:
             raise ValueError(f"weights: expected none with network={self.network!r}, got {self.weights!r}")
         for name in self.given("method", "window", "order"):
@@ -128,8 +124,8 @@ class Preset:
     @property
     def clip(self) -> int:
         """How many spike frames a clip has; that of a file of weights which is not the package's is taken for 41."""
-        shipped = find_shipped(self.weights or "")
-        return (shipped and shipped.frames) or self.frames or _FRAMES
+        model = find_model(self.weights or "")
+        return (model and model.frames) or self.frames or _FRAMES
 
     @classmethod
     def columns(cls) -> list[str]:
@@ -169,7 +165,7 @@ class Preset:
             ValueError: neither weights nor a network, weights of something else, or an unknown estimator.
         """
         if self.network is not None:
-            return _NETWORKS[self.network](**self.given("method", "window", "order", "scale", "frames")).eval()
+            return ClassicalDecoder(**self.given("method", "window", "order", "scale", "frames")).eval()
         if self.weights is None:
             raise ValueError(f"preset: expected weights or the name of a network, got {self}")
         return CSCSR.from_pretrained(self.weights, self._estimator(), **self.given("steps"))
@@ -214,7 +210,12 @@ class Choice:
 
 
 def choices(
-    scale: int, size: tuple[int, int], film: bool = False, frames: int = _FRAMES, white: float = 0.4
+    scale: int,
+    size: tuple[int, int],
+    film: bool = False,
+    frames: int = _FRAMES,
+    white: float = 0.4,
+    noisy: bool = False,
 ) -> list[Choice]:
     """Return the presets of the table for a scale that leave the precision as it is, fastest first.
 
@@ -232,35 +233,48 @@ def choices(
         frames: spike frames that a clip may have; presets that need more are left out.
         white: spikes a frame of a white pixel; below 0.2 the table is that of scenes at 0.1, where longer clips are
             worth more, if the package has one for the scale.
+        noisy: whether the sensor may be noisy: of the table only the rows of networks of which the package has weights
+            that were trained for noise, with these weights; all rows, where it has none for the scale.
 
     Raises:
         ValueError: no table comes with the package for this scale.
     """
     rows = _table(scale, film, white)
+    twins = _for_noise(scale) if noisy else {}
     frame = min(float(row["mib"]) for row in rows)
     found = []
     for row in rows:
         preset = Preset.read(row)
         if preset.precision is not None or preset.tile == 0 or not (preset.weights or preset.network):
             continue
-        if preset.clip > frames:
+        if preset.clip > frames or (twins and preset.weights not in twins):
             continue
+        preset = replace(preset, weights=twins.get(preset.weights, preset.weights))
         measured = int(row["height"]) * int(row["width"])
         pixels = size[0] * size[1] / measured
-        shipped = find_shipped(preset.weights or "")
-        halo = shipped.halo if shipped else CSCSR.halo
-        in_tile = min(pixels, ((preset.tile or TILE) + 2 * (halo + FAR)) ** 2 / measured)
+        model = find_model(preset.weights or "")
+        margin = model.margin if model else CSCSR.halo
+        in_tile = min(pixels, ((preset.tile or TILE) + 2 * (margin + FAR)) ** 2 / measured)
         psnr, ratio, mib = (float(row[name]) for name in ("psnr", "ratio", "mib"))
         moves = preset.motion != "ZeroFlow" and preset.network != _DECODER
         everywhere = frame + moves * _MOTION * measured
         mib = everywhere * pixels + (mib - everywhere) * in_tile
         ms = ratio * float(_reference(rows)["ms"]) * pixels
-        found.append(Choice(row["setting"], preset, psnr, 0.0, ms, mib))
+        name = row["setting"].replace(row["weights"], preset.weights) if preset.weights else row["setting"]
+        found.append(Choice(name, preset, psnr, 0.0, ms, mib))
     if not found:
         raise ValueError(f"{_FOLDER / f'x{scale}.csv'}: expected presets with tiles, got none")
     best = max(choice.psnr for choice in found)
     found = [replace(choice, below=best - choice.psnr) for choice in found]
     return sorted(found, key=lambda choice: choice.ms)
+
+
+def _for_noise(scale: int) -> dict[str, str]:
+    """Return the names of weights that were trained for noise, by those of the same network that were not."""
+    models = list_models(scale)
+    noisy = {(one.size, one.frames, one.film, one.pattern): one.name for one in models if one.noise}
+    keys = {one.name: (one.size, one.frames, one.film, one.pattern) for one in models if not one.noise}
+    return {name: noisy[key] for name, key in keys.items() if key in noisy}
 
 
 def _table(scale: int, film: bool = False, white: float = 0.4) -> list[dict[str, str]]:
@@ -327,6 +341,7 @@ def choose(
     film: bool = False,
     frames: int = _FRAMES,
     white: float = 0.4,
+    noisy: bool = False,
 ) -> Choice:
     """Choose the best preset for a speed or a budget.
 
@@ -343,6 +358,7 @@ def choose(
         film: whether frames are made one after the other, see :func:`choices`.
         frames: spike frames that a clip may have; 101 or more let longer clips be chosen, where that pays.
         white: spikes a frame of a white pixel, see :func:`choices`.
+        noisy: whether the sensor may be noisy, see there.
 
     Raises:
         ValueError: an unknown speed, a budget that cannot be read or that nothing fits, a scale without a table.
@@ -357,7 +373,7 @@ def choose(
     """
     if (speed is None) == (budget is None):
         raise ValueError(f"speed, budget: expected one of them, got {speed!r} and {budget!r}")
-    found = choices(scale, size, film, frames, white)
+    found = choices(scale, size, film, frames, white, noisy)
     if speed is not None:
         if speed not in SPEEDS:
             raise ValueError(f"speed: expected one of {', '.join(SPEEDS)}, got {speed!r}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Literal, Self
 
 import torch
@@ -11,10 +11,9 @@ import torch.nn.functional as F
 from pytorch_lightning.cli import LRSchedulerCallable, OptimizerCallable
 from torch import Tensor, nn
 
-from lightning_modules.data.clips_around import film_groups
 from lightning_modules.data.margin import trim
-from lightning_modules.inference.film_pictures import FilmPictures, check_interpolated
-from lightning_modules.inference.film_reader import check_future
+from lightning_modules.inference.clips import film_groups
+from lightning_modules.inference.film import FilmMaker
 from lightning_modules.inference.predict import predict
 from lightning_modules.inference.presets import Preset, choose
 from lightning_modules.inference.self_ensemble import COUNTS
@@ -113,16 +112,9 @@ class SuperResolution(Learner):
         self.psnr_tolerance = psnr_tolerance
         self.self_ensemble = self_ensemble
         self.flow = flow
-        self.future = check_future(network, future)
-        self.interpolated = check_interpolated(network, interpolated)
-        self.done: Callable[[float], object] | None = None  # told how far a picture is, see predict
-        self._film_pictures: FilmPictures | None = None
+        self.future, self.interpolated = future, interpolated
+        FilmMaker(network, future, interpolated, **self._how)  # what is wrong with them is said at once
         self._told = ["alpha", "noise"] if network.settings.get("noise") else ["alpha"]  # what it hears of the camera
-        if isinstance(network, RecurrentCSCSR) and (psnr_tolerance or self_ensemble > 1):
-            got = f"{psnr_tolerance} and {self_ensemble}"
-            raise ValueError(
-                f"psnr_tolerance, self_ensemble: expected 0 and 1 for a network that makes films, got {got}"
-            )
         parts = dict(network.named_modules())
         for name in frozen:
             if name not in parts:
@@ -194,8 +186,11 @@ class SuperResolution(Learner):
         The motion is ``flow``, (B, 2, 2, H, W), none with ``static``, or else what the network's estimator sees. The
         picture is multiplied by ``exposure``.
         """
-        how = {"tile": self.tile, "psnr_tolerance": self.psnr_tolerance, "self_ensemble": self.self_ensemble}
-        return predict(self.network, spikes, flow, static, exposure=exposure, done=self.done, **how)
+        return predict(self.network, spikes, flow, static, exposure=exposure, **self._how)
+
+    @property
+    def _how(self) -> dict[str, Any]:
+        return {"tile": self.tile, "psnr_tolerance": self.psnr_tolerance, "self_ensemble": self.self_ensemble}
 
     def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:  # noqa: D102
         batch, flow = self._with_motion(batch)
@@ -265,37 +260,16 @@ class SuperResolution(Learner):
     def _makes_films(self) -> bool:
         return isinstance(self.network, RecurrentCSCSR) or self.interpolated > 0
 
-    @property
-    def film_warm_up(self) -> int:
-        """On how many pictures before a group of a film it depends, as far as one can see."""
-        keys = max(self.network.warm_up, min(self.interpolated, 1))
-        return keys * (self.interpolated + 1)
-
-    def _new_film(self) -> FilmPictures:
-        how = {"tile": self.tile, "psnr_tolerance": self.psnr_tolerance, "self_ensemble": self.self_ensemble}
-        if isinstance(self.network, RecurrentCSCSR):
-            how = {"tile": self.tile}
-        else:
-            how["done"] = lambda share: self.done(share) if self.done else None  # which begins with every picture
-        return FilmPictures(self.network, self.interpolated, **how)
-
     def _film(self, clips: Tensor, every: int) -> Tensor:
         """Pictures (K, 3, s H, s W) of clips (K, N, H, W), every so many clocks."""
-        pictures = self._new_film()
+        pictures = FilmMaker(self.network, self.future, self.interpolated, **self._how)
         groups = film_groups(range(len(clips)), self.future, self.interpolated)
         return torch.cat([pictures(clips[group], [every * n for n in group]) for group in groups])
 
     def predict_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:
         """Return rgb (B, 3, s H, s W), clamped to [0, 1]; a rate of ``white``, where it is known, is 1, else alpha."""
         exposure = self.network.settings["alpha"] / batch["white"][:, None, None, None] if "white" in batch else 1.0
-        if self._film_pictures is None:
-            return self(batch["spikes"], exposure=exposure)
-        return self._film_pictures(batch["spikes"], batch["frame"].tolist(), exposure=exposure)
-
-    def on_predict_start(self) -> None:
-        """Begin a film."""
-        if self._makes_films:
-            self._film_pictures = self._new_film()
+        return self(batch["spikes"], exposure=exposure)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:  # noqa: D102
         super().on_load_checkpoint(checkpoint)

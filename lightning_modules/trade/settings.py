@@ -63,7 +63,7 @@ _VARIANTS = [
 ]
 
 #: networks that two sets of weights make together
-_TOGETHER = [Preset(network="TwoSpanCSCSR", scale=4, frames=101)]
+_TOGETHER: list[Preset] = []
 
 _SPIKE2FLOW = {"motion": "Spike2Flow", "motion_weights": "spike2flow"}
 _LEARNED = [("Spike2Flow", _SPIKE2FLOW), ("Spike2Flow, once", {**_SPIKE2FLOW, "motion_iterations": 1})]

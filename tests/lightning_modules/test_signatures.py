@@ -4,7 +4,7 @@ from inspect import Parameter, signature
 
 import pytest
 
-from lightning_modules.data import FilmScenes, Recording, RecordingClips, StillClips, StillScenes
+from lightning_modules.data import FilmScenes, StillClips, StillScenes
 from lightning_modules.data.films import ClipRecipe
 from lightning_modules.signatures import takes
 
@@ -48,7 +48,6 @@ def test_what_is_passed_on_in_place_keeps_its_place():
     [
         (StillScenes, StillClips, {"pictures", "augment", "textures", "length"}, ["root", "val_root"]),
         (FilmScenes, ClipRecipe, set(), ["root"]),
-        (Recording, RecordingClips, set(), ["path", "height", "width"]),
     ],
 )
 def test_data_take_the_arguments_of_their_clips(scenes, clips, without, first):

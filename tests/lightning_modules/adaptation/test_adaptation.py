@@ -12,7 +12,8 @@ from lightning_modules.adaptation import learn as learning
 from lightning_modules.adaptation import lessons as making
 from lightning_modules.adaptation.learn import learn, likeness
 from lightning_modules.adaptation.lessons import HELD_OUT, Lessons, chosen_frames, make_lessons
-from lightning_modules.data.recording import RecordingClips
+from lightning_modules.inference._open import open_recording
+from lightning_modules.inference.clips import RecordingClips
 from lightning_modules.networks import CSCSR
 from lightning_modules.storage.shipped import find_shipped
 from spikekit import Calibration, simulate_spikes, write_calibration, write_spikes
@@ -34,7 +35,7 @@ def recording(tmp_path_factory):
 @pytest.fixture(scope="module")
 def lessons(recording):
     student, teacher = CSCSR.from_pretrained("cscsr_tiny_x4").eval(), CSCSR.from_pretrained("cscsr_small_x4").eval()
-    return make_lessons(student, teacher, RecordingClips(str(recording), pattern="RGGB", frames=41))
+    return make_lessons(student, teacher, RecordingClips(open_recording(recording, pattern="RGGB"), 41))
 
 
 @pytest.mark.parametrize(("total", "frames"), [(123, 41), (124, 41), (303, 101), (1000, 101), (20_000, 41)])
@@ -50,7 +51,7 @@ def test_no_clip_that_is_held_out_overlaps_one_that_is_taught(total, frames):
 def test_lessons_are_what_the_student_would_see_where_it_is_the_teacher(recording, monkeypatch):
     monkeypatch.setattr(making, "_SIDE", 20)  # windows, by chance
     student = CSCSR.from_pretrained("cscsr_tiny_x4").eval()
-    clips = RecordingClips(str(recording), pattern="BGGR", frames=51)  # longer than the student's
+    clips = RecordingClips(open_recording(recording, pattern="BGGR"), 51)  # longer than the student's
     assert clips.size == (27, 23)
     brighter = CSCSR.from_pretrained("cscsr_tiny_x4", alpha=0.2).eval()  # half the light is white
     made = make_lessons(student, brighter, clips)
@@ -138,8 +139,7 @@ def test_it_goes_on_where_it_was_interrupted(lessons, tmp_path, monkeypatch):
 
 
 def typed(recording, output, *more):
-    data = ["--data", "Recording", "--data.path", str(recording), "--data.pattern", "RGGB"]
-    return ["adapt", *data, "--model.weights", "cscsr_tiny_x4", "-o", str(output), *more]
+    return ["adapt", str(recording), "--pattern", "RGGB", "--weights", "cscsr_tiny_x4", "-o", str(output), *more]
 
 
 def test_the_command(recording, tmp_path, capsys, monkeypatch):
@@ -149,7 +149,7 @@ def test_the_command(recording, tmp_path, capsys, monkeypatch):
     written = tmp_path / "out" / "adapted.safetensors"
     said = capsys.readouterr().out
     assert "dB from the held-out pictures of cscsr_small_x4 before, " in said
-    assert f"lightning predict --model.weights {written}" in said
+    assert f"lightning predict --weights {written}" in said
     adapted, shipped = CSCSR.from_pretrained(written), CSCSR.from_pretrained("cscsr_tiny_x4")
     assert adapted.settings == shipped.settings
     assert any(not torch.equal(a, b) for a, b in zip(adapted.parameters(), shipped.parameters(), strict=True))
@@ -158,8 +158,7 @@ def test_the_command(recording, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(learning._Patches, "__getitem__", None)
     main(asked)  # nothing is left to learn
     assert written.read_bytes() == first
-    how = ["--data", "Recording", "--data.path", str(recording), "--data.frame", "80", "-o", str(tmp_path / "a.png")]
-    main(["predict", "--model.weights", str(written), *how])
+    main(["predict", str(recording), "--weights", str(written), "--frame", "80", "-o", str(tmp_path / "a.png")])
     assert (tmp_path / "a.png").is_file()
     with pytest.raises(SystemExit, match=r"steps: expected 8 of the adaptation in .*, got 9; -o goes elsewhere"):
         main([*asked[:-1], "9"])
@@ -180,14 +179,13 @@ def test_what_gains_nothing_is_not_kept(recording, tmp_path):
         ),
         (["--teacher", "cscsr_huge_long_x4"], "expected at least 303 frames, 3 clips of 101, got 160"),
         (["--teacher", "ClassicalDecoder"], "--teacher: expected weights, got ClassicalDecoder, which has none"),
-        (["--model.weights", "ClassicalDecoder"], "--model.weights: expected a network that learns"),
+        (["--weights", "ClassicalDecoder"], "--weights: expected a network that learns"),
         (
-            ["--model.weights", "cscsr_large_film_x4"],
-            "--model.weights: expected a network that learns",
+            ["--weights", "cscsr_large_film_x4"],
+            "--weights: expected a network that learns",
         ),
-        (["--model.weights", "TwoSpanCSCSR"], "--model.weights: expected a network that learns"),
         (["-o", "out.safetensors"], "-o: expected a folder, got out.safetensors, which ends like a file"),
-        (["--model.weights", "none"], "none: neither a file of weights nor the name"),
+        (["--weights", "none"], "none: neither a file of weights nor the name"),
     ],
 )
 def test_errors_are_one_line(recording, tmp_path, capsys, more, expected):
@@ -209,8 +207,7 @@ def test_a_recording_that_is_too_short_for_any_teacher(tmp_path):
     [
         ("cscsr_small_x4", 303, None, "cscsr_huge_long_noisy_x4"),
         ("cscsr_small_x4", 302, None, "cscsr_huge_noisy_x4"),
-        ("cscsr_small_x4", 303, 0.0, "cscsr_huge_long_noisy_x4"),  # gains from the scene
-        ("cscsr_small_x4", 303, 0.01, "cscsr_huge_long_x4"),  # in the dark as well
+        ("cscsr_small_x4", 303, 0.01, "cscsr_huge_long_x4"),
         ("cscsr_small_x2", 303, None, "cscsr_huge_x2"),
     ],
 )
@@ -220,7 +217,9 @@ def test_the_teacher_is_the_slowest_for_such_a_sensor(tmp_path, weights, frames,
     if measured is not None:
         planes = torch.ones(6, 6), torch.full((6, 6), measured), torch.zeros(6, 6, dtype=torch.uint8)
         write_calibration(tmp_path / "camera.calibration.safetensors", Calibration(*planes))
-    clips, name = cli.clips_and_teacher({"path": str(path)}, CSCSR.from_pretrained(weights), None)
+    recording = open_recording(path)
+    noisy = recording.calibration is None
+    clips, name = cli.clips_and_teacher(recording, CSCSR.from_pretrained(weights), None, noisy)
     assert name == expected
     assert clips.frames == CSCSR.from_pretrained(expected).frames
 
@@ -239,7 +238,7 @@ def test_what_lies_in_the_folder_is_of_this_adaptation(recording, lessons, tmp_p
     mine, data = tmp_path / "mine.safetensors", tmp_path / "data.npz"
     mine.write_bytes(find_shipped("cscsr_tiny_x4").path.read_bytes())
     data.write_bytes(recording.read_bytes())
-    asked = typed(data, tmp_path / "out", "--teacher", "cscsr_small_x4", "--model.weights", str(mine))
+    asked = typed(data, tmp_path / "out", "--teacher", "cscsr_small_x4", "--weights", str(mine))
     main(asked)
     kept = tmp_path / "out" / "lessons.safetensors"
     whole = kept.read_bytes()
@@ -264,12 +263,3 @@ def test_a_checkpoint_that_no_training_wrote(lessons, tmp_path):
     torch.save({"state_dict": {}}, tmp_path / "last.ckpt")
     with pytest.raises(ValueError, match=r"last\.ckpt: not a checkpoint that training can go on with"):
         learn(CSCSR.from_pretrained("cscsr_tiny_x4").eval(), lessons, 8, tmp_path, enable_progress_bar=False)
-
-
-def test_interrupted(recording, tmp_path, monkeypatch):
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(cli, "make_lessons", stop)
-    with pytest.raises(SystemExit, match="adapt: stopped; the same command goes on"):
-        main(typed(recording, tmp_path, "--teacher", "cscsr_small_x4"))

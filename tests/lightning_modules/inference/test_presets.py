@@ -7,22 +7,16 @@ from itertools import pairwise
 import pytest
 import torch
 
-from lightning_modules.__main__ import main
-from lightning_modules.cli import prediction
-from lightning_modules.cli.arguments import preset_arguments
-from lightning_modules.cli.command import run
-from lightning_modules.cli.rehearsal import Rehearsal
 from lightning_modules.inference import presets as speed
+from lightning_modules.inference._open import find_model
 from lightning_modules.inference.presets import SPEEDS, Choice, Preset, choices, choose, pace
-from lightning_modules.motion import ZeroFlow
-from lightning_modules.networks import CSCSR, ClassicalDecoder, RecurrentCSCSR
-from lightning_modules.tasks.super_resolution import SuperResolution
-from spikekit import Calibration, read_picture, write_calibration, write_spikes
+from lightning_modules.networks import CSCSR, RecurrentCSCSR
+from lightning_modules.storage.pretrained import settings_of
 
 HEADER = ["setting", *Preset.columns(), "psnr", "ratio", "mib", "reference", "height", "width", "failed", "ms"]
 WEIGHTS = {"weights": "tiny.ckpt"}
 DECODER = {"network": "ClassicalDecoder"}
-TWO_SPANS = {"network": "TwoSpanCSCSR", "scale": 4, "frames": 101}
+LONG = {"network": "ClassicalDecoder", "method": "tfp", "window": 33, "scale": 4, "frames": 101}
 ROWS = [
     ("tfi", 25.0, 4, 2, DECODER | {"method": "tfi"}, ""),
     ("all", 30.0, 400, 80, WEIGHTS, ""),
@@ -45,10 +39,8 @@ def _argv(monkeypatch):
 @pytest.fixture(name="table")
 def _table(tmp_path, monkeypatch):
     network = CSCSR(3, width=4, representation_width=4, features=1, stages=1, end_blocks=1)
-    module = SuperResolution(network)
-    content = {"state_dict": module.state_dict()}
-    module.on_save_checkpoint(content)
-    torch.save(content, tmp_path / "tiny.ckpt")
+    state = {f"network.{name}": value for name, value in network.state_dict().items()}
+    torch.save({"state_dict": state, "network": settings_of(network), "motion": {}}, tmp_path / "tiny.ckpt")
     with open(tmp_path / "x3.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, HEADER, restval="")
         writer.writeheader()
@@ -167,7 +159,7 @@ def _longer(table):
     """A table whose best setting needs clips of 101 frames."""
     lines = (table / "x3.csv").read_text().splitlines()
     row = dict(zip(HEADER, lines[2].split(","), strict=True)) | {"setting": "longer", "psnr": "31.0", "weights": ""}
-    row |= {name: str(value) for name, value in TWO_SPANS.items()}
+    row |= {name: str(value) for name, value in LONG.items()}
     (table / "x3.csv").write_text("\n".join([*lines, ",".join(row[name] for name in HEADER)]))
     return table
 
@@ -176,67 +168,12 @@ def _longer(table):
 def test_longer_clips_are_chosen_where_there_is_room_for_them():
     assert choose(3, "best").name == "all"
     assert choose(3, "best", frames=100).name == "all"
-    assert choose(3, "best", frames=101).preset == Preset(**TWO_SPANS)
+    assert choose(3, "best", frames=101).preset == Preset(**LONG)
     assert choose(3, budget="1GB", size=(40, 50), frames=101).name == "longer"
     lengths = [
-        Preset(**given).clip for given in ({}, {"weights": "cscsr_huge_long_x4"}, {"weights": "x4-e"}, TWO_SPANS)
+        Preset(**given).clip for given in ({}, {"weights": "cscsr_huge_long_x4"}, {"weights": "cscsr_small_x4"}, LONG)
     ]
     assert lengths == [41, 101, 41, 101]
-
-
-@pytest.mark.parametrize(
-    ("total", "frame", "expected"),
-    [
-        (1009, [], ("all", 49)),  # a tenth of the recording and more would have no picture
-        (1010, [], ("longer", 46)),
-        (101, ["--data.frame", "50"], ("longer", 1)),
-        (102, ["--data.frame=50:52:1"], ("longer", 2)),
-        (101, ["--data.frame", "49"], ("all", 1)),
-        (101, ["--data.frame=50:52:1"], ("all", 2)),
-    ],
-)
-def test_a_recording_says_how_much_room_there_is(longer, total, frame, expected):
-    path = longer / "recording.npz"
-    write_spikes(path, torch.zeros(total, 6, 6, dtype=torch.uint8))
-    typed = ["predict", "--speed", "best", "--data.path", str(path), "--model.network.scale", "3", *frame]
-    preset, said = prediction._choice(typed)
-    name, count = expected
-    assert (preset.clip, said.partition(":")[0]) == (101 if name == "longer" else 41, name)
-    assert f"\n{count} {'picture' if count == 1 else 'pictures'}, " in said
-
-
-@pytest.mark.parametrize(
-    ("typed", "expected"),
-    [
-        ([], "cscsr_huge_film_noisy_x4"),
-        (["--data.every", "20", "--data.frame", "50:151:20"], "cscsr_huge_long_film_noisy_x4"),
-        (["--data.frame", "100"], "cscsr_huge_long_noisy_x4"),
-        (["--model.network.scale", "2"], ""),
-    ],
-)
-def test_a_camera_that_nobody_measured_is_said(tmp_path, typed, expected):
-    path = tmp_path / "camera.npz"
-    spikes = torch.zeros(201, 6, 6, dtype=torch.uint8)
-    spikes[::10] = 1  # little light
-    write_spikes(path, spikes)
-    asked = ["predict", "--speed", "best", "--data.path", str(path), *typed]
-    hint = f"\nno calibration of this sensor: if it is noisy, run spikekit calibrate {path}"
-    said = prediction._choice(asked)[1]
-    assert said.endswith(hint + (f", or name --model.weights {expected}" if expected else ""))
-    assert hint not in prediction._choice([*asked, "--data.calibration", "none"])[1]
-    assert hint not in prediction._choice([*asked[:2], "fastest", *asked[3:]])[1]
-    ones = torch.ones(6, 6)
-    write_calibration(tmp_path / "camera.calibration.safetensors", Calibration(ones, 0 * ones, 0 * ones.byte()))
-    assert hint not in prediction._choice(asked)[1]
-
-
-@pytest.mark.parametrize(("every", "name"), [(41, "cscsr_huge_film_fast_x4"), (42, "cscsr_huge_x4")])
-@pytest.mark.parametrize("output", ["film.mp4", "pictures"])
-def test_pictures_that_know_each_other_are_a_film(tmp_path, every, name, output):
-    write_spikes(tmp_path / "recording.npz", torch.zeros(200, 6, 6, dtype=torch.uint8))
-    typed = ["--data.path", str(tmp_path / "recording.npz"), "--data.every", str(every), "-o", str(tmp_path / output)]
-    preset, _ = prediction._choice(["predict", "--speed", "balanced", *typed])
-    assert preset.weights == name
 
 
 @pytest.mark.usefixtures("table")
@@ -313,50 +250,6 @@ def test_wishes_that_cannot_be(table, arguments, message):
         choose(**{"scale": 3, **arguments})
 
 
-def test_a_name_in_place_of_a_scale_is_pointed_to_where_names_go():
-    with pytest.raises(ValueError, match=r"expected a number, got 'x'; .* CSCSR.from_pretrained\('x'\)"):
-        SuperResolution.from_pretrained("x")
-
-
-def test_modules_of_a_speed(table):
-    best, balanced, fast = (SuperResolution.from_pretrained(3, name) for name in ("best", "balanced", "fast"))
-    assert isinstance(fast.network, ClassicalDecoder)
-    assert isinstance(balanced.network.motion, ZeroFlow)
-    assert not best.training
-    spikes = torch.rand(2, 41, 8, 10) < 0.3
-    expected = CSCSR.from_pretrained(table / "tiny.ckpt")(spikes).clamp(0, 1)
-    torch.testing.assert_close(best(spikes), expected)
-    assert torch.equal(SuperResolution.from_pretrained(3)(spikes), balanced(spikes))
-    assert SuperResolution.from_pretrained(3, budget="20MiB", size=(40, 50)).tile == 16
-
-
-@pytest.mark.slow
-def test_predict_at_a_speed(table, tmp_path, capsys):
-    spikes = torch.rand(41, 8, 10) < 0.3
-    write_spikes(tmp_path / "clip.dat", spikes)
-    recording = ["--data", "Recording", "--data.path", str(tmp_path / "clip.dat"), "--data.height", "8",
-                 "--data.width", "10", "--data.white", "0.4", "--model.network.scale", "3", "-o"]  # fmt: skip
-    for wish, method in (["--speed", "fastest"], "tfi"), (["--budget=1ms"], "tfp"), (["--budget", "9ms"], None):
-        main(["predict", *wish, *recording, str(tmp_path / "out")])
-        assert ("machine of the table" if "--speed" in wish else "on this machine") in capsys.readouterr().out
-        made = ClassicalDecoder(method, 3) if method else CSCSR.from_pretrained(table / "tiny.ckpt", ZeroFlow())
-        picture = made(spikes[None])[0].clamp(0, 1)
-        assert (read_picture(tmp_path / "out" / "frame_000020.png") - picture).abs().max() < 0.51 / 255
-    for wish, message in (
-        (["--budget", "1us"], "budget: expected a time or memory"),
-        (
-            ["--speed", "best", "--model.weights", "cscsr_small_x4"],
-            "choose from the weights of the package, got --model.weights",
-        ),
-    ):
-        with pytest.raises(SystemExit) as stopped:
-            main(["predict", *wish, *recording, str(tmp_path / "out")])
-        assert message in str(stopped.value)
-        assert "\n" not in str(stopped.value)
-    with pytest.raises(SystemExit, match="expected a recording: --data Recording"):
-        main(["predict", "--speed", "fast", "--data", "StillScenes", "-o", str(tmp_path / "out")])
-
-
 def test_presets_are_read_as_they_are_written():
     for given in ({}, WEIGHTS | {"motion": "Spike2Flow", "motion_iterations": 1, "psnr_tolerance": 0.1, "tile": 0}):
         preset = Preset(**given)
@@ -369,14 +262,11 @@ def test_presets_are_read_as_they_are_written():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (
-            {"network": "CSCSR"},
-            "network: expected 'ClassicalDecoder' or 'TwoSpanCSCSR', or weights of another, got 'CSCSR'",
-        ),
+        ({"network": "CSCSR"}, "network: expected 'ClassicalDecoder', or weights of another, got 'CSCSR'"),
         (DECODER | WEIGHTS, "weights: expected none with network='ClassicalDecoder', got 'tiny.ckpt'"),
         (WEIGHTS | {"scale": 3}, "scale: expected the name of a network with it, got None"),
         (WEIGHTS | {"frames": 41}, "frames: expected the name of a network with it, got None"),
-        (TWO_SPANS | {"window": 5}, "window: expected network='ClassicalDecoder' with it, got 'TwoSpanCSCSR'"),
+        (WEIGHTS | {"window": 5}, "window: expected network='ClassicalDecoder' with it, got None"),
         (WEIGHTS | {"motion_iterations": 2}, "motion_iterations: expected the estimator's class as motion with it"),
     ],
 )
@@ -389,49 +279,30 @@ def test_presets_that_cannot_be_built():
     with pytest.raises(ValueError, match="expected weights or the name of a network"):
         Preset(tile=32).build()
     with pytest.raises(ValueError, match=r"motion: expected one of .*ZeroFlow.*, got 'os'"):
-        Preset("x4-e", motion="os").build()
+        Preset("cscsr_small_x4", motion="os").build()
     with pytest.raises(FileNotFoundError, match="nowhere"):
         Preset("nowhere").build()
-    with pytest.raises(ValueError, match="precision: expected none, as a Trainer sets it, got 'bf16-true'"):
-        SuperResolution.from_preset(Preset("x4-e", precision="bf16-true"))
 
 
-@pytest.mark.parametrize(
-    "given",
-    [
-        {"motion": "ZeroFlow", "self_ensemble": 2},
-        {"motion": "Spike2Flow", "motion_weights": "spike2flow", "motion_iterations": 1},
-        {"steps": 0},
-        {"tile": 4, "psnr_tolerance": 20.0},  # noise loses much by less work
-    ],
-)
-def test_a_preset_is_the_same_from_python_and_as_it_is_typed(given, configs):
-    """Nothing of it is lost on either way: the pictures are the same and not those of the bare weights."""
-    preset = Preset("x4-e", **given)
-    spikes = torch.rand(1, 41, 24, 26, generator=torch.Generator().manual_seed(0)) < 0.3
-    ours = SuperResolution.from_preset(preset)
-    typed = run(["test", "-c", str(configs / "x4.yaml"), *preset_arguments(preset)], Rehearsal).model.eval()
-    with torch.no_grad():
-        assert torch.equal(ours(spikes), typed(spikes))
-        assert not torch.equal(ours(spikes), SuperResolution.from_preset(Preset("x4-e"))(spikes))
-
-
-def test_help_says_the_figures_that_speeds_are_chosen_by(capsys):
-    with pytest.raises(SystemExit):
-        main(["predict", "--help=all"])
-    said = " ".join(capsys.readouterr().out.split())
-    assert f"at most {SPEEDS['balanced']:g} dB (balanced) or {SPEEDS['fast']:g} dB (fast) below it" in said
-
-
-def test_tables_of_the_package(monkeypatch):
-    monkeypatch.setattr(speed, "pace", lambda *_: 1.0)
+def test_tables_of_the_package():
     for scale in (2, 3, 4):
-        found = choices(scale, (250, 400))
         picked = [choose(scale, name) for name in SPEEDS]
         assert all(faster.ms < 0.8 * slower.ms for faster, slower in pairwise(picked))  # every speed is worth its name
         assert picked[-2].preset.self_ensemble is None  # several views are for the best alone
         reference = speed._reference(speed._table(scale))
         assert (reference["ratio"], Preset.read(reference)) == ("1", Preset(reference["setting"]))
-        for choice in found:
-            module = SuperResolution.from_pretrained(scale, budget=f"{choice.ms + 0.001:.6f}ms")
-            assert module.network.scale == scale
+        for choice in choices(scale, (250, 400)):
+            assert (find_model(choice.preset.weights).scale if choice.preset.weights else choice.preset.scale) == scale
+
+
+def test_a_sensor_that_may_be_noisy_gets_weights_for_noise_at_the_same_cost():
+    for film in (False, True):
+        for white in (0.4, 0.1):
+            noisy = choices(4, (250, 400), film, 101, white, noisy=True)
+            ideal = {choice.name: choice for choice in choices(4, (250, 400), film, 101, white)}
+            assert noisy
+            for choice in noisy:
+                assert find_model(choice.preset.weights).noise
+                assert any(choice.ms == other.ms and choice.psnr == other.psnr for other in ideal.values())
+            assert min(choice.below for choice in noisy) == 0
+    assert choices(2, (250, 400), noisy=True) == choices(2, (250, 400))  # there are no such weights

@@ -1,0 +1,96 @@
+"""Networks that ``-c`` describes, built without Lightning, for the verbs that need no Trainer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from jsonargparse import ArgumentError, ArgumentParser
+
+from lightning_modules.cli.arguments import inner_arguments, read_config
+from lightning_modules.cli.errors import InputError, UsageError
+from lightning_modules.cli.reasons import reason
+from lightning_modules.networks import NETWORKS, Network
+from lightning_modules.storage.pretrained import load_weights, read_weights
+
+
+def configured_network(
+    configs: Sequence[str] = (), weights: str | None = None, checkpoint: str | Path | None = None
+) -> Network:
+    """Build the network of configurations or of weights, with its weights.
+
+    Weights know the network of this package that they are of; of a configuration they then take the estimator of motion
+    alone. A checkpoint has to be of the network of the configuration, where there is one.
+
+    Args:
+        configs: files, later ones over earlier ones; of each, what it says of the model.
+        weights: the name of weights, or a file of them, over those that a configuration names.
+        checkpoint: instead, a checkpoint.
+
+    Raises:
+        InputError: no network, no weights, or weights of another network.
+    """
+    chosen, named = None, weights
+    parser = ArgumentParser(exit_on_error=False)
+    parser.add_subclass_arguments(Network, "network", required=False)
+    try:
+        for config in configs:
+            model = inner_arguments(read_config(config).get("model"))
+            named = weights or model.get("weights") or named
+            if model.get("network") is not None:
+                chosen = parser.parse_object({"network": model["network"]}, namespace=chosen)
+        source = checkpoint or named
+        found = None if source is None else read_weights(source)
+        described = None if chosen is None else parser.instantiate(chosen).network
+        ours = found is not None and found.settings.get("class") in NETWORKS
+        if ours and (described is None or checkpoint is None):
+            own = chosen is not None and chosen.network.init_args.get("motion") is not None
+            return Network.from_pretrained(source, described.motion if own else None)
+        if described is None:
+            kind = "none" if found is None else found.settings.get("class")
+            raise UsageError(f"-c: expected the configuration of a network that is not of this package, {kind}")
+        if found is not None:
+            load_weights(described, found)
+        elif any(True for _ in described.parameters()):
+            raise UsageError(f"--weights, --ckpt_path: expected one of them for {type(described).__name__}, got none")
+    except UsageError:
+        raise
+    except (ArgumentError, OSError, ValueError) as error:
+        raise InputError(reason(str(error))) from error
+    return described.eval()
+
+
+def checkpoint_of(asked: str | None, configs: Sequence[str], output: Path) -> Path | None:
+    """Return the file of ``--ckpt_path``: a checkpoint, or the best or the last of a run.
+
+    Args:
+        asked: what was typed.
+        configs: those of the run, which may say where it is.
+        output: where it may be as well.
+
+    Raises:
+        InputError: there is no such file; the message says which there are.
+    """
+    if asked not in ("best", "last"):
+        return None if asked is None else Path(asked).expanduser()
+    said = [read_config(config).get("output") for config in configs]
+    folders = [output, *(Path(str(folder)).expanduser() for folder in said if folder)]
+    runs = [folder / "checkpoints" for folder in folders if (folder / "checkpoints").is_dir()]
+    if not runs:
+        where = " or ".join(str(folder / "checkpoints") for folder in folders)
+        raise InputError(f"--ckpt_path {asked}: expected a run of lightning fit in {where}, there is none")
+    return run_checkpoint(runs[-1], asked)
+
+
+def run_checkpoint(folder: Path, asked: str) -> Path:
+    """Return the best or the last checkpoint of a run.
+
+    Raises:
+        InputError: there is none; the message says which there are.
+    """
+    path = folder / f"{asked}.ckpt"
+    if not path.is_file():
+        there = sorted(other.name for other in folder.glob("*.ckpt"))
+        why = "; a run that ended before its first validation has no best" if asked == "best" else ""
+        raise InputError(f"{path}: no such checkpoint, there is {' and '.join(there) or 'none'}{why}")
+    return path

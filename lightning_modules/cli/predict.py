@@ -1,0 +1,207 @@
+"""The command ``lightning predict``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from itertools import count
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from lightning_modules.cli.configured import checkpoint_of, configured_network
+from lightning_modules.cli.errors import InputError, UsageError, VerbParser
+from lightning_modules.cli.folder_lock import check_folder, locked_folder
+from lightning_modules.cli.processes import calls_on_ray
+from lightning_modules.inference.output import LOCK, Output, is_film, is_picture
+from lightning_modules.inference.presets import SPEEDS
+from lightning_modules.inference.reconstruct import Reconstruction, reconstruct
+from spikekit.arguments import UsageError as SpikekitUsageError
+from spikekit.arguments import positive, whole
+from spikekit.color.cfa import PATTERNS
+from spikekit.decoders.methods import DECODERS
+from spikekit.io import recording as recordings
+from spikekit.io.sidecar import check_unclaimed
+from spikekit.io.video_output import check_film
+from spikekit.progress import progress
+from spikekit.timing import duration
+
+#: arguments of :func:`lightning_modules.reconstruct` that describe the recording
+RECORDING = "height", "width", "flip", "pattern", "camera", "calibration"
+
+_HOW = "tile", "psnr_tolerance", "self_ensemble", "future", "interpolated"
+
+
+def add_recording(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that describe a recording."""
+    recordings.add_arguments(parser)
+    recordings.add_calibration(parser)
+    parser.add_argument(
+        "--pattern",
+        choices=[*PATTERNS, "grey"],
+        help="Bayer phase after the flip, RGGB if nothing else is known; grey for a camera without colours",
+    )
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the verb."""
+    made = VerbParser(
+        prog="lightning predict",
+        allow_abbrev=False,
+        description="Make colour pictures of a recording. Without weights, --speed balanced chooses them: weights "
+        "trained for noisy sensors where nobody has measured this one. What is there already is not made again.",
+        epilog="example: lightning predict FILE.dat --height 250 --width 400 --flip -o film.mp4",
+    )
+    add_recording(made)
+    add = made.add_argument
+    add("-o", "--output", required=True, metavar="OUT", help="a folder, a film (.mp4, .mov, .mkv, .gif) or a .png")
+    add(
+        "--frame",
+        metavar="N|A:B[:STEP]",
+        help="which frames to make pictures of, from A to B - 1; every 20th if not given",
+    )
+    add("--white", type=float, help="spikes a frame of a pixel that is shown white; measured if not given")
+    group = made.add_argument_group("the network")
+    add = group.add_argument
+    add(
+        "--speed",
+        choices=list(SPEEDS),
+        help=f"the best weights of the package; the fastest at most {SPEEDS['balanced']:g} dB (balanced) or "
+        f"{SPEEDS['fast']:g} dB (fast) below them; the fastest",
+    )
+    add("--budget", help="instead, what a picture may cost, such as 2s, 25fps or 200MB: the best that fits")
+    add("--scale", type=whole(1), default=4, help="super-resolution factor, of speed and budget; 4 if not given")
+    add("--weights", metavar="NAME", help="instead, a name that lightning models lists, a .safetensors, a .ckpt")
+    add("-c", "--config", action="append", default=[], metavar="FILE", help="instead, the network of a configuration")
+    add("--ckpt_path", metavar="FILE", help="its checkpoint; best and last are those of its output, or of -o")
+    add = made.add_argument_group("how it is used").add_argument
+    add("--tile", type=whole(0), metavar="N", help="side of the tiles, in sensor pixels; 0 for none, 128 if not given")
+    add(
+        "--tolerance",
+        type=float,
+        dest="psnr_tolerance",
+        metavar="DB",
+        help="skip the motion of parts that rest, as long as this costs no more PSNR",
+    )
+    add("--self_ensemble", type=int, metavar="N", help="2, 4 or 8: the mean over so many views of a clip")
+    add("--interpolated", type=whole(0), metavar="N", help="pictures between two that the network makes")
+    add("--future", type=whole(0), metavar="N", help="pictures that one may wait for, of weights for films")
+    add("--device", help="such as cpu or cuda:1; a GPU where there is one")
+    add("--precision", choices=["32-true", "bf16-mixed"], help="bf16-mixed on a GPU that supports it, if not given")
+    add = made.add_argument_group("the output").add_argument
+    add("--fps", type=positive, default=25.0, help="pictures shown in a second of a film; 25 if not given")
+    add("--beside", choices=list(DECODERS), help="show what this decoder makes of the clip left of every picture")
+    add("--engine", choices=["local", "ray"], default="local", help="make them here, or in parts on a Ray cluster")
+    add("--jobs", type=whole(1), help="parts at once on the cluster; one a GPU, or a node, if not given")
+    return made
+
+
+def predict(args: Sequence[str]) -> None:
+    """Make pictures of a recording.
+
+    Args:
+        args: what was typed after ``lightning predict``.
+
+    Raises:
+        InputError: a recording, weights or an output that cannot be used.
+    """
+    asked, begin = parser().parse_args(args), perf_counter()
+    output = Path(asked.output).expanduser()
+    if is_film(output):
+        check_film(output)
+    if not is_film(output) and not is_picture(output):
+        check_folder(output)
+    arguments = _arguments(asked, output)
+    try:
+        pictures = reconstruct(asked.file, **arguments)
+        _check_output(output, pictures)
+    except (OSError, ValueError) as error:
+        raise (UsageError if isinstance(error, SpikekitUsageError) else InputError)(str(error)) from error
+    for line in pictures.notes:
+        print(line, flush=True)
+    there = Output(output, pictures.clips.chosen, {**pictures.identity(), "beside": asked.beside})
+    with locked_folder(there.folder, "lightning predict", LOCK):
+        before = there.made()
+        if asked.engine == "ray":
+            _on_ray(asked, arguments, output)
+        else:
+            _make(pictures, there, before, asked.beside)
+        there.finish(asked.fps)
+    there.clear()
+    total, new = len(pictures), len(pictures) - len(before)
+    said = f"{total} {'picture' if total == 1 else 'pictures'}" + (f", {new} of them new" if before else "")
+    took = perf_counter() - begin
+    each = f" ({duration(took / new)} each)" if new > 1 else ""
+    print(f"{output}: {said}, in {duration(took)}{each}; {pictures.white:.4g} spikes a frame are white")
+
+
+def _arguments(asked: argparse.Namespace, output: Path) -> dict[str, Any]:
+    """Return the arguments of :func:`lightning_modules.reconstruct`."""
+    own = {"--weights": asked.weights, "-c": asked.config, "--ckpt_path": asked.ckpt_path}
+    named = [option for option, value in own.items() if value]
+    chosen = [option for option in ("speed", "budget") if getattr(asked, option) is not None]
+    if named and chosen:
+        raise UsageError(f"--{chosen[0]}: it chooses from the weights of the package, got {named[0]} as well")
+    names = ("speed", "budget", "scale", "frame", "white", "device", "precision", *RECORDING)
+    arguments = {name: getattr(asked, name) for name in names}
+    if named:
+        checkpoint = checkpoint_of(asked.ckpt_path, asked.config, output)
+        arguments["network"] = configured_network(asked.config, asked.weights, checkpoint)
+    return arguments | {name: getattr(asked, name) for name in _HOW if getattr(asked, name) is not None}
+
+
+def _check_output(output: Path, pictures: Reconstruction) -> None:
+    """Refuse a file for several pictures, and one that the recording needs."""
+    if is_picture(output) and len(pictures) != 1:
+        several = f"a folder or a film for {len(pictures)} pictures"
+        raise UsageError(f"-o: expected {several}, got {output}; --frame chooses one")
+    if is_picture(output) or is_film(output):
+        try:
+            check_unclaimed([output], pictures.clips.recording.path)
+        except ValueError as error:
+            raise UsageError(f"-o: {error}") from error
+
+
+def _make(
+    pictures: Reconstruction, there: Output, made: set[int], beside: str | None, part: tuple[int, int] = (0, 1)
+) -> None:
+    """Make the pictures that are not there; say how far they are, by a line a picture where nobody watches bars."""
+    left, number = len(pictures) - len(made), count(1)
+    watched = sys.stderr.isatty()
+    bar = progress(what="pictures", total=left, unit="picture", delay=0)
+    shown = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}, {remaining} left"
+    present = progress(what="this picture", total=1.0, position=1, bar_format=shown, delay=0)
+
+    def done(share: float) -> None:
+        present.update(share - present.n)
+
+    with bar, present:
+        for frame, rgb in pictures.pictures(made, part, beside, done if watched else None):
+            path = there.write(frame, rgb)
+            bar.update()
+            present.reset()
+            if not watched:
+                print(f"{path}, {next(number)} of {left}", flush=True)
+
+
+def _on_ray(asked: argparse.Namespace, arguments: dict[str, Any], output: Path) -> None:
+    if asked.budget is not None:
+        raise UsageError("--engine ray: expected --speed or --weights, got --budget, which differs by node")
+
+    def calls(parts: int) -> dict[str, tuple[Any, ...]]:
+        settings = (asked.file.resolve(), arguments, output.resolve(), asked.beside)
+        return {f"part {n + 1} of {parts}": (_make_part, *settings, (n, parts)) for n in range(parts)}
+
+    for ended in calls_on_ray(calls, asked.jobs):
+        for name, reason in ended.items():
+            if reason is not None:
+                raise InputError(f"predict: {name}: {reason}")
+            print(f"{name} is made", flush=True)
+
+
+def _make_part(file: Path, arguments: dict[str, Any], output: Path, beside: str | None, part: tuple[int, int]) -> None:
+    """Make a part of the pictures, in a process of a cluster."""
+    pictures = reconstruct(file, **arguments)
+    there = Output(output, pictures.clips.chosen, {**pictures.identity(), "beside": beside})
+    _make(pictures, there, there.made(), beside, part)

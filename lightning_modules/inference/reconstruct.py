@@ -1,0 +1,352 @@
+"""From a recording to colour pictures, in one call."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Collection, Iterator
+from contextlib import nullcontext
+from dataclasses import replace
+from itertools import islice, pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lightning_modules.inference._open import find_model, open_recording
+from lightning_modules.inference.clips import FRAMES, RecordingClips, film_groups, is_grey
+from lightning_modules.inference.film import FilmFrame, FilmMaker
+from lightning_modules.inference.output import file_identity
+from lightning_modules.inference.presets import SPEEDS, Choice, Preset, choose
+from lightning_modules.networks import ClassicalDecoder, Network
+from spikekit import __version__
+from spikekit.io.image_bytes import to_bytes
+from spikekit.io.recording import Recording
+from spikekit.timing import duration
+
+# how many times as long as its clips a recording is whose first and last pictures a longer clip may cost
+_MANY = 10
+# dB that longer clips have to be worth to be mentioned where the recording leaves no room for them
+_WORTH_ROOM = 0.3
+# clocks between two pictures of the network up to which those between, interpolated, lose nothing: in fast scenes, and
+# in slower ones
+_APART, _FARTHER_APART = 6, 12
+# milliseconds a pixel of a picture, written as PNG by one core
+_WRITING = 7e-5
+# white pixels between two pictures
+_GAP = 4
+# spikes of a white pixel in a clip, below which pictures by a decoder are mostly noise
+_ENOUGH = 8
+
+
+def reconstruct(
+    path: str | Path,
+    speed: str | None = None,
+    *,
+    budget: str | None = None,
+    network: Network | str | Path | None = None,
+    scale: int = 4,
+    height: int | None = None,
+    width: int | None = None,
+    flip: bool = False,
+    pattern: str | None = None,
+    camera: str | None = None,
+    calibration: str | None = None,
+    frame: str | None = None,
+    white: float | None = None,
+    device: str | torch.device | None = None,
+    precision: str | None = None,
+    **how: Any,
+) -> Reconstruction:
+    """Reconstruct the colour pictures of a recording.
+
+    Convention:
+        Without a ``network``, the weights of the package are chosen by speed, of those that the recording has room for.
+        Where nobody has measured the sensor, neither by a calibration nor as the side-car of a simulator says, they are
+        weights that were trained for noisy sensors; ``calibration="none"`` says that the pixels are ideal.
+
+    Args:
+        path: a ``.dat`` or ``.npz`` file, see :func:`spikekit.read_spikes`.
+        speed: ``"best"``, ``"balanced"`` (when nothing is given), ``"fast"`` or ``"fastest"``, see
+            :func:`lightning_modules.inference.presets.choose`.
+        budget: instead, what a picture may cost, such as ``"40ms"`` or ``"200MB"``, see there.
+        network: instead, a network, the name of weights of the package, or a file of weights.
+        scale: super-resolution factor, of speed and budget.
+        height: rows; needed for a ``.dat`` without side-car or camera, as it has no header.
+        width: columns; likewise.
+        flip: turn the stored frames upside down, as real cameras need.
+        pattern: Bayer phase after the flip; that of the side-car or the camera, or else RGGB, when not given;
+            ``"grey"`` for a camera without colours, whose pictures are grey then.
+        camera: what recorded it, one of :data:`spikekit.CAMERAS` or a ``.json`` file; gives all these, and the gamma of
+            the pictures.
+        calibration: what spikekit calibrate measured of the pixels; the spikes are made those of an ideal sensor by it.
+            When not given, the recording's own, NAME.calibration.safetensors beside it.
+        frame: which spike frames are shown: N, or from A to B - 1 as A:B or A:B:STEP, 20 apart where STEP is left out.
+        white: spikes a frame of a pixel that is shown white; less makes pictures brighter. When not given, that of the
+            side-car, or else what 99.9 % of the pixels of the recording do not exceed, the same in all its pictures.
+        device: where the network runs; a GPU where there is one, when not given.
+        precision: ``"32-true"`` or ``"bf16-mixed"``; the latter on a GPU that supports it, when not given.
+        how: ``tile``, ``psnr_tolerance``, ``self_ensemble``, ``future`` and ``interpolated`` of
+            :class:`lightning_modules.inference.film.FilmMaker`, over those of the choice.
+
+    Returns:
+        The pictures, which are made when they are asked for: iterate, or take all as an ``array``.
+
+    Raises:
+        spikekit.SpikeFileError: the file cannot be read.
+        FileNotFoundError: there are no such weights.
+        ValueError: the recording is shorter than a clip, or an argument is out of range.
+
+    Example:
+        >>> import tempfile, torch
+        >>> from spikekit import write_spikes
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_spikes(f"{folder}/clip.npz", torch.rand(61, 8, 10) < 0.3)
+        ...     pictures = reconstruct(f"{folder}/clip.npz", "fastest")
+        ...     [clock for clock, rgb in pictures], pictures.array().shape
+        ([20, 40], (2, 32, 40, 3))
+    """
+    given = [value for value in (speed, budget, network) if value is not None]
+    if len(given) > 1:
+        raise ValueError(f"speed, budget, network: expected one of them, got {', '.join(map(str, given))}")
+    recording = open_recording(
+        path, height=height, width=width, flip=flip, pattern=pattern, camera=camera, calibration=calibration
+    )
+    notes: list[str] = []
+    if network is None:
+        white = RecordingClips(recording).white if white is None else white
+        measured = calibration == "none" or recording.alpha is not None or recording.calibration is not None
+        speed = "balanced" if budget is None and speed is None else speed
+        preset, notes = _chosen(recording, speed, budget, scale, frame, white, not measured)
+        how = {**preset.given("tile", "psnr_tolerance", "self_ensemble", "interpolated"), **how}
+        network = preset.build()
+    elif not isinstance(network, Network):
+        network = Network.from_pretrained(network)
+    clips = RecordingClips(recording, network.frames, frame, network.pattern)
+    return Reconstruction(network, clips, white, device, precision, notes, **how)
+
+
+class Reconstruction:
+    """Pictures of a recording, which are made when they are asked for.
+
+    Iterating yields them in order, as :class:`lightning_modules.inference.film.FilmFrame`.
+
+    Args:
+        network: any of :mod:`lightning_modules.networks`.
+        clips: of the recording, as long as the network takes them.
+        white: spikes a frame of a white pixel; measured when not given.
+        device: as of :func:`reconstruct`.
+        precision: likewise.
+        notes: on how the network was chosen.
+        how: likewise.
+
+    Attributes:
+        notes: lines on what was chosen, and why.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        clips: RecordingClips,
+        white: float | None = None,
+        device: str | torch.device | None = None,
+        precision: str | None = None,
+        notes: list[str] | None = None,
+        **how: Any,
+    ) -> None:
+        if white is not None and not 0 < white < float("inf"):
+            raise ValueError(f"white: expected a finite number above 0, got {white}")
+        if precision not in (None, "32-true", "bf16-mixed"):
+            raise ValueError(f"precision: expected 32-true or bf16-mixed, got {precision!r}")
+        self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        self.precision = precision or precision_of(self.device)
+        self.network = network.to(self.device).eval()
+        self.clips, self.notes, self.how = clips, notes or [], how
+        self._maker()  # what is wrong with the arguments is said at once
+        self.white = clips.white if white is None else white
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+    def __iter__(self) -> Iterator[FilmFrame]:
+        return self.pictures()
+
+    def _maker(self, done: Callable[[float], object] | None = None) -> FilmMaker:
+        return FilmMaker(self.network, **self.how, **({"done": done} if done else {}))
+
+    def pictures(
+        self,
+        made: Collection[int] = (),
+        part: tuple[int, int] = (0, 1),
+        beside: str | None = None,
+        done: Callable[[float], object] | None = None,
+    ) -> Iterator[FilmFrame]:
+        """Yield the pictures that are not there already.
+
+        Args:
+            made: frames whose pictures are there.
+            part: which part of the recording, counted from 0, and of how many.
+            beside: ``"tfi"`` or ``"tfp"`` shows what this decoder makes of the same clip left of every picture.
+            done: called with the share of the present picture that is made.
+        """
+        maker = self._maker(done)
+        exposure = self.network.settings["alpha"] / self.white
+        groups = self._groups(maker, set(made), *part)
+        clips = self.clips.in_order(frame for group, _ in groups for frame in group)
+        mixed = torch.autocast(self.device.type, torch.bfloat16) if self.precision == "bf16-mixed" else nullcontext()
+        for group, wanted in groups:
+            spikes = torch.stack([clip for _, clip in islice(clips, len(group))]).to(self.device)
+            with torch.inference_mode(), mixed:
+                rgb = maker(spikes, group, exposure=exposure).float()
+            for frame, clip, picture in zip(group, spikes, rgb, strict=True):
+                if wanted and frame not in made:
+                    shown = self._shown(picture.cpu().clone())
+                    yield FilmFrame(frame, torch.cat([*self._decoded(clip, beside), shown], dim=-1))
+
+    def _groups(self, maker: FilmMaker, made: set[int], part: int, parts: int) -> list[tuple[list[int], bool]]:
+        """Groups of frames that are made together, and whether they are wanted, or only seen again by the network."""
+        groups = list(film_groups(self.clips.chosen, maker.future, maker.interpolated))
+        mine = range(*(len(groups) * n // parts for n in (part, part + 1)))
+        wanted = {n for n in mine if not made.issuperset(groups[n])}
+        before = -(-maker.warm_up // ((maker.future + 1) * (maker.interpolated + 1)))
+        seen = sorted({n for last in wanted for n in range(max(last - before, 0), last + 1)})
+        return [(groups[n], n in wanted) for n in seen]
+
+    def _shown(self, rgb: Tensor) -> Tensor:
+        """Light (3, H, W) in [0, 1], white being 1, as the camera shows it."""
+        recording = self.clips.recording
+        if is_grey(recording) and len(rgb) == 3:
+            rgb = (rgb * rgb.new_tensor([0.25, 0.5, 0.25])[:, None, None]).sum(0, keepdim=True)
+        rgb = rgb.expand(3, -1, -1)
+        return rgb if recording.camera is None else replace(recording.camera, gain=1.0).display(rgb)
+
+    def _decoded(self, clip: Tensor, method: str | None) -> list[Tensor]:
+        """What a decoder makes of a clip (N, H, W), and a white gap."""
+        if method is None:
+            return []
+        settings = self.network.settings
+        decoder = ClassicalDecoder(method, settings["scale"], settings["pattern"], self.white)
+        rgb = self._shown(decoder(clip[None].cpu())[0].clamp(0, 1))
+        return [rgb, rgb.new_ones(3, rgb.shape[1], _GAP)]
+
+    def array(self) -> np.ndarray:
+        """Return all pictures as a viewer takes them: (K, s H, s W, 3), uint8."""
+        return np.stack([to_bytes(rgb).numpy() for _, rgb in self])
+
+    def identity(self) -> dict[str, Any]:
+        """Return all that the pictures depend on, as plain values."""
+        recording, clips = self.clips.recording, self.clips
+        measured = recording.calibration and sorted(vars(recording.calibration).items())
+        return {
+            "recording": file_identity(recording.path),
+            "read": [recording.stored, recording.flip, recording.pattern, clips.top, clips.left, recording.camera],
+            "calibration": measured and _digest((name, value) for name, value in measured),
+            "white": self.white,
+            "network": [type(self.network).__name__, self.network.settings, _digest(self.network.state_dict().items())],
+            "motion": str(getattr(self.network, "motion", None)),
+            "how": self.how,
+            "precision": self.precision,
+            "version": __version__,
+        }
+
+
+def precision_of(device: torch.device) -> str:
+    """Return bfloat16 for a GPU that supports it, float32 otherwise."""
+    return "bf16-mixed" if device.type == "cuda" and torch.cuda.is_bf16_supported() else "32-true"
+
+
+def _digest(values: Any) -> str:
+    """Return a number that all of some named tensors have a share in."""
+    total = hashlib.sha256()
+    for name, value in values:
+        total.update(name.encode())
+        if isinstance(value, Tensor):
+            value = value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy()
+        else:
+            value = str(value).encode()
+        total.update(value)
+    return total.hexdigest()
+
+
+def _chosen(
+    recording: Recording,
+    speed: str | None,
+    budget: str | None,
+    scale: int,
+    frame: str | None,
+    white: float,
+    noisy: bool,
+) -> tuple[Preset, list[str]]:
+    """Return the preset that speed or budget ask for, and lines that say what it is and costs."""
+    clips = RecordingClips(recording, frame=frame)
+    every = min((later - clock for clock, later in pairwise(clips.chosen)), default=clips.frames + 1)
+    film = every <= clips.frames  # one picture knows the other
+    around = 2 * min(clips.chosen[0], recording.frames - 1 - clips.chosen[-1]) + 1
+    room = max(FRAMES, recording.frames // _MANY if frame is None else around)
+    asked = {"scale": scale, "size": clips.size, "film": film, "white": white, "noisy": noisy}
+    choice = choose(speed=speed, budget=budget, frames=room, **asked)
+    clips = RecordingClips(recording, choice.preset.clip, frame)
+    interpolated = _interpolated(choice.preset, every, speed)
+
+    def took(one: Choice, speed: str | None) -> str:
+        network = one.ms / (_interpolated(one.preset, every, speed) + 1)
+        return duration(len(clips) * (network + _WRITING * scale**2 * clips.size[0] * clips.size[1]) / 1e3)
+
+    speeds = list(SPEEDS)
+    sooner = speeds[max(speeds.index(speed) - 1, 0)] if speed else None
+    other = choose(speed=sooner, frames=room, **asked) if sooner else choice
+    below = f"{other.below:.2f} dB below the best"
+    instead = "" if other == choice else f"; --speed {sooner}: {took(other, sooner)}, {below}"
+    count = "1 picture" if len(clips) == 1 else f"{len(clips)} pictures"
+    said = [str(choice), f"{count}, written as PNG: about {took(choice, speed)}{instead}"]
+    if interpolated:
+        said.append(
+            f"{interpolated} of {interpolated + 1} pictures are interpolated, being {every} frames apart; "
+            "--interpolated 0 makes all by the network"
+        )
+    if speed:
+        ideal = choose(speed=speed, frames=recording.frames, **asked)
+        said += _longer(ideal, choice, clips)
+    said += _sensor(choice.preset, recording, scale, noisy) + _noise(choice.preset, white)
+    return replace(choice.preset, interpolated=interpolated or None), said
+
+
+def _interpolated(preset: Preset, every: int, speed: str | None) -> int:
+    """How many pictures between two of the network's follow from these as well."""
+    if preset.weights is None or preset.motion == "ZeroFlow":
+        return 0
+    apart = _APART if speed in (None, "best") else _FARTHER_APART
+    return max(apart // every - 1, 0)
+
+
+def _longer(ideal: Choice, choice: Choice, clips: RecordingClips) -> list[str]:
+    """Return a hint where clips at the ends of the recording keep longer ones from being chosen."""
+    gain, half = ideal.psnr - choice.psnr, ideal.preset.clip // 2
+    if ideal.preset.clip <= choice.preset.clip or gain < _WORTH_ROOM:
+        return []
+    return [
+        f"clips of {ideal.preset.clip} frames would be about {gain:.1f} dB better: --frame "
+        f"{half}:{clips.recording.frames - half} leaves room for them"
+    ]
+
+
+def _sensor(preset: Preset, recording: Recording, scale: int, noisy: bool) -> list[str]:
+    """Return what follows for a camera whose pixels nobody measured."""
+    if not noisy:
+        return []
+    model = find_model(preset.weights or "")
+    measure = f"spikekit calibrate {recording.path} measures it, --calibration none takes it for ideal"
+    if model and model.noise:
+        return [f"nobody has measured this sensor: weights trained for noisy ones; {measure}"]
+    return [f"nobody has measured this sensor, and there are no weights for noisy ones at scale {scale}; {measure}"]
+
+
+def _noise(preset: Preset, white: float) -> list[str]:
+    """Return a hint where a decoder has too few spikes for a picture, by those of a white pixel in a frame."""
+    if not preset.method or (spikes := white * preset.clip) >= _ENOUGH:
+        return []
+    return [
+        f"a white pixel fires {spikes:.1f} times in {preset.clip} frames: a decoder's picture is noisy; --speed fast "
+        "and slower ones use a network, which sees less noise"
+    ]

@@ -1,0 +1,169 @@
+import pytest
+import torch
+
+from lightning_modules.inference._open import open_recording
+from lightning_modules.inference.clips import RecordingClips, clips_around, is_grey
+from spikekit import (
+    Calibration,
+    SensorNoise,
+    SpikeSensor,
+    bayer_mask,
+    split_bayer,
+    write_calibration,
+    write_picture,
+    write_spikes,
+)
+from spikekit.cli.command import main as spikekit_main
+
+PATTERNS = ["RGGB", "BGGR", "GRBG", "GBRG"]
+
+
+@pytest.fixture(name="spikes")
+def _spikes():
+    return (torch.rand(70, 6, 10) < 0.3).to(torch.uint8)
+
+
+@pytest.fixture(name="opened")
+def _opened(tmp_path):
+    """A recording of spikes, written and opened."""
+
+    def opened(spikes, name="clip.npz", flip=False, **known):
+        write_spikes(tmp_path / name, spikes, flip=flip)
+        size = {"height": spikes.shape[1], "width": spikes.shape[2]} if name.endswith(".dat") else {}
+        return open_recording(tmp_path / name, **size, flip=flip, **known)
+
+    return opened
+
+
+@pytest.mark.parametrize("name", ["clip.dat", "clip.npz"])
+def test_clips_are_those_of_the_file(opened, spikes, name):
+    clips = RecordingClips(opened(spikes, name))
+    assert clips.chosen == [20, 40]
+    for frame, clip in clips.in_order():
+        assert clip.equal(spikes[frame - 20 : frame + 21])
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("flip", [False, True])
+def test_every_phase_becomes_rggb(opened, spikes, pattern, flip):
+    ((_, clip),) = RecordingClips(opened(spikes, "clip.dat", flip, pattern=pattern), frame="20").in_order()
+    red = split_bayer(spikes, pattern)[0][:41]
+    found = clip[:, ::2, ::2]
+    assert found.equal(red[:, : found.shape[1], : found.shape[2]])
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("crop_to", PATTERNS)
+def test_every_phase_becomes_that_of_the_network(opened, pattern, crop_to):
+    red = bayer_mask(6, 10, pattern, dtype=torch.uint8)[0]
+    clips = RecordingClips(opened(red.expand(41, 6, 10), pattern=pattern), crop_to=crop_to)
+    ((_, clip),) = clips.in_order()
+    assert {6 - clips.size[0], 10 - clips.size[1]} <= {0, 1}
+    assert clip.equal(bayer_mask(*clips.size, crop_to, dtype=torch.uint8)[0].expand(41, -1, -1))
+
+
+def test_a_grey_recording_is_not_cropped_to_a_phase(opened, spikes, tmp_path):
+    grey = opened(spikes, pattern="grey")
+    assert is_grey(grey)
+    assert next(RecordingClips(grey, crop_to="BGGR").in_order())[1].equal(spikes[:41])
+    assert not is_grey(opened(spikes))
+    write_spikes(tmp_path / "a.dat", torch.zeros(41, 250, 400, dtype=torch.uint8))
+    assert is_grey(open_recording(tmp_path / "a.dat", camera="vidar"))
+
+
+def test_a_recording_of_which_too_little_is_left_is_refused(opened, spikes):
+    tiny = torch.zeros(41, 3, 5, dtype=torch.uint8)
+    RecordingClips(opened(tiny))
+    with pytest.raises(ValueError, match=r"clip.npz: expected at least 3 x 3 pixels .* got \(2, 4\)"):
+        RecordingClips(opened(tiny, pattern="BGGR"))
+    with pytest.raises(ValueError, match=r"clip.npz: expected at least 41 frames for a clip, got 40"):
+        RecordingClips(opened(spikes[:40]))
+
+
+@pytest.mark.parametrize(
+    ("frame", "expected"), [("30", [30]), ("22:40:6", [22, 28, 34]), ("25:", [25, 45]), (":41", [20, 40])]
+)
+def test_frames_are_chosen(opened, spikes, frame, expected):
+    clips = RecordingClips(opened(spikes), frame=frame)
+    assert [middle for middle, _ in clips.in_order()] == expected
+
+
+@pytest.mark.parametrize("frame", ["19", "50", "19:30", "20:51", "40:30", "x"])
+def test_frames_that_no_clip_is_around_are_refused(opened, spikes, frame):
+    with pytest.raises(ValueError, match=f"frame: expected .* got {frame}; a clip has 41 frames of the 70 of"):
+        RecordingClips(opened(spikes), frame=frame)
+
+
+def test_white_is_the_same_whichever_frames_are_chosen(opened):
+    spikes = torch.zeros(2041, 8, 10, dtype=torch.uint8)
+    spikes[1000:, 2, 3] = 1  # half of the time
+    spikes[::4, 4:] = 1
+    recording = opened(spikes)
+    assert RecordingClips(recording, frame="20:60:20").white == RecordingClips(recording).white
+    assert RecordingClips(recording).white == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_sidecar_knows_size_phase_and_white(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_picture("photo.png", torch.ones(3, 30, 40))
+    simulate = ["simulate", "photo.png", "-o", "a.dat", "--scale", "1", "--pattern", "GBRG", "--alpha", "0.3"]
+    assert spikekit_main(simulate) == 0
+    clips = RecordingClips(open_recording("a.dat"))
+    assert (clips.size, clips.recording.pattern, clips.white) == ((29, 40), "GBRG", 0.3)
+
+
+def test_a_camera_knows_size_phase_and_crop(tmp_path):
+    raw = torch.zeros(41, 1000, 1024, dtype=torch.uint8)
+    raw[::2] = 1
+    write_spikes(tmp_path / "a.dat", raw)
+    clips = RecordingClips(open_recording(tmp_path / "a.dat", camera="m1k40-bayer"))
+    assert clips.size == next(clips.in_order())[1].shape[1:] == (992, 992)
+
+
+@pytest.mark.parametrize("name", ["clip.dat", "clip.npz"])
+@pytest.mark.parametrize("frame", ["20:50:1", "21:50:28"])
+def test_every_frame_is_read_once_and_what_nobody_wants_is_not_read(opened, spikes, name, frame, monkeypatch):
+    clips = RecordingClips(opened(spikes, name, pattern="BGGR"), 5, frame)
+    read, frames_from = [], type(clips.recording).frames_from
+
+    def counted(recording, start):
+        for n, plane in enumerate(frames_from(recording, start), start):
+            read.append(n)
+            yield plane
+
+    monkeypatch.setattr(type(clips.recording), "frames_from", counted)
+    for middle, clip in clips.in_order():
+        assert clip.equal(spikes[middle - 2 : middle + 3, 1:, 1:])
+    assert read == sorted(set(read))
+    if name == "clip.dat" and frame == "21:50:28":
+        assert read == [*range(19, 24), *range(47, 52)]
+
+
+def test_what_lies_between_clips_is_left_out_where_a_stream_can(spikes):
+    read = []
+
+    def jump(start):
+        for n in range(start, len(spikes)):
+            read.append(n)
+            yield spikes[n]
+
+    found = dict(clips_around([6, 8, 60], 5, jump(4), 4, jump))
+    assert read == [*range(4, 11), *range(58, 63)]
+    assert all(clip.equal(spikes[middle - 2 : middle + 3]) for middle, clip in found.items())
+    assert list(found) == [6, 8, 60]
+
+
+def test_a_calibration_makes_ideal_spikes(opened, tmp_path):
+    defects = torch.zeros(6, 10, dtype=torch.uint8)
+    defects[3, 4] = 2
+    gain = torch.linspace(0.5, 1.5, 10).repeat(6, 1)
+    sensor = Calibration(gain, torch.zeros(6, 10), defects)
+    spikes = SpikeSensor(SensorNoise(calibration=sensor)).expose(torch.full((41, 6, 10), 0.2))
+    ((_, before),) = RecordingClips(opened(spikes)).in_order()
+    assert before.equal(spikes)
+    write_calibration(tmp_path / "clip.calibration.safetensors", sensor)
+    corrected = RecordingClips(opened(spikes))
+    ((_, after),) = corrected.in_order()
+    assert (after.sum(0) - 41 * 0.2).abs().max() < 2
+    assert (before.sum(0) - 41 * 0.2).abs().max() > 30
+    assert corrected.white < 0.3

@@ -1,0 +1,195 @@
+"""From a recording to pictures, in Python: what is chosen, and what the pictures show."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from lightning_modules import reconstruct
+from lightning_modules.inference._open import find_model
+from lightning_modules.inference.clips import film_groups
+from lightning_modules.inference.film import film
+from lightning_modules.networks import CSCSR, ClassicalDecoder, RecurrentCSCSR
+from spikekit import mosaic, read_spikes, simulate_spikes, write_picture, write_spikes
+from spikekit.cli.command import main as spikekit_main
+
+TINY = {"scale": 2, "width": 8, "representation_width": 8, "features": 1, "stages": 1, "end_blocks": 1}
+
+
+@pytest.fixture(name="recording")
+def _recording(tmp_path):
+    """A recording of 99 frames of noise."""
+    write_spikes(tmp_path / "clip.npz", torch.rand(99, 12, 16, generator=torch.Generator().manual_seed(0)) < 0.3)
+    return tmp_path / "clip.npz"
+
+
+@pytest.fixture(name="flat")
+def _flat(tmp_path):
+    """Writes an ideal recording of 200 frames of a grey wall, of which a white pixel fires so often."""
+
+    def write(white):
+        light = torch.full((200, 8, 8), white)
+        write_spikes(tmp_path / "flat.npz", simulate_spikes(light, generator=torch.Generator().manual_seed(0)))
+        return tmp_path / "flat.npz"
+
+    return write
+
+
+def test_pictures_are_an_iterator_and_an_array(recording):
+    pictures = reconstruct(recording, network=ClassicalDecoder("tfi", scale=2), white=0.4)
+    clocks, rgb = zip(*pictures, strict=True)
+    assert clocks == (20, 40, 60)
+    assert len(pictures) == 3
+    array = pictures.array()
+    assert array.shape == (3, 24, 32, 3)
+    assert array.dtype == "uint8"
+    for shown, picture in zip(array, rgb, strict=True):
+        assert abs(shown / 255 - picture.movedim(0, -1).numpy()).max() <= 0.51 / 255
+
+
+@pytest.mark.parametrize("trained", ["RGGB", "GBRG"])
+def test_pictures_have_the_colours_of_the_scene_whatever_phase_the_network_takes(tmp_path, trained):
+    colour = torch.tensor([0.9, 0.3, 0.1])
+    light = 0.4 * mosaic(colour[:, None, None].expand(41, 3, 16, 20), "BGGR")
+    write_spikes(tmp_path / "flat.npz", simulate_spikes(light, generator=torch.Generator().manual_seed(0)))
+    network = ClassicalDecoder(scale=2, pattern=trained)
+    ((_, rgb),) = reconstruct(tmp_path / "flat.npz", network=network, pattern="BGGR", white=0.4)
+    torch.testing.assert_close(rgb.mean(dim=(1, 2)), colour, rtol=0, atol=0.04)
+
+
+def test_pictures_of_a_grey_camera_are_grey(recording):
+    ((_, rgb),) = reconstruct(recording, network=ClassicalDecoder(scale=2), pattern="grey", frame="40")
+    assert rgb[0].equal(rgb[1])
+    assert rgb[0].equal(rgb[2])
+    assert rgb.std() > 0
+
+
+def test_a_dim_recording_is_shown_bright(tmp_path):
+    light = torch.linspace(0, 0.02, 400).reshape(20, 20).expand(121, 20, 20)
+    write_spikes(tmp_path / "dim.npz", simulate_spikes(light, generator=torch.Generator().manual_seed(0)))
+    network = ClassicalDecoder("tfp")
+    for _, rgb in reconstruct(tmp_path / "dim.npz", network=network, frame="40:81:40"):
+        assert rgb.quantile(0.999) > 0.9
+    ((_, rgb),) = reconstruct(tmp_path / "dim.npz", network=network, frame="40", white=0.4)
+    assert rgb.max() < 0.2
+
+
+@pytest.mark.parametrize("speed", ["best", "balanced", "fast", "fastest"])
+def test_weights_for_noise_are_chosen_where_nobody_has_measured_the_sensor(flat, speed):
+    pictures = reconstruct(flat(0.4), speed)
+    assert find_model(pictures.notes[0].split(",")[0].split(":")[0]).noise
+    assert "nobody has measured this sensor" in pictures.notes[-1]
+
+
+def test_ideal_sensors_get_the_weights_for_them(flat, tmp_path, monkeypatch):
+    asked = reconstruct(flat(0.4), "balanced", calibration="none")
+    assert not find_model(asked.notes[0].split(",")[0].split(":")[0]).noise
+    monkeypatch.chdir(tmp_path)
+    write_picture("photo.png", torch.ones(3, 30, 40))
+    spikekit_main(["simulate", "photo.png", "-o", "a.dat", "--scale", "1"])
+    simulated = reconstruct("a.dat", "fastest")
+    assert isinstance(simulated.network, ClassicalDecoder)
+
+
+@pytest.mark.parametrize(
+    ("white", "speed", "hint"), [(0.05, "fastest", True), (0.4, "fastest", False), (0.05, "fast", False)]
+)
+def test_a_decoder_of_a_dark_recording_is_said_to_be_noisy(flat, white, speed, hint):
+    pictures = reconstruct(flat(white), speed, calibration="none")
+    assert isinstance(pictures.network, ClassicalDecoder) == (speed == "fastest")
+    assert any("picture is noisy" in line for line in pictures.notes) == hint
+
+
+@pytest.mark.parametrize(
+    ("white", "frame", "frames", "hint"),
+    [(0.05, None, 41, True), (0.05, "50:150", 101, False), (0.05, "50:151", 41, True), (0.4, None, 41, False)],
+)
+def test_longer_clips_are_chosen_or_hinted_at_in_little_light(flat, white, frame, frames, hint):
+    pictures = reconstruct(flat(white), "best", frame=frame)
+    assert pictures.network.frames == frames
+    assert any("--frame 50:150 leaves room for them" in line for line in pictures.notes) == hint
+
+
+def test_a_white_that_is_given_decides_what_is_little_light(flat):
+    path = flat(0.4)
+    assert reconstruct(path, "best", frame="100").network.frames == 41
+    assert reconstruct(path, "best", frame="100", white=0.05).network.frames == 101
+
+
+@pytest.mark.parametrize(
+    ("every", "speed", "interpolated"),
+    [(1, "balanced", 11), (6, "balanced", 1), (3, "best", 1), (4, "best", 0), (20, "balanced", 0), (3, "fastest", 0)],
+)
+def test_pictures_close_to_each_other_are_interpolated(flat, every, speed, interpolated):
+    pictures = reconstruct(flat(0.3), speed, frame=f"60:120:{every}", calibration="none")
+    assert pictures.how.get("interpolated", 0) == interpolated
+    without = reconstruct(flat(0.3), speed, frame=f"60:120:{every}", calibration="none", interpolated=0)
+    assert without.how["interpolated"] == 0
+
+
+def test_a_film_is_that_of_the_stream_and_parts_of_it_are_the_same(recording):
+    torch.manual_seed(0)
+    network = RecurrentCSCSR(**TINY).eval()
+    for weight in (network.fusion.share.weight, network.fusion.rest.weight):
+        torch.nn.init.normal_(weight, std=0.05)
+    for future in (0, 3):
+        pictures = reconstruct(recording, network=network, frame="20:79:10", white=0.3, future=future)
+        unbroken = dict(pictures)
+        shown = dict(film(network, [read_spikes(recording)], 10, future=future, white=0.3))
+        assert unbroken.keys() == shown.keys()
+        for clock, rgb in shown.items():
+            torch.testing.assert_close(unbroken[clock], rgb)
+        parts = [dict(pictures.pictures(part=(n, 2))) for n in range(2)]
+        again = dict(pictures.pictures(made=[20, 30, 50, 60]))
+        assert again.keys() == {40, 70}
+        for found in (*parts, again):
+            assert all(torch.allclose(rgb, unbroken[clock]) for clock, rgb in found.items())
+        assert [*parts[0], *parts[1]] == [*unbroken]
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3])
+@pytest.mark.parametrize(("future", "interpolated"), [(0, 0), (2, 0), (0, 2), (1, 1)])
+def test_what_comes_before_a_wanted_picture_is_seen_again(recording, parts, future, interpolated):
+    network = RecurrentCSCSR(**TINY).eval()
+    network.warm_up = 4
+    how = {"future": future, "interpolated": interpolated}
+    pictures = reconstruct(recording, network=network, frame="20:79:2", white=0.3, **how)
+    chosen, made, shown = pictures.clips.chosen, {30, 34, 36}, []
+    of_group = list(film_groups(chosen, future, interpolated))
+    for part in range(parts):
+        groups = pictures._groups(pictures._maker(), made, part, parts)
+        assert all(group in of_group for group, _ in groups)
+        seen = [frame for group, _ in groups for frame in group]
+        wanted = [frame for group, whether in groups for frame in group if whether and frame not in made]
+        shown += wanted
+        for frame in wanted:
+            assert set([n for n in chosen if n < frame][-4:]) <= set(seen[: seen.index(frame)])
+    assert shown == [frame for frame in chosen if frame not in made]
+
+
+def test_tiles_views_and_tolerance_reach_the_network(recording):
+    torch.manual_seed(0)
+    network = CSCSR(**TINY).eval()
+    ((_, plain),) = reconstruct(recording, network=network, frame="40", white=0.3)
+    ((_, mean),) = reconstruct(recording, network=network, frame="40", white=0.3, self_ensemble=2)
+    assert not torch.allclose(plain, mean)
+    with pytest.raises(ValueError, match="interpolated: expected a whole number"):
+        reconstruct(recording, network=network, interpolated=-1)
+
+
+def test_mistakes_are_said_in_one_line(recording, tmp_path):
+    with pytest.raises(ValueError, match="white: expected a finite number above 0, got -1"):
+        reconstruct(recording, network=ClassicalDecoder(), white=-1)
+    with pytest.raises(ValueError, match="speed, budget, network: expected one of them, got fast, 2s"):
+        reconstruct(recording, "fast", budget="2s")
+    with pytest.raises(ValueError, match=r"none\.npz"):
+        reconstruct(tmp_path / "none.npz")
+    with pytest.raises(ValueError, match="scale: expected one that was measured"):
+        reconstruct(recording, scale=7)
+
+
+def test_pictures_are_made_without_lightning(recording):
+    code = f"import sys, lightning_modules as l; list(l.reconstruct({str(recording)!r}, 'fastest', frame='40'))"
+    check = f"{code}; assert 'pytorch_lightning' not in sys.modules"
+    subprocess.run([sys.executable, "-c", check], check=True)
