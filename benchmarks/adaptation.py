@@ -21,12 +21,12 @@ from lightning_modules.adaptation.lessons import HELD_OUT, chosen_frames, make_l
 from lightning_modules.cli.command import without_chatter
 from lightning_modules.data.pictures import folder_pictures
 from lightning_modules.data.stills import StillClips
-from lightning_modules.inference._open import open_recording
 from lightning_modules.inference.clips import RecordingClips
 from lightning_modules.inference.export import load_network
 from lightning_modules.inference.predict import predict
 from lightning_modules.networks import Network
 from spikekit import SensorNoise, SpikeSensor, psnr, write_spikes
+from spikekit.recording import open_recording
 from spikekit.tables import table
 
 FRAMES, PATCH = 601, 80

@@ -19,10 +19,10 @@ from lightning_modules.data.pictures import folder_pictures
 from lightning_modules.data.stills import StillClips
 from lightning_modules.networks import CSCSR
 from spikekit import SensorNoise, SpikeSensor, correct_spikes, demosaic, psnr, tfi_at, tfp_at
-from spikekit.flow.scene_calibration import calibrate_in_motion, count_segments, segment_length
-from spikekit.sensor.calibrate import calibrate, find_defects
-from spikekit.sensor.calibration import Calibration
-from spikekit.sensor.pixel_rates import PixelRates
+from spikekit.calibration.calibration import Calibration
+from spikekit.calibration.in_motion import calibrate_in_motion, count_segments, segment_length
+from spikekit.calibration.measure import calibrate, find_defects
+from spikekit.calibration.pixel_rates import PixelRates
 from spikekit.tables import table
 
 ALPHA, PATTERN, FRAMES, PATCH = 0.25, "BGGR", 401, 80

@@ -17,7 +17,7 @@ from lightning_modules.cli.command import without_chatter
 from lightning_modules.cli.errors import InputError, UsageError, VerbParser
 from lightning_modules.cli.folder_lock import check_folder, locked_folder
 from lightning_modules.cli.predict import RECORDING, add_recording
-from lightning_modules.inference._open import find_model, list_models, open_recording
+from lightning_modules.inference._open import find_model, list_models
 from lightning_modules.inference.clips import RecordingClips
 from lightning_modules.inference.export import load_network
 from lightning_modules.inference.output import file_identity
@@ -26,7 +26,7 @@ from lightning_modules.networks import Network, RecurrentCSCSR
 from lightning_modules.storage.pretrained import Weights, motion_of, settings_of, write_weights
 from spikekit.arguments import UsageError as SpikekitUsageError
 from spikekit.arguments import whole
-from spikekit.io.recording import Recording
+from spikekit.recording import Recording, open_recording
 from spikekit.timing import duration
 
 #: dB by which the held-out pictures have to come nearer to the teacher's

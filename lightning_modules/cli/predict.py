@@ -19,9 +19,8 @@ from lightning_modules.inference.presets import SPEEDS
 from lightning_modules.inference.reconstruct import Reconstruction, reconstruct
 from spikekit.arguments import UsageError as SpikekitUsageError
 from spikekit.arguments import positive, whole
-from spikekit.color.cfa import PATTERNS
+from spikekit.cli import recordings
 from spikekit.decoders.methods import DECODERS
-from spikekit.io import recording as recordings
 from spikekit.io.sidecar import check_unclaimed
 from spikekit.io.video_output import check_film
 from spikekit.progress import progress
@@ -36,12 +35,6 @@ _HOW = "tile", "psnr_tolerance", "self_ensemble", "future", "interpolated"
 def add_recording(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that describe a recording."""
     recordings.add_arguments(parser)
-    recordings.add_calibration(parser)
-    parser.add_argument(
-        "--pattern",
-        choices=[*PATTERNS, "grey"],
-        help="Bayer phase after the flip, RGGB if nothing else is known; grey for a camera without colours",
-    )
 
 
 def parser() -> argparse.ArgumentParser:

@@ -1,12 +1,8 @@
-"""Stands between two rooms that are being rebuilt: models and recordings as they will be called."""
+"""Stands between two rooms that are being rebuilt: models as they will be called."""
 
-from argparse import Namespace
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
 
 from lightning_modules.storage.shipped import list_pretrained
-from spikekit.io import recording
 
 
 @dataclass(frozen=True)
@@ -35,11 +31,3 @@ def list_models(scale: int | None = None, pattern: str | None = None) -> list[Mo
 def find_model(name: str) -> Model | None:
     """Find weights by their name."""
     return next((one for one in list_models() if one.name == name), None)
-
-
-def open_recording(path: str | Path, *, pattern: str | None = None, **known: Any) -> recording.Recording:
-    """Open a recording."""
-    said = None if pattern == "grey" else pattern
-    known = {**dict.fromkeys(("height", "width", "camera", "calibration")), "flip": False, **known}
-    found = recording.open_recording(Namespace(file=Path(path), pattern=said, **known))
-    return replace(found, pattern="grey") if pattern == "grey" else found

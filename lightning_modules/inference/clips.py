@@ -14,7 +14,7 @@ from torch import Tensor
 
 from spikekit import bayer_sites
 from spikekit.arguments import frames_of
-from spikekit.io.recording import Recording, white_rate
+from spikekit.recording import Recording, white_rate
 
 Item = TypeVar("Item")
 
@@ -29,7 +29,7 @@ class RecordingClips:
     """Clips around some frames of a recording, which is read once, from its beginning to its end.
 
     Args:
-        recording: as :func:`spikekit.io.open_recording` gives it.
+        recording: as :func:`spikekit.recording.open_recording` gives it.
         frames: spike frames N of a clip, as the network takes them.
         frame: which frames are in the middle of clips: N, or from A to B - 1 as A:B or A:B:STEP, 20 apart where STEP is
             left out; all, 20 apart, when not given.

@@ -18,7 +18,7 @@ from lightning_modules.networks import Network, RecurrentCSCSR
 from lightning_modules.networks.recurrent_cscsr import read_forward, read_from_end
 from spikekit import flow_warp, linear_motion, upsample_flow
 from spikekit.check import check_planes, check_positive, check_whole
-from spikekit.io.recording import white_rate
+from spikekit.recording import white_rate
 
 
 class FilmFrame(NamedTuple):

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lightning_modules.inference._open import find_model, open_recording
+from lightning_modules.inference._open import find_model
 from lightning_modules.inference.clips import FRAMES, RecordingClips, film_groups, is_grey
 from lightning_modules.inference.film import FilmFrame, FilmMaker
 from lightning_modules.inference.output import file_identity
@@ -22,7 +22,7 @@ from lightning_modules.inference.presets import SPEEDS, Choice, Preset, choose
 from lightning_modules.networks import ClassicalDecoder, Network
 from spikekit import __version__
 from spikekit.io.image_bytes import to_bytes
-from spikekit.io.recording import Recording
+from spikekit.recording import Recording, open_recording
 from spikekit.timing import duration
 
 # how many times as long as its clips a recording is whose first and last pictures a longer clip may cost
@@ -124,6 +124,7 @@ def reconstruct(
     elif not isinstance(network, Network):
         network = Network.from_pretrained(network)
     clips = RecordingClips(recording, network.frames, frame, network.pattern)
+    notes = [line for line in (recording.note, *notes) if line]
     return Reconstruction(network, clips, white, device, precision, notes, **how)
 
 

@@ -10,23 +10,23 @@ from typing import Any
 from torch import Tensor
 
 from spikekit.arguments import UsageError
-from spikekit.color.cfa import PATTERNS
-from spikekit.flow.scene_calibration import (
+from spikekit.calibration.calibration import Calibration
+from spikekit.calibration.files import ENDING, read_calibration, write_calibration
+from spikekit.calibration.in_motion import (
     LEAST_SEGMENTS,
     MOST_SEGMENTS,
     calibrate_in_motion,
     count_segments,
     segment_length,
 )
-from spikekit.io import recording as recordings
-from spikekit.io.calibration import ENDING, read_calibration, write_calibration
+from spikekit.calibration.measure import Measured, calibrate, find_defects
+from spikekit.calibration.pixel_rates import PixelRates
+from spikekit.cli import recordings
 from spikekit.io.failures import writing
 from spikekit.io.files import iter_spikes
-from spikekit.io.recording import Recording, open_recording, own_calibration
 from spikekit.progress import progress
-from spikekit.sensor.calibrate import Measured, calibrate, find_defects
-from spikekit.sensor.calibration import DEAD, HOT, WORKS, Calibration
-from spikekit.sensor.pixel_rates import PixelRates
+from spikekit.recording import Recording, open_recording, own_calibration
+from spikekit.sensor.noise import DEAD, HOT, WORKS
 
 _LEAST_FRAMES = 100
 _CHUNK = 1 << 24  # pixels that are counted at a time
@@ -44,9 +44,9 @@ def run(args: argparse.Namespace) -> None:
     --calibration.
     """
     output = args.output or own_calibration(args.file)
-    recording = open_recording(_of(args, args.file))
+    recording = _open(args, args.file)
     _check_output(output)
-    others = {name: open_recording(_of(args, path)) for name in ("flat", "dark") if (path := getattr(args, name))}
+    others = {name: _open(args, path) for name in ("flat", "dark") if (path := getattr(args, name))}
     for other in others.values():
         if other.size != recording.size:
             sizes = " x ".join(map(str, recording.size)), " x ".join(map(str, other.size))
@@ -54,9 +54,9 @@ def run(args: argparse.Namespace) -> None:
     seen = {name: _halves(other) for name, other in (others or {"scene": recording}).items()}
     try:
         if others:
-            found, said = calibrate(seen.get("flat"), seen.get("dark"), recording.pattern), None
+            found, said = calibrate(seen.get("flat"), seen.get("dark"), recording.bayer), None
         else:
-            found = find_defects(seen["scene"][0] + seen["scene"][1], recording.pattern)
+            found = find_defects(seen["scene"][0] + seen["scene"][1], recording.bayer)
             moved, said = _in_motion(recording, seen["scene"][0] + seen["scene"][1], found.calibration)
             found = moved or found
     except ValueError as error:
@@ -77,9 +77,9 @@ def run(args: argparse.Namespace) -> None:
     print(f"{output}: {', '.join(f'{name} {half[0].frames + half[1].frames} frames' for name, half in seen.items())}")
 
 
-def _of(args: argparse.Namespace, path: Path) -> argparse.Namespace:
-    """Return arguments for another file of the same sensor; what is on the disk does not count."""
-    return argparse.Namespace(**{**vars(args), "file": path, "calibration": "none"})
+def _open(args: argparse.Namespace, path: Path) -> Recording:
+    """Open a file of the sensor, uncorrected."""
+    return open_recording(path, **recordings.known(args), calibration="none")
 
 
 def _halves(recording: Recording) -> tuple[PixelRates, PixelRates]:
@@ -112,7 +112,7 @@ def _in_motion(recording: Recording, rates: PixelRates, known: Calibration) -> t
         return None, f"not measured: that takes {least} frames of a scene that moves, got {frames}"
     with progress(what="segments counted", total=frames) as bar:
         segments = count_segments(_parts(recording, 0, frames, bar), length)
-    found = calibrate_in_motion(segments, known, recording.pattern)
+    found = calibrate_in_motion(segments, known, recording.bayer)
     return found, None if found else f"not measured in {frames} frames: too little moves, or gains are all but equal"
 
 
@@ -131,9 +131,8 @@ def _check_output(output: Path) -> None:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    recordings.add_arguments(parser)
+    recordings.add_arguments(parser, calibration=False)
     add = parser.add_argument
     add("--flat", type=Path, metavar="FILE", help="a recording of even light, by the same camera")
     add("--dark", type=Path, metavar="FILE", help="a recording in the dark, by the same camera")
-    add("--pattern", type=str.upper, choices=PATTERNS, help="Bayer phase after the flip; grey without it")
     add("-o", "--output", type=Path, metavar="OUT", help=f"the file to write; NAME{ENDING} beside FILE if not given")

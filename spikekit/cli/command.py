@@ -16,22 +16,20 @@ from spikekit.completion import OPTION, completion
 from spikekit.extras import remedy
 from spikekit.standard_output import BROKEN_PIPE, stop_printing
 
-#: what every verb does, the module whose ``add_arguments`` and ``run`` it is, and an example
+#: what every verb does, and an example; ``add_arguments`` and ``run`` are those of the module of its name
 VERBS = {
-    "info": ("what a recording holds", "cli.info", "info street.dat --height 250 --width 400"),
+    "info": ("what a recording holds", "info street.dat --height 250 --width 400"),
     "decode": (
         "the picture of one frame, or of many",
-        "cli.decode",
         "decode water.dat --height 1000 --width 1000 --flip --pattern BGGR --method tfi -o water.png",
     ),
-    "simulate": ("a stream of a film", "cli.simulate", "simulate walk -o walk.dat --scale 4"),
+    "simulate": ("a stream of a film", "simulate walk -o walk.dat --scale 4"),
     "calibrate": (
         "gain and defects of pixels",
-        "cli.calibrate",
         "calibrate street.dat --height 250 --width 400 --flat wall.dat --dark cap.dat",
     ),
-    "view": ("a recording as a picture or a page", "cli.view", "view walk.dat -o walk.html"),
-    "cameras": ("the cameras that --camera knows", "cli.cameras", "cameras"),
+    "view": ("a recording as a picture or a page", "view walk.dat -o walk.html"),
+    "cameras": ("the cameras that --camera knows", "cameras"),
 }
 
 
@@ -85,7 +83,7 @@ def _parser(*asked: str) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"spikekit {__version__}")
     parser.add_argument(OPTION, metavar="SHELL", help="print what lets bash or zsh complete with the tab key")
     verbs = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
-    for name, (summary, home, example) in VERBS.items():
+    for name, (summary, example) in VERBS.items():
         verb = verbs.add_parser(
             name,
             help=summary,
@@ -93,7 +91,7 @@ def _parser(*asked: str) -> argparse.ArgumentParser:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         if name in asked:
-            module = import_module(f"spikekit.{home}")
+            module = import_module(f"spikekit.cli.{name}")
             verb.description = inspect.getdoc(module.run)
             verb.set_defaults(run=module.run)
             module.add_arguments(verb)

@@ -11,17 +11,16 @@ import numpy as np
 import torch
 
 from spikekit.arguments import FRAMES, UsageError, ending_in, frames_of, positive, whole
-from spikekit.color.cfa import PATTERNS
+from spikekit.cli import recordings
 from spikekit.color.demosaic import demosaic
 from spikekit.decoders.methods import DECODERS, TFI_REACH
-from spikekit.io import recording as recordings
 from spikekit.io.failures import writing
 from spikekit.io.files import iter_spikes
 from spikekit.io.images import write_picture
-from spikekit.io.recording import Recording, open_recording, white_rate
 from spikekit.io.sidecar import check_unclaimed
 from spikekit.io.video import PICTURE_ENDINGS
 from spikekit.progress import progress
+from spikekit.recording import Recording, white_rate
 
 #: Frames that TFP averages when nothing else is said.
 TFP_WINDOW = 41
@@ -43,7 +42,7 @@ def run(args: argparse.Namespace) -> None:
         raise UsageError(f"--order: expected {_with_option('order')}, got {args.order} with {args.method}")
     if args.output.is_dir():
         raise ValueError(f"{args.output}: expected a picture to write, got a folder")
-    recording = open_recording(args)
+    recording = recordings.opened(args)
     frames = recording.frames
     chosen = _chosen(args, frames)
     if len(chosen) > 1 and _NUMBER not in str(args.output):
@@ -65,7 +64,7 @@ def run(args: argparse.Namespace) -> None:
         first, last = _span(n, reach, frames)
         raw = torch.from_numpy(decoder.planes(plane, n, range(first, last + 1), frames, **options))
         raw = recording.correct(raw) / white
-        picture = raw if recording.pattern is None else demosaic(raw, recording.pattern)
+        picture = raw if recording.bayer is None else demosaic(raw, recording.bayer)
         picture = recording.show(picture, known=alpha is not None)
         with writing(paths[n], wrong=Exception):  # what a picture library raises depends on the ending
             write_picture(paths[n], picture)
@@ -86,7 +85,6 @@ def _with_option(name: str) -> str:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     recordings.add_arguments(parser)
-    recordings.add_calibration(parser)
     add = parser.add_argument
     add(
         "--method",
@@ -105,7 +103,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="OUT.png",
         help=f"the picture to write; {_NUMBER} in it becomes the number of the frame, with leading zeros",
     )
-    add("--pattern", type=str.upper, choices=PATTERNS, help="Bayer phase after the flip, for colour; grey without it")
     add(
         "--frame",
         type=_frames,

@@ -6,8 +6,7 @@ import argparse
 
 from torch import Tensor
 
-from spikekit.io import recording as recordings
-from spikekit.io.recording import open_recording
+from spikekit.cli import recordings
 
 #: Clocks a second of the cameras.
 CLOCK_HZ = 20_000
@@ -15,7 +14,7 @@ CLOCK_HZ = 20_000
 
 def run(args: argparse.Namespace) -> None:
     """Print what a recording holds, in one pass over its frames."""
-    recording = open_recording(args)
+    recording = recordings.opened(args)
     frames, (height, width) = recording.frames, recording.size
     counts = recording.counts(0, frames)
     pixels, spikes = counts.numel(), int(counts.sum())
@@ -41,7 +40,6 @@ def run(args: argparse.Namespace) -> None:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     recordings.add_arguments(parser)
-    recordings.add_calibration(parser)
 
 
 def _at(rates: Tensor, index: Tensor) -> str:

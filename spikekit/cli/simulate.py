@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 from spikekit.arguments import UsageError, ending_in, positive, whole
-from spikekit.cli.simulation import Settings, Source, is_own, simulate
+from spikekit.calibration.files import read_calibration
 from spikekit.color.cfa import PATTERNS
-from spikekit.io.calibration import read_calibration
 from spikekit.io.sidecar import Sidecar, read_sidecar
+from spikekit.io.video import VideoError
+from spikekit.scenes.simulation import Settings, Source, build, is_own, simulate
 from spikekit.sensor.noise import SensorNoise
 
 _NOISE = {
@@ -53,8 +55,22 @@ def run(args: argparse.Namespace) -> None:
         if "scale" not in given:
             raise UsageError("--scale: needed, unless INPUT is a side-car")
         settings, path = _settings(given), args.input
-    for line in simulate(Source(path, settings), settings, args.output, replayed):
+    with _options():
+        source = Source(path, settings)
+        build(settings.interpolation)
+    for line in simulate(source, settings, args.output, replayed):
         print(line)
+
+
+@contextmanager
+def _options() -> Iterator[None]:
+    """Say of a setting that makes no sense which option it is; what is wrong with a file passes."""
+    try:
+        yield
+    except VideoError:
+        raise
+    except ValueError as error:
+        raise UsageError(f"--{str(error).replace('_', '-', 1)}") from error
 
 
 def _names(kind: Any) -> set[str]:
@@ -65,15 +81,11 @@ def _settings(given: dict[str, Any]) -> Settings:
     noise = {name: value for name, value in given.items() if name in _NOISE}
     calibration = given.get("calibration")
     known = calibration and read_calibration(calibration)
-    try:
+    with _options():
         return Settings(
             **{name: value for name, value in given.items() if name not in noise},
             noise=SensorNoise(**noise, calibration=known),
         )
-    except UsageError:
-        raise
-    except ValueError as error:
-        raise UsageError(f"--{str(error).replace('_', '-', 1)}") from error
 
 
 def _settings_of(path: Path, sidecar: Sidecar, given: dict[str, Any]) -> Settings:

@@ -17,19 +17,18 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from spikekit.arguments import UsageError, ending_in, positive, whole
+from spikekit.cli import recordings
 from spikekit.cli.drawing import fit, histogram, raster, sheet
-from spikekit.color.cfa import PATTERNS
 from spikekit.color.demosaic import demosaic
 from spikekit.decoders.single_frame import search
 from spikekit.flow.fields import upsample_flow
-from spikekit.io import recording
 from spikekit.io.failures import writing
 from spikekit.io.image_bytes import gif_bytes, picture_bytes, png_bytes
 from spikekit.io.images import flow_to_rgb
-from spikekit.io.recording import Recording, open_recording, white_rate
 from spikekit.io.sidecar import check_unclaimed
 from spikekit.io.whole_file import whole_file
 from spikekit.progress import progress
+from spikekit.recording import Recording, white_rate
 
 #: Frames on each side of the one in the middle that are looked at.
 REACH = 200
@@ -51,7 +50,7 @@ def run(args: argparse.Namespace) -> None:
 
     Size, Bayer phase and brightness can be omitted if a side-car or --camera gives them.
     """
-    shown = open_recording(args)
+    shown = recordings.opened(args)
     begin, end = _span(args.frames, shown)
     window = min(args.window or _WINDOW, end - begin)
     ending = args.output.suffix.lower()
@@ -151,7 +150,7 @@ class Moment:
 
     def picture(self, raw: Tensor) -> Tensor:
         """Return raw light as it is shown, (3, H, W) or (H, W)."""
-        light, pattern = self.recording.correct(raw) / self.white, self.recording.pattern
+        light, pattern = self.recording.correct(raw) / self.white, self.recording.bayer
         colour = demosaic(light, pattern) if pattern and min(light.shape) >= 3 else light
         return fit(self.recording.show(colour, known=self.alpha is not None), _SIDE, _SIDE)
 
@@ -313,12 +312,10 @@ def _span(text: str | None, recording: Recording) -> tuple[int, int]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    recording.add_arguments(parser)
-    recording.add_calibration(parser)
+    recordings.add_arguments(parser)
     add = parser.add_argument
     output = ending_in(".png", ".gif", ".html", said="a file that ends in .png, .gif or .html")
     add("-o", "--output", required=True, type=output, metavar="OUT", help="what to write: .png, .gif or .html")
-    add("--pattern", type=str.upper, choices=PATTERNS, help="Bayer phase after the flip, for colour")
     add(
         "--alpha", type=positive, metavar="A", help="gain of a simulated recording: a white pixel fires A times a frame"
     )

@@ -1,6 +1,5 @@
 """From spikes back to light."""
 
-from spikekit.decoders.calibrated import correct_spikes
 from spikekit.decoders.chunked import decode_in_chunks
 from spikekit.decoders.dense import SpikeInterval, Tfi, Tfp, spike_interval, tfi, tfp
 from spikekit.decoders.packing import pack_spikes, unpack_spikes
@@ -10,7 +9,6 @@ __all__ = [
     "SpikeInterval",
     "Tfi",
     "Tfp",
-    "correct_spikes",
     "decode_in_chunks",
     "pack_spikes",
     "spike_interval",

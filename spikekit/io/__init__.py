@@ -1,6 +1,5 @@
 """Recordings, side-cars, cameras, pictures and videos in files."""
 
-from spikekit.io.calibration import read_calibration, write_calibration
 from spikekit.io.cameras import CAMERAS, Camera, camera
 from spikekit.io.files import SpikeFileError, iter_spikes, read_spikes, spikes_shape, write_spikes
 from spikekit.io.images import PictureError, flow_to_rgb, panel, read_picture, write_picture
@@ -18,12 +17,10 @@ __all__ = [
     "flow_to_rgb",
     "iter_spikes",
     "panel",
-    "read_calibration",
     "read_picture",
     "read_spikes",
     "read_video",
     "spikes_shape",
-    "write_calibration",
     "write_picture",
     "write_spikes",
     "write_video",

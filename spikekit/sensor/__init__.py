@@ -1,12 +1,10 @@
 """The sensor: from light to spikes, and the noise that a real one adds."""
 
-from spikekit.sensor.calibration import Calibration
 from spikekit.sensor.integrate_fire import SpikeIntegrateFire, spike_integrate_fire
 from spikekit.sensor.noise import SensorNoise, SpikeChange
 from spikekit.sensor.simulate import SpikeSensor, simulate_spikes
 
 __all__ = [
-    "Calibration",
     "SensorNoise",
     "SpikeChange",
     "SpikeIntegrateFire",

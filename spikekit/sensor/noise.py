@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from spikekit.check import check_whole
-from spikekit.sensor.calibration import DEAD, HOT, WORKS, Calibration
 
 # Each has its own random numbers. The place in the list tells them apart: append, never reorder.
 _PURPOSES = ("charge", "gain", "dark current", "defects", "photons", "electrons")
@@ -21,6 +20,22 @@ _MEAN_SIZE = math.sqrt(2 / math.pi)  # E|x| of a standard normal x
 # A pixel that leaks a threshold fires at every clock; of pixels that differ more, nearly all would see nothing.
 _MOST = {"dark_current": 1.0, "dark_spread": 10.0, "gain_spread": 10.0, "hot": 1.0, "dead": 1.0}
 _MOST_PHOTONS = 1e18  # NumPy's Poisson numbers end at 9.2e18, and one photon more or less is no longer seen here
+
+
+#: What ``defects`` of a measured sensor hold: the pixel works, does not see light, or fires whatever the light is.
+WORKS, DEAD, HOT = 0, 1, 2
+
+
+class MeasuredPixels(Protocol):
+    """What noise reads of a sensor that was measured, such as a :class:`spikekit.Calibration`; all (H, W)."""
+
+    gain: Tensor
+    dark: Tensor
+    defects: Tensor
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W)."""
 
 
 class SpikeChange(NamedTuple):
@@ -70,8 +85,8 @@ class SensorNoise:
         gain_spread: :math:`\sigma_g`, standard deviation of the gain between pixels, at most 10: fixed-pattern noise.
         hot: share of pixels that always fire.
         dead: share of pixels that never fire.
-        calibration: gain, dark current and defects of a sensor that was measured, instead of chance; then the spreads
-            and shares above are 0.
+        calibration: gain, dark current and defects of a sensor that was measured, a :class:`spikekit.Calibration`,
+            instead of chance; then the spreads and shares above are 0.
 
     Raises:
         ValueError: a number out of its range, shares of hot and dead pixels that together exceed 1, a spread of a dark
@@ -102,7 +117,7 @@ class SensorNoise:
     gain_spread: float = 0.0
     hot: float = 0.0
     dead: float = 0.0
-    calibration: Calibration | None = field(default=None, repr=False)
+    calibration: MeasuredPixels | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if self.photons is not None and not 1 <= self.photons < math.inf:

@@ -12,11 +12,11 @@ from lightning_modules.adaptation import learn as learning
 from lightning_modules.adaptation import lessons as making
 from lightning_modules.adaptation.learn import learn, likeness
 from lightning_modules.adaptation.lessons import HELD_OUT, Lessons, chosen_frames, make_lessons
-from lightning_modules.inference._open import open_recording
 from lightning_modules.inference.clips import RecordingClips
 from lightning_modules.networks import CSCSR
 from lightning_modules.storage.shipped import find_shipped
 from spikekit import Calibration, simulate_spikes, write_calibration, write_spikes
+from spikekit.recording import open_recording
 
 
 def stripes(frames, height=28, width=24):

@@ -1,7 +1,6 @@
 import pytest
 import torch
 
-from lightning_modules.inference._open import open_recording
 from lightning_modules.inference.clips import RecordingClips, clips_around, is_grey
 from spikekit import (
     Calibration,
@@ -14,6 +13,7 @@ from spikekit import (
     write_spikes,
 )
 from spikekit.cli.command import main as spikekit_main
+from spikekit.recording import open_recording
 
 PATTERNS = ["RGGB", "BGGR", "GRBG", "GBRG"]
 

@@ -3,7 +3,6 @@
 import os
 import re
 import resource
-from argparse import Namespace
 from pathlib import Path
 
 import pytest
@@ -12,10 +11,10 @@ from safetensors.torch import save_file
 
 from spikekit import Calibration, SensorNoise, SpikeSensor, read_calibration, read_picture, write_calibration
 from spikekit import write_spikes as write
+from spikekit.calibration.files import ENDING
 from spikekit.cli.command import main
-from spikekit.io.calibration import ENDING
-from spikekit.io.recording import open_recording
-from spikekit.sensor.calibration import DEAD, HOT
+from spikekit.recording import open_recording
+from spikekit.sensor.noise import DEAD, HOT
 
 SIZE = 24, 32
 HOW = ["--height", "24", "--width", "32", "--flip", "--pattern", "BGGR"]
@@ -74,10 +73,9 @@ def test_pictures_are_corrected(command, capsys):
 def test_another_file_and_rows_that_are_not_turned(truth):
     measured()
     os.rename(f"scene{ENDING}", "camera.safetensors")
-    known = {"camera": None, "height": 24, "width": 32}
     for flip in (False, True):
-        args = Namespace(file=Path("wall.dat"), calibration="camera.safetensors", flip=flip, **known)
-        defects = open_recording(args).calibration.defects
+        wall = open_recording("wall.dat", height=24, width=32, flip=flip, calibration="camera.safetensors")
+        defects = wall.calibration.defects
         assert defects.equal(truth.defects if flip else truth.defects.flip(0))
 
 

@@ -17,11 +17,11 @@ import torch
 from spikekit import (
     __version__,
     bin_to_sensor,
-    extremes,
     iter_spikes,
     psnr,
     read_picture,
     read_spikes,
+    recording,
     spike_integrate_fire,
     tfi,
     tfp,
@@ -29,7 +29,6 @@ from spikekit import (
 )
 from spikekit.cli import decode
 from spikekit.cli.command import VERBS, main
-from spikekit.io import recording
 
 SPIKES = Path(__file__).parents[3].parent / "shared" / "data" / "spikes"
 REDS = SPIKES / "reds_sim_mono_203_250x400.dat"
@@ -129,13 +128,13 @@ def test_info_of_an_array(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("size", "expected"),
     [
-        (12_500 * 301, "250 x 400 (grey Vidar camera: 301 frames) divides its 3762500 bytes exactly"),
-        (7_813 * 2, "250 x 250 (UHSR: 2 frames) divides its 15626 bytes exactly"),
+        (12_500 * 301, "250 x 400 (vidar: 301 frames) divides its 3762500 bytes exactly"),
+        (7_813 * 2, "250 x 250 (uhsr: 2 frames) divides its 15626 bytes exactly"),
         (
             250_000,
-            "250 x 400 (grey Vidar camera: 20 frames) and 1000 x 1000 (colour spike camera: 2 frames) divide its",
+            "250 x 400 (vidar: 20 frames) and 1000 x 1000 (m1k40 or m1k40-bayer: 2 frames) divide its",
         ),
-        (30, "none of 250 x 400, 250 x 416, 250 x 250, 1000 x 1000, 1000 x 1024 divides its 30 bytes exactly"),
+        (30, "none of 250 x 250, 250 x 400, 250 x 416, 1000 x 1000, 1000 x 1024 divides its 30 bytes exactly"),
     ],
 )
 @pytest.mark.parametrize("given", [(), ("--height", 250), ("--width", 400)])
@@ -522,21 +521,6 @@ def test_full_disk(clip):
             [*COMMAND, "info", *map(str, sized(clip))], stdout=full, stderr=subprocess.PIPE, text=True
         )
     assert (done.returncode, done.stderr) == (1, "spikekit: standard output: No space left on device\n")
-
-
-def test_a_file_that_cannot_be_opened_is_named(tmp_path, fails):
-    long, inside = tmp_path / ("a" * 300), tmp_path / "file" / "a.md"
-    inside.parent.write_text("no folder")
-    for out, why in ((inside, "Not a directory"), (long, "File name too long")):
-        assert fails(1, "extremes", "--operator", "tfp", "-o", out) == f"spikekit: {out}: {why}\n"
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
-def test_a_table_without_room_is_named(fails, monkeypatch):
-    few = [case for case in extremes.CASES if case.extreme == "no spike"]
-    monkeypatch.setattr(extremes, "CASES", few)
-    words = "extremes", "--operator", "spike_interval", "--device", "cpu", "-o", "/dev/full"
-    assert fails(1, *words) == "spikekit: /dev/full: No space left on device\n"
 
 
 class Full(io.StringIO):

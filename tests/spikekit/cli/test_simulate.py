@@ -16,11 +16,11 @@ from skimage import io
 
 from spikekit import Calibration, read_picture, read_spikes, tfp, write_calibration, write_picture
 from spikekit.cli.command import main
-from spikekit.cli.simulation import Settings, Source, build
 from spikekit.io.sidecar import find_sidecar, published, read_sidecar
 from spikekit.scenes.adaptive_sampling import Plan
 from spikekit.scenes.frame_sequence import Film
-from spikekit.sensor.calibration import DEAD, HOT
+from spikekit.scenes.simulation import Settings, Source, build
+from spikekit.sensor.noise import DEAD, HOT
 
 # Forks processes of the command, so many at once, and kills them where seconds are given. What is started anew takes
 # seconds to import torch and more.
@@ -231,7 +231,7 @@ def test_an_interpolation_of_ones_own(film, monkeypatch):
     [
         "os.mkdir(path='harmed')",
         "test_simulate.Hold",
-        "spikekit.cli.simulation.build(text='os.getcwd()')",
+        "spikekit.scenes.simulation.build(text='os.getcwd()')",
         "FlowInterpolation(shrink=1000000000)",
         "FlowInterpolation(shrink=True)",
         "Blend(first='os.mkdir')",
@@ -429,7 +429,7 @@ def test_one_thread(film, monkeypatch):
 @pytest.mark.parametrize(
     ("part", "status", "said"),
     [
-        ("settings", 2, "expected more frames, or fewer with --frames"),
+        ("settings", 2, "expected more frames, or fewer clocks"),
         ("stream", 1, "b.dat: not the stream of its side-car"),
     ],
 )
@@ -558,9 +558,9 @@ def test_grey_deep_and_transparent(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "status", "said"),
     [
-        (["film", "--scale", "2", "--frame", "0"], 2, "expected --frame 1 to 3, got frame 0"),
-        (["film", "--scale", "2", "--frames", "401"], 2, "of 5 frames, expected more frames, or fewer with --frames"),
-        (["film", "--scale", "2", "--all", "--frame", "1"], 2, "--frame: not with --all, got 1"),
+        (["film", "--scale", "2", "--frame", "0"], 2, "--frame: expected 1 to 3, got 0"),
+        (["film", "--scale", "2", "--frames", "401"], 2, "--frame: expected more frames, or fewer clocks, got 2"),
+        (["film", "--scale", "2", "--all", "--frame", "1"], 2, "--frame: expected none with the whole film, got 1"),
         (["film", "--scale", "20"], 1, "film: frames: expected 40 x 40 pixels or more, got 35 x 37"),
         (["film"], 2, "--scale: needed"),
         (["film", "--scale", "2", "--source", "film"], 2, "--source: expected a side-car"),
@@ -570,7 +570,7 @@ def test_grey_deep_and_transparent(tmp_path, monkeypatch):
         (["film", "--scale", "2", "--interpolation", "Blend(3)"], 2, "cannot be made (arguments need names)"),
         (["film", "--scale", "2", "--dark-current", "-1"], 2, "--dark-current: expected 0 to 1, got -1.0"),
         (["film", "--scale", "2", "--hot", "much"], 2, "argument --hot: expected a number, got much"),
-        (["film/f0.png", "--scale", "2", "--all"], 2, "one picture, which has no end"),
+        (["film/f0.png", "--scale", "2", "--all"], 2, "one picture without an end"),
         (["nothing", "--scale", "2"], 1, "nothing: no such file or folder"),
         (["nothing.json"], 1, "nothing.json: cannot be read (No such file or directory)"),
     ],

@@ -18,6 +18,7 @@ from spikekit import (
     Motion,
     Scene,
     read_picture,
+    recording,
     simulate_spikes,
     tfi,
     tfp,
@@ -28,7 +29,6 @@ from spikekit.cli.command import main
 from spikekit.cli.drawing import fit, histogram, raster, sheet
 from spikekit.cli.view import Moment
 from spikekit.decoders.dense import spike_interval
-from spikekit.io import recording
 from spikekit.io.image_bytes import gif_bytes
 
 PATTERN = "RGGB"

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from spikekit import bayer_mask, correct_spikes, demosaic, psnr, tfi_at
-from spikekit.sensor.calibrate import calibrate, find_defects
-from spikekit.sensor.calibration import DEAD, HOT, WORKS, Calibration
-from spikekit.sensor.noise import SensorNoise
-from spikekit.sensor.pixel_rates import PixelRates
+from spikekit.calibration.calibration import Calibration
+from spikekit.calibration.measure import calibrate, find_defects
+from spikekit.calibration.pixel_rates import PixelRates
+from spikekit.sensor.noise import DEAD, HOT, WORKS, SensorNoise
 from spikekit.sensor.simulate import SpikeSensor
 
 SIZE = 40, 48

@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spikekit.sensor.calibration import DEAD, HOT, Calibration, colors
-from spikekit.sensor.pixel_rates import PixelRates
+from spikekit.calibration.calibration import Calibration, colors
+from spikekit.calibration.pixel_rates import PixelRates
+from spikekit.sensor.noise import DEAD, HOT
 
 _LEAST_SPIKES = 10  # of a pixel's neighbours, before its silence says that it is dead
 _DEAD_GAIN = 0.1  # of that of other pixels
@@ -107,7 +108,7 @@ def find_defects(scene: PixelRates, pattern: str | None = None) -> Measured:
         A pixel is dead if it fires less than a tenth as often as the median of the pixels of its colour around it,
         which fire at least ten times, and hot if it fires at nearly every clock where they do so at less than half.
         Gains stay 1: at rest they cannot be told from the texture of the scene; where it moves, see
-        :func:`spikekit.flow.scene_calibration.calibrate_in_motion`.
+        :func:`spikekit.calibration.in_motion.calibrate_in_motion`.
 
     Args:
         scene: rates of a recording.

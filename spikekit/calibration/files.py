@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from spikekit.arguments import one_line
+from spikekit.calibration.calibration import Calibration
 from spikekit.io.failures import no_pipe
 from spikekit.io.images import MOST_PIXELS
 from spikekit.io.whole_file import whole_file
-from spikekit.sensor.calibration import Calibration
 
 #: What a recording's own calibration is called: its name with this ending.
 ENDING = ".calibration.safetensors"

@@ -11,13 +11,14 @@ import torch.nn.functional as F
 from kornia.filters import filter2d_separable
 from torch import Tensor
 
+from spikekit.calibration.calibration import Calibration, colors
+from spikekit.calibration.measure import Measured
 from spikekit.check import check_planes
 from spikekit.color.cfa import bayer_mask
 from spikekit.color.demosaic import demosaic
 from spikekit.flow.tvl1 import tvl1_flow
 from spikekit.progress import progress
-from spikekit.sensor.calibrate import Measured
-from spikekit.sensor.calibration import WORKS, Calibration, colors
+from spikekit.sensor.noise import WORKS
 from spikekit.warp.warp import flow_warp
 
 MOST_SEGMENTS = 100  #: of a recording are enough, and what memory is for
@@ -109,7 +110,7 @@ def calibrate_in_motion(segments: Segments, known: Calibration, pattern: str | N
 
     Args:
         segments: counts, at least 12 of them.
-        known: the dead and hot pixels, see :func:`spikekit.sensor.calibrate.find_defects`.
+        known: the dead and hot pixels, see :func:`spikekit.calibration.measure.find_defects`.
         pattern: Bayer phase; ``None`` for a grey sensor.
 
     Returns:

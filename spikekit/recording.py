@@ -1,8 +1,7 @@
-"""A recording with its metadata, from its side-car, its camera or the command line."""
+"""A recording with its metadata, from its side-car, its camera or whoever opens it."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,25 +10,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spikekit.arguments import UsageError, whole
-from spikekit.decoders.calibrated import correct_spikes
-from spikekit.io.calibration import ENDING, read_calibration
-from spikekit.io.cameras import CAMERAS, Camera, camera
+from spikekit.arguments import UsageError
+from spikekit.calibration.calibration import Calibration
+from spikekit.calibration.files import ENDING, read_calibration
+from spikekit.calibration.spikes import correct_spikes
+from spikekit.color.cfa import GREY, cfa_pattern
+from spikekit.io.cameras import CAMERAS, Camera
+from spikekit.io.cameras import camera as load_camera
 from spikekit.io.files import iter_spikes, read_spikes, spikes_shape
 from spikekit.io.formats import SpikeFileError
 from spikekit.io.sidecar import find_sidecar
 from spikekit.progress import progress
-from spikekit.sensor.calibration import Calibration
-
-#: (height, width) of what the field's headerless recordings come from.
-USUAL_SIZES = {
-    (250, 400): "grey Vidar camera",
-    (250, 416): "grey Vidar camera, 16 columns of header",
-    (250, 250): "UHSR",
-    (1000, 1000): "colour spike camera",
-    (1000, 1024): "colour spike camera, PCIe stream",
-}
-
 
 # Pixels that are counted at a time.
 _BLOCK = 1 << 24
@@ -44,10 +35,11 @@ class Recording:
         frames: how many it holds.
         stored: (H, W) of its frames.
         flip: whether they are stored upside down.
-        pattern: Bayer phase of what is read; ``None`` for grey.
+        pattern: Bayer phase of what is read, or ``"grey"``; ``None`` where nobody says.
         alpha: light of a white pixel per clock, where it is known.
         camera: where it is known.
         calibration: that of the pixels that are read, where it is known.
+        note: a line that whoever sees a picture of it should read, or nothing.
     """
 
     path: Path
@@ -58,6 +50,12 @@ class Recording:
     alpha: float | None = None
     camera: Camera | None = None
     calibration: Calibration | None = None
+    note: str = ""
+
+    @property
+    def bayer(self) -> str | None:
+        """Bayer phase of what is read; ``None`` where it is grey, or nobody says."""
+        return None if self.pattern == GREY else self.pattern
 
     @property
     def size(self) -> tuple[int, int]:
@@ -88,11 +86,11 @@ class Recording:
 
     def correct(self, raw: Tensor) -> Tensor:
         """Return rates (*, H, W), in spikes a clock, as an ideal sensor would have them."""
-        return raw if self.calibration is None else self.calibration.correct(raw, self.pattern)
+        return raw if self.calibration is None else self.calibration.correct(raw, self.bayer)
 
     def correct_spikes(self, spikes: Tensor) -> Tensor:
         """Return spikes (*, T, H, W) as an ideal sensor would have fired them."""
-        return spikes if self.calibration is None else correct_spikes(spikes, self.calibration, self.pattern)
+        return spikes if self.calibration is None else correct_spikes(spikes, self.calibration, self.bayer)
 
     @property
     def said(self) -> str:
@@ -123,48 +121,53 @@ def white_rate(rates: Tensor) -> float:
     return float(np.quantile(rates.numpy(), 0.999)) or float(rates.max()) or 1.0
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that name a recording."""
-    add = parser.add_argument
-    add("file", type=Path, metavar="FILE", help="a recording, .dat (8 pixels a byte, no header) or .npz")
-    add("--height", type=whole(1), metavar="H", help="rows of a frame; a .dat without side-car or camera needs it")
-    add("--width", type=whole(1), metavar="W", help="columns of a frame; likewise")
-    add("--flip", action="store_true", help="the frames are stored upside down, as real cameras do")
-    add(
-        "--camera",
-        metavar="NAME",
-        help=f"what recorded it: {', '.join(CAMERAS)}, or a .json file of the same form; gives the size, the "
-        "flip, the Bayer phase, what to crop, and how pictures are shown",
-    )
+def open_recording(
+    path: str | Path,
+    *,
+    height: int | None = None,
+    width: int | None = None,
+    flip: bool = False,
+    pattern: str | None = None,
+    camera: str | Path | None = None,
+    calibration: str | Path | None = None,
+) -> Recording:
+    """Open a recording with all that is known of it.
 
+    Args:
+        path: a file ending in ``.dat`` or ``.npz``.
+        height: rows of a frame; a ``.dat`` without side-car or camera needs it.
+        width: columns of a frame; likewise.
+        flip: whether the frames are stored upside down.
+        pattern: Bayer phase after the flip, or ``"grey"``; that of the side-car or the camera when not given.
+        camera: what recorded it, see :func:`spikekit.camera`; gives the size, the flip, the Bayer phase and the crop.
+        calibration: what ``spikekit calibrate`` measured of the pixels; the recording's own, beside it, when not given,
+            and ``"none"`` for none.
 
-def add_calibration(parser: argparse.ArgumentParser) -> None:
-    """Add the argument that names a calibration."""
-    parser.add_argument(
-        "--calibration",
-        metavar="FILE",
-        help="gain, dark rate and defects of the pixels, from spikekit calibrate, to correct pictures by; "
-        f"the recording's own, NAME{ENDING} beside it, if not given; none for none",
-    )
-
-
-def open_recording(args: argparse.Namespace) -> Recording:
-    """Return the recording that the arguments name, with the metadata of its side-car, camera and calibration.
+    Returns:
+        The recording; nothing but its size has been read.
 
     Raises:
-        UsageError: a headerless file whose size nobody knows, or a camera and a size as well.
+        UsageError: a headerless file whose size nobody knows, a camera and a size as well, or an unknown pattern.
         ValueError: a file that cannot be read, or is not of the camera; a calibration of another sensor.
+
+    Example:
+        >>> import tempfile
+        >>> from spikekit import write_spikes
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_spikes(f"{folder}/street.dat", torch.ones(5, 250, 400))
+        ...     street = open_recording(f"{folder}/street.dat", height=250, width=400)
+        >>> street.frames, street.size, street.note
+        (5, (250, 400), '250 x 400 is the size of the camera vidar, which stores frames upside down: --flip turns them')
     """
-    recording = _described(args)
-    asked = getattr(args, "calibration", None)
-    file = own_calibration(recording.path) if asked is None else Path(asked)
-    if asked == "none" or (asked is None and not file.is_file()):
+    recording = _described(Path(path).expanduser(), height, width, flip, pattern, camera)
+    file = own_calibration(recording.path) if calibration is None else Path(calibration).expanduser()
+    if str(calibration) == "none" or (calibration is None and not file.is_file()):
         return recording
-    calibration = read_calibration(file)
-    if calibration.size != tuple(recording.size):
-        sizes = " x ".join(map(str, recording.size)), " x ".join(map(str, calibration.size))
+    known = read_calibration(file)
+    if known.size != tuple(recording.size):
+        sizes = " x ".join(map(str, recording.size)), " x ".join(map(str, known.size))
         raise ValueError(f"{file}: expected {sizes[0]} pixels as {recording.path} has them, got {sizes[1]}")
-    return replace(recording, calibration=calibration.flip() if recording.flip else calibration)
+    return replace(recording, calibration=known.flip() if recording.flip else known)
 
 
 def own_calibration(path: Path) -> Path:
@@ -172,48 +175,69 @@ def own_calibration(path: Path) -> Path:
     return path.with_suffix(ENDING)
 
 
-def _described(args: argparse.Namespace) -> Recording:
-    path, pattern = args.file, getattr(args, "pattern", None)
-    if args.camera is not None:
-        if args.flip or not args.height is args.width is None:
+def _described(
+    path: Path, height: int | None, width: int | None, flip: bool, pattern: str | None, camera: str | Path | None
+) -> Recording:
+    try:
+        pattern = None if pattern is None else cfa_pattern(pattern)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"--{error}") from error
+    if camera is not None:
+        if flip or not height is width is None:
             raise UsageError("--camera: it knows --height, --width and --flip, leave them out")
-        return _of_camera(path, camera(args.camera), pattern)
-    known = find_sidecar(path) if args.height is args.width is None else None  # a damaged one can be done without
+        return _of_camera(path, load_camera(camera), pattern)
+    known = find_sidecar(path) if height is width is None else None  # a damaged one can be done without
     if known is not None:
         size = known.stream["height"], known.stream["width"]
         frames, *_ = spikes_shape(path, *size)
         if frames != known.stream["frames"]:
             raise ValueError(f"{path}: expected {known.stream['frames']} frames as its side-car says, got {frames}")
         settings = known.settings
-        return Recording(path, frames, size, args.flip, pattern or settings.get("pattern"), settings.get("alpha"))
-    if path.suffix.lower() == ".dat" and path.is_file() and None in (args.height, args.width):
+        return Recording(path, frames, size, flip, pattern or settings.get("pattern"), settings.get("alpha"))
+    if path.suffix.lower() == ".dat" and path.is_file() and None in (height, width):
         raise UsageError(_without_size(path))
-    frames, *size = spikes_shape(path, args.height, args.width)
-    return Recording(path, frames, tuple(size), args.flip, pattern)
+    frames, *size = spikes_shape(path, height, width)
+    return Recording(path, frames, tuple(size), flip, pattern, note="" if flip else _upside_down(*size))
 
 
 def _of_camera(path: Path, known: Camera, pattern: str | None) -> Recording:
     if pattern is not None:
-        known = replace(known, pattern=pattern)
+        known = replace(known, pattern=None if pattern == GREY else pattern)
     for width in dict.fromkeys((known.width, known.stored_width)):
         try:
             frames, *size = spikes_shape(path, known.height, width)
         except SpikeFileError as error:
             wrong = error
             continue
-        return Recording(path, frames, tuple(size), known.flip, known.prepared_pattern, camera=known)
+        return Recording(path, frames, tuple(size), known.flip, known.prepared_pattern or GREY, camera=known)
     raise wrong
 
 
+def _usual_sizes() -> dict[tuple[int, int], list[Camera]]:
+    """Return the known cameras by (height, width) of their frames as they are stored."""
+    sizes: dict[tuple[int, int], list[Camera]] = {}
+    for known in map(load_camera, CAMERAS):
+        for width in dict.fromkeys((known.width, known.stored_width)):
+            sizes.setdefault((known.height, width), []).append(known)
+    return dict(sorted(sizes.items()))
+
+
+def _upside_down(height: int, width: int) -> str:
+    """Say that frames of this size are likely to be stored upside down; nothing where they are not."""
+    names = [known.name for known in _usual_sizes().get((height, width), []) if known.flip]
+    said = f"{height} x {width} is the size of the camera {' and '.join(names)}"
+    return f"{said}, which stores frames upside down: --flip turns them" if names else ""
+
+
 def _without_size(path: Path) -> str:
-    size = path.stat().st_size
+    size, usual = path.stat().st_size, _usual_sizes()
     fits = {}
-    for (height, width), name in USUAL_SIZES.items():
+    for (height, width), known in usual.items():
         frames, rest = divmod(size, -(-height * width // 8))
         if frames and not rest:
-            fits[height, width] = f"{height} x {width} ({name}: {frames} frames)"
-    sizes = " and ".join(fits.values()) or f"none of {', '.join(f'{h} x {w}' for h, w in USUAL_SIZES)}"
+            fits[height, width] = f"{height} x {width} ({' or '.join(one.name for one in known)}: {frames} frames)"
+    sizes = " and ".join(fits.values()) or f"none of {', '.join(f'{h} x {w}' for h, w in usual)}"
     return (
-        f"{path}: a .dat has no header, give --height and --width (of lightning, --data.height and --data.width); "
-        f"of the usual sizes (H x W), {sizes} divide{'' if len(fits) > 1 else 's'} its {size} bytes exactly"
+        f"{path}: a .dat has no header, give --height and --width, or --camera; of the sizes (H x W) of known cameras, "
+        f"{sizes} divide{'' if len(fits) > 1 else 's'} its {size} bytes exactly"
     )

@@ -7,9 +7,9 @@ import math
 import torch
 from torch import Tensor
 
+from spikekit.calibration.calibration import Calibration
 from spikekit.check import check_planes, default_float
 from spikekit.decoders.dense import tfi
-from spikekit.sensor.calibration import Calibration
 from spikekit.sensor.integrate_fire import spike_integrate_fire
 
 _GOLDEN = (math.sqrt(5) - 1) / 2

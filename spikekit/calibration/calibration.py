@@ -10,9 +10,7 @@ from torch import Tensor
 
 from spikekit.check import check_planes
 from spikekit.color.cfa import bayer_sites
-
-#: What ``Calibration.defects`` holds: the pixel works, does not see light, or fires whatever the light is.
-WORKS, DEAD, HOT = 0, 1, 2
+from spikekit.sensor.noise import HOT, WORKS
 
 _NEIGHBORS = 4
 

@@ -6,10 +6,11 @@ import torch.nn.functional as F
 from torch.testing import assert_close
 
 from spikekit import SensorNoise, SpikeSensor, bayer_mask, demosaic, psnr, tfp_at
-from spikekit.flow.scene_calibration import Segments, calibrate_in_motion, count_segments, segment_length
-from spikekit.sensor.calibrate import find_defects
-from spikekit.sensor.calibration import DEAD, HOT, WORKS, Calibration
-from spikekit.sensor.pixel_rates import PixelRates
+from spikekit.calibration.calibration import Calibration
+from spikekit.calibration.in_motion import Segments, calibrate_in_motion, count_segments, segment_length
+from spikekit.calibration.measure import find_defects
+from spikekit.calibration.pixel_rates import PixelRates
+from spikekit.sensor.noise import DEAD, HOT, WORKS
 
 SIZE, FRAMES = (44, 56), 480
 

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from spikekit.arguments import UsageError, one_line
+from spikekit.arguments import one_line
 from spikekit.io.failures import writing
 from spikekit.io.files import write_spikes
 from spikekit.io.formats import SpikeFileError, dat_bytes
@@ -53,7 +53,7 @@ class Settings:
         calibration: the file of the sensor that was measured, whose pixels ``noise`` has.
 
     Raises:
-        UsageError: a plan that is unknown or has more latent frames than clocks.
+        ValueError: a plan that is unknown or has more latent frames than clocks.
     """
 
     scale: int
@@ -73,8 +73,8 @@ class Settings:
 
     def __post_init__(self) -> None:
         if not (self.plan in ("scene", "everything") or self.plan in range(self.clocks)):
-            raise UsageError(
-                f"--plan: expected scene, everything or 0 to {self.clocks - 1} latent frames in {self.clocks} clocks, "
+            raise ValueError(
+                f"plan: expected scene, everything or 0 to {self.clocks - 1} latent frames in {self.clocks} clocks, "
                 f"got {self.plan}"
             )
 
@@ -105,7 +105,7 @@ class Source:
 
     Raises:
         VideoError: there are no frames to read.
-        UsageError: a frame that is not there, or too few around it.
+        ValueError: a frame that is not there, or too few around it.
     """
 
     def __init__(self, path: Path, settings: Settings) -> None:
@@ -115,9 +115,9 @@ class Source:
         self.frame = None
         if settings.frames is None:
             if settings.frame is not None:
-                raise UsageError(f"--frame: not with --all, got {settings.frame}")
+                raise ValueError(f"frame: expected none with the whole film, got {settings.frame}")
             if self.still:
-                raise UsageError(f"{path}: one picture, which has no end: give --frames instead of --all")
+                raise ValueError(f"frames: expected a number, as {path} is one picture without an end, got all")
             self.first, self.span = 0, range(total)
             self.clocks = ((total - 1) * clocks + 1) // settings.readout * settings.readout
             self.truth = {index: index * clocks for index in range(total) if index * clocks < self.clocks}
@@ -128,10 +128,10 @@ class Source:
         frame = total // 2 if settings.frame is None else settings.frame
         least, most = (0, 0) if self.still else (needed[0], total - 1 - needed[1])
         if not least <= frame <= most:
-            fits = f"--frame {least} to {most}" if least <= most else "more frames, or fewer with --frames"
-            raise UsageError(
-                f"{path}: {self.clocks} clocks, {clocks} from one frame to the next, need {needed[0]} frames before "
-                f"the middle and {needed[1]} after it: of {total} frames, expected {fits}, got frame {frame}"
+            fits = f"{least} to {most}" if least <= most else "more frames, or fewer clocks"
+            raise ValueError(
+                f"frame: expected {fits}, got {frame}: {self.clocks} clocks, {clocks} from one frame to the next, need "
+                f"{needed[0]} of the {total} frames of {path} before the middle and {needed[1]} after it"
             )
         self.frame = frame
         self.span = range(frame - needed[0], frame + needed[1] + 1)
@@ -164,7 +164,7 @@ def build(text: str) -> Any:
         An object of the class.
 
     Raises:
-        UsageError: no such class, or arguments that it does not take.
+        ValueError: no such class, or arguments that it does not take.
     """
     try:
         module, name, values = _parts(text)
@@ -172,7 +172,7 @@ def build(text: str) -> Any:
         if not callable(made):
             raise TypeError(f"expected what looks at two frames, got a {type(made).__name__}")
     except Exception as error:
-        raise UsageError(f"--interpolation: {text} cannot be made ({one_line(error)})") from error
+        raise ValueError(f"interpolation: {text} cannot be made ({one_line(error)})") from error
     return made
 
 
@@ -237,8 +237,6 @@ def simulate(source: Source, settings: Settings, output: Path, replayed: Sidecar
             raise ValueError(f"{output}: its ground truth, {picture}, would replace the source; choose another name")
     try:
         film = settings.film(source.frames)
-    except UsageError:
-        raise
     except ValueError as error:
         raise ValueError(f"{source.path}: {error}") from error
     _check_calibration(settings, film, replayed)
