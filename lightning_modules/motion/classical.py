@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
@@ -14,10 +16,11 @@ from spikekit.check import check_planes, check_positive, check_whole
 from spikekit.color.cfa import cfa_pattern, cfa_sites
 from spikekit.flow.tvl1 import tvl1_flow
 from spikekit.kernels import compiler_kept_out
+from spikekit.kernels.graphs import Replayed
 from spikekit.sensor.quantization_noise import flicker
 
-_GREY = torch.tensor([[0.25, 0.5, 0.25]])  # each pixel the mean of the Bayer cells that it is part of
-_BLUR = get_gaussian_kernel1d(5, 0.5)  # of the pictures of a site, in Bayer cells
+_GREY = 0.25, 0.5, 0.25  # each pixel the mean of the Bayer cells that it is part of
+_BLUR = tuple(get_gaussian_kernel1d(5, 0.5)[0].tolist())  # of the pictures of a site, in Bayer cells
 _ORDER = 3  # of the means that pictures are
 _LONGEST = 17  # their window, in frames: in longer clips more of motion blurs them than noise is averaged
 _LIGHT = 0.1  # mean firing rate of a clip below which noise harms more, and their window is longer
@@ -82,49 +85,78 @@ class ClassicalFlow(MotionEstimator):
             raise ValueError(f"spikes: expected {expected}, got {tuple(spikes.shape)}")
         pattern = cfa_pattern(pattern)
         alike = _clips_by_window(spikes)  # clips that need one window are seen at once
-        velocities = [
-            self._of_window(spikes if len(alike) == 1 else spikes[clips], middle, window, pattern, by_site)
-            for window, clips in alike.items()
-        ]
+        run = _replayed if spikes.is_cuda else _of_window
+        velocities = []
+        for window, clips in alike.items():
+            way = _Way(self.attachment, self.warps, middle, window, pattern, by_site)
+            noise = noise_by_rate(window, spikes.device)
+            velocities.append(run(way, spikes if len(alike) == 1 else spikes[clips], noise))
         order = torch.tensor([clip for clips in alike.values() for clip in clips], device=spikes.device).argsort()
         before, after = torch.cat(velocities, dim=-5).index_select(-5, order).unbind(dim=-4)
         return before * (first - middle), after * (last - middle)
 
-    def _of_window(self, spikes: Tensor, middle: int, window: int, pattern: str, by_site: bool) -> Tensor:
-        """Velocities before and after the middle, (*, B, 2, 2, h, w), by means of one window."""
-        with torch.autocast(spikes.device.type, enabled=False):
-            raw, clock = _decode(spikes, middle, window)
-            noise = _noise(window).to(raw)[(raw.mean(dim=1, keepdim=True) * _RATES).long().clamp(0, _RATES - 1)]
-            sites = 1
-            if by_site:
-                sites = len(cfa_sites(pattern)[0])
-                raw, noise = (split_any_size(part, pattern).flatten(0, 1) for part in (raw, noise))
-            kernel, border = (_BLUR, "replicate") if by_site else (_GREY, "reflect")
-            pictures, noise = (
-                filter2d_separable(part, weights.to(raw), weights.to(raw), border)
-                for part, weights in ((raw, kernel), (noise, kernel**2))
-            )
-            attachment = self.attachment / (1 + noise[:, 0] / _NOISE**2)
-            velocities = self._velocities(pictures, clock, attachment)
-        return velocities.unflatten(0, (sites, -1)) if by_site else velocities
-
-    def _velocities(self, pictures: Tensor, clock: Tensor, attachment: Tensor) -> Tensor:
-        """Velocities before and after the middle, (B, 2, 2, h, w), in pixels a frame, of pictures (B, 3, h, w)."""
-        count, ends = len(pictures), pictures[:, ::2]
-        away, span = clock[::2] - clock[1], clock[2] - clock[0]
-        one = tvl1_flow(ends, (away / span).expand(count, 2), attachment, warps=self.warps) / span
-        away = away.to(one).reshape(2, 1, 1, 1)
-        one = one.unsqueeze(1).expand(-1, 2, -1, -1, -1)
-        halves = torch.stack([pictures[:, 1:2].expand_as(ends), ends], dim=2).flatten(0, 1)
-        start, weight = (one * away).flatten(0, 1), attachment.repeat_interleave(2, dim=0)
-        own = tvl1_flow(halves, clock.new_tensor([0, 1]).expand(2 * count, 2), weight, start, self.warps)
-        own = own.reshape(one.shape) / away
-        unlike, less = (_unlike(pictures, velocities * away) for velocities in (one, own))
-        bent = ((unlike / (less + _UNSEEN) - _PART[0]) / (_PART[1] - _PART[0])).clamp(0, 1)
-        return torch.lerp(one, own, bent.unsqueeze(1))
-
     def extra_repr(self) -> str:  # noqa: D102
         return f"attachment={self.attachment}, warps={self.warps}"
+
+
+@dataclass(frozen=True)
+class _Way:
+    """How motion is estimated, besides the clips."""
+
+    attachment: float
+    warps: int
+    middle: int
+    window: int
+    pattern: str
+    by_site: bool
+
+
+def _of_window(way: _Way, spikes: Tensor, noise: Tensor) -> Tensor:
+    """Velocities before and after the middle, (*, B, 2, 2, h, w), by means of one window, whose noise is known."""
+    with torch.autocast(spikes.device.type, enabled=False):
+        seen, clock = _moments(spikes.shape[1], way.middle, way.window)
+        raw = torch.stack([tfp_at(spikes, n, way.window, order=_ORDER, dtype=torch.float32) for n in seen], dim=1)
+        variance = noise[(raw.mean(dim=1, keepdim=True) * _RATES).long().clamp(0, _RATES - 1)]
+        sites = 1
+        if way.by_site:
+            sites = len(cfa_sites(way.pattern)[0])
+            raw, variance = (split_any_size(part, way.pattern).flatten(0, 1) for part in (raw, variance))
+        kernel, border = (_BLUR, "replicate") if way.by_site else (_GREY, "reflect")
+        pictures, variance = (
+            _filtered(part, weights, border) for part, weights in ((raw, kernel), (variance, [w**2 for w in kernel]))
+        )
+        attachment = way.attachment / (1 + variance[:, 0] / _NOISE**2)
+        velocities = _velocities(pictures, clock, attachment, way.warps)
+    return velocities.unflatten(0, (sites, -1)) if way.by_site else velocities
+
+
+#: a GPU waits for the launches of an estimate, not for its work
+_replayed = Replayed(_of_window)
+
+
+def _filtered(planes: Tensor, weights: Sequence[float], border: str) -> Tensor:
+    kernel = torch.cat([planes.new_full((1, 1), weight) for weight in weights], dim=1)
+    return filter2d_separable(planes, kernel, kernel, border)
+
+
+def _velocities(pictures: Tensor, clock: tuple[float, float, float], attachment: Tensor, warps: int) -> Tensor:
+    """Velocities before and after the middle, (B, 2, 2, h, w), in pixels a frame, of pictures (B, 3, h, w)."""
+    ends, span = pictures[:, ::2], clock[2] - clock[0]
+    before, after = clock[0] - clock[1], clock[2] - clock[1]
+    one = tvl1_flow(ends, _times(pictures, before / span, after / span), attachment, warps=warps) / span
+    one = one.unsqueeze(1).expand(-1, 2, -1, -1, -1)
+    away = _times(pictures[:1], before, after).reshape(2, 1, 1, 1)
+    halves = torch.stack([pictures[:, 1:2].expand_as(ends), ends], dim=2).flatten(0, 1)
+    start, weight = (one * away).flatten(0, 1), attachment.repeat_interleave(2, dim=0)
+    own = tvl1_flow(halves, _times(halves, 0.0, 1.0), weight, start, warps).reshape(one.shape) / away
+    unlike, less = (_unlike(pictures, velocities * away) for velocities in (one, own))
+    bent = ((unlike / (less + _UNSEEN) - _PART[0]) / (_PART[1] - _PART[0])).clamp(0, 1)
+    return torch.lerp(one, own, bent.unsqueeze(1))
+
+
+def _times(pictures: Tensor, first: float, second: float) -> Tensor:
+    """(B, 2), without waiting for a GPU."""
+    return torch.stack([pictures.new_full((len(pictures),), time) for time in (first, second)], dim=1)
 
 
 def _clips_by_window(spikes: Tensor) -> dict[int, list[int]]:
@@ -139,24 +171,26 @@ def _clips_by_window(spikes: Tensor) -> dict[int, list[int]]:
     return found
 
 
-def _decode(spikes: Tensor, middle: int, window: int) -> tuple[Tensor, Tensor]:
-    """Three raw pictures (B, 3, H, W) by means of a window, and the times that they show."""
-    frames = spikes.shape[1]
+@lru_cache(maxsize=16)
+def _moments(frames: int, middle: int, window: int) -> tuple[tuple[int, ...], tuple[float, ...]]:
+    """Frames in which a clip is decoded, and the times that the pictures show.
+
+    Where the mean is cut by the ends of the clip, it stands for a later or an earlier time.
+    """
     away = max(frames // 4, 1)
-    seen = [max(middle - away, 0), middle, min(middle + away, frames - 1)]
-    raw = torch.stack([tfp_at(spikes, n, window, order=_ORDER, dtype=torch.float32) for n in seen], dim=1)
-    # where the mean is cut by the ends of the clip, it stands for a later or an earlier time
-    clock = torch.arange(frames, dtype=torch.float64).reshape(-1, 1, 1)
-    return raw, torch.cat([tfp_at(clock, n, window, order=_ORDER).flatten() for n in seen])
+    seen = max(middle - away, 0), middle, min(middle + away, frames - 1)
+    clock = torch.arange(frames, dtype=torch.float64, device="cpu").reshape(-1, 1, 1)
+    return seen, tuple(tfp_at(clock, n, window, order=_ORDER).item() for n in seen)
 
 
 @lru_cache(maxsize=16)
-def _noise(window: int) -> Tensor:
-    """Variance of the mean of a pixel in constant light, by its firing rate."""
-    frames = 3 * window
-    impulses = torch.eye(frames, dtype=torch.float64).unsqueeze(1)
-    rates = (torch.arange(_RATES) + 0.5) / _RATES
-    return flicker(tfp_at(impulses, frames // 2, window, order=_ORDER), rates)[0]
+def noise_by_rate(window: int, device: torch.device | str = "cpu") -> Tensor:
+    """Variance of the mean of a pixel in constant light, by its firing rate, float32."""
+    with torch.inference_mode(False), torch.device("cpu"):
+        impulses = torch.eye(3 * window, dtype=torch.float64).unsqueeze(1)
+        rates = (torch.arange(_RATES) + 0.5) / _RATES
+        variance = flicker(tfp_at(impulses, 3 * window // 2, window, order=_ORDER), rates)[0]
+    return variance.float().to(device)
 
 
 def _unlike(pictures: Tensor, flows: Tensor) -> Tensor:

@@ -298,7 +298,7 @@ class CSCSR(Network):
         """TFP of the whole clip, demosaiced, smoothed, enlarged."""
         raw = tfp_at(spikes, self.frames // 2, self.frames) / self.config.alpha
         # zero at the Nyquist frequency, where demosaicing leaves a zipper that training would have to undo first
-        binomial = raw.new_tensor([[0.25, 0.5, 0.25]])
+        binomial = torch.cat([raw.new_full((1, 1), weight) for weight in (0.25, 0.5, 0.25)], dim=1)
         smooth = filter2d_separable(demosaic(raw, self.pattern), binomial, binomial)
         if self.scale == 1:
             return smooth

@@ -177,7 +177,9 @@ def expected_flows(pictures, raw, clock, squared, border):
     ``squared`` are the weights of the raw pixels in a picture, along an axis, squared: noise adds up by them.
     """
     steps = torch.linspace(0, 1, 1025)[:-1]
-    noise = torch.from_numpy(classical._noise(13).numpy()[torch.searchsorted(steps, raw.mean(0), right=True) - 1])
+    noise = torch.from_numpy(
+        classical.noise_by_rate(13).numpy()[torch.searchsorted(steps, raw.mean(0), right=True) - 1]
+    )
     for axis in range(2):
         noise = torch.from_numpy(convolve1d(noise.numpy(), squared, axis, mode=border))
     attachment = 120 / (1 + noise / 0.002**2)
@@ -227,7 +229,7 @@ def test_noise_of_a_mean_is_that_of_an_ideal_pixel(step):
     charge = (torch.arange(100_000, dtype=torch.float64) + 0.5) / 100_000
     light = torch.full((41, 1, len(charge)), (step + 0.5) / 1024, dtype=torch.float64)
     means = tfp_at(spike_integrate_fire(light, charge=charge.reshape(1, -1))[0].double(), 20, 13, order=3)
-    assert classical._noise(13)[step].item() == pytest.approx(means.var().item(), rel=1e-3)
+    assert classical.noise_by_rate(13)[step].item() == pytest.approx(means.var().item(), rel=1e-3)
 
 
 def test_dark_flicker_is_no_motion():
