@@ -17,10 +17,9 @@ from torch.utils.data import DataLoader, Dataset
 from lightning_modules.adaptation.lessons import HELD_OUT, Lessons
 from lightning_modules.inference.tiles import TILE, forward_in_tiles
 from lightning_modules.networks import Network
-from lightning_modules.storage.checkpoint import read_checkpoint
 from lightning_modules.tasks.checkpoint_io import Checkpoints
+from lightning_modules.tasks.resume import check_resume, load_weights_of
 from lightning_modules.tasks.super_resolution import SuperResolution
-from lightning_modules.tasks.training_state import check_training_state
 from spikekit import psnr
 
 #: what is kept of a training that is interrupted
@@ -112,8 +111,8 @@ def learn(student: Network, lessons: Lessons, steps: int, folder: Path, **traine
     seen, resumed = 0, None
     if (folder / CHECKPOINT).is_file():
         resumed = folder / CHECKPOINT
-        checkpoint = read_checkpoint(resumed)
-        check_training_state(checkpoint, resumed)
+        checkpoint = check_resume(resumed, module, running)
+        load_weights_of(checkpoint, resumed, module)
         seen = _BATCH * checkpoint["global_step"]
     patches = _Patches(taught, student.pattern, student.scale, _BATCH * steps, seen)
     student.train()

@@ -22,11 +22,11 @@ from pytorch_lightning.callbacks import LearningRateMonitor, ModelCheckpoint
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from pytorch_lightning.loggers import TensorBoardLogger
 from pytorch_lightning.utilities import rank_zero_only
-from pytorch_lightning.utilities.exceptions import MisconfigurationException
+from pytorch_lightning.utilities.exceptions import MisconfigurationException, SIGTERMException
 
 from lightning_modules.cli.arguments import classes_first, flatten, whole_counts, with_network_of_weights
 from lightning_modules.cli.configured import run_checkpoint
-from lightning_modules.cli.errors import InputError, UsageError
+from lightning_modules.cli.errors import Ended, InputError, UsageError
 from lightning_modules.cli.folder_lock import FolderError, check_folder, locked_folder
 from lightning_modules.cli.reasons import reason, suggestion, unknown
 from lightning_modules.data import FilmScenes, StillScenes
@@ -35,11 +35,11 @@ from lightning_modules.motion import Spike2Flow
 from lightning_modules.networks import CSCSR
 from lightning_modules.storage.checkpoint import read_checkpoint
 from lightning_modules.storage.pretrained import check_settings
-from lightning_modules.tasks.base import Learner
-from lightning_modules.tasks.checkpoint_io import Checkpoints
+from lightning_modules.tasks.base import BaseTask
+from lightning_modules.tasks.checkpoint_io import Checkpoints, LastCheckpoint, requeued_checkpoint
 from lightning_modules.tasks.optical_flow import FlowTraining
+from lightning_modules.tasks.resume import check_resume, load_weights_of
 from lightning_modules.tasks.super_resolution import SuperResolution
-from lightning_modules.tasks.training_state import Begun, check_like_fresh, check_training_state, restoring
 from spikekit.arguments import one_line
 from spikekit.io import PictureError, SpikeFileError, VideoError
 from spikekit.io.whole_file import whole_file
@@ -129,7 +129,7 @@ class Command(LightningCLI):
         parser.add_argument(
             "-o",
             "--output",
-            type=str,
+            type=os.path.expanduser,
             default="runs",
             help="Folder of the run: checkpoints, TensorBoard files, config.yaml, tables and pictures.",
         )
@@ -139,9 +139,7 @@ class Command(LightningCLI):
             parser.link_arguments(f"{network}.{name}", f"data.init_args.{name}")
         parser.link_arguments(f"{network}.pattern", "data.init_args.crop_to")
         parser.link_arguments("model.init_args.flow", "data.init_args.flow_patch", {"scene": 0, "estimated": 48}.get)
-        parser.link_arguments(
-            "model", "data.init_args.flow_times", lambda model: model.flow_times[::2], apply_on="instantiate"
-        )
+        parser.link_arguments("model", "data.init_args.flow_times", _ends, apply_on="instantiate")
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:  # noqa: D102
         args = classes_first(self.typed)
@@ -167,6 +165,8 @@ class Command(LightningCLI):
         config = self.config[self.subcommand]
         check_folder(config.output)
         checkpoints = Path(config.output) / "checkpoints"
+        if self.subcommand == "fit" and not config.get("ckpt_path"):
+            config.ckpt_path = requeued_checkpoint(config.output)
         asked = config.get("ckpt_path")
         if asked in ("best", "last"):
             # a run that was killed before its first last.ckpt has best.ckpt alone
@@ -176,9 +176,7 @@ class Command(LightningCLI):
             raise InputError(f"{config.ckpt_path}: no such checkpoint")
         if asked:
             try:
-                checkpoint = read_checkpoint(config.ckpt_path)
-                if self.subcommand == "fit":
-                    check_training_state(checkpoint, config.ckpt_path)
+                read_checkpoint(config.ckpt_path)
             except (OSError, ValueError) as error:
                 raise InputError(str(error)) from error
         if (
@@ -195,9 +193,20 @@ class Command(LightningCLI):
         self.trainer.callbacks.append(begun)
         try:
             if config.ckpt_path:  # before a folder is made and scenes are loaded
-                check_settings(self.model.network, read_checkpoint(config.ckpt_path)["network"], config.ckpt_path)
-            with _locked(subcommand, config), restoring(config.ckpt_path, begun):
+                checkpoint = read_checkpoint(config.ckpt_path)
+                check_settings(self.model.network, checkpoint["network"], config.ckpt_path)
+                load_weights_of(checkpoint, config.ckpt_path, self.model)
+            with _locked(subcommand, config):
                 super()._run_subcommand(subcommand)
+        except (SIGTERMException, RuntimeError) as error:  # Lightning's would end with status 0
+            if not self.trainer.received_sigterm:
+                raise
+            goes_on = "; --ckpt_path last resumes" if subcommand == "fit" else ""
+            raise Ended(f"lightning: {config.output}: {subcommand} was stopped by SIGTERM{goes_on}", 143) from error
+        except SystemExit as error:
+            if isinstance(error.__context__, KeyboardInterrupt):  # which Lightning turns into status 1
+                raise KeyboardInterrupt from None
+            raise
         except (MisconfigurationException, ModuleNotFoundError) as error:  # of Lightning's, such as a callback's
             raise InputError(one_line(error)) from error
         except ValueError as error:
@@ -248,7 +257,10 @@ class Command(LightningCLI):
         kwargs["callbacks"] = [*_listed(config.get("callbacks")), *self._callbacks(output)]
         if self.subcommand != "fit":
             self.save_config_callback = None  # config.yaml is the record of the training
-        return super().instantiate_trainer(**kwargs)
+        try:
+            return super().instantiate_trainer(**kwargs)
+        except TypeError as error:  # such as of -1 devices, of a CPU
+            raise UsageError(f"trainer: {one_line(error)}") from error
 
     def _callbacks(self, output: Path) -> list[Callback]:
         if self.subcommand == "fit":
@@ -257,11 +269,30 @@ class Command(LightningCLI):
             logs = self._get(self.config_init, "trainer").get("logger") not in (False, [])
             return [
                 ModelCheckpoint(filename="best", monitor=monitor, mode=mode, **folder),
-                ModelCheckpoint(filename="last", save_on_train_epoch_end=True, **folder),
+                LastCheckpoint(filename="last", save_on_train_epoch_end=True, **folder),
                 *([LearningRateMonitor()] if logs else []),
                 self.model.pictures(),
             ]
         return [self.model.report(output)] if self.subcommand == "test" else []
+
+
+class Begun(Callback):
+    """Is true once a run has restored what there is to restore: an error is then no longer the user's."""
+
+    _begun = False
+
+    def __bool__(self) -> bool:
+        return self._begun
+
+    def _begin(self, *_: Any) -> None:
+        self._begun = True
+
+    on_train_start = on_validation_start = on_test_start = on_predict_start = _begin
+
+
+def _ends(model: BaseTask) -> tuple[int, int]:
+    """The frames that the data's flow runs to; no lambda, which no process could be given."""
+    return model.flow_times[::2]
 
 
 def _locked(verb: str, config: Any) -> AbstractContextManager[None]:
@@ -303,7 +334,7 @@ def _check_trainer(trainer: Any) -> None:
         raise UsageError("trainer.limit_val_batches: expected more than 0, validation chooses best.ckpt, got 0")
 
 
-def _check_verb(verb: str, model: Learner, data: LightningDataModule) -> None:
+def _check_verb(verb: str, model: BaseTask, data: LightningDataModule) -> None:
     loader = _LOADERS[verb]
     if getattr(type(data), loader) is getattr(LightningDataModule, loader):
         raise UsageError(f"{verb}: expected scenes whose truth is known, got {type(data).__name__}")
@@ -311,9 +342,9 @@ def _check_verb(verb: str, model: Learner, data: LightningDataModule) -> None:
         raise UsageError(f"fit: expected a network that learns, got {type(model.network).__name__}")
 
 
-def _check_continuation(path: str, model: Learner, trainer: Trainer | None) -> None:
+def _check_continuation(path: str, model: BaseTask, trainer: Trainer | None) -> None:
     """Refuse to go on with another network, optimizer or schedule: the checkpoint's would win without a word."""
-    checkpoint = read_checkpoint(path)
+    checkpoint = read_checkpoint(path) if trainer is None else check_resume(path, model, trainer)
     check_settings(model.network, checkpoint["network"], path)
     here = dict(flatten(model.recipe))
     there = dict(flatten(checkpoint["recipe"] or model.recipe))  # older checkpoints do not say
@@ -322,11 +353,9 @@ def _check_continuation(path: str, model: Learner, trainer: Trainer | None) -> N
             name, expected = key.replace(".init_args", ""), f"{there.get(key)}, as {path} was trained with"
             anew = "--model.weights starts anew with other settings"
             raise UsageError(f"model.{name}: expected {expected}, got {here.get(key)}; {anew}")
-    if trainer is not None:  # a rehearsal has none
-        check_like_fresh(checkpoint, path, model, trainer)
 
 
-def _check_agreement(model: Learner, data: LightningDataModule) -> None:
+def _check_agreement(model: BaseTask, data: LightningDataModule) -> None:
     """Refuse a model and data that disagree; a recording has a Bayer phase of its own."""
     if not isinstance(data, (StillScenes, FilmScenes)):
         return
@@ -360,7 +389,7 @@ def run(args: Sequence[str] | None, command: type[Command]) -> Command:
     elif os.environ.get(_FIRST) == str(os.getppid()):
         end_when_orphaned()
     return command(
-        Learner,
+        BaseTask,
         LightningDataModule,
         subclass_mode_model=True,
         subclass_mode_data=True,

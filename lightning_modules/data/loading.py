@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 _MOST_WORKERS = 16
 _A_MOMENT = 2.0  # seconds
+_GRACE = 10.0  # seconds
 
 
 class FreshClips(DistributedSampler[int]):
@@ -175,6 +177,8 @@ def _to_arrays(clips: list[dict[str, Tensor]]) -> dict[str, np.ndarray]:
 
 def _start_worker(_: int) -> None:
     torch.set_num_threads(1)
+    # schedulers send it to all processes of a run: training ends its step and saves, for which it needs its workers
+    signal.signal(signal.SIGTERM, lambda *_: threading.Timer(_GRACE, os._exit, (0,)).start())
     end_when_orphaned()  # torch's own watch does not reach a worker that waits for its clip to leave a full pipe
 
 

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from lightning_modules.cli.command import check_folder
-from lightning_modules.cli.errors import InputError, UsageError, VerbParser
+from lightning_modules.cli.errors import INTERRUPTED, Ended, InputError, UsageError, VerbParser
 from lightning_modules.cli.folder_lock import locked_folder
 from lightning_modules.sweep.budget import seconds
 from lightning_modules.sweep.cost import measure_variants
@@ -29,6 +29,10 @@ def _time(text: str) -> float:
         return seconds(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def _folder(text: str) -> Path:
+    return Path(text).expanduser()
 
 
 def parser() -> argparse.ArgumentParser:
@@ -102,7 +106,9 @@ examples:
         "(convolutions and matrix products, forward and backward; not what is done element by element, nor the warp)",
     )
     how = made.add_argument_group("how")
-    how.add_argument("-o", "--output", type=Path, default=Path("runs/sweep"), metavar="DIR", help="default: runs/sweep")
+    how.add_argument(
+        "-o", "--output", type=_folder, default=Path("runs/sweep"), metavar="DIR", help="default: runs/sweep"
+    )
     how.add_argument(
         "--engine",
         choices=_ENGINES,
@@ -159,13 +165,15 @@ def _run(trials: Sequence[Trial], asked: argparse.Namespace) -> dict[Path, str]:
     try:
         for ended in _ENGINES[asked.engine](waiting, asked.jobs, asked.every) if waiting else []:
             for folder, reason in ended.items():
+                if reason is None and not (folder / RESULT).is_file():
+                    reason = "it ended without a result"
                 if reason is not None:
                     failed[folder] = reason
                 view.ended(by_folder[folder])
                 _write_tables(trials, failed, asked)
             view.draw()
     except KeyboardInterrupt:
-        raise InputError("sweep: stopped; the same command goes on") from None
+        raise Ended("lightning: sweep: interrupted; the same command resumes it", INTERRUPTED) from None
     finally:
         view.close()
     print(f"\n{_write_tables(trials, failed, asked, with_costs=True)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -19,7 +20,7 @@ def step_schedule(optimizer: torch.optim.Optimizer) -> torch.optim.lr_scheduler.
     return torch.optim.lr_scheduler.StepLR(optimizer, 7500, 0.8)
 
 
-class Learner(LightningModule):
+class BaseTask(LightningModule):
     """Base of the LightningModules.
 
     Args:
@@ -27,11 +28,12 @@ class Learner(LightningModule):
         needs: options of the data, by name, that must be as they are here.
         flow_times: frames that flow runs between, the first, the middle and the last; ``lightning`` tells the data.
         optimizer: builds the optimizer from the parameters.
-        lr_scheduler: builds the schedule from the optimizer, counted in steps.
+        lr_scheduler: builds the schedule from the optimizer, counted in steps; ReduceLROnPlateau is asked after every
+            validation instead, and watches what ``best`` names unless it has a ``monitor`` of its own.
 
     Attributes:
         recipe: what a configuration says of optimizer and schedule, which ``lightning fit`` fills in; a checkpoint
-            remembers it, because it goes on with its own.
+            remembers it, because it resumes with its own.
     """
 
     #: the figure of validation that says which checkpoint is the best, and whether it is the "min" or the "max"
@@ -74,15 +76,22 @@ class Learner(LightningModule):
         module.load_state_dict(checkpoint["state_dict"])
         return module
 
-    def configure_optimizers(self) -> Any:  # noqa: D102
-        optimizer = self.make_optimizer(self.network.parameters())
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": self.make_lr_scheduler(optimizer), "interval": "step"},
-        }
+    def configure_optimizers(self) -> dict[str, Any]:  # noqa: D102
+        return self.optimizers_of(self.network.parameters())
+
+    def optimizers_of(self, parameters: Iterable[nn.Parameter]) -> dict[str, Any]:
+        """Return the optimizer and the schedule of parameters, as Lightning takes them."""
+        optimizer = self.make_optimizer(parameters)
+        schedule = self.make_lr_scheduler(optimizer)
+        how = {"scheduler": schedule, "interval": "step"}
+        if isinstance(schedule, torch.optim.lr_scheduler.ReduceLROnPlateau):
+            every = self._trainer.check_val_every_n_epoch if self._trainer else None
+            how |= {"interval": "epoch", "frequency": every or 1}
+            how["monitor"] = getattr(schedule, "monitor", self.best[0])
+        return {"optimizer": optimizer, "lr_scheduler": how}
 
     def log_mean(self, name: str, values: Tensor, **how: Any) -> None:
-        """Log the mean over the clips that all processes validate, however many each of them has.
+        """Log the mean over the clips that all processes see, however many each of them has.
 
         Args:
             name: of the figure.
@@ -97,6 +106,10 @@ class Learner(LightningModule):
         checkpoint["network"] = settings_of(self.network)
         checkpoint["motion"] = motion_of(self.network)
         checkpoint["recipe"] = self.recipe
+        if "loops" in checkpoint and not self.trainer.validating:
+            # Lightning counts a step for its loggers after it has saved: resumed, it would log all steps one too early
+            progress = checkpoint["loops"]["fit_loop"]["epoch_loop.state_dict"]
+            progress["_batches_that_stepped"] = checkpoint["global_step"]
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:  # noqa: D102
         check_settings(self.network, checkpoint.get("network", {}), "the checkpoint")

@@ -8,12 +8,37 @@ from typing import Any
 
 import torch
 from lightning_fabric.plugins import TorchCheckpointIO
+from pytorch_lightning import LightningModule, Trainer
+from pytorch_lightning.callbacks import ModelCheckpoint
+from pytorch_lightning.utilities.exceptions import SIGTERMException
 
 from lightning_modules.storage.checkpoint import DivergedError, check_tensors, read_checkpoint
 from spikekit.io.whole_file import whole_file
 
 #: of the state of a ModelCheckpoint: files that it may go on to remove
 _PATHS = ("best_model_path", "kth_best_model_path", "last_model_path")
+
+
+#: weights that forked or spawned processes of Lightning hand on to the one that started them
+_HANDED_ON = ".temp.ckpt"
+
+
+class LastCheckpoint(ModelCheckpoint):
+    """Also saves where SIGTERM ends a training: Lightning then ends it between two steps."""
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:  # noqa: D102
+        self.save_on_exception = isinstance(exception, SIGTERMException)
+        super().on_exception(trainer, pl_module, exception)
+
+
+def requeued_checkpoint(output: str | Path) -> str | None:
+    """Return the newest checkpoint that a SLURM job which was requeued has left in its folder, None for other runs."""
+    output = Path(output)
+    saved = [*output.glob("hpc_ckpt_*.ckpt")]  # Lightning writes them before it asks for the job to be queued again
+    if "SLURM_JOB_ID" not in os.environ or not (saved or int(os.environ.get("SLURM_RESTART_COUNT") or 0)):
+        return None
+    found = [path for path in (*saved, output / "checkpoints" / "last.ckpt") if path.is_file()]
+    return str(max(found, key=lambda path: path.stat().st_mtime_ns)) if found else None
 
 
 class Checkpoints(TorchCheckpointIO):
@@ -26,7 +51,8 @@ class Checkpoints(TorchCheckpointIO):
             DivergedError: its weights are not finite; the checkpoint that was there is what training can go on from.
         """
         try:
-            check_tensors(checkpoint["state_dict"])
+            # processes that Lightning forks or spawns hand on the weights alone
+            check_tensors(checkpoint.get("state_dict", checkpoint))
         except ValueError as error:
             raise DivergedError(f"{path}: not written, as the training has diverged ({error})") from error
         with whole_file(path) as file:
@@ -39,6 +65,8 @@ class Checkpoints(TorchCheckpointIO):
 
     def load_checkpoint(self, path: str | Path, *_: Any, **__: Any) -> dict[str, Any]:
         """Read a checkpoint; its callbacks may name files of their own folder, and no others."""
+        if Path(path).name == _HANDED_ON:
+            return torch.load(path, map_location="cpu", weights_only=True)
         checkpoint = read_checkpoint(path)
         states = checkpoint.get("callbacks", {})
         if isinstance(states, dict):

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from lightning_modules.metrics.flow import end_point_error, outliers
 from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
-from lightning_modules.tasks.base import Learner, step_schedule
+from lightning_modules.tasks.base import BaseTask, step_schedule
 from lightning_modules.tasks.flow_callbacks import FlowPictures, FlowReport
 from spikekit import bayer_pattern, split_bayer
 
@@ -23,7 +23,7 @@ def _adamw(parameters: Iterable[nn.Parameter]) -> torch.optim.AdamW:
     return torch.optim.AdamW(parameters, lr=1e-3)
 
 
-class FlowTraining(Learner):
+class FlowTraining(BaseTask):
     """Train Spike2Flow on clips whose flow is known, judge it beside the estimators without weights.
 
     Every sub-stream learns its own flow, on the way of every iteration: the mean absolute error of the last one counts

@@ -20,7 +20,7 @@ from lightning_modules.inference.self_ensemble import COUNTS
 from lightning_modules.inference.tiles import TILE
 from lightning_modules.networks import ClassicalDecoder, Network, RecurrentCSCSR
 from lightning_modules.storage.pretrained import load_weights, read_weights, with_own_motion
-from lightning_modules.tasks.base import Learner, step_schedule
+from lightning_modules.tasks.base import BaseTask, step_schedule
 from lightning_modules.tasks.callbacks import TestReport, ValidationPictures, middle_clip, middle_half
 from spikekit import psnr, ssim
 from spikekit.decoders.methods import DECODERS
@@ -40,7 +40,7 @@ def _loss(rgb: Tensor, batch: dict[str, Tensor]) -> Tensor:
     return ((rgb - batch["rgb"]).abs().flatten(1).mean(dim=1) + _NO_ERROR).log().mean()
 
 
-class SuperResolution(Learner):
+class SuperResolution(BaseTask):
     """Train a network on clips whose truth is known, judge it beside the classical decoders, run it on recordings.
 
     Everything but training uses the network's own estimator of motion, as a recording would; ``test`` shows the result

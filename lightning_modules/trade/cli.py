@@ -23,6 +23,10 @@ from spikekit.progress import progress
 _OUTPUT, _ROUNDS = Path("runs/trade"), 9
 
 
+def _folder(text: str) -> Path:
+    return Path(text).expanduser()
+
+
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the verb."""
     made = VerbParser(
@@ -67,7 +71,14 @@ examples:
     )
     add("--rounds", type=whole(1), default=_ROUNDS, metavar="N", help=f"timings of every setting; default {_ROUNDS}")
     add("--film", type=whole(1), metavar="EVERY", help="measure films, with a picture every so many clocks")
-    add("-o", "--output", type=Path, default=_OUTPUT, metavar="DIR", help=f"default: {_OUTPUT}")
+    add(
+        "-o",
+        "--output",
+        type=_folder,
+        default=_OUTPUT,
+        metavar="DIR",
+        help=f"default: {_OUTPUT}",
+    )
     return made
 
 

@@ -1,0 +1,145 @@
+"""Trainings that are stopped and resumed."""
+
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from lightning_modules.__main__ import main
+
+TINY = """
+model: {network: {init_args: {width: 4, representation_width: 4, features: 1, stages: 1, blocks: 1, end_blocks: 1}}}
+data: {init_args: {patch: 8, val_patch: 12, train_clips: 8, val_clips: 2, batch_size: 2, workers: 0}}
+trainer: {check_val_every_n_epoch: 2, log_every_n_steps: 1, max_steps: 10, accelerator: cpu}
+"""
+STOPS = """
+import os, signal
+from pytorch_lightning import Callback
+class Stop(Callback):
+    def __init__(self, step: int, where: str = "step", signal: int = signal.SIGTERM):
+        self.step, self.where, self.signal = step, where, signal
+    def _stop(self, trainer, where):
+        if trainer.global_step == self.step and self.where == where and not trainer.sanity_checking:
+            os.kill(os.getpid(), self.signal)
+    def on_train_batch_end(self, trainer, *_):
+        self._stop(trainer, "step")
+    def on_validation_batch_end(self, trainer, *_):
+        self._stop(trainer, "validation")
+"""
+
+
+@pytest.fixture(name="fit")
+def _fit(tmp_path, monkeypatch, configs):
+    (tmp_path / "tiny.yaml").write_text(TINY)
+    (tmp_path / "stops.py").write_text(STOPS)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["lightning"])
+    monkeypatch.chdir(tmp_path)
+
+    def run(output, *words):
+        shown = ["--trainer.enable_progress_bar=false", "--trainer.enable_model_summary=false"]
+        main(["fit", "-c", str(configs / "x4.yaml"), "-c", "tiny.yaml", "-o", str(output), *shown, *words])
+        return torch.load(tmp_path / output / "checkpoints" / "last.ckpt", weights_only=True)
+
+    return run
+
+
+def stop(step, where="step", number=15):
+    arguments = f'{{"step": {step}, "where": "{where}", "signal": {number}}}'
+    return [f'--trainer.callbacks={{"class_path": "stops.Stop", "init_args": {arguments}}}']
+
+
+def logged(folder):
+    events = EventAccumulator(str(folder)).Reload()
+    return {step.step: step.value for step in events.Scalars("train/loss")}
+
+
+@pytest.fixture(name="unbroken")
+def _unbroken(fit, tmp_path, _once={}):  # noqa: B006
+    if not _once:
+        _once.update(weights=fit("unbroken")["state_dict"], losses=logged("unbroken"), best=best("unbroken"))
+    return _once
+
+
+def best(folder):
+    return torch.load(f"{folder}/checkpoints/best.ckpt", weights_only=True)["global_step"]
+
+
+def same(weights, others):
+    return all(value.equal(others[name]) for name, value in weights.items())
+
+
+@pytest.mark.parametrize(("step", "where"), [(6, "step"), (8, "validation")])
+def test_a_training_that_sigterm_stops_resumes_as_if_nothing_had_happened(fit, unbroken, tmp_path, step, where, capfd):
+    with pytest.raises(SystemExit) as ended:
+        fit("broken", *stop(step, where))
+    assert ended.value.code == 143
+    assert "SIGTERM; --ckpt_path last resumes" in capfd.readouterr().err
+    last = torch.load(tmp_path / "broken" / "checkpoints" / "last.ckpt", weights_only=True)
+    assert last["global_step"] == step
+    resumed = fit("broken", "--ckpt_path", "last")
+    assert same(unbroken["weights"], resumed["state_dict"])
+    assert logged("broken") == unbroken["losses"]  # at the same steps, too
+    assert best("broken") == unbroken["best"]
+
+
+def test_ctrl_c_is_a_line_and_status_130(fit, capfd):
+    with pytest.raises(SystemExit) as ended:
+        fit("broken", *stop(2, number=2))
+    assert ended.value.code == 130
+    assert re.findall("lightning: .*", capfd.readouterr().err) == ["lightning: interrupted"]
+
+
+def test_a_slurm_job_that_is_requeued_resumes_without_being_told(fit, unbroken, monkeypatch, tmp_path):
+    with pytest.raises(SystemExit):
+        fit("job", *stop(6))
+    with pytest.raises(SystemExit, match="holds a run already"):
+        fit("job")
+    monkeypatch.setenv("SLURM_JOB_ID", "1")
+    os.rename(tmp_path / "job" / "checkpoints" / "last.ckpt", tmp_path / "job" / "hpc_ckpt_1.ckpt")
+    resumed = fit("job")
+    assert same(unbroken["weights"], resumed["state_dict"])
+
+
+@pytest.mark.parametrize(
+    "schedule", ["pytorch_lightning.cli.ReduceLROnPlateau", "torch.optim.lr_scheduler.ReduceLROnPlateau"]
+)
+def test_a_plateau_is_looked_for_in_what_chooses_the_best(fit, schedule):
+    words = ["--model.lr_scheduler", schedule, "--model.lr_scheduler.mode", "max", "--model.lr_scheduler.patience", "0"]
+    words += ["--model.lr_scheduler.threshold", "1000"] + ["--model.lr_scheduler.monitor", "val/psnr"] * (
+        schedule[0] == "p"
+    )
+    checkpoint = fit("run", *words)
+    assert checkpoint["optimizer_states"][0]["param_groups"][0]["lr"] == pytest.approx(
+        1e-5
+    )  # after the second of two validations
+
+
+@pytest.mark.slow
+def test_processes_that_lightning_spawns_itself(tmp_path, configs):
+    (tmp_path / "tiny.yaml").write_text(TINY)
+    words = ["fit", "-c", str(configs / "x4.yaml"), "-c", "tiny.yaml", "--trainer.max_steps=2", "--trainer.devices=1"]
+    words = [sys.executable, "-m", "lightning_modules", *words, "--trainer.strategy=ddp_spawn", "-o", "run"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert torch.load(tmp_path / "run/checkpoints/last.ckpt", weights_only=True)["global_step"] == 2
+
+
+def test_devices_that_a_cpu_lacks(fit):
+    with pytest.raises(SystemExit) as ended:
+        fit("run", "--trainer.devices=-1")
+    assert ended.value.code == 2
+
+
+def test_a_home_in_an_output_is_found(fit, monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "there.yaml").write_text("output: ~/run")
+    with pytest.raises(FileNotFoundError):  # by this test, which does not know of ~
+        fit("~/run", "--trainer.max_steps=1")
+    assert (tmp_path / "run" / "checkpoints" / "last.ckpt").is_file()
+    with pytest.raises(SystemExit, match="holds a run already"):
+        fit("~/run", "-c", "there.yaml")
