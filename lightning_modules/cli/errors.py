@@ -17,9 +17,6 @@ from spikekit.arguments import one_line
 from spikekit.extras import remedy
 from spikekit.standard_output import BROKEN_PIPE, FULL, stop_printing
 
-#: status of a command that Ctrl-C ends, as of shells
-INTERRUPTED = 130
-
 
 class InputError(ValueError):
     """Unusable input from the user; shown as one line, and the command ends with status 1."""
@@ -106,8 +103,6 @@ def as_one_line() -> Iterator[None]:
             yield
         finally:
             print(end="", flush=True)
-    except KeyboardInterrupt as error:
-        raise Ended("lightning: interrupted", INTERRUPTED) from error
     except OSError as error:
         if error.filename is not None:
             raise Ended(f"lightning: {error.filename}: {one_line(error)}", 1) from error

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from lightning_modules.cli.command import check_folder
-from lightning_modules.cli.errors import INTERRUPTED, Ended, InputError, UsageError, VerbParser
+from lightning_modules.cli.errors import Ended, InputError, UsageError, VerbParser
 from lightning_modules.cli.folder_lock import locked_folder
 from lightning_modules.sweep.budget import seconds
 from lightning_modules.sweep.cost import measure_variants
@@ -173,7 +173,7 @@ def _run(trials: Sequence[Trial], asked: argparse.Namespace) -> dict[Path, str]:
                 _write_tables(trials, failed, asked)
             view.draw()
     except KeyboardInterrupt:
-        raise Ended("lightning: sweep: interrupted; the same command resumes it", INTERRUPTED) from None
+        raise Ended("lightning: sweep: interrupted; the same command resumes it", 130) from None
     finally:
         view.close()
     print(f"\n{_write_tables(trials, failed, asked, with_costs=True)}")

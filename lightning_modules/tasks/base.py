@@ -106,7 +106,7 @@ class BaseTask(LightningModule):
         checkpoint["network"] = settings_of(self.network)
         checkpoint["motion"] = motion_of(self.network)
         checkpoint["recipe"] = self.recipe
-        if "loops" in checkpoint and not self.trainer.validating:
+        if "loops" in checkpoint and not (self._trainer and self._trainer.validating):
             # Lightning counts a step for its loggers after it has saved: resumed, it would log all steps one too early
             progress = checkpoint["loops"]["fit_loop"]["epoch_loop.state_dict"]
             progress["_batches_that_stepped"] = checkpoint["global_step"]

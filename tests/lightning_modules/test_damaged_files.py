@@ -20,13 +20,12 @@ from lightning_modules.cli.arguments import whole_counts, with_network_of_weight
 from lightning_modules.cli.errors import InputError
 from lightning_modules.data.cache import ClipCache, _digest
 from lightning_modules.inference import presets
-from lightning_modules.storage.checkpoint import read_checkpoint
 from lightning_modules.storage.error_model import read_error_model
 from lightning_modules.sweep.state import PROGRESS, RESULT, read_json, read_yaml
 from lightning_modules.sweep.table import collect, markdown, write_csv
 from lightning_modules.sweep.trials import Trial
 from lightning_modules.sweep.view import _standing
-from lightning_modules.tasks.training_state import check_like_fresh, check_training_state
+from lightning_modules.tasks.resume import check_resume
 
 WEIGHTS = Path(presets.__file__).parents[1] / "weights"
 
@@ -229,9 +228,7 @@ def test_states_of_a_training(fuzz, training, tmp_path):
     parts = [name for name in content if name not in ("state_dict", "network", "motion", "recipe")]
 
     def read(path):
-        checkpoint = read_checkpoint(path)
-        check_training_state(checkpoint, path)
-        check_like_fresh(checkpoint, path, model, trainer)
+        checkpoint = check_resume(path, model, trainer)
         made = model.configure_optimizers()
         made["optimizer"].load_state_dict(checkpoint["optimizer_states"][0])
         made["lr_scheduler"]["scheduler"].load_state_dict(checkpoint["lr_schedulers"][0])
@@ -255,25 +252,29 @@ def test_states_of_a_training(fuzz, training, tmp_path):
     assert fuzz(read, make, "bad.ckpt", cases=30) > 10
 
 
-@pytest.mark.parametrize(("name", "value", "least"), [("step_size", 0, 1), ("step_size", -3, 1), ("last_epoch", -1, 0)])
-def test_periods_and_counts_of_a_schedule(training, name, value, least):
+def _resumes(training, folder, **changes):
     model, trainer, content = training
-    [schedule] = content["lr_schedulers"]
+    torch.save({**content, "pytorch-lightning_version": "2.6.0", **changes}, folder / "a.ckpt")
+    check_resume(folder / "a.ckpt", model, trainer)
+
+
+@pytest.mark.parametrize(("name", "value"), [("step_size", 0), ("step_size", -3), ("last_epoch", -1), ("gamma", "a")])
+def test_a_schedule_with_impossible_numbers_is_rejected(training, tmp_path, name, value):
+    [schedule] = training[2]["lr_schedulers"]
     assert name in schedule
-    with pytest.raises(ValueError, match=f"^a.ckpt: .*{name}: expected a whole number, {least} or more, got {value}$"):
-        check_like_fresh({**content, "lr_schedulers": [{**schedule, name: value}]}, "a.ckpt", model, trainer)
-    check_like_fresh(content, "a.ckpt", model, trainer)
+    _resumes(training, tmp_path)
+    with pytest.raises(ValueError, match=rf"a.ckpt: .*{name}: expected .*{value}$"):
+        _resumes(training, tmp_path, lr_schedulers=[{**schedule, name: value}])
 
 
-def test_settings_of_an_optimizer_that_are_not_there(training):
-    model, trainer, content = training
-    [state] = content["optimizer_states"]
+def test_settings_of_an_optimizer_that_are_not_there(training, tmp_path):
+    [state] = training[2]["optimizer_states"]
     [group] = state["param_groups"]
 
     def without(name):
         left = {key: value for key, value in group.items() if key != name}
-        return {**content, "optimizer_states": [{**state, "param_groups": [left]}]}
+        return [{**state, "param_groups": [left]}]
 
-    with pytest.raises(ValueError, match=r"^a.ckpt: .*param_groups: expected weight_decay, got none$"):
-        check_like_fresh(without("weight_decay"), "a.ckpt", model, trainer)
-    check_like_fresh(without("amsgrad"), "a.ckpt", model, trainer)  # torch fills in what older versions did not have
+    with pytest.raises(ValueError, match=r"a.ckpt: .*param_groups: expected weight_decay, got none$"):
+        _resumes(training, tmp_path, optimizer_states=without("weight_decay"))
+    _resumes(training, tmp_path, optimizer_states=without("amsgrad"))  # older versions of torch did not have it
