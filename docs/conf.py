@@ -30,7 +30,7 @@ extensions = [
     "sphinx_copybutton",
     "sphinx_gallery.gen_gallery",
 ]
-exclude_patterns = ["_build", "examples", "sg_execution_times.rst", "gallery/sg_execution_times.rst"]
+exclude_patterns = ["_build", "_templates", "examples", "sg_execution_times.rst", "gallery/sg_execution_times.rst"]
 html_math_renderer = "mathml"  # browsers draw it themselves: the pages need no network
 html_theme = "furo"
 html_static_path = ["_static"]
@@ -41,11 +41,11 @@ html_title = f"spikekit {version}"
 nitpicky = True
 nitpick_ignore_regex = [
     ("py:.*", r"(torch|kornia|collections|pathlib|optional|numpy|pytorch_lightning)\b.*"),
-    ("py:.*", "(CFA|(Recurrent)?CSCSRConfig|Tensor|Path|Callback|InputError|UsageError)"),
-    ("py:.*", r".*(recurrent_cscsr.State|clips_around.Item)"),
+    ("py:.*", "(CFA|Tensor|Path)"),
 ]
 
-autosummary_generate = False  # every name has a page already
+templates_path = ["_templates"]  # of the pages that autosummary makes
+autosummary_ignore_module_all = False
 autodoc_inherit_docstrings = False
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
@@ -156,8 +156,14 @@ def _block_math(self, node):
     raise nodes.SkipNode
 
 
+def _plain_inside(app, env, node, contnode):
+    """Show as text what docstrings of lightning_modules say of its inner parts, which have no page."""
+    return contnode if node["refdoc"].startswith(("generated/", "api/lightning_modules")) else None
+
+
 def setup(app):
     """Register the directives, and MathML as the form of formulas."""
+    app.connect("missing-reference", _plain_inside)
     app.add_directive("run", Run)
     app.add_directive("shipped-trade", ShippedTrade)
     app.add_html_math_renderer("mathml", (_inline_math, None), (_block_math, None))
