@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Collection, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
@@ -86,7 +87,7 @@ def reconstruct(
         white: spikes a frame of a pixel that is shown white; less makes pictures brighter. When not given, that of the
             side-car, or else what 99.9 % of the pixels of the recording do not exceed, the same in all its pictures.
         device: where the network runs; a GPU where there is one, when not given.
-        precision: ``"32-true"`` or ``"bf16-mixed"``; the latter on a GPU that supports it, when not given.
+        precision: ``"32-true"`` or ``"bf16-mixed"``; the latter where the device computes in it, when not given.
         how: ``tile``, ``psnr_tolerance``, ``self_ensemble``, ``future`` and ``interpolated`` of
             :class:`lightning_modules.inference.film.FilmMaker`, over those of the choice.
 
@@ -253,8 +254,17 @@ class Reconstruction:
 
 
 def precision_of(device: torch.device) -> str:
-    """Return bfloat16 for a GPU that supports it, float32 otherwise."""
-    return "bf16-mixed" if device.type == "cuda" and torch.cuda.is_bf16_supported() else "32-true"
+    """Return bfloat16 for a GPU or a processor that computes in it, float32 otherwise."""
+    able = device.type == "cuda" and torch.cuda.is_bf16_supported()
+    return "bf16-mixed" if able or (device.type == "cpu" and _cpu_computes_in_bfloat16()) else "32-true"
+
+
+def _cpu_computes_in_bfloat16() -> bool:
+    """Whether the processor has instructions for it that torch may use: emulated, it is slower than float32."""
+    asked = getattr(torch.cpu, "get_capabilities", dict)()  # from torch 2.10 on
+    allowed = os.environ.get("ONEDNN_MAX_CPU_ISA", "DEFAULT").upper()
+    allowed = allowed in ("DEFAULT", "ALL") or "BF16" in allowed or "AMX" in allowed
+    return bool(asked.get("avx512_bf16")) and torch.backends.cpu.get_cpu_capability() == "AVX512" and allowed
 
 
 def _digest(values: Any) -> str:

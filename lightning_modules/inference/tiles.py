@@ -13,7 +13,7 @@ from lightning_modules.inference.scene_activity import CELL, look, required
 from lightning_modules.networks import Network
 
 #: side of a tile, in sensor pixels, where nothing else is asked for
-TILE = 128
+TILE = 200
 #: motion that is followed over the edge of a tile, in sensor pixels; what moves further is searched inside
 FAR = 48
 #: sensor pixels around the tiles that move in which motion is estimated, where a tolerance is given
