@@ -22,8 +22,7 @@ from spikekit.timing import cpu_name, software
 #: what the columns mean, for the table and for ``--help``
 COLUMNS = """\
 PSNR, SSIM  spikekit.psnr and spikekit.ssim of every test clip, averaged; the network estimates its motion itself
-LPIPS       likewise, with AlexNet's features, where torchvision and its weights are to be had; of pictures of 0 .. 1
-            as they are, the authors' convention
+LPIPS       likewise, with AlexNet's features, where its weights are at hand (see lightning_modules.metrics.lpips)
 ms a frame  one clip, one picture: median of the rounds, and its quartiles; without reading the clip
 ratio       the same time over that of the first row, round by round: median. Other machines are nearer in this column
 MiB         by how much a clip raises the memory in use at its worst moment
