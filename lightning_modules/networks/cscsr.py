@@ -284,22 +284,27 @@ class CSCSR(Network):
 
     def _search_in_graph(self, features: Tensor, offsets: Tensor, color: int) -> Tensor:
         """The same in operations that other programs know, for any even height and width."""
-        if not self.steps or self.config.neighbors != 4:
+        if not self.steps or self.config.neighbors > 4:
             got = f"steps={self.steps}, neighbors={self.config.neighbors}"
-            raise ValueError(f"steps, neighbors: expected rounded positions and 4 neighbours to export, got {got}")
+            raise ValueError(f"steps, neighbors: expected rounded positions and 4 neighbours at most, got {got}")
         offsets = offsets.expand(-1, features.shape[1], -1, -1, -1)
         height, width = features.shape[-2:]
         mask = bayer_mask(height, width, self.pattern, scale=self.scale, device=features.device, dtype=torch.bool)
         pixels = self._enlarge(features.flatten(0, 1), mask[color])
-        found = bayer_warp_idw(pixels, offsets.flatten(0, 1), self.pattern, color, self.scale, self.steps)
+        how = self.scale, self.steps, self.config.neighbors
+        found = bayer_warp_idw(pixels, offsets.flatten(0, 1), self.pattern, color, *how)
         return found.unflatten(0, features.shape[:2])
 
     def _base(self, spikes: Tensor) -> Tensor:
-        """TFP of the whole clip, demosaiced, smoothed, enlarged."""
-        raw = tfp_at(spikes, self.frames // 2, self.frames) / self.config.alpha
-        # zero at the Nyquist frequency, where demosaicing leaves a zipper that training would have to undo first
-        binomial = torch.cat([raw.new_full((1, 1), weight) for weight in (0.25, 0.5, 0.25)], dim=1)
-        smooth = filter2d_separable(demosaic(raw, self.pattern), binomial, binomial)
+        """TFP of the whole clip, demosaiced, smoothed, enlarged; of third order, which moves less, of a grey sensor."""
+        if self.colors == 1:
+            smooth = tfp_at(spikes, self.frames // 2, (self.frames - 1) // 6 * 2 + 1, order=3).unsqueeze(1)
+            smooth = smooth / self.config.alpha
+        else:
+            raw = tfp_at(spikes, self.frames // 2, self.frames) / self.config.alpha
+            # zero at the Nyquist frequency, where demosaicing leaves a zipper that training would have to undo first
+            binomial = torch.cat([raw.new_full((1, 1), weight) for weight in (0.25, 0.5, 0.25)], dim=1)
+            smooth = filter2d_separable(demosaic(raw, self.pattern), binomial, binomial)
         if self.scale == 1:
             return smooth
         return F.interpolate(smooth, scale_factor=self.scale, mode="bicubic", align_corners=False)

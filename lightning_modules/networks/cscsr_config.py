@@ -31,7 +31,8 @@ class CSCSRConfig:
         end_blocks: residual blocks after the last fusion.
         end_width: channels after the last fusion; when not given, ``width``.
         skip: learn what to add to a smooth, enlarged TFP picture instead of the picture itself. The paper has no
-            such skip; with it training starts where the classical decoder ends.
+            such skip; with it training starts where the classical decoder ends. The picture of a grey sensor, which
+            has nothing to demosaic, is the widest mean of third order that the clip has room for, and not smooth.
         alpha: gain of the camera, what a white pixel receives per clock in thresholds, of clips that come without one:
             the picture is light, divided by it. Weights trained with another are adapted when they are loaded.
         noise: whether the network is told how noisy the sensor is.

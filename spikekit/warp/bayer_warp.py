@@ -9,12 +9,13 @@ from torch import Tensor
 from spikekit.color.cfa import cfa_sites
 from spikekit.warp.neighbors import finite
 
-_NEIGHBORS = 4
 _FLAT = 1 << 31  # above every flat index: a distance and an index make one number
 
 
-def bayer_warp_idw(features: Tensor, flow: Tensor, pattern: str | CFA, color: int, scale: int, steps: int) -> Tensor:
-    """Do what :func:`spikekit.flow_warp_idw` does with four neighbours and the mask of one colour.
+def bayer_warp_idw(
+    features: Tensor, flow: Tensor, pattern: str | CFA, color: int, scale: int, steps: int, neighbors: int = 4
+) -> Tensor:
+    """Do what :func:`spikekit.flow_warp_idw` does with the mask of one colour.
 
     No operator of our own, no table that depends on the size: what ``torch.export`` makes of it takes any even height
     and width of the sensor, of 8 pixels or more. It takes several times the time.
@@ -26,6 +27,7 @@ def bayer_warp_idw(features: Tensor, flow: Tensor, pattern: str | CFA, color: in
         color: 0, 1, 2 for R, G, B; 0 for grey.
         scale: pixels s of the features that a sensor pixel is wide.
         steps: positions per pixel and axis that flow is rounded to, even.
+        neighbors: how many known pixels to weigh, at most 4.
 
     Returns:
         As ``features``.
@@ -44,13 +46,13 @@ def bayer_warp_idw(features: Tensor, flow: Tensor, pattern: str | CFA, color: in
     for colour, row, column in sites:
         if colour != color:
             continue
-        rows = _nearest_on_axis(y, height, row, side, scale, steps)
-        columns = _nearest_on_axis(x, width, column, side, scale, steps)
-        for i in range(_NEIGHBORS):
-            for j in range(_NEIGHBORS // (i + 1)):  # so many pixels of these rows and columns are at least as near
+        rows = _nearest_on_axis(y, height, row, side, scale, steps, neighbors)
+        columns = _nearest_on_axis(x, width, column, side, scale, steps, neighbors)
+        for i in range(neighbors):
+            for j in range(neighbors // (i + 1)):  # so many pixels of these rows and columns are at least as near
                 square = (steps * rows[i] - y).square() + (steps * columns[j] - x).square()
                 keys.append(square * _FLAT + rows[i] * width + columns[j])
-    nearest = torch.stack(keys, dim=-1).topk(_NEIGHBORS, largest=False, sorted=True).values
+    nearest = torch.stack(keys, dim=-1).topk(neighbors, largest=False, sorted=True).values
     distance = (nearest // _FLAT).to(flow.dtype).sqrt()
     # relative to the nearest: nothing for the others on a known pixel
     others = distance[..., :1] / distance[..., 1:]
@@ -59,7 +61,7 @@ def bayer_warp_idw(features: Tensor, flow: Tensor, pattern: str | CFA, color: in
     index = (nearest % _FLAT).flatten(1, 2).unsqueeze(1)
     planes, weight = features.flatten(2), weight.flatten(1, 2).unsqueeze(1)
     result = torch.zeros_like(planes)
-    for k in range(_NEIGHBORS):
+    for k in range(neighbors):
         result = result + weight[..., k] * planes.gather(2, index[..., k].expand_as(planes))
     return result.reshape(features.shape)
 
@@ -70,16 +72,18 @@ def _rounded(flow: Tensor, pixel: Tensor, length: int, steps: int) -> Tensor:
     return moved.clamp(min=-(steps // 2)).minimum(torch.full_like(pixel, length - 1) * steps + steps // 2)
 
 
-def _nearest_on_axis(position: Tensor, length: int, site: int, side: int, scale: int, steps: int) -> list[Tensor]:
-    """The four known pixels nearest to each position on an axis, nearest first, the lower one among equals."""
+def _nearest_on_axis(
+    position: Tensor, length: int, site: int, side: int, scale: int, steps: int, neighbors: int
+) -> list[Tensor]:
+    """The known pixels nearest to each position on an axis, nearest first, the lower one among equals."""
     reach = 2 * scale + 8  # as far as the fourth can be, at a border as well
     half = torch.arange(2 * length, device=position.device)  # order does not change between half pixels
     candidates = (half // 2).unsqueeze(1) + torch.arange(-reach, reach + 1, device=position.device)
     known = (candidates >= 0) & (candidates < length) & (candidates.clamp(min=0) // scale % side == site)
     away = 2 * candidates - half.unsqueeze(1)
     order = torch.where(known, 2 * away.abs() + (away > 0), 1 << 20)
-    found = order.float().topk(_NEIGHBORS, largest=False, sorted=True).indices
+    found = order.float().topk(neighbors, largest=False, sorted=True).indices
     nearest = candidates.gather(1, found)
     place = -((-2 * position) // steps)
     place = place.clamp(min=0).minimum(half[-1])
-    return [nearest[:, k][place] for k in range(_NEIGHBORS)]
+    return [nearest[:, k][place] for k in range(neighbors)]

@@ -8,8 +8,8 @@ from spikekit.warp.bayer_warp import bayer_warp_idw
 
 
 @pytest.mark.parametrize("scale", [1, 2, 3, 4])
-@pytest.mark.parametrize("pattern", ["RGGB", "GBRG"])
-def test_it_is_the_same_warp(scale, pattern):
+@pytest.mark.parametrize(("pattern", "neighbors"), [("RGGB", 4), ("GBRG", 4), ("BGGR", 1), ("grey", 4), ("grey", 1)])
+def test_it_is_the_same_warp(scale, pattern, neighbors):
     generator = torch.Generator().manual_seed(scale)
     for height, width in ((8, 10), (30, 16)):
         features = torch.rand(2, 3, scale * height, scale * width, generator=generator)
@@ -17,5 +17,6 @@ def test_it_is_the_same_warp(scale, pattern):
         flow[:, :, ::3] = (2 * flow[:, :, ::3]).round() / 2  # where neighbours are equally far
         flow[0, 0, 0, 0], flow[0, 1, 1, 1] = float("nan"), 1e9
         for color, mask in enumerate(bayer_mask(height, width, pattern, scale=scale)):
-            got = bayer_warp_idw(features, flow, pattern, color, scale, 16)
-            torch.testing.assert_close(got, flow_warp_idw(features, flow, mask, steps=16), rtol=0, atol=1e-5)
+            got = bayer_warp_idw(features, flow, pattern, color, scale, 16, neighbors)
+            expected = flow_warp_idw(features, flow, mask, neighbors=neighbors, steps=16)
+            torch.testing.assert_close(got, expected, rtol=0, atol=1e-5)
