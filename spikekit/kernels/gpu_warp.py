@@ -122,7 +122,7 @@ def _weigh_kernel(flow, index, weight, height, width, neighbors, block: tl.const
 
 
 def nearest_known(flow: Tensor, products: list[tuple[Tensor, Tensor]], neighbors: int) -> tuple[Tensor, Tensor]:
-    """Exact search, in float64: as the operator of the same name without a table of steps.
+    """Exact search, in float64: as the operator of the same name, of flow that is rounded already.
 
     ``products`` has the tables of the rows and columns that the mask consists of, int32: for every half of a pixel on
     the axis, its nearest known positions, (at most ``neighbors``, 2 H) and (at most ``neighbors``, 2 W).

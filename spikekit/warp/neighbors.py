@@ -8,7 +8,7 @@ Everything that warps with the same flow and mask can share them::
 
 from __future__ import annotations
 
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
-from spikekit.kernels import cpu_warp, custom_operator, gpu_kernel, register_kernel, register_on_gpu
-from spikekit.kernels.position_table import PositionTable
+from spikekit.kernels import custom_operator, gpu_kernel, register_kernel, register_on_gpu
+from spikekit.kernels.loops import import_loops
 from spikekit.warp.gather import fold_into_batch
 
 _FARTHEST = 2.0**30  # flow beyond it is cut: positions must fit an integer
@@ -143,23 +143,6 @@ def search_and_weigh(
     return index, _weigh(index, width, cell, part)
 
 
-@lru_cache(maxsize=8)
-def _table(key: _Key, neighbors: int, steps: int, dtype: torch.dtype) -> PositionTable:
-    bits, height, width, device = key
-    known = np.frombuffer(bits, dtype=bool).reshape(height, width)
-    return PositionTable(known, neighbors, steps, _search_in, dtype, device)
-
-
-def table_of(mask: Tensor, neighbors: int, steps: int, dtype: torch.dtype) -> PositionTable:
-    """Return the table of a mask, with weights in ``dtype``, kept between calls."""
-    return _table(_key(mask), neighbors, steps, dtype)
-
-
-def _search_in(known: np.ndarray, neighbors: int, cell: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
-    products = _products((known.tobytes(), *known.shape, "cpu"), neighbors)
-    return search_and_weigh(products, neighbors, known.shape[1], cell, part)
-
-
 def _weigh(index: Tensor, width: int, cell: Tensor, part: Tensor) -> Tensor:
     """Weights by inverse distance, of sum 1, that pixels (neighbors, n) have at cell + part, (2, n)."""
     row = index // width
@@ -179,21 +162,18 @@ def _nearest_known(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tu
         flow: (N, 2, H, W), float32 or float64, finite and less than 2^30.
         mask: (H, W).
         neighbors: how many known pixels to weigh, K.
-        steps: positions per pixel and axis that flow is rounded to, so that a table can be asked; 0: no rounding.
+        steps: positions per pixel and axis that flow is rounded to; 0: no rounding.
 
     Returns:
         Index, int64, and weight, in the dtype of ``flow``: both (N, K, H W), the nearest first. Where fewer pixels
         are known, the nearest is repeated with weight 0.
     """
     count, _, height, width = flow.shape
-    if steps:
-        find = table_of(mask, neighbors, steps, flow.dtype).find
-    else:
-        find = partial(search_and_weigh, products_of(mask, neighbors), neighbors, width)
+    products, wanted = products_of(mask, neighbors), _wanted(flow, steps)
     # double, so that what is nearer does not depend on rounding
     double = torch.float32 if flow.device.type == "mps" else torch.float64
     plane = height * width
-    flat = flow.movedim(1, 0).reshape(2, -1)
+    flat = wanted.movedim(1, 0).reshape(2, -1)
     index = flow.new_empty(neighbors, count * plane, dtype=torch.int64)
     weight = flow.new_empty(neighbors, count * plane)
     size = _CHUNK if flow.device.type == "cpu" else 128 * _CHUNK  # elsewhere a launch costs more than the cache saves
@@ -203,7 +183,7 @@ def _nearest_known(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tu
         pixel = torch.arange(begin, begin + moved.shape[1], device=flow.device) % plane
         cell, part = torch.stack([pixel % width, pixel // width]) + whole.long(), moved - whole
         chunk = slice(begin, begin + size)
-        index[:, chunk], weight[:, chunk] = find(cell, part)
+        index[:, chunk], weight[:, chunk] = search_and_weigh(products, neighbors, width, cell, part)
     shape = neighbors, count, plane
     return index.reshape(shape).movedim(0, 1).contiguous(), weight.reshape(shape).movedim(0, 1).contiguous()
 
@@ -218,21 +198,14 @@ nearest_known = custom_operator("nearest_known", _nearest_known, _fake)
 
 @register_kernel(nearest_known, "cpu")
 def _(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
-    if steps:
-        return cpu_warp.nearest_in_table(flow, table_of(mask, neighbors, steps, flow.dtype))
-    if neighbors == 4:
-        products = products_of(mask, neighbors)
-        if len(products) <= 2 and all(len(table) == 4 for product in products for table in product):
-            return cpu_warp.nearest_four(flow, products)
-    return _nearest_known(flow, mask, neighbors, steps)
+    loops = import_loops("spikekit.kernels.cpu_search")
+    if loops is None:
+        return _nearest_known(flow, mask, neighbors, steps)
+    return loops.nearest_known(flow, products_of(mask, neighbors), neighbors, steps)
 
 
 def _on_gpu(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
-    if steps & (steps - 1):  # a third has no end in binary, so that a search might decide ties otherwise than the table
-        return _nearest_known(flow, mask, neighbors, steps)
-    # a GPU searches sooner than it reads a table
-    wanted = _rounded(flow.double(), steps)[0] if steps else flow
-    index, weight = gpu_kernel("nearest_known")(wanted, products_of(mask, neighbors), neighbors)
+    index, weight = gpu_kernel("nearest_known")(_wanted(flow, steps), products_of(mask, neighbors), neighbors)
     return index, weight.to(flow.dtype)
 
 
@@ -240,8 +213,15 @@ register_on_gpu(nearest_known, _on_gpu)
 fold_into_batch(nearest_known, 1)
 
 
+def _wanted(flow: Tensor, steps: int) -> Tensor:
+    """Return the flow that neighbours are searched for: rounded, where that is asked for, without loss."""
+    if not steps:
+        return flow
+    return _rounded(flow if flow.device.type == "mps" else flow.double(), steps)[0]
+
+
 def _rounded(flow: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-    """Return the flow that a table stands for, with the gradient of what was rounded, and where it is not cut."""
+    """Return the rounded flow, with the gradient of what was rounded, and where it is not cut."""
     height, width = flow.shape[-2:]
     y, x = (torch.arange(length, device=flow.device, dtype=flow.dtype) for length in (height, width))
     pixel = torch.stack([x.expand(height, width), y[:, None].expand(height, width)])
@@ -302,7 +282,7 @@ def idw_neighbors(flow: Tensor, mask: Tensor, neighbors: int = 4, steps: int | N
         flow: (N, 2, H, W), floating.
         mask: (H, W); a pixel is known where it is not 0.
         neighbors: how many known pixels to weigh, K.
-        steps: positions per pixel and axis that flow is rounded to, even, so that a table can be asked; None: exact.
+        steps: positions per pixel and axis that flow is rounded to, even; None: exact.
 
     Returns:
         Flat indices, int64, and weights, in the dtype of ``flow`` but float32 at least: both (N, K, H W). The weights

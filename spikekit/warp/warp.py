@@ -10,7 +10,6 @@ from torch import Tensor, nn
 from spikekit.check import check_planes, check_whole
 from spikekit.warp.gather import Gather
 from spikekit.warp.neighbors import finite, idw_neighbors
-from spikekit.warp.table_warp import in_one_go, warp_by_table
 
 
 def _check_warp(name: str, image: Tensor, flow: Tensor) -> None:
@@ -125,15 +124,17 @@ def flow_warp_idw(
         pixel the gradient with respect to the flow, a cone's tip, is 0, and so it is where the flow is not finite.
 
         With ``steps`` the flow is rounded to that many positions per pixel and axis, and positions outside the image
-        are moved to its edge, so that neighbours and weights can be looked up in a table, made once for a mask. The
-        gradient is that of the rounded flow, 0 where a position was moved. Fewer than 32 channels on a CPU are warped
-        in loops that Numba compiles, where it is installed (``pip install '.[fast]'``): the same result sooner.
+        are moved to its edge, as in a network that was exported. The gradient is that of the rounded flow, 0 where a
+        position was moved.
+
+        A CPU searches by Numba where it is installed (``pip install 'spikekit[fast]'``), a GPU by Triton, any other
+        device by PyTorch: the same neighbours everywhere.
 
     Args:
         features: :math:`(*, C, H, W)`, floating.
         flow: :math:`(*, 2, H, W)`.
-        mask: :math:`(H, W)`; a pixel is known where it is not 0. The tables of a mask are kept between calls; on a GPU
-            they are made anew where the mask counts a change, which one through ``mask.data`` does not.
+        mask: :math:`(H, W)`; a pixel is known where it is not 0. What is made of a mask is kept between calls; on a GPU
+            it is made anew where the mask counts a change, which one through ``mask.data`` does not.
         neighbors: how many known pixels to weigh.
         steps: positions per pixel and axis that the flow is rounded to, an even number such as 16; None for the exact
             search.
@@ -144,8 +145,7 @@ def flow_warp_idw(
     Raises:
         TypeError: features or flow are not floating-point tensors.
         ValueError: sizes that do not fit each other, ``neighbors`` below 1, ``steps`` that are odd or below 1, a mask
-            without a known pixel, ``steps`` for a large mask that does not repeat along rows and columns as those of a
-            Bayer filter do, whose table would be huge.
+            without a known pixel.
 
     Example:
         >>> features = torch.tensor([[[[1.0, 0.0, 5.0, 0.0]]]])
@@ -165,9 +165,6 @@ def flow_warp_idw(
     dtype = torch.promote_types(features.dtype, flow.dtype)
     flow = flow.reshape(-1, 2, height, width).to(dtype)
     values = features.reshape(-1, features.shape[-3], height * width)
-    if steps and in_one_go(values):
-        flow = flow.to(torch.promote_types(dtype, torch.float32))
-        return warp_by_table(values, flow, mask, neighbors, steps).reshape(features.shape)
     index, weight = idw_neighbors(flow, mask, neighbors, steps)
     return Gather.apply(values, index, weight).reshape(features.shape)
 

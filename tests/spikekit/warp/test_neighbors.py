@@ -1,4 +1,4 @@
-"""The search of known pixels: closed form and general path against brute force in whole numbers, tables, caches."""
+"""The search of known pixels, by Numba and by PyTorch, against brute force in whole numbers."""
 
 from contextlib import nullcontext
 
@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from spikekit import bayer_mask, flow_warp_idw
-from spikekit.kernels import cpu_warp
-from spikekit.warp.neighbors import _key, _products, _table, idw_neighbors, nearest_known
+from spikekit.warp.neighbors import idw_neighbors, nearest_known
 
 UNIT = 64  # flows below are multiples of 1 / UNIT, squared distances are whole numbers in units of 1 / UNIT^2
 
@@ -45,9 +44,9 @@ def check(flow, mask, neighbors=4):
     )
 
 
-@pytest.fixture(params=["closed form", "general"])
+@pytest.fixture(params=["Numba", "PyTorch"])
 def path(request, without_kernels):
-    with without_kernels(nearest_known) if request.param == "general" else nullcontext():
+    with without_kernels(nearest_known) if request.param == "PyTorch" else nullcontext():
         yield request.param
 
 
@@ -71,16 +70,11 @@ def masks():
 
 
 @pytest.mark.parametrize("mask", list(masks()))
-def test_at_every_eighth_of_a_pixel(mask, path, monkeypatch):
+def test_at_every_eighth_of_a_pixel(mask, path):
     """The whole picture, its borders and what lies beyond them; ties are everywhere."""
-    monkeypatch.setattr(cpu_warp, "_TILE", 333)
-    called = []
-    four = cpu_warp.nearest_four
-    monkeypatch.setattr(cpu_warp, "nearest_four", lambda *args: called.append(args) or four(*args))
     eighths = torch.cartesian_prod(torch.arange(8), torch.arange(8))[:, :, None, None] / 8
     for reach in (0, 2, 20):
         check(eighths + torch.randint(-reach - 1, reach + 1, (64, 2, *mask.shape)), mask)
-    assert bool(called) == (path == "closed form")
 
 
 @pytest.mark.parametrize("mask", list(masks()))
@@ -92,13 +86,13 @@ def test_at_any_position(mask, dtype, path):
 
 
 @pytest.mark.parametrize("neighbors", [1, 2, 3, 5, 8, 30])
-def test_of_any_number(neighbors):
+def test_of_any_number(neighbors, path):
     for mask in (*bayer_mask(3, 4, scale=2), torch.rand(6, 8) < 0.3):
         check(torch.randint(-4 * UNIT, 4 * UNIT, (5, 2, *mask.shape)) / UNIT, mask, neighbors)
 
 
 @pytest.mark.parametrize("width", [1, 3, 4])
-def test_of_masks_too_small_for_the_closed_form(width):
+def test_of_masks_with_fewer_pixels_than_neighbours(width, path):
     for height in (1, 3, 5):
         mask = torch.ones(height, width)
         check(torch.randint(-4 * UNIT, 4 * UNIT, (5, 2, height, width)) / UNIT, mask)
@@ -139,41 +133,6 @@ def test_vmap_is_over_the_flow():
         torch.func.vmap(idw_neighbors, (0, 0))(flow, mask.expand(3, 4, 6))
 
 
-def test_tables_are_made_once():
-    flow, mask = torch.randn(1, 2, 6, 8), torch.rand(6, 8) < 0.3
-    nearest_known(flow, mask, 4, 0)
-    made = _products.cache_info().misses
-    nearest_known(flow, mask, 4, 0)
-    nearest_known(flow, mask.clone(), 4, 0)
-    nearest_known(flow, mask.double(), 4, 0)
-    assert _products.cache_info().misses == made
-    nearest_known(flow, mask, 3, 0)
-    nearest_known(flow, ~mask, 4, 0)
-    nearest_known(flow.mT, mask.reshape(8, 6), 4, 0)
-    assert _products.cache_info().misses == made + 3
-
-
-class Elsewhere(torch.Tensor):
-    """On the CPU, but says that it is not."""
-
-    device = torch.device("cuda")
-
-
-def test_the_same_mask_is_not_read_again(monkeypatch):
-    """On a GPU reading it would wait for all that runs there; on the CPU its memory may be another's."""
-    here = torch.rand(6, 8) < 0.3
-    mask = here.clone().as_subclass(Elsewhere)
-    seen = _key(mask)
-    _key(here)
-    mask[0] = ~mask[0]
-    changed = _key(mask)
-    assert changed != seen
-    monkeypatch.setattr(torch.Tensor, "cpu", lambda self: pytest.fail("read again"))
-    assert _key(mask) == changed
-    with pytest.raises(pytest.fail.Exception, match="read again"):
-        _key(here)
-
-
 def on_the_grid(mask, steps):
     """Flows of whole steps that stay within half a pixel of the picture, as (64, 2, H, W)."""
     height, width = mask.shape
@@ -186,19 +145,19 @@ def on_the_grid(mask, steps):
 @pytest.mark.parametrize(
     ("scale", "neighbors", "size"), [(1, 4, (14, 18)), (1, 6, (24, 3)), (2, 4, (9, 6)), (3, 2, (5, 4))]
 )
-def test_table_is_exact_at_its_positions(scale, neighbors, size, path):
+def test_rounding_is_exact_at_its_positions(scale, neighbors, size, path):
     """All colours, near the borders and inside: every class of positions has its own neighbours."""
     for mask in bayer_mask(*size, "GRBG", scale=scale):
         flow = on_the_grid(mask, 8)
-        exact, table = nearest_known(flow, mask, neighbors, 0), nearest_known(flow, mask, neighbors, 8)
-        assert torch.equal(exact[0].sort(1).values, table[0].sort(1).values)
-        order = [index.argsort(1) for index, _ in (exact, table)]
-        shares = [weight.gather(1, by) for (_, weight), by in zip((exact, table), order, strict=True)]
+        exact, rounded = nearest_known(flow, mask, neighbors, 0), nearest_known(flow, mask, neighbors, 8)
+        assert torch.equal(exact[0].sort(1).values, rounded[0].sort(1).values)
+        order = [index.argsort(1) for index, _ in (exact, rounded)]
+        shares = [weight.gather(1, by) for (_, weight), by in zip((exact, rounded), order, strict=True)]
         torch.testing.assert_close(*shares)
 
 
 @pytest.mark.parametrize("steps", [2, 4, 16])
-def test_table_between_its_positions(steps, path):
+def test_rounding_between_its_positions(steps, path):
     """Weights are those of the rounded position, and no neighbour is farther than the rounding lets it."""
     mask = bayer_mask(12, 14, scale=2)[1]
     height, width = mask.shape
@@ -218,42 +177,36 @@ def test_table_between_its_positions(steps, path):
     torch.testing.assert_close(*shares)
 
 
-def test_table_far_outside_is_that_of_the_border(path):
+def test_rounded_far_outside_is_at_the_border(path):
     mask = bayer_mask(12, 14, scale=2)[0]
     far, border = torch.full((1, 2, *mask.shape), 2.0**30), torch.zeros(1, 2, *mask.shape)
     border[0, 0], border[0, 1] = 27.5 - torch.arange(28), 23.5 - torch.arange(24)[:, None]
     assert torch.equal(nearest_known(far, mask, 4, 4)[0], nearest_known(border, mask, 4, 4)[0])
 
 
-def test_table_keeps_known_pixels():
+def test_rounding_keeps_known_pixels():
     features, mask = torch.randn(1, 9, 24, 28), bayer_mask(12, 14, scale=2, dtype=torch.bool)[2]
     for steps in (2, 6, 16):
         warped = flow_warp_idw(features, torch.zeros(1, 2, 24, 28), mask, steps=steps)
         assert torch.equal(warped[..., mask], features[..., mask])
 
 
-def test_table_grows_with_the_period_only():
-    sizes = set()
-    for size in (24, 48, 50):
-        mask = bayer_mask(size, size, scale=2, dtype=torch.bool)[0]
-        sizes.add(_table((mask.numpy().tobytes(), *mask.shape, "cpu"), 4, 4, torch.float32).shift.shape)
-    assert len(sizes) == 1
-
-
-@pytest.mark.parametrize("known", ["random", "one pixel", "diagonal"])
-def test_table_needs_a_period(known):
-    mask = {"random": torch.rand(400, 300) < 0.3, "one pixel": torch.zeros(400, 300), "diagonal": torch.eye(400, 300)}
-    mask["one pixel"][3, 5] = 1
-    with pytest.raises(ValueError, match="repeats"):
-        flow_warp_idw(torch.zeros(1, 1, 400, 300), torch.zeros(1, 2, 400, 300), mask[known], steps=16)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 4)])
-def test_table_of_a_small_mask_needs_none(size, path):
-    mask = torch.rand(size) < 0.5
-    mask[0, 0] = True
-    flow = on_the_grid(mask, 4)
-    for neighbors in (1, 4):
-        exact, table = nearest_known(flow, mask, neighbors, 0), nearest_known(flow, mask, neighbors, 4)
-        assert torch.equal(exact[0].sort(1).values, table[0].sort(1).values)
-        torch.testing.assert_close(exact[1].sum(1), table[1].sum(1))
+@pytest.mark.parametrize("steps", [0, 6, 16])
+def test_threads_and_devices_find_the_same(steps, without_kernels):
+    """Without Numba the neighbours are the same, weights within a rounding; more threads change no bit."""
+    mask, flow = bayer_mask(70, 61, scale=2)[1], 3 * torch.randn(2, 2, 140, 122)
+    flow[1] = (flow[1] * 4).round() / 4
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        index, weight = nearest_known(flow, mask, 4, steps)
+        torch.set_num_threads(3)
+        again = nearest_known(flow, mask, 4, steps)
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(again[0], index)
+    assert torch.equal(again[1], weight)
+    with without_kernels(nearest_known):
+        plain = nearest_known(flow, mask, 4, steps)
+    assert torch.equal(plain[0], index)
+    torch.testing.assert_close(plain[1], weight, rtol=1e-6, atol=1e-7)
