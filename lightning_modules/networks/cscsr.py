@@ -209,7 +209,7 @@ class CSCSR(Network):
         learned = flow is not None and flow.requires_grad and torch.is_grad_enabled()
         if learned or is_exporting() or torch.jit.is_tracing():
             return False
-        known = config.search and config.representation == "bssr" and config.neighbors == 4
+        known = config.search and config.representation == "bssr" and config.neighbors <= 4
         return known and self.fold == self.scale and min(spikes.shape[-2:]) >= SMALLEST
 
     def _search_sites(self, features: Iterable[Tensor], flow: Tensor | None, spikes: Tensor) -> Iterator[Tensor]:
@@ -219,8 +219,9 @@ class CSCSR(Network):
         flows = moved.unbind(1) if moved.ndim == 6 else [moved] * self.colors
         shares = _shares(self.times, self.flow_times, spikes.device)
         for color, (part, one) in enumerate(zip(features, flows, strict=True)):
-            odd = height % 2 == 1, width % 2 == 1
-            yield search_sites(part, one, shares, site_table(self.pattern, color, self.scale, odd, spikes.device))
+            of_border = height % 2 == 1, width % 2 == 1
+            table = site_table(self.pattern, color, self.scale, of_border, spikes.device, self.config.neighbors)
+            yield search_sites(part, one, shares, table)
 
     @torch.no_grad()
     def scale_picture(self, factor: float) -> None:  # noqa: D102

@@ -33,7 +33,6 @@ _loops = import_loops("spikekit.kernels.cpu_sites")
 
 STEPS = 32  #: positions per sensor pixel and axis that flow is rounded to
 SMALLEST = 12  #: sensor pixels along an axis from which on both borders have classes of their own
-_NEIGHBORS = 4
 _SIDE = 16  # of the sensor that classes are found on
 _AROUND = 4, 6  # sensor pixels around the base among which the known ones are; where scale is 1, they are further apart
 _CHUNK = 1 << 13  # positions searched at a time: in the cache
@@ -111,7 +110,9 @@ def _steps_to(moved: Tensor, length: int, axis: int) -> Tensor:
 
 
 @lru_cache(maxsize=24)
-def site_table(pattern: str, color: int, scale: int, odd: tuple[bool, bool], device: torch.device) -> SiteTable:
+def site_table(
+    pattern: str, color: int, scale: int, odd: tuple[bool, bool], device: torch.device, neighbors: int = 4
+) -> SiteTable:
     """Make the table of one colour, or return the one that was made before.
 
     Args:
@@ -120,27 +121,28 @@ def site_table(pattern: str, color: int, scale: int, odd: tuple[bool, bool], dev
         scale: super-resolution factor s.
         odd: whether height and width of the sensor are odd, as the border at the end is then of another phase.
         device: where the table is needed.
+        neighbors: known temporal pixels that are weighed, 4 at most.
     """
     with torch.inference_mode(False), torch.device("cpu"):  # what is made in inference mode has no gradient later
         if device.type == "cpu":
-            return _make_table(pattern, color, scale, odd)
-        return site_table(pattern, color, scale, odd, torch.device("cpu")).to(device)
+            return _make_table(pattern, color, scale, odd, neighbors)
+        return site_table(pattern, color, scale, odd, torch.device("cpu"), neighbors).to(device)
 
 
-def _make_table(pattern: str, color: int, scale: int, odd: tuple[bool, bool]) -> SiteTable:
+def _make_table(pattern: str, color: int, scale: int, odd: tuple[bool, bool], neighbors: int) -> SiteTable:
     size = _SIDE + odd[0], _SIDE + odd[1]
     mask = bayer_mask(*size, pattern, scale=scale, dtype=torch.bool)[color]
     inside, step = [_SIDE // 2, _SIDE // 2 + 1], torch.arange(STEPS)
     ends = step[[0, 1, STEPS // 2 - 1, STEPS // 2, STEPS // 2 + 1, -2, -1]]
     # away from both borders of an axis, however near one of the other axis is: there known pixels lie further apart
     near = [[*inside, -1, 0, 1, length, length - 1, length - 2] for length in size]
-    wide = _weights(mask, size, scale, _steps(near[0], ends), _steps(inside, ends))[1][:, 1]
-    high_ones = _weights(mask, size, scale, _steps(inside, ends), _steps(near[1], ends))[1][:, 0]
+    wide = _weights(mask, neighbors, scale, _steps(near[0], ends), _steps(inside, ends))[1][:, 1]
+    high_ones = _weights(mask, neighbors, scale, _steps(inside, ends), _steps(near[1], ends))[1][:, 0]
     low, high = int(min(wide.min(), high_ones.min())), int(max(wide.max(), high_ones.max()))
     axes = [[*inside, *range(-1, -low), *range(length, length - high - 1, -1)] for length in size]
     found = [
-        _weights(mask, size, scale, _steps(inside, step), _steps(inside, step)),
-        _weights(mask, size, scale, *(_steps(axis, step[::2]) for axis in axes)),
+        _weights(mask, neighbors, scale, _steps(inside, step), _steps(inside, step)),
+        _weights(mask, neighbors, scale, *(_steps(axis, step[::2]) for axis in axes)),
     ]
     count, offset, weight = (torch.cat(parts) for parts in zip(*found, strict=True))
     start = F.pad(count.cumsum(0), (1, 0))
@@ -152,14 +154,12 @@ def _steps(bases: list[int], steps: Tensor) -> Tensor:
     return torch.tensor(bases)[:, None] * STEPS + steps
 
 
-def _weights(
-    mask: Tensor, size: tuple[int, int], scale: int, rows: Tensor, columns: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def _weights(mask: Tensor, neighbors: int, scale: int, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Weights of all pairs of places on both axes and of all fractions.
 
     Args:
         mask: (s H, s W), known temporal pixels.
-        size: H, W.
+        neighbors: how many of them are weighed.
         scale: s.
         rows: (I, S), positions in steps.
         columns: (J, S).
@@ -167,7 +167,7 @@ def _weights(
     Returns:
         Of the I J S^2 classes: the number of features, (classes,), their offsets, (n, 2), and weights, (n, s^2).
     """
-    height, width = size
+    height, width = (length // scale for length in mask.shape)
     sub = torch.arange(scale)
     # of every temporal pixel of the site, where it is moved to: (I, S, s) and (J, S, s), in temporal pixels
     y = (rows[..., None] * (scale / STEPS) + sub).double().clamp(-0.5, scale * height - 0.5)
@@ -177,7 +177,7 @@ def _weights(
     x = x[None, :, None, :, None, :].expand(*places, scale, scale).reshape(-1)
     base_y = (rows[:, 0] // STEPS)[:, None, None, None].expand(places).reshape(-1)
     base_x = (columns[:, 0] // STEPS)[None, :, None, None].expand(places).reshape(-1)
-    products = products_of(mask, _NEIGHBORS)
+    products = products_of(mask, neighbors)
     around, per_site = _AROUND[scale == 1], scale**2
     side = 2 * around + 1
     counts, offsets, weights = [], [], []
@@ -186,7 +186,7 @@ def _weights(
         part = slice(begin * per_site, (begin + classes) * per_site)
         at = torch.stack([x[part], y[part]])
         cell = at.round()
-        index, weight = search_and_weigh(products, _NEIGHBORS, scale * width, cell.long(), at - cell)
+        index, weight = search_and_weigh(products, neighbors, scale * width, cell.long(), at - cell)
         chunk_y, chunk_x = base_y[begin : begin + classes], base_x[begin : begin + classes]
         dense = torch.zeros(len(chunk_y), per_site, side * side)
         # a known temporal pixel is a bilinear mixture of features, as torch.nn.functional.interpolate makes it
@@ -196,7 +196,7 @@ def _weights(
                 away_y = i.unflatten(1, (-1, per_site)) - chunk_y[:, None] + around
                 away_x = j.unflatten(1, (-1, per_site)) - chunk_x[:, None] + around
                 amount = (weight * weight_y * weight_x).unflatten(1, (-1, per_site))
-                for k in range(_NEIGHBORS):
+                for k in range(neighbors):
                     # where a mixture has no part in a feature, that may lie outside
                     where = (away_y[k] * side + away_x[k]).where(amount[k] != 0, 0)
                     dense.scatter_add_(2, where.unsqueeze(-1), amount[k].float().unsqueeze(-1))

@@ -13,8 +13,8 @@ CPU = torch.device("cpu")
 SHARES = torch.tensor([[1.0, 0.0], [0.5, 0.0], [0.0, 0.25], [0.0, 1.0]])
 
 
-def table_for(size, pattern="RGGB", color=0, scale=4):
-    return site_table(pattern, color, scale, (size[0] % 2 == 1, size[1] % 2 == 1), CPU)
+def table_for(size, pattern="RGGB", color=0, scale=4, neighbors=4):
+    return site_table(pattern, color, scale, (size[0] % 2 == 1, size[1] % 2 == 1), CPU, neighbors)
 
 
 def rounded_flow(size, generator, reach=5.0):
@@ -23,7 +23,7 @@ def rounded_flow(size, generator, reach=5.0):
     return whole * 8 / STEPS
 
 
-def searched(features, flow, pattern, color, scale):
+def searched(features, flow, pattern, color, scale, neighbors=4):
     """Enlarge, move every temporal pixel by the flow of its site, half a pixel beyond the border at most, and fold."""
     batch, times, channels, height, width = features.shape
     moved = torch.einsum("tk,bkchw->btchw", SHARES.double(), flow.double()).flatten(0, 1) * scale
@@ -35,7 +35,7 @@ def searched(features, flow, pattern, color, scale):
     if scale > 1:
         pixels = F.interpolate(pixels, scale_factor=scale, mode="bilinear", align_corners=False)
     mask = bayer_mask(height, width, pattern, scale=scale, dtype=torch.bool)[color]
-    found = F.pixel_unshuffle(flow_warp_idw(pixels, moved, mask), scale)
+    found = F.pixel_unshuffle(flow_warp_idw(pixels, moved, mask, neighbors=neighbors), scale)
     return found.reshape(batch, times * channels * scale**2, height, width)
 
 
@@ -52,6 +52,16 @@ def test_sites_are_the_enlarged_features_searched_along_the_motion_up_to_the_bor
         torch.testing.assert_close(search_sites(features, flow, SHARES, table), expected, rtol=0, atol=1e-5)
         single = search_sites(features.float(), flow, SHARES, table)  # by compiled loops, where there are such
         torch.testing.assert_close(single.double(), expected, rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "grey"])
+def test_a_single_neighbour_is_the_nearest(pattern):
+    size, generator = (13, 14), torch.Generator().manual_seed(0)
+    features, flow = torch.randn(2, 4, 3, *size, generator=generator), rounded_flow(size, generator)
+    for scale in (1, 2):
+        found = search_sites(features, flow, SHARES, table_for(size, pattern, 0, scale, neighbors=1))
+        expected = searched(features.double(), flow, pattern, 0, scale, neighbors=1).float()
+        torch.testing.assert_close(found, expected, rtol=0, atol=2e-5)
 
 
 def test_flow_between_two_steps_is_rounded_to_the_nearer_one():
