@@ -7,7 +7,7 @@ lists them. Arguments are those of ``CSCSR.from_pretrained``.
 from functools import partial
 
 from lightning_modules.networks import CSCSR
-from lightning_modules.storage.shipped import list_pretrained
+from lightning_modules.registry import list_models
 
 dependencies = ["torch", "kornia", "numpy", "safetensors"]
 
@@ -18,4 +18,4 @@ def _entry(name: str) -> partial[CSCSR]:
     return load
 
 
-globals().update({weights.name: _entry(weights.name) for weights in list_pretrained() if weights.scale})
+globals().update({model.name: _entry(model.name) for model in list_models() if model.scale})

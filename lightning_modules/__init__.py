@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from lightning_modules.inference.reconstruct import reconstruct
     from lightning_modules.networks import CSCSR
-    from lightning_modules.storage.shipped import list_pretrained
+    from lightning_modules.registry import list_models
     from lightning_modules.tasks.super_resolution import SuperResolution
 
-__all__ = ["CSCSR", "SuperResolution", "list_pretrained", "reconstruct"]
+__all__ = ["CSCSR", "SuperResolution", "list_models", "reconstruct"]
 
 # where what the package offers is
 _HOME = {
     "CSCSR": "networks",
     "SuperResolution": "tasks.super_resolution",
-    "list_pretrained": "storage.shipped",
+    "list_models": "registry",
     "reconstruct": "inference.reconstruct",
 }
 

@@ -17,12 +17,12 @@ from lightning_modules.cli.command import without_chatter
 from lightning_modules.cli.errors import InputError, UsageError, VerbParser
 from lightning_modules.cli.folder_lock import check_folder, locked_folder
 from lightning_modules.cli.predict import RECORDING, add_recording
-from lightning_modules.inference._open import find_model, list_models
 from lightning_modules.inference.clips import RecordingClips
 from lightning_modules.inference.export import load_network
 from lightning_modules.inference.output import file_identity
 from lightning_modules.inference.reconstruct import precision_of
 from lightning_modules.networks import Network, RecurrentCSCSR
+from lightning_modules.registry import find_model, list_models
 from lightning_modules.storage.pretrained import Weights, motion_of, settings_of, write_weights
 from spikekit.arguments import UsageError as SpikekitUsageError
 from spikekit.arguments import whole

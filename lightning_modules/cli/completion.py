@@ -13,14 +13,14 @@ from lightning_modules.cli.errors import UsageError
 from lightning_modules.cli.short_help import VERBS
 from lightning_modules.motion import ESTIMATORS
 from lightning_modules.networks import NETWORKS
-from lightning_modules.storage.shipped import list_pretrained
+from lightning_modules.registry import list_models
 from spikekit.arguments import UsageError as SpikekitUsageError
 from spikekit.completion import completion
 from spikekit.io.cameras import CAMERAS
 
 #: what options take that no parser says
 _KNOWN = {
-    "--model.weights": [weights.name for weights in list_pretrained() if weights.scale],
+    "--model.weights": [model.name for model in list_models() if model.scale],
     "--model.network": [*NETWORKS],
     "--model.network.motion": [*ESTIMATORS],
     "--data": [choice.__name__ for option, choice in CHOICES if option == "data"],

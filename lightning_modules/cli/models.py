@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 
 from lightning_modules.cli.errors import VerbParser
-from lightning_modules.storage.shipped import list_pretrained
+from lightning_modules.registry import list_models
 from spikekit.tables import table
 
 _LEGEND = """
@@ -31,7 +31,7 @@ def models(args: Sequence[str]) -> None:
     """
     parser().parse_args(args)
     rows = []
-    for one in list_pretrained():
+    for one in list_models():
         cells = [one.name, one.scale and f"x{one.scale}", one.size, f"{one.parameters:,}", f"{one.macs / 1e6:.2f}"]
         scores = [score and f"{score:.2f}" for score in (one.kodak, one.vid4)]
         rows.append([*cells, *scores, f"{one.path.stat().st_size / 1e6:.1f}"])

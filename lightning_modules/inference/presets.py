@@ -13,10 +13,10 @@ from typing import Any, get_args, get_type_hints
 import torch
 
 from lightning_modules import motion as estimators
-from lightning_modules.inference._open import find_model, list_models
 from lightning_modules.inference.predict import predict
 from lightning_modules.inference.tiles import FAR, TILE
 from lightning_modules.networks import CSCSR, ClassicalDecoder, Network
+from lightning_modules.registry import find_model, list_models
 from spikekit.arguments import one_line
 from spikekit.timing import timer_of
 

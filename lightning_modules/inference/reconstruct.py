@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lightning_modules.inference._open import find_model
 from lightning_modules.inference.clips import FRAMES, RecordingClips, film_groups, is_grey
 from lightning_modules.inference.film import FilmFrame, FilmMaker
 from lightning_modules.inference.output import file_identity
 from lightning_modules.inference.presets import SPEEDS, Choice, Preset, choose
 from lightning_modules.networks import ClassicalDecoder, Network
+from lightning_modules.registry import find_model
 from spikekit import __version__
 from spikekit.io.image_bytes import to_bytes
 from spikekit.recording import Recording, open_recording

@@ -6,7 +6,6 @@ from lightning_modules.networks.cscsr import CSCSR
 from lightning_modules.networks.cscsr_config import CSCSRConfig
 from lightning_modules.networks.network import Network
 from lightning_modules.networks.recurrent_cscsr import RecurrentCSCSR
-from lightning_modules.networks.two_span_cscsr import TwoSpanCSCSR
 
 #: what weights and configurations may name
 NETWORKS = {
@@ -26,6 +25,5 @@ __all__ = [
     "RecurrentCSCSR",
     "SpikeSRNetLike",
     "SwinIR",
-    "TwoSpanCSCSR",
     "VidarSR",
 ]

@@ -14,10 +14,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from lightning_modules.registry import FUSION, find_model, list_models
 from lightning_modules.storage.checkpoint import check_tensors, read_checkpoint
 from lightning_modules.storage.error_model import read_error_model
 from lightning_modules.storage.settings import check_plain, check_shapes
-from lightning_modules.storage.shipped import FUSION, find_shipped, list_pretrained
 from spikekit.io.whole_file import whole_file
 
 _MOTION = "motion."
@@ -61,15 +61,15 @@ def read_weights(source: str | Path) -> Weights:
         ValueError: a file that is damaged or of something else, weights that are not finite, or settings that this
             package cannot have written or that do not fit the weights; the message is one line and names the file.
     """
-    shipped = find_shipped(str(source))
-    path = shipped.path if shipped else Path(source)
+    model = find_model(str(source))
+    path = model.path if model else Path(source)
     if not path.is_file():
-        names = ", ".join(weights.name for weights in list_pretrained())
+        names = ", ".join(model.name for model in list_models())
         raise FileNotFoundError(f"{source}: neither a file of weights nor the name of those in the package ({names})")
     found = _read_safetensors(path) if path.suffix == ".safetensors" else _read_checkpoint(path)
-    if shipped and not shipped.film and found.settings["class"] == "RecurrentCSCSR":
+    if model and not model.film and found.settings["class"] == "RecurrentCSCSR":
         found = _of_a_clip(found)
-    return replace(found, halo=shipped.halo) if shipped else found
+    return replace(found, halo=model.margin) if model else found
 
 
 def _of_a_clip(weights: Weights) -> Weights:

@@ -13,7 +13,7 @@ from lightning_modules.cli.errors import UsageError
 from lightning_modules.cost.setting import Setting
 from lightning_modules.inference.presets import Preset
 from lightning_modules.networks import Network
-from lightning_modules.storage.shipped import find_shipped, list_pretrained
+from lightning_modules.registry import Model, list_models
 from spikekit.decoders.methods import DECODERS
 
 
@@ -41,9 +41,6 @@ def read_setting(text: str) -> Setting:
     return Setting(named[1].strip() if named else shlex.join(args), args, arguments_preset(args))
 
 
-#: weights that ratios refer to and that are tried in more ways than the others: of a middle size
-_REFERENCE = "cscsr_base_x{scale}"
-
 #: what is tried on every network: behind its name, and what it changes
 _NO_MOTION, _TWO_VIEWS = ("no motion", {"motion": "ZeroFlow"}), ("self-ensemble of 2", {"self_ensemble": 2})
 
@@ -61,9 +58,6 @@ _VARIANTS = [
     ("tolerance 0.1 dB", {"psnr_tolerance": 0.1}),
     ("tolerance 0.5 dB", {"psnr_tolerance": 0.5}),
 ]
-
-#: networks that two sets of weights make together
-_TOGETHER: list[Preset] = []
 
 _SPIKE2FLOW = {"motion": "Spike2Flow", "motion_weights": "spike2flow"}
 _LEARNED = [("Spike2Flow", _SPIKE2FLOW), ("Spike2Flow, once", {**_SPIKE2FLOW, "motion_iterations": 1})]
@@ -87,17 +81,13 @@ def usual_settings(
         frames: spike frames of the scenes; networks of longer clips are left out.
     """
     # Noisy sensors would need other scenes; a network for films is another's equal on one clip.
-    left_out = ("_noisy_", *(() if film else ("_film_",)))
-    shipped = [weights for weights in list_pretrained(scale) if not any(part in weights.name for part in left_out)]
-    shipped = [weights for weights in shipped if Preset(weights.name).clip <= frames]
-    shipped.sort(key=lambda weights: (weights.name != _REFERENCE.format(scale=scale), weights.macs))
-    largest = max(shipped, key=lambda weights: weights.macs).name if shipped else None
-    networks = {weights.name: Preset(weights.name) for weights in shipped}
-    fitting = [preset for preset in _TOGETHER if preset.scale == scale and preset.clip <= frames]
-    networks |= {preset.network: preset for preset in fitting}
+    models = [one for one in list_models(scale) if not one.noise and one.film <= film and one.frames <= frames]
+    models.sort(key=lambda model: model.macs)
+    largest = models[-1].name if models else None
+    reference = _reference(models) if models else None
+    networks = {one.name: Preset(one.name) for one in sorted(models, key=lambda one: one is not reference)}
     if own:
         networks, largest = {"own weights": Preset()}, "own weights"
-    learned = _LEARNED if find_shipped("spike2flow") else []
     lacking: set[str] = set()
     if network is not None:
         lacking = {"motion", "steps"} - signature(type(network)).parameters.keys()
@@ -105,7 +95,7 @@ def usual_settings(
             lacking |= {"tile", "psnr_tolerance"}
     presets = dict(networks)
     for place, (weights, preset) in enumerate(networks.items()):
-        more = [_TWO_VIEWS, *(_MOST if weights == largest else []), *([*learned, *_VARIANTS] if place == 0 else [])]
+        more = [_TWO_VIEWS, *(_MOST if weights == largest else []), *([*_LEARNED, *_VARIANTS] if place == 0 else [])]
         fixed = {"motion"} if preset.network else set()
         for name, changes in [_NO_MOTION, *([] if film else more)]:
             if not (lacking | fixed) & changes.keys():
@@ -124,3 +114,10 @@ def usual_settings(
     return [Setting(name, preset_arguments(preset), preset) for name, preset in presets.items()] + [
         Setting(name, [*preset_arguments(preset), *without], preset) for name, preset in decoders.items()
     ]
+
+
+def _reference(models: Sequence[Model]) -> Model:
+    """Return what ratios refer to and is tried in more ways than the others: of a middle size, for a short clip."""
+    short = min(one.frames for one in models)
+    single = [one for one in models if one.frames == short and not one.film]
+    return single[(len(single) - 1) // 2]

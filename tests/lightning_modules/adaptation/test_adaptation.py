@@ -14,7 +14,7 @@ from lightning_modules.adaptation.learn import learn, likeness
 from lightning_modules.adaptation.lessons import HELD_OUT, Lessons, chosen_frames, make_lessons
 from lightning_modules.inference.clips import RecordingClips
 from lightning_modules.networks import CSCSR
-from lightning_modules.storage.shipped import find_shipped
+from lightning_modules.registry import find_model
 from spikekit import Calibration, simulate_spikes, write_calibration, write_spikes
 from spikekit.recording import open_recording
 
@@ -174,7 +174,7 @@ def test_what_gains_nothing_is_not_kept(recording, tmp_path):
     ("more", "expected"),
     [
         (
-            ["--teacher", "cscsr_small_x2"],
+            ["--teacher", "cscsr_base_x2"],
             "--teacher: expected scale 4 of the weights that learn, got 2",
         ),
         (["--teacher", "cscsr_huge_long_x4"], "expected at least 303 frames, 3 clips of 101, got 160"),
@@ -208,7 +208,7 @@ def test_a_recording_that_is_too_short_for_any_teacher(tmp_path):
         ("cscsr_small_x4", 303, None, "cscsr_huge_long_noisy_x4"),
         ("cscsr_small_x4", 302, None, "cscsr_huge_noisy_x4"),
         ("cscsr_small_x4", 303, 0.01, "cscsr_huge_long_x4"),
-        ("cscsr_small_x2", 303, None, "cscsr_huge_x2"),
+        ("cscsr_base_x2", 303, None, "cscsr_huge_x2"),
     ],
 )
 def test_the_teacher_is_the_slowest_for_such_a_sensor(tmp_path, weights, frames, measured, expected):
@@ -236,7 +236,7 @@ def test_what_lies_in_the_folder_is_of_this_adaptation(recording, lessons, tmp_p
     monkeypatch.setattr(cli, "make_lessons", lambda *_: lessons)
     monkeypatch.setattr(cli, "learn", lambda *_, **__: (30.0, 31.0))
     mine, data = tmp_path / "mine.safetensors", tmp_path / "data.npz"
-    mine.write_bytes(find_shipped("cscsr_tiny_x4").path.read_bytes())
+    mine.write_bytes(find_model("cscsr_tiny_x4").path.read_bytes())
     data.write_bytes(recording.read_bytes())
     asked = typed(data, tmp_path / "out", "--teacher", "cscsr_small_x4", "--weights", str(mine))
     main(asked)

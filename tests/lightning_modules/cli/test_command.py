@@ -16,7 +16,7 @@ import yaml
 from pytorch_lightning.callbacks import LearningRateMonitor
 
 import spikekit
-from lightning_modules import list_pretrained
+from lightning_modules import list_models
 from lightning_modules.__main__ import main
 from lightning_modules.cli.arguments import behind_configurations, options
 from lightning_modules.cli.command import run as run_command
@@ -301,13 +301,13 @@ def test_models_lists_the_weights_of_the_package(capsys):
     assert max(map(len, lines)) <= 120
     head, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|"))
     assert head == ["weights", "scale", "size", "parameters", "MMAC/px", "Kodak", "Vid4", "MB"]
-    assert [row[0] for row in rows] == [weights.name for weights in list_pretrained()]
+    assert [row[0] for row in rows] == [weights.name for weights in list_models()]
     assert ["cscsr_tiny_x4", "x4", "tiny", "300,963", "0.36", "27.95", "23.51"] in [row[:-1] for row in rows]
 
 
 def test_the_package_offers_its_names_without_importing_torch():
     seen = "import sys, lightning_modules as l; assert 'CSCSR' in dir(l) and 'torch' not in sys.modules; "
-    seen += "from lightning_modules import CSCSR, SuperResolution, list_pretrained; CSCSR.from_pretrained"
+    seen += "from lightning_modules import CSCSR, SuperResolution, list_models; CSCSR.from_pretrained"
     done = subprocess.run([sys.executable, "-c", seen], capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
 

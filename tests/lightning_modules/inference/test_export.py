@@ -15,8 +15,7 @@ from lightning_modules.__main__ import main
 from lightning_modules.inference import export
 from lightning_modules.inference.export import WITHOUT_WEIGHTS, as_exported, difference, example_inputs, export_network
 from lightning_modules.motion import ClassicalFlow, ZeroFlow
-from lightning_modules.networks import CSCSR, NETWORKS, ClassicalDecoder, RecurrentCSCSR, TwoSpanCSCSR
-from lightning_modules.storage.pretrained import Weights, settings_of, write_weights
+from lightning_modules.networks import CSCSR, NETWORKS, ClassicalDecoder, RecurrentCSCSR
 from spikekit import write_spikes
 
 CONFIGS = Path(__file__).parents[3] / "configs"
@@ -85,7 +84,7 @@ def unlike_at_first(network):
 
 def test_every_network_is_exported_by_a_test():
     assert {kind for kind, _ in MADE.values()} == set(NETWORKS.values())
-    assert set(WITHOUT_WEIGHTS.values()) == {ClassicalDecoder, TwoSpanCSCSR}
+    assert set(WITHOUT_WEIGHTS.values()) == {ClassicalDecoder}
 
 
 @pytest.fixture(name="program")
@@ -220,23 +219,3 @@ def test_what_has_no_weights_is_exported_by_its_name(tmp_path, capsys):
     torch.testing.assert_close(run(spikes), ClassicalDecoder()(spikes), rtol=0, atol=1e-4)
     with pytest.raises(SystemExit, match="expected --format torch or onnx, as it has no weights"):
         main(["export", "ClassicalDecoder", "-o", str(tmp_path / "a.safetensors")])
-
-
-@pytest.mark.slow
-def test_two_networks_in_one_program(tmp_path, monkeypatch):
-    """The program as it is, without the file of it, which takes torch as long again; other tests load one."""
-    made = []
-    monkeypatch.setattr(export, "_torch", lambda program, *_: made.append(program.module()) or b"a program")
-    monkeypatch.setattr(export, "exported", lambda *_: made[0])
-    weights = {name: str(tmp_path / f"{name}.safetensors") for name in ("short", "long")}
-    for path, clip in zip(weights.values(), ({"frames": 21, "stride": 1}, {"frames": 41}), strict=True):
-        part = unlike_at_first(CSCSR(scale=2, **clip, **TINY))
-        write_weights(Weights(path, settings_of(part), {}, part.state_dict()), path)
-    network = TwoSpanCSCSR(2, 41, **weights).eval()
-    said = export_network(network, tmp_path / "a.pt2", "torch")
-    assert said.startswith("takes spikes (1, 41, H, W) and flow (1, 2, 2, 2, H, W)")
-    [run] = made
-    spikes, flow = example_inputs(network, (38, 20)).values()
-    with torch.no_grad():
-        for motion in (0.1 * flow, 0.4 * flow):  # slow, and where both are seen
-            torch.testing.assert_close(run(spikes, motion), network(spikes, motion), rtol=0, atol=1e-4)

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from lightning_modules.inference import presets as speed
-from lightning_modules.inference._open import find_model
 from lightning_modules.inference.presets import SPEEDS, Choice, Preset, choices, choose, pace
 from lightning_modules.networks import CSCSR, RecurrentCSCSR
+from lightning_modules.registry import find_model
 from lightning_modules.storage.pretrained import settings_of
 
 HEADER = ["setting", *Preset.columns(), "psnr", "ratio", "mib", "reference", "height", "width", "failed", "ms"]
@@ -96,14 +96,14 @@ def test_films_have_a_table_of_their_own(table):
     ("scale", "expected"),
     [
         (2, ("cscsr_huge_film_fast_x2", "cscsr_huge_x2")),
-        (3, ("cscsr_large_film_x3", "cscsr_large_x3")),
+        (3, ("cscsr_base_x3", "cscsr_base_x3")),
         (4, ("cscsr_huge_film_fast_x4", "cscsr_huge_x4")),
     ],
 )
 def test_a_film_is_made_by_a_network_for_films(scale, expected):
     film, picture = (choose(scale, "balanced", film=film).preset for film in (True, False))
     assert (film.weights, picture.weights) == expected
-    assert isinstance(film.build(), RecurrentCSCSR)
+    assert isinstance(film.build(), RecurrentCSCSR) == find_model(film.weights).film
 
 
 def test_little_light_has_tables_of_its_own(table, monkeypatch):
@@ -286,7 +286,7 @@ def test_presets_that_cannot_be_built():
 
 def test_tables_of_the_package():
     for scale in (2, 3, 4):
-        picked = [choose(scale, name) for name in SPEEDS]
+        picked = [choose(scale, name, frames=101) for name in SPEEDS]
         assert all(faster.ms < 0.8 * slower.ms for faster, slower in pairwise(picked))  # every speed is worth its name
         assert picked[-2].preset.self_ensemble is None  # several views are for the best alone
         reference = speed._reference(speed._table(scale))

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from lightning_modules import reconstruct
-from lightning_modules.inference._open import find_model
 from lightning_modules.inference.clips import film_groups
 from lightning_modules.inference.film import film
 from lightning_modules.networks import CSCSR, ClassicalDecoder, RecurrentCSCSR
+from lightning_modules.registry import find_model
 from spikekit import mosaic, read_spikes, simulate_spikes, write_picture, write_spikes
 from spikekit.cli.command import main as spikekit_main
 

@@ -6,14 +6,14 @@ import shutil
 import pytest
 
 from lightning_modules.networks import CSCSR
+from lightning_modules.registry import list_models
 from lightning_modules.storage.error_model import FILE, ErrorModel, read_error_model, write_error_model
-from lightning_modules.storage.shipped import FOLDER, list_pretrained
 
 
 def test_all_weights_of_the_package_have_their_own():
-    single = [weights for weights in list_pretrained() if weights.scale and "_film_" not in weights.name]
-    assert set(json.loads((FOLDER / FILE).read_text())) == {weights.path.name for weights in single}
-    models = [read_error_model(weights.path) for weights in single]
+    files = {model.path for model in list_models() if model.scale}
+    assert set(json.loads(next(iter(files)).with_name(FILE).read_text())) == {path.name for path in files}
+    models = [read_error_model(path) for path in files]
     assert len(set(models)) == len(models)
     careful = ErrorModel()  # the defaults spend no less than any of them
     for model in models:
@@ -23,7 +23,7 @@ def test_all_weights_of_the_package_have_their_own():
 
 def test_a_network_has_the_constants_of_its_weights(tmp_path):
     file = tmp_path / "mine.safetensors"
-    shutil.copy(next(weights.path for weights in list_pretrained(4)), file)
+    shutil.copy(list_models(4)[0].path, file)
     assert CSCSR.from_pretrained(file).error_model == ErrorModel()
     model = ErrorModel(flat=1.0, faint=0.0)
     assert write_error_model(file, model) == tmp_path / FILE

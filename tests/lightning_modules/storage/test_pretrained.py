@@ -1,10 +1,8 @@
 """Weights in files, from Python and as they are typed."""
 
-import csv
 import json
 import os
 import pickle
-import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -20,8 +18,8 @@ from lightning_modules.cli.command import run
 from lightning_modules.cli.rehearsal import Rehearsal
 from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
 from lightning_modules.networks import CSCSR, ClassicalDecoder
+from lightning_modules.registry import find_model
 from lightning_modules.storage.pretrained import load_weights, read_weights, write_weights
-from lightning_modules.storage.shipped import FOLDER, list_pretrained, shipped_weights
 from lightning_modules.tasks.super_resolution import SuperResolution
 from spikekit import read_picture, write_picture, write_spikes
 
@@ -136,7 +134,10 @@ def test_weights_of_something_else(file, tmp_path):
 def test_damaged_files_say_so_in_one_line(file, suffix, length, capsys):
     path = file.with_suffix(suffix)
     path.write_bytes(path.read_bytes()[:length])
-    for args in (["predict", "--model.weights", str(path)], ["export", str(path), "-o", "other.safetensors"]):
+    for args in (
+        ["predict", "clip.dat", "--weights", str(path), "-o", "out"],
+        ["export", str(path), "-o", "other.safetensors"],
+    ):
         with pytest.raises(SystemExit) as stopped:
             main(args)
         assert str(stopped.value).startswith(f"lightning: {path}: not a ")
@@ -160,7 +161,7 @@ def test_classes_of_a_file_are_names_and_no_paths(tmp_path):
     said = {"class": "this.That", **network().settings}
     torch.save({"network": said, "state_dict": {}}, tmp_path / "file.ckpt")
     save_file(
-        load_file(shipped_weights()["cscsr_tiny_x4"]),
+        load_file(find_model("cscsr_tiny_x4").path),
         tmp_path / "file.safetensors",
         {"network": json.dumps(said), "motion": "{}"},
     )
@@ -202,112 +203,6 @@ def test_a_module_can_be_pickled():
     module = SuperResolution.from_pretrained(speed="fastest")
     spikes = torch.ones(1, 41, 8, 8)
     assert torch.equal(pickle.loads(pickle.dumps(module))(spikes), module(spikes))
-
-
-def test_shipped_weights_are_what_their_names_and_cards_say():
-    assert "spike2flow" in shipped_weights()
-    for name, path in shipped_weights().items():
-        assert path.stat().st_size < 16 * 2**20
-        assert path.with_name(f"{name}.md").is_file(), f"{name} has no card"
-        found = read_weights(name)
-        if name == "spike2flow":
-            Spike2Flow(weights=name)
-            continue
-        assert found.settings["class"] == ("RecurrentCSCSR" if "_film_" in name else "CSCSR")
-        assert name.endswith(f"_x{found.settings['scale']}")
-        network = CSCSR.from_pretrained(name)
-        built = {"class": type(network).__name__, **network.settings}
-        assert {key: built[key] for key in found.settings} == found.settings
-
-
-SHIPPED_ONCE = ["x2-e", "x2-d", "x2-w", "x3-e", "x3-d", "x3-w", "x4-t", "x4-e", "x4-d", "x4-w", "x4-h", "spike2flow"]
-
-
-def test_every_file_of_weights_is_in_the_index_and_loads_by_every_name_it_had():
-    assert set(FOLDER.glob("*.safetensors")) == set(shipped_weights().values())
-    for former in SHIPPED_ONCE:
-        (name,) = [weights.name for weights in list_pretrained() if former in (weights.name, weights.former)]
-        assert read_weights(former).source == read_weights(name).source == shipped_weights()[name]
-    with pytest.raises(FileNotFoundError, match=r"^x4-q: neither a file of weights nor .* \(cscsr_small_x2, "):
-        read_weights("x4-q")
-
-
-@pytest.mark.parametrize(
-    "film", [weights for weights in list_pretrained() if weights.film], ids=lambda weights: weights.name
-)
-def test_a_network_for_films_shares_its_file_with_the_one_that_it_contains(film):
-    (inside,) = [weights for weights in list_pretrained() if weights.path == film.path and weights != film] or [None]
-    if inside is None:
-        return
-    assert inside.parameters == sum(value.numel() for value in CSCSR.from_pretrained(inside.name).parameters())
-    assert inside.parameters < film.parameters
-    spikes = (torch.rand(1, inside.frames, 12, 10) < 0.3).to(torch.uint8)
-    clip, both = CSCSR.from_pretrained(inside.name), CSCSR.from_pretrained(film.name)
-    assert type(clip) is CSCSR
-    assert torch.equal(clip(spikes, static=True), both(spikes, static=True))
-
-
-def _rows_of_card(path):
-    """The tables of a card: rows by their first cell, each a dictionary by the heading."""
-    rows, heading = {}, []
-    for line in path.read_text().splitlines():
-        cells = [cell.strip(" *") for cell in line.strip("|").split("|")]
-        if line.startswith("| `lightning test"):
-            heading = cells
-        elif line.startswith("| "):
-            rows[cells[0]] = dict(zip(heading, cells, strict=False))
-    return rows
-
-
-@pytest.mark.parametrize("weights", list_pretrained(), ids=lambda weights: weights.name)
-def test_what_is_listed_is_what_cards_and_tables_say(weights):
-    card = weights.path.with_name(f"{weights.name}.md")
-    said = re.search(r"([\d.]+)\s+MMAC a sensor", card.read_text())
-    assert not said or float(said[1]) == pytest.approx(weights.macs / 1e6, abs=0.005)
-    if not weights.scale:
-        return
-    rows = _rows_of_card(card)
-    beginnings = {
-        "kodak": ("Kodak, 24 stills in motion", "Kodak, up to 3 in 20 clocks"),
-        "vid4": ("Vid4, foliage and walk only, 20 clocks a frame",),
-    }
-    for name, begin in beginnings.items():
-        (score,) = [row[weights.name] for first, row in rows.items() if first.startswith(begin)]
-        assert float(score) == getattr(weights, name)
-    with open(FOLDER / f"x{weights.scale}.csv", newline="") as file:
-        measured = {row["setting"]: row for row in csv.DictReader(file)}
-    if weights.name in measured:
-        assert float(measured[weights.name]["macs"]) == pytest.approx(weights.macs, rel=1e-5)
-
-
-def test_the_list_of_weights_says_what_the_networks_are(configs):
-    import lightning_modules
-
-    listed = lightning_modules.list_pretrained()
-    assert [weights.name for weights in listed] == list(shipped_weights())
-    assert [weights.size for weights in lightning_modules.list_pretrained(4)] == [
-        "tiny",
-        "small",
-        "base",
-        "large",
-        "huge",
-        "huge",
-        "huge_long",
-        "huge_long",
-        "large_film",
-        "huge_deep_film",
-        "huge_deep_film",
-        "huge_long_deep_film",
-        "huge_long_deep_film",
-    ]
-    for weights in listed:
-        found = read_weights(weights.name)
-        assert weights.parameters == sum(value.numel() for value in found.tensors.values())
-        assert weights.scale == found.settings.get("scale")
-        if weights.scale:
-            assert min(weights.macs, weights.kodak, weights.vid4) > 0
-            overlay = yaml.safe_load((configs / f"size/{weights.size}.yaml").read_text())
-            assert overlay["model"]["network"]["init_args"].items() <= found.settings.items()
 
 
 @pytest.mark.slow

@@ -393,8 +393,8 @@ def test_time_ends_training(typed, overlays, tmp_path):
         (["X", "--set", "ckpt_path=a.ckpt"], "ckpt_path: expected none, a trial goes on from its own; model.weights"),
         (["X", "--set", "trainer.max_steps=5,6", "--steps", "4"], "same settings for max_steps=5 and max_steps=6"),
         (
-            ["X", "--set", "model.weights=x4-e", "--over", "A", "J", "--seeds", "0", "1"],
-            "same settings for a-seed0 and j-seed0; model.weights=x4-e says what the network is, whatever overlays say",
+            ["X", "--set", "model.weights=cscsr_small_x4", "--over", "A", "J", "--seeds", "0", "1"],
+            "same settings for a-seed0 and j-seed0; model.weights=cscsr_small_x4 says what the network is",
         ),
     ],
 )

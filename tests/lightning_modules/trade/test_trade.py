@@ -19,7 +19,7 @@ from pytorch_lightning import LightningDataModule
 from lightning_modules.__main__ import main
 from lightning_modules.cli.arguments import arguments_preset
 from lightning_modules.cli.errors import InputError, UsageError
-from lightning_modules.cost import charts
+from lightning_modules.cost import charts, energy, measure
 from lightning_modules.cost.energy import energy_meter, energy_per_call
 from lightning_modules.cost.measure import Row, Timed, running, time_in_turns
 from lightning_modules.cost.runner import Runner, make_runner
@@ -29,9 +29,9 @@ from lightning_modules.inference.presets import Preset
 from lightning_modules.metrics.flicker import film_flicker
 from lightning_modules.motion import Spike2Flow
 from lightning_modules.networks import CSCSR, TSCNN
+from lightning_modules.registry import find_model
 from lightning_modules.storage.pretrained import settings_of
-from lightning_modules.storage.shipped import Pretrained
-from lightning_modules.trade import cli, energy, measure
+from lightning_modules.trade import cli
 from lightning_modules.trade.films import film_scenes
 from lightning_modules.trade.pareto import pareto_front
 from lightning_modules.trade.plot import _labels, plot
@@ -243,70 +243,54 @@ def test_usual_settings_all_run_on_weights_of_ones_own(shared, checkpoint, tmp_p
     assert len({psnr[name] for name in (*motions, "TFI", "TFP 41", "TFP 13, order 3")}) == 5
 
 
-def test_usual_settings_are_those_of_the_weights_that_are_shipped(monkeypatch, tmp_path):
-    macs = {"spike2flow": 1, "cscsr_small_x2": 3, "cscsr_huge_x4": 5, "cscsr_base_x4": 4, "cscsr_small_x4": 3}
-    shipped = [
-        Pretrained(name, tmp_path / name, scale=int(name[-1]) if "_x" in name else None, macs=count)
-        for name, count in {**macs, "cscsr_tiny_x4": 2}.items()
-    ]
-    monkeypatch.setattr("lightning_modules.storage.shipped._index", lambda: tuple(shipped))
-    monkeypatch.setattr(Pretrained, "frames", property(lambda weights: 101 if "long" in weights.name else 41))
+def networks_of(settings):
+    return [setting.name for setting in settings if setting.name.startswith("cscsr_") and "," not in setting.name]
+
+
+def test_usual_settings_are_the_networks_of_the_package_and_the_decoders():
     settings = {setting.name: setting for setting in usual_settings(4)}
-    assert list(settings)[:4] == [
-        "cscsr_base_x4",
-        "cscsr_tiny_x4",
-        "cscsr_small_x4",
-        "cscsr_huge_x4",
-    ]  # the reference, then by their multiplications
-    assert "Spike2Flow" in settings["cscsr_base_x4, Spike2Flow"].args
-    assert settings["cscsr_base_x4, no tiles"].preset == Preset("cscsr_base_x4", tile=0)
-    assert settings["cscsr_tiny_x4, self-ensemble of 2"].args == [
-        "--model.weights",
-        "cscsr_tiny_x4",
-        "--model.self_ensemble",
-        "2",
-    ]
+    networks = networks_of(settings.values())
+    assert networks == ["cscsr_small_x4", "cscsr_tiny_x4", "cscsr_large_x4", "cscsr_huge_x4"]  # the reference first
+    assert [*settings][: len(networks)] == networks
+    assert "Spike2Flow" in settings["cscsr_small_x4, Spike2Flow"].args
+    assert settings["cscsr_small_x4, no tiles"].preset == Preset("cscsr_small_x4", tile=0)
+    two = ["--model.weights", "cscsr_tiny_x4", "--model.self_ensemble", "2"]
+    assert settings["cscsr_tiny_x4, self-ensemble of 2"].args == two
     assert settings["cscsr_tiny_x4, no motion"].preset == Preset("cscsr_tiny_x4", motion="ZeroFlow")
     assert len([name for name in settings if name.startswith("cscsr_tiny_x4")]) == 3
-    assert settings["cscsr_huge_x4, self-ensemble of 8"].args == [
-        "--model.weights",
-        "cscsr_huge_x4",
-        "--model.self_ensemble",
-        "8",
-    ]
-    assert len([name for name in settings if name.startswith("cscsr_huge_x4")]) == 5
-    assert not [name for name in settings if name.endswith("_x2")]
+    assert len([name for name in settings if name.startswith("cscsr_huge_x4")]) == 5  # larger ensembles of the largest
     assert settings["TFI"].args[-3:] == ["tfi", "--model.network.scale", "4"]
     assert all(arguments_preset(setting.args) == setting.preset for setting in settings.values())
+
+
+def test_usual_settings_of_ones_own_weights_take_the_place_of_the_package():
     own = {setting.name: setting for setting in usual_settings(4, ["--ckpt_path"])}
     assert own["own weights"].args == []
     assert own["own weights, self-ensemble of 4"].args == ["--model.self_ensemble", "4"]
     assert own["TFI"].args[-2:] == ["--ckpt_path", "null"]
-    assert own["TFI"].preset == settings["TFI"].preset
     tscnn = [setting.name for setting in usual_settings(4, ["--ckpt_path"], TSCNN(width=8, blocks=1))]
     ensembles = [f"own weights, self-ensemble of {views}" for views in (2, 4, 8)]
     assert tscnn[:6] == ["own weights", *ensembles, "own weights, bf16-true", "own weights, bf16-mixed"]
-    assert set(tscnn[6:]) == {"TFI", *(name for name in settings if name.startswith("TFP"))}
-    del shipped[0]
-    assert not [setting for setting in usual_settings(4) if "Spike2Flow" in setting.args]
-    shipped += [replace(shipped[-1], name=f"cscsr_large_{made_for}_x4") for made_for in ("film", "noisy")]
-    assert not [setting for setting in usual_settings(4) if "film" in setting.name or "noisy" in setting.name]
-    filmed = [setting.name for setting in usual_settings(4, film=True)]
+    assert not [name for name in tscnn[6:] if not name.startswith(("TFI", "TFP"))]
+
+
+@pytest.mark.parametrize("scale", [2, 3, 4])
+def test_usual_settings_of_films_have_networks_for_films_and_no_variants(scale):
+    filmed = [setting.name for setting in usual_settings(scale, film=True, frames=101)]
     networks = [name for name in filmed if name.startswith("cscsr_") and "," not in name]
-    assert "cscsr_large_film_x4" in networks
+    assert any(find_model(name).film for name in networks)
+    assert not any(find_model(name).noise for name in networks)
     assert filmed[: 2 * len(networks)] == [*networks, *(f"{name}, no motion" for name in networks)]
-    assert set(filmed[2 * len(networks) :]) == {"TFI", *(name for name in settings if name.startswith("TFP"))}
-    shipped.append(replace(shipped[-1], name="cscsr_huge_long_x4"))
-    assert not [setting for setting in usual_settings(4, frames=100) if "long" in setting.name or "Two" in setting.name]
-    longer = {setting.name: setting for setting in usual_settings(4, frames=101)}
-    assert "cscsr_huge_long_x4" in longer
-    assert longer["TFI"].preset == replace(settings["TFI"].preset, frames=41)
-    two = ["--model.network", "TwoSpanCSCSR", "--model.network.scale", "4", "--model.network.frames", "101"]
-    assert longer["TwoSpanCSCSR"].args == two
-    assert [name for name in longer if name.startswith("Two")][1:] == ["TwoSpanCSCSR, self-ensemble of 2"]
+    single = networks_of(usual_settings(scale, frames=101))
+    assert not any(find_model(name).film for name in single)
+
+
+def test_usual_settings_of_longer_scenes_have_networks_and_decoders_of_longer_clips():
+    usual, longer = ({one.name: one for one in usual_settings(4, frames=frames)} for frames in (100, 101))
+    assert {find_model(name).frames for name in networks_of(usual.values())} == {41}
+    assert {find_model(name).frames for name in networks_of(longer.values())} == {41, 101}
+    assert longer["TFI"].preset == replace(usual["TFI"].preset, frames=41)
     assert longer["TFP 33, order 3"].preset == replace(longer["TFP 13, order 3"].preset, window=33, frames=101)
-    assert "TFP 33, order 3" not in {setting.name for setting in usual_settings(4)}
-    assert not [setting for setting in usual_settings(2, frames=101) if "TwoSpan" in setting.name]
 
 
 @pytest.mark.parametrize("name", ["small tiles", "a, b|c", "it's"])
@@ -322,7 +306,7 @@ def test_settings_are_read_as_they_are_written(name, args):
         ("nothing:", Preset()),
         ("--model.network ClassicalDecoder --model.network.order 2", Preset(network="ClassicalDecoder", order=2)),
         ("-c my.yaml --model.weights cscsr_small_x4", None),
-        ("--model.weights cscsr_small_x4 --model.weights cscsr_base_x4", None),
+        ("--model.weights cscsr_small_x4 --model.weights cscsr_large_x4", None),
         ("--model.weights cscsr_small_x4 --model.tile", None),
         ("--model.weights cscsr_small_x4 --model.tile wide", None),
         ("--model.weights cscsr_small_x4 --model.network CSCSR", None),
@@ -343,7 +327,7 @@ def test_a_table_is_read_as_it_is_written(tmp_path, monkeypatch):
     """The reader of the package's tables takes that of a trade, and skips what is no preset."""
     rows, _ = some_rows(4, [(9.0, 9.0), (2.0, 2.0), (1.0, 1.0), (1.0, 3.0)])
     typed = [
-        "lost: --model.weights cscsr_base_x4",
+        "lost: --model.weights cscsr_large_x4",
         "one: --model.weights cscsr_small_x4 --model.self_ensemble 2",
         "-c my.yaml --model.weights cscsr_small_x4",
         "tfi: --model.network ClassicalDecoder --model.network.method tfi",

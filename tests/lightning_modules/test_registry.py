@@ -1,0 +1,61 @@
+"""The registry of the weights that come with the package."""
+
+import csv
+
+import pytest
+import torch
+
+import lightning_modules
+from lightning_modules.motion import Spike2Flow
+from lightning_modules.networks import CSCSR, RecurrentCSCSR
+from lightning_modules.registry import find_model, list_models
+
+MODELS = list_models()
+NETWORKS = [model for model in MODELS if model.scale]
+
+
+def test_every_file_of_weights_has_a_row_a_card_and_a_bounded_size():
+    folder = MODELS[0].path.parent
+    assert set(folder.glob("*.safetensors")) == {model.path for model in MODELS}
+    assert {path.stem for path in folder.glob("*.md")} == {model.name for model in MODELS}
+    assert sum(path.stat().st_size for path in folder.glob("*.safetensors")) < 70e6  # what a wheel may hold
+
+
+def test_models_are_chosen_by_scale_and_pattern():
+    assert lightning_modules.list_models() == MODELS
+    assert [model for scale in (2, 3, 4) for model in list_models(scale)] == NETWORKS
+    assert list_models(4, "RGGB") == list_models(4)
+    assert list_models(pattern="BGGR") == []
+    assert find_model("cscsr_small_x4") == next(model for model in MODELS if model.name == "cscsr_small_x4")
+    assert find_model("x4-e") is None
+
+
+@pytest.mark.parametrize("model", NETWORKS, ids=lambda model: model.name)
+def test_a_row_says_what_the_network_is(model):
+    network = CSCSR.from_pretrained(model.name)
+    assert type(network) is (RecurrentCSCSR if model.film else CSCSR)
+    assert (network.scale, network.frames, network.pattern) == (model.scale, model.frames, model.pattern)
+    assert network.halo == model.margin
+    assert model.parameters == sum(value.numel() for value in network.parameters())
+    assert min(model.macs, model.kodak, model.vid4) > 0
+
+
+def test_the_estimator_of_motion_has_a_row():
+    model = find_model("spike2flow")
+    assert model.parameters == sum(value.numel() for value in Spike2Flow(weights=model.name).parameters())
+
+
+@pytest.mark.parametrize("film", [model for model in NETWORKS if model.film], ids=lambda model: model.name)
+def test_a_network_for_films_makes_the_picture_of_the_network_for_clips_inside_it(film):
+    (inside,) = (model for model in NETWORKS if model.file == film.file and not model.film)
+    spikes = (torch.rand(1, inside.frames, 12, 10) < 0.3).to(torch.uint8)
+    clip, both = CSCSR.from_pretrained(inside.name), CSCSR.from_pretrained(film.name)
+    assert inside.parameters < film.parameters
+    assert torch.equal(clip(spikes, static=True), both(spikes, static=True))
+
+
+@pytest.mark.parametrize("table", sorted(MODELS[0].path.parent.glob("x?*.csv")), ids=lambda path: path.stem)
+def test_tables_of_presets_name_weights_that_there_are(table):
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    assert {row["weights"] for row in rows} - {""} <= {model.name for model in list_models(int(table.stem[1]))}
+    assert {row["reference"] for row in rows} <= {row["setting"] for row in rows}
