@@ -24,8 +24,9 @@ from lightning_modules.data.loading import ClipScenes, cut_key_frames
 from lightning_modules.data.margin import flow_margin, trim
 from lightning_modules.data.pictures import split_pictures
 from lightning_modules.signatures import takes
-from spikekit import bayer_pattern
+from spikekit import bin_to_sensor
 from spikekit.check import check_positive, check_whole
+from spikekit.color.cfa import GREY, cfa_pattern
 from spikekit.flow.interpolate import FlowInterpolation
 from spikekit.io.video import read_video
 from spikekit.scenes.frame_sequence import SIMULATOR_VERSION, Film, FilmClip
@@ -39,7 +40,7 @@ class ClipRecipe:
     Args:
         scale: super-resolution factor.
         frames: spike frames of a clip. The truth is the source frame at frame ``frames // 2``.
-        pattern: Bayer phase of the sensor: RGGB, BGGR, GRBG or GBRG.
+        pattern: Bayer phase of the sensor: RGGB, BGGR, GRBG or GBRG; or grey, whose truth has one channel.
         alpha: light of a white pixel per clock; a threshold of charge is 1.
         clocks: spike frames from one source frame to the next.
         key_frames: clips that follow each other, around so many source frames, an odd number; their truth is all of
@@ -72,7 +73,7 @@ class ClipRecipe:
         check_positive("alpha", self.alpha)
         check_whole("frames", self.frames)
         check_whole("clocks", self.clocks)
-        bayer_pattern(self.pattern)
+        object.__setattr__(self, "pattern", cfa_pattern(self.pattern))
         if check_whole("key_frames", self.key_frames) % 2 == 0:
             raise ValueError(f"key_frames: expected an odd number, got {self.key_frames}")
         if any(not 0 <= time < self.frames for time in self.flow_times):
@@ -100,7 +101,7 @@ class ClipRecipe:
             shrink=film.shrink,
             interpolation=_interpolation_digest(self.interpolation),
             noise=asdict(self.noise),
-            pattern=bayer_pattern(self.pattern),
+            pattern=self.pattern,
             flow_times=list(self.flow_times),
             **{name: getattr(self, name) for name in ("scale", "frames", "alpha", "clocks", "key_frames", "seed")},
         )
@@ -129,15 +130,19 @@ class ClipRecipe:
             key_frames = (
                 clip.middle + n * self.clocks for n in range(-(self.key_frames // 2), self.key_frames // 2 + 1)
             )
-            return {"spikes": spikes, "rgb": torch.stack([clip.rgb(clock) for clock in key_frames])}
+            return {"spikes": spikes, "rgb": self._seen(torch.stack([clip.rgb(clock) for clock in key_frames]))}
         if film.truth is None:
             rgb = clip.rgb(clip.middle)
         else:
             rgb = _truth(paths[-1], tuple(pictures[0].shape[1:]), self.scale, spikes)
-        made = {"spikes": spikes, "rgb": rgb}
+        made = {"spikes": spikes, "rgb": self._seen(rgb)}
         if self.flow_times:
             made["flow"] = torch.stack([self._flow(clip, time) for time in self.flow_times])
         return made
+
+    def _seen(self, rgb: Tensor) -> Tensor:
+        """Colours as they are, or their luminance, (*, 1, s H, s W), where the sensor sees no more."""
+        return bin_to_sensor(rgb, GREY, scale=1).unsqueeze(-3) if self.pattern == GREY else rgb
 
     def view(self, film: FilmFiles, middle: int) -> FilmClip:
         """Return what the camera sees around a source frame.

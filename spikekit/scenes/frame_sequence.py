@@ -12,7 +12,7 @@ from kornia.color import CFA
 from torch import Tensor
 
 from spikekit.check import check_picture, check_positive, check_whole
-from spikekit.color.cfa import bayer_pattern, bin_to_sensor
+from spikekit.color.cfa import bin_to_sensor, cfa_pattern
 from spikekit.flow.interpolate import Blend, FlowInterpolation, Still
 from spikekit.scenes.adaptive_sampling import Plan, SceneProfile, profile_interval
 from spikekit.scenes.frame_interval import Interval
@@ -48,7 +48,7 @@ class Film:
     Args:
         frames: ``rgb`` (3, H, W) each, floating, in [0, 1], such as :class:`spikekit.VideoFrames`.
         scale: how many pixels a sensor pixel is wide.
-        pattern: Bayer phase of the sensor, see :func:`spikekit.bayer_pattern`.
+        pattern: Bayer phase of the sensor, see :func:`spikekit.bayer_pattern`, or ``"grey"``.
         alpha: light of a white pixel per clock, in thresholds.
         clocks: clocks from one frame to the next.
         interpolation: what makes latent frames; :class:`spikekit.FlowInterpolation` by default.
@@ -96,7 +96,7 @@ class Film:
         scale = check_whole("scale", scale)
         for name, value in (("alpha", alpha), ("spike_tolerance", spike_tolerance), ("step", step)):
             check_positive(name, value)
-        self.frames, self.scale, self.pattern = frames, scale, bayer_pattern(pattern)
+        self.frames, self.scale, self.pattern = frames, scale, cfa_pattern(pattern)
         self.alpha, self.clocks = alpha, check_whole("clocks", clocks)
         self.interpolation = FlowInterpolation() if interpolation is None else interpolation
         self.spike_tolerance, self.step, self.motion = spike_tolerance, step, motion
@@ -391,7 +391,7 @@ class FilmClip:
         Raises:
             ValueError: another pattern, scale or alpha than the film's.
         """
-        wanted = pattern and bayer_pattern(pattern), scale, alpha
+        wanted = pattern and cfa_pattern(pattern), scale, alpha
         own = self.film.pattern, self.film.scale, self.film.alpha
         if any(value is not None and value != has for value, has in zip(wanted, own, strict=True)):
             raise ValueError(f"pattern, scale, alpha: expected those of the film, {own}, got {wanted}")

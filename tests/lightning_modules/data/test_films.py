@@ -358,3 +358,17 @@ def test_a_damaged_clip_is_made_again(film, tmp_path, simulated):
         warnings.simplefilter("error")
         assert equal(clips[0], fresh)
     assert simulated.clips == 2
+
+
+@pytest.mark.parametrize("key_frames", [1, 3])
+def test_films_of_a_grey_sensor_show_the_luminance(tmp_path, write_film, key_frames):
+    write_film(tmp_path / "film", 11, (36, 48))
+    options = {"clips": 1, "key_frames": key_frames, "cache": str(tmp_path / "cache")}
+    grey, colour = (scenes(tmp_path, pattern=pattern, **options) for pattern in ("grey", "RGGB"))
+    for _ in ("fresh", "cached"):
+        clip = grey.test_set[0]
+        luminance = bin_to_sensor(colour.test_set[0]["rgb"], "grey", scale=1).unsqueeze(-3)
+        assert torch.equal(clip["rgb"], luminance)
+        light = 0.4 * bin_to_sensor(clip["rgb"], "grey", scale=2)
+        assert (clip["spikes"].float().mean(-3) - light)[..., :4, :].abs().max() < 0.05  # where no disc comes by
+        assert grey.train_set[0]["rgb"].shape[-3:] == (1, 16, 16)
