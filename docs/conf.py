@@ -41,7 +41,7 @@ html_title = f"spikekit {version}"
 nitpicky = True
 nitpick_ignore_regex = [
     ("py:.*", r"(torch|kornia|collections|pathlib|optional|numpy|pytorch_lightning)\b.*"),
-    ("py:.*", "(CFA|Tensor|Path)"),
+    ("py:.*", "(CFA|Tensor|Path)|.*MeasuredPixels"),
 ]
 
 templates_path = ["_templates"]  # of the pages that autosummary makes

@@ -73,7 +73,7 @@ def count_colors(pattern: str | CFA) -> int:
     """Return how many colours a sensor sees: 3 through a Bayer filter, 1 where it is grey.
 
     Raises:
-        ValueError: the pattern is unknown, see :func:`cfa_pattern`.
+        ValueError: the pattern is unknown, see :func:`bayer_pattern`.
 
     Example:
         >>> count_colors("GBRG"), count_colors("grey")
@@ -86,7 +86,7 @@ def cfa_sites(pattern: str | CFA) -> tuple[tuple[tuple[int, int, int], ...], int
     """Return ``(colour, row, column)`` of the pixels of one cell of a colour filter array, and the cell's side.
 
     Args:
-        pattern: see :func:`cfa_pattern`.
+        pattern: see :func:`bayer_pattern`.
 
     Returns:
         Those of :func:`bayer_sites` and 2; a cell of a grey sensor is a single pixel.
@@ -125,7 +125,7 @@ def bayer_sites(pattern: str | CFA) -> tuple[tuple[int, int, int], ...]:
 
 
 class PatternModule(nn.Module):
-    """Base of the modules whose only option is the pattern, see :func:`cfa_pattern`."""
+    """Base of the modules whose only option is the pattern, see :func:`bayer_pattern`."""
 
     bayer_only: ClassVar[bool] = False  #: whether a grey sensor makes no sense
 
@@ -160,7 +160,7 @@ def bayer_mask(
     Args:
         height: rows of the sensor.
         width: columns of the sensor.
-        pattern: Bayer phase or ``"grey"``, see :func:`cfa_pattern`.
+        pattern: Bayer phase or ``"grey"``, see :func:`bayer_pattern`.
         scale: super-resolution factor.
         device: where to put the mask.
         dtype: its type; torch's default type when not given.
@@ -236,7 +236,7 @@ def mosaic(rgb: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
 
     Args:
         rgb: colour image :math:`(*, 3, H, W)`; odd sizes are legal.
-        pattern: Bayer phase or ``"grey"``, see :func:`cfa_pattern`.
+        pattern: Bayer phase or ``"grey"``, see :func:`bayer_pattern`.
 
     Returns:
         The mosaic :math:`(*, H, W)`, in the dtype of ``rgb``.
@@ -288,7 +288,7 @@ def bin_to_sensor(rgb: Tensor, pattern: str | CFA = "RGGB", *, scale: int) -> Te
     Args:
         rgb: colour image :math:`(*, 3, H, W)`, H and W multiples of ``scale``; :math:`(*, 1, H, W)` is taken by a
             grey sensor, too.
-        pattern: Bayer phase of the sensor or ``"grey"``, see :func:`cfa_pattern`.
+        pattern: Bayer phase of the sensor or ``"grey"``, see :func:`bayer_pattern`.
         scale: how many picture pixels a sensor pixel is wide.
 
     Returns:
@@ -370,7 +370,7 @@ def split_colors(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
 
     Args:
         raw: mosaic or spike stream :math:`(*, H, W)`, any dtype.
-        pattern: Bayer phase or ``"grey"``, see :func:`cfa_pattern`.
+        pattern: Bayer phase or ``"grey"``, see :func:`bayer_pattern`.
 
     Returns:
         :math:`(3, *, H, W)`, or :math:`(1, *, H, W)` where the sensor is grey, in the dtype of ``raw``.
