@@ -17,7 +17,7 @@ NETWORKS = [model for model in MODELS if model.scale]
 def test_every_file_of_weights_has_a_row_a_card_and_a_bounded_size():
     folder = MODELS[0].path.parent
     assert set(folder.glob("*.safetensors")) == {model.path for model in MODELS}
-    assert {path.stem for path in folder.glob("*.md")} == {model.name for model in MODELS}
+    assert {path.stem for path in folder.glob("*.md")} == {model.path.stem for model in MODELS}
     assert sum(path.stat().st_size for path in folder.glob("*.safetensors")) < 70e6  # what a wheel may hold
 
 
