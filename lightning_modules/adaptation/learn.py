@@ -21,6 +21,7 @@ from lightning_modules.tasks.checkpoint_io import Checkpoints
 from lightning_modules.tasks.resume import check_resume, load_weights_of
 from lightning_modules.tasks.super_resolution import SuperResolution
 from spikekit import psnr
+from spikekit.color.cfa import GREY
 
 #: what is kept of a training that is interrupted
 CHECKPOINT = "last.ckpt"
@@ -37,7 +38,7 @@ class _Patches(Dataset):
 
     def __init__(self, lessons: Lessons, pattern: str, scale: int, length: int, start: int = 0) -> None:
         self.lessons, self.scale, self.length, self.start = lessons, scale, length, start
-        self.symmetric = pattern in ("RGGB", "BGGR")  # transposed, it begins with the same colours
+        self.symmetric = pattern in ("RGGB", "BGGR", GREY)  # transposed, it begins with the same colours
 
     def __len__(self) -> int:
         return self.length

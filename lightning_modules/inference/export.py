@@ -170,7 +170,7 @@ def example_inputs(network: Network, size: tuple[int, int], still: bool = False)
         quarters = torch.randn(*groups, 2, 2, generator=generator)
         found["flow"] = quarters.repeat_interleave(size[0] // 2, -2).repeat_interleave(size[1] // 2, -1)
     if films:
-        channels = 3 * network.scale**2 + network.config.memory
+        channels = network.colors * network.scale**2 + network.config.memory
         found["state"] = torch.rand(1, channels, *size, generator=generator)
     if films and moves:
         found["every"] = torch.tensor(20.0)

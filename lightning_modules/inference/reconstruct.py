@@ -22,6 +22,7 @@ from lightning_modules.inference.presets import SPEEDS, Choice, Preset, choose
 from lightning_modules.networks import ClassicalDecoder, Network
 from lightning_modules.registry import find_model
 from spikekit import __version__
+from spikekit.color.cfa import GREY, PATTERNS
 from spikekit.io.image_bytes import to_bytes
 from spikekit.recording import Recording, open_recording
 from spikekit.timing import duration
@@ -125,7 +126,7 @@ def reconstruct(
     elif not isinstance(network, Network):
         network = Network.from_pretrained(network)
     clips = RecordingClips(recording, network.frames, frame, network.pattern)
-    notes = [line for line in (recording.note, *notes) if line]
+    notes = [line for line in (recording.note, _other_sensor(recording, network.pattern), *notes) if line]
     return Reconstruction(network, clips, white, device, precision, notes, **how)
 
 
@@ -251,6 +252,15 @@ class Reconstruction:
             "precision": self.precision,
             "version": __version__,
         }
+
+
+def _other_sensor(recording: Recording, pattern: str) -> str | None:
+    """What to say where a grey camera meets weights for colours, or the other way round."""
+    if is_grey(recording) and pattern != GREY:
+        return f"the camera is grey, and the weights are for {pattern}: they see colours where there are none"
+    if recording.pattern in PATTERNS and pattern == GREY:
+        return f"the camera is {recording.pattern}, and the weights are for grey: they take its mosaic for texture"
+    return None
 
 
 def precision_of(device: torch.device) -> str:

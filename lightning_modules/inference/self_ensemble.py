@@ -9,6 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from spikekit.color.cfa import GREY
+
 
 class _View(NamedTuple):
     top_down: bool
@@ -73,6 +75,8 @@ def self_ensemble(
 
 def _margins(view: _View, height: int, width: int, pattern: str) -> tuple[int, int]:
     """Sensor pixels to leave out above and below, and left and right, so that red is where it was."""
+    if pattern == GREY:
+        return 0, 0
     row, column = divmod(pattern.index("R"), 2)
     seen_row = height - 1 - row if view.top_down else row
     seen_column = width - 1 - column if view.left_right else column
