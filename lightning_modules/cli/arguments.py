@@ -35,17 +35,15 @@ _PRESET = {
     "motion_weights": "--model.network.motion.weights",
     "motion_iterations": "--model.network.motion.iterations",
     "steps": "--model.network.steps",
-    "tile": "--model.tile",
-    "psnr_tolerance": "--model.psnr_tolerance",
-    "self_ensemble": "--model.self_ensemble",
-    "interpolated": "--model.interpolated",
+    "tile": "--tile",
+    "psnr_tolerance": "--psnr_tolerance",
+    "self_ensemble": "--self_ensemble",
+    "interpolated": "--interpolated",
     "precision": "--trainer.precision",
 }
 #: arguments of the Trainer that count batches where they are whole, and are shares where they are not
 _COUNTS = {f"limit_{stage}_batches" for stage in ("train", "val", "test", "predict")}
 _COUNTS |= {"overfit_batches", "val_check_interval"}
-
-_OLD = {"--model.tolerance": "psnr_tolerance"}
 
 
 def with_network_of_weights(args: Sequence[str]) -> list[str]:
@@ -201,11 +199,11 @@ def _with_class(choice: Any) -> dict[str, Any] | None:
 
 
 def preset_arguments(preset: Preset) -> list[str]:
-    """Return the arguments of ``lightning predict`` and ``test`` that make a preset.
+    """Return the arguments of a setting of ``lightning trade`` that make a preset.
 
     Example:
         >>> preset_arguments(Preset("cscsr_small_x4", motion="ZeroFlow", tile=64))
-        ['--model.weights', 'cscsr_small_x4', '--model.network.motion', 'ZeroFlow', '--model.tile', '64']
+        ['--model.weights', 'cscsr_small_x4', '--model.network.motion', 'ZeroFlow', '--tile', '64']
     """
     return [word for name, text in preset.write().items() if text for word in (_PRESET[name], text)]
 
@@ -219,7 +217,7 @@ def arguments_preset(args: Sequence[str]) -> Preset | None:
         >>> arguments_preset(["--config", "my.yaml"])
     """
     words = [part for word in args for part in (word.split("=", 1) if word.startswith("--") else [word])]
-    names = {option: name for name, option in _PRESET.items()} | _OLD
+    names = {option: name for name, option in _PRESET.items()}
     given = {names.get(option): value for option, value in zip(words[::2], words[1::2], strict=False)}
     if None in given or 2 * len(given) != len(words):
         return None

@@ -163,6 +163,8 @@ class Command(LightningCLI):
     def before_instantiate_classes(self) -> None:
         """Turn ``--ckpt_path best`` and ``last`` into files, and keep a run from being written over."""
         config = self.config[self.subcommand]
+        if self.subcommand == "test":
+            config.verbose = False  # Lightning's table; ours has all methods
         check_folder(config.output)
         checkpoints = Path(config.output) / "checkpoints"
         if self.subcommand == "fit" and not config.get("ckpt_path"):

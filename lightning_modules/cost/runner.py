@@ -8,17 +8,16 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import torch
-from pytorch_lightning import LightningModule
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 
 from lightning_modules.cli.command import run
-from lightning_modules.cli.errors import InputError, UsageError
+from lightning_modules.cli.errors import InputError, UsageError, VerbParser
 from lightning_modules.cli.rehearsal import Rehearsal, argument_names, mistake, resolved
-from lightning_modules.inference.film import FilmFrame, film
-from lightning_modules.networks import RecurrentCSCSR
+from lightning_modules.inference.film import FilmFrame, FilmMaker, film
 from lightning_modules.storage.pretrained import load_weights, read_weights
-from spikekit.arguments import one_line
+from lightning_modules.tasks.super_resolution import SuperResolution
+from spikekit.arguments import one_line, whole
 
 # What the clips of a test do not depend on; and frames, as a network of fewer gets the middle of the clips of all.
 _WITHOUT_EFFECT = ("patch", "train_clips", "batch_size", "workers", "frames", "flow_times")
@@ -41,7 +40,8 @@ class Runner:
     """A network, its precision and its device.
 
     Args:
-        args: of ``lightning test``, in the order in which they are typed.
+        args: of ``lightning test``, in the order in which they are typed; and how pictures are made, as of ``predict``:
+            ``--tile``, ``--psnr_tolerance``, ``--self_ensemble``, ``--interpolated`` and ``--future``.
         names: arguments that there are, to guess which one was meant.
 
     Attributes:
@@ -56,20 +56,27 @@ class Runner:
     """
 
     def __init__(self, args: Sequence[str], names: Sequence[str] = ()) -> None:
+        how, args = _how().parse_known_args(args)
+        if how.tile is not None and how.tile % 2:
+            raise UsageError(f"tile: expected an even number of sensor pixels, or 0 for no tiles, got {how.tile}")
         logging.disable(logging.INFO)  # Lightning would say for every setting anew what machine this is
         try:
             command = _built(args, names)
         finally:
             logging.disable(logging.NOTSET)
         trainer, module = command.trainer, command.model
-        if type(module).predict_step is LightningModule.predict_step:
+        if not isinstance(module, SuperResolution):
             raise UsageError(f"expected a model that makes pictures, got {type(module).__name__}")
         self.config = resolved(command)
         self.data = command.datamodule
         self.device = trainer.strategy.root_device
         self.precision = trainer.precision_plugin
-        self.module = self.precision.convert_module(module).to(self.device).eval()
-        self.network = module.network
+        self.network = self.precision.convert_module(module).to(self.device).eval().network
+        self.how = {name: value for name, value in vars(how).items() if value is not None}
+        try:
+            self._maker()  # what is wrong with them is said at once
+        except ValueError as error:
+            raise UsageError(str(error)) from error
 
     @property
     def scenes(self) -> dict[str, Any]:
@@ -86,9 +93,12 @@ class Runner:
             spikes: (1, N, H, W), on the device; of more frames than the network takes, those in the middle.
         """
         first = (spikes.shape[1] - self.network.frames) // 2
-        batch = {"spikes": spikes[:, first : first + self.network.frames]}
+        clip = spikes[:, first : first + self.network.frames]
         with torch.inference_mode(), self.precision.predict_step_context():
-            return self.module.predict_step(self.precision.convert_input(batch), 0)
+            return self._maker()(self.precision.convert_input(clip), [0])
+
+    def _maker(self) -> FilmMaker:
+        return FilmMaker(self.network, **self.how)
 
     def film(self, chunks: Iterable[Tensor], every: int) -> Iterator[FilmFrame]:
         """Yield the pictures of a film, see :func:`lightning_modules.inference.film.film`.
@@ -97,11 +107,18 @@ class Runner:
             chunks: spikes (T, H, W), on the device.
             every: clocks between two pictures.
         """
-        module, alpha = self.module, self.network.settings["alpha"]
-        names = ("tile",) if isinstance(self.network, RecurrentCSCSR) else ("tile", "psnr_tolerance", "self_ensemble")
-        how = {name: getattr(module, name) for name in ("future", "interpolated", *names)}
+        chunks, white = map(self.precision.convert_input, chunks), self.network.settings["alpha"]
         with torch.inference_mode(), self.precision.predict_step_context():
-            yield from film(self.network, map(self.precision.convert_input, chunks), every, white=alpha, **how)
+            yield from film(self.network, chunks, every, white=white, **self.how)
+
+
+def _how() -> VerbParser:
+    """The options of a setting that say how pictures are made, as of ``lightning predict``."""
+    parser = VerbParser(prog="lightning trade", add_help=False, allow_abbrev=False)
+    for name in ("tile", "self_ensemble", "interpolated", "future"):
+        parser.add_argument(f"--{name}", type=whole(0))
+    parser.add_argument("--psnr_tolerance", type=float)
+    return parser
 
 
 def make_runner(shared: Sequence[str], args: Sequence[str], base: Runner) -> Runner:

@@ -26,8 +26,8 @@ class Setting(NamedTuple):
         """As :func:`lightning_modules.trade.settings.read_setting` takes it.
 
         Example:
-            >>> Setting("small tiles", ["--model.tile", "32"]).text
-            'small tiles: --model.tile 32'
+            >>> Setting("small tiles", ["--tile", "32"]).text
+            'small tiles: --tile 32'
         """
         typed = shlex.join(self.args)
         return typed if typed == self.name else f"{self.name}: {typed}".rstrip()

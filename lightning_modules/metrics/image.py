@@ -38,6 +38,12 @@ def measures() -> list[Measure]:
     return found if why_no_lpips() else [*found, Measure("lpips", "LPIPS", 4, lpips)]
 
 
+def score(rgb: Tensor, truth: Tensor) -> dict[str, Tensor]:
+    """Return all measures of pictures (B, ..., 3, H, W) by name: a value (B) each, the mean of those of a film."""
+    flat, known = (planes.reshape(-1, *planes.shape[-3:]) for planes in (rgb, truth))
+    return {measure.name: measure.of(flat, known).reshape(len(truth), -1).mean(dim=1) for measure in measures()}
+
+
 def why_no_lpips() -> str | None:
     """Return in one line what LPIPS lacks here, or None."""
     try:

@@ -79,7 +79,7 @@ def find_weights() -> list[Path]:
     if alexnet.is_file() and heads.is_file():
         return [alexnet, heads]
     raise FileNotFoundError(
-        f"expected the weights of LPIPS in a file that {VARIABLE} names, or torchvision's AlexNet in {alexnet}, got none"
+        f"expected the weights of LPIPS in a file that {VARIABLE} names, or AlexNet, torchvision's {alexnet}, got none"
     )
 
 

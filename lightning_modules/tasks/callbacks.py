@@ -13,7 +13,7 @@ from pytorch_lightning import Callback, LightningModule, Trainer
 from pytorch_lightning.loggers import TensorBoardLogger
 from torch import Tensor
 
-from lightning_modules.metrics.image import Measure, measures, why_no_lpips
+from lightning_modules.metrics.image import measures, why_no_lpips
 from lightning_modules.networks import ClassicalDecoder
 from spikekit import panel, write_picture
 from spikekit.io.whole_file import whole_file
@@ -90,29 +90,16 @@ class TestReport(Callback):
         """Columns of ``test.csv``, their headings in the table, and how many digits it shows."""
         return [(measure.name, measure.heading, measure.digits) for measure in measures()]
 
-    def score(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, list[tuple[float, ...]]]:
-        """Return the measures of every clip of a batch, by method; of a film their mean."""
-        truth = batch["rgb"][:, middle_half(batch)] if "every" in batch else batch["rgb"]
-
-        def means(measure: Measure, rgb: Tensor) -> list[float]:
-            values = measure.of(rgb.reshape(-1, *rgb.shape[-3:]), truth.reshape(-1, *truth.shape[-3:]))
-            return values.reshape(len(truth), -1).mean(dim=1).tolist()
-
-        return {
-            method: list(zip(*(means(measure, rgb) for measure in measures()), strict=True))
-            for method, rgb in outputs.items()
-        }
-
     def missing(self) -> str | None:
         """Return in a line what was not measured, and why."""
         return why_no_lpips()
 
-    def rows(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> list[list[Tensor]]:
+    def rows(self, pictures: dict[str, Tensor], batch: dict[str, Tensor]) -> list[list[Tensor]]:
         """Return the pictures of every clip of a batch: one of every method, and the truth; those amid a film."""
         if "every" in batch:
-            outputs = {method: rgb[:, rgb.shape[1] // 2] for method, rgb in outputs.items()}
+            pictures = {method: rgb[:, rgb.shape[1] // 2] for method, rgb in pictures.items()}
             batch = middle_clip(batch)
-        return [[rgb.clamp(0, 1).cpu() for rgb in row] for row in zip(*outputs.values(), batch["rgb"], strict=True)]
+        return [[rgb.clamp(0, 1).cpu() for rgb in row] for row in zip(*pictures.values(), batch["rgb"], strict=True)]
 
     def on_test_start(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
         self._scores: dict[str, list[tuple[float, ...]]] = defaultdict(list)
@@ -121,10 +108,10 @@ class TestReport(Callback):
     def on_test_batch_end(  # noqa: D102
         self, trainer: Trainer, module: LightningModule, outputs: dict[str, Any], batch: dict[str, Tensor], *_: Any
     ) -> None:
-        for method, scores in self.score(outputs, batch).items():
-            self._scores[method] += scores
+        for method, scores in outputs["scores"].items():
+            self._scores[method] += zip(*(scores[column].tolist() for column, _, _ in self.columns()), strict=True)
         if len(self._rows) < self.clips:
-            self._rows += self.rows(outputs, batch)[: self.clips - len(self._rows)]
+            self._rows += self.rows(outputs["pictures"], batch)[: self.clips - len(self._rows)]
 
     def on_test_end(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
         self._gather(trainer.world_size)

@@ -7,7 +7,6 @@ from typing import Any
 from pytorch_lightning import LightningModule
 from torch import Tensor
 
-from lightning_modules.metrics.flow import end_point_error, outliers
 from lightning_modules.tasks.callbacks import TestReport, ValidationPictures
 from spikekit import flow_to_rgb
 
@@ -50,18 +49,8 @@ class FlowReport(TestReport):
     def missing(self) -> None:
         """Nothing is missing."""
 
-    def score(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, list[tuple[float, ...]]]:  # noqa: D102
-        truth = batch["flow"]
-        scores = {}
-        for method, (flow, seconds) in outputs.items():
-            error = end_point_error(flow, truth)
-            measures = error, 100 * (error > 1).float(), 100 * outliers(error, truth).float()
-            columns = [measure.flatten(1).mean(dim=1).tolist() for measure in measures]
-            scores[method] = [(*row, 1000 * seconds / len(truth)) for row in zip(*columns, strict=True)]
-        return scores
-
-    def rows(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> list[list[Tensor]]:  # noqa: D102
-        flows = [flow[:, 1] for flow, _ in outputs.values()]
+    def rows(self, pictures: dict[str, Tensor], batch: dict[str, Tensor]) -> list[list[Tensor]]:  # noqa: D102
+        flows = [flow[:, 1] for flow in pictures.values()]
         return [flow_row(row[:-1], row[-1]) for row in zip(*flows, batch["flow"][:, 1], strict=True)]
 
 

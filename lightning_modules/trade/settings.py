@@ -26,8 +26,8 @@ def read_setting(text: str) -> Setting:
     Example:
         >>> read_setting("my own: -c my.yaml").args
         ['-c', 'my.yaml']
-        >>> read_setting("--model.tile 32").name
-        '--model.tile 32'
+        >>> read_setting("--tile 32").name
+        '--tile 32'
     """
     named = re.fullmatch(r"\s*([^-:\s][^:]*):(?:\s+(.*))?", text, re.DOTALL)
     typed = (named[2] or "") if named else text
@@ -37,7 +37,7 @@ def read_setting(text: str) -> Setting:
         raise UsageError(f"--setting: {text!r} cannot be read ({error})") from error
     if not named and not typed.lstrip().startswith("-"):
         expected = "expected arguments of lightning test, or a name, a colon and such arguments"
-        raise UsageError(f"--setting: {expected}, as in 'small tiles: --model.tile 32', got {text!r}")
+        raise UsageError(f"--setting: {expected}, as in 'small tiles: --tile 32', got {text!r}")
     return Setting(named[1].strip() if named else shlex.join(args), args, arguments_preset(args))
 
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 from test_ablations import TINY, clip, variant
 
+from lightning_modules.inference.predict import predict
 from lightning_modules.inference.tiles import forward_in_tiles
 from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
 from lightning_modules.networks import CSCSR, ClassicalDecoder
-from lightning_modules.tasks.super_resolution import SuperResolution
 
 DEVICE = pretend.DEVICE
 LIBRARY = pretend.register()
@@ -81,10 +81,10 @@ def test_tiles(tolerance):
 
 
 def test_self_ensemble():
-    module = SuperResolution(CSCSR(2, **TINY), self_ensemble=8)
+    network = CSCSR(2, **TINY)
     spikes, flow = clip(height=12, width=15)
-    expected = module(spikes, flow)
-    got = module.to(DEVICE)(spikes.to(DEVICE), flow.to(DEVICE))
+    expected = predict(network, spikes, flow, self_ensemble=8)
+    got = predict(network.to(DEVICE), spikes.to(DEVICE), flow.to(DEVICE), self_ensemble=8)
     assert got.device == DEVICE
     torch.testing.assert_close(got.cpu(), expected, rtol=0, atol=1e-4)
 

@@ -1,9 +1,11 @@
+from functools import partial
+
 import pytest
 import torch
 
+from lightning_modules.inference.predict import predict
 from lightning_modules.inference.self_ensemble import self_ensemble
 from lightning_modules.networks import CSCSR, ClassicalDecoder
-from lightning_modules.tasks.super_resolution import SuperResolution
 from spikekit import bayer_mask
 
 TINY = {"width": 4, "representation_width": 4, "features": 2, "stages": 1, "blocks": 1, "end_blocks": 1}
@@ -27,7 +29,7 @@ def transposed(flow):
 def test_two_views_are_the_clip_and_its_transposed(pattern):
     network = CSCSR(2, **TINY, pattern=pattern)
     spikes, flow = clip()
-    one, both = SuperResolution(network), SuperResolution(network, self_ensemble=2)
+    one, both = partial(predict, network), partial(predict, network, self_ensemble=2)
     with_flow = (network(spikes, flow) + network(spikes.mT, transposed(flow)).mT) / 2
     torch.testing.assert_close(both(spikes, flow), with_flow.clamp(0, 1))
     own = (network(spikes) + network(spikes.mT).mT) / 2
@@ -82,7 +84,7 @@ def test_what_follows_the_flow_comes_back_the_same_from_every_view(pattern, size
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR"])
 def test_what_is_transposed_gives_the_transposed_picture(pattern, tile, tolerance):
     network = CSCSR(3, **TINY, pattern=pattern)
-    module = SuperResolution(network, tile=tile, psnr_tolerance=tolerance, self_ensemble=2)
+    module = partial(predict, network, tile=tile, psnr_tolerance=tolerance, self_ensemble=2)
     spikes, _ = clip()
     torch.testing.assert_close(module(spikes.mT), module(spikes).mT, rtol=0, atol=1e-5)
 
@@ -91,21 +93,11 @@ def test_what_is_transposed_gives_the_transposed_picture(pattern, tile, toleranc
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_of_odd_sides_every_turn_of_the_clip_gives_that_of_the_picture(pattern):
     """Mirrors of an odd side leave nothing out: all eight views are those of the turned clip as well."""
-    module = SuperResolution(CSCSR(2, **TINY, pattern=pattern), self_ensemble=8)
+    module = partial(predict, CSCSR(2, **TINY, pattern=pattern), self_ensemble=8)
     spikes, _ = clip(23, 29)
     expected = module(spikes)
     for axes in [-1], [-2], [-1, -2]:
         torch.testing.assert_close(module(spikes.flip(axes)).flip(axes), expected, rtol=0, atol=1e-5)
-
-
-def test_test_has_it_with_either_motion():
-    module = SuperResolution(CSCSR(2, **TINY), self_ensemble=8)
-    spikes, flow = clip()
-    with torch.no_grad():
-        pictures = module.test_step({"spikes": spikes, "flow": flow}, 0)
-        assert pictures["CSCSR"].equal(module(spikes))
-        assert pictures["CSCSR, true flow"].equal(module(spikes, flow))
-        assert not pictures["CSCSR"].equal(pictures["CSCSR, true flow"])
 
 
 @torch.no_grad()
@@ -113,21 +105,16 @@ def test_a_decoder_has_it_as_well():
     spikes, _ = clip()
     decoder = ClassicalDecoder("tfp", 2)
     expected = (decoder(spikes) + decoder(spikes.mT).mT) / 2
-    torch.testing.assert_close(SuperResolution(decoder, self_ensemble=2)(spikes), expected.clamp(0, 1))
+    torch.testing.assert_close(predict(decoder, spikes, self_ensemble=2), expected.clamp(0, 1))
 
 
 @pytest.mark.parametrize("views", [True, False, 0, 3, 16])
 def test_other_numbers_of_views_are_refused(views):
     with pytest.raises(ValueError, match=rf"^self_ensemble: expected one of \(1, 2, 4, 8\), got {views}$"):
-        SuperResolution(CSCSR(2, **TINY), self_ensemble=views)
+        predict(CSCSR(2, **TINY), torch.zeros(1, 41, 8, 8), self_ensemble=views)
 
 
 def test_a_clip_that_has_no_views_is_refused():
     with pytest.raises(ValueError, match=r"^self_ensemble: expected at least 5 x 5 sensor pixels, got 4 x 9$"):
-        SuperResolution(CSCSR(2, **TINY), self_ensemble=2)(torch.zeros(1, 41, 4, 9))
-    assert SuperResolution(ClassicalDecoder("tfp", 2), self_ensemble=8)(torch.zeros(1, 41, 5, 5)).shape == (
-        1,
-        3,
-        10,
-        10,
-    )
+        predict(CSCSR(2, **TINY), torch.zeros(1, 41, 4, 9), self_ensemble=2)
+    assert predict(ClassicalDecoder("tfp", 2), torch.zeros(1, 41, 5, 5), self_ensemble=8).shape == (1, 3, 10, 10)

@@ -6,7 +6,6 @@ from lightning_modules.inference.tiles import AROUND, forward_in_tiles
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks import CSCSR, ClassicalDecoder
 from lightning_modules.storage.error_model import ErrorModel
-from lightning_modules.tasks.super_resolution import SuperResolution
 from spikekit.scenes.analytic import Layer, Motion, Scene
 from spikekit.sensor.simulate import simulate_spikes
 
@@ -257,15 +256,15 @@ def test_how_far_a_picture_is_is_told_tile_by_tile_and_view_by_view(tolerance):
 @pytest.mark.parametrize("tolerance", [-0.1, float("nan"), float("inf")])
 def test_a_tolerance_that_is_none_is_refused(tolerance):
     with pytest.raises(ValueError, match=f"^psnr_tolerance: expected 0 dB or more, got {tolerance}$"):
-        SuperResolution(CSCSR(2, **TINY), psnr_tolerance=tolerance)
+        predict(CSCSR(2, **TINY), torch.zeros(1, 41, 8, 8), psnr_tolerance=tolerance)
 
 
 def test_predict_has_the_tolerance():
     network, calls = counted()
     spikes = clip([Layer(torch.full((3, 64, 64), 0.5))], 32, 32)
-    SuperResolution(network, psnr_tolerance=0.5).predict_step({"spikes": spikes}, 0)
+    predict(network, spikes, psnr_tolerance=0.5)
     assert calls == []
-    SuperResolution(network).predict_step({"spikes": spikes}, 0)
+    predict(network, spikes)
     assert len(calls) == 1
 
 
@@ -297,17 +296,6 @@ def test_clips_of_another_length_are_refused_before_motion_is_estimated():
     with pytest.raises(ValueError, match=r"^spikes: expected \(B, 41, H, W\) .*, got \(1, 15, 64, 192\)$"):
         forward_in_tiles(network, mixed()[:, :15], 64)
     assert network.motion.sizes == []
-
-
-def test_test_shows_what_predict_would():
-    network, calls = counted()
-    batch = {"spikes": mixed(), "flow": torch.full((1, 2, 2, 64, 192), 0.5)}
-    module = SuperResolution(network, tile=64, psnr_tolerance=0.01)
-    pictures = module.test_step(batch, 0)
-    assert [size for size, _ in calls[:3]] == [size for size, _ in calls[3:]]  # three tiles, with either motion
-    assert [moves for _, moves in calls] == [False, True, False] * 2
-    assert pictures["CSCSR"].equal(module.predict_step(batch, 0))
-    assert not pictures["CSCSR"].equal(pictures["CSCSR, true flow"])
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")

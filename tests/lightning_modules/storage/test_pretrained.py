@@ -200,7 +200,7 @@ def test_weights_that_share_memory_can_be_exported(tmp_path):
 
 
 def test_a_module_can_be_pickled():
-    module = SuperResolution.from_pretrained(speed="fastest")
+    module = SuperResolution(CSCSR.from_pretrained("cscsr_tiny_x4"))
     spikes = torch.ones(1, 41, 8, 8)
     assert torch.equal(pickle.loads(pickle.dumps(module))(spikes), module(spikes))
 

@@ -9,6 +9,7 @@ from lightning_modules.__main__ import main
 from lightning_modules.networks import CSCSR, ClassicalDecoder, RecurrentCSCSR
 from lightning_modules.storage.pretrained import Weights, read_weights, settings_of, write_weights
 from lightning_modules.tasks.super_resolution import SuperResolution
+from spikekit import psnr
 
 TINY = {"scale": 2, "width": 8, "representation_width": 8, "features": 1, "stages": 1, "end_blocks": 1}
 DATA = [
@@ -92,15 +93,14 @@ def test_a_network_without_a_state_takes_every_key_frame_by_itself():
     clips = batch(count=3)
     shown = module.validation_step(clips, 0)
     torch.testing.assert_close(shown, module(clips["spikes"][:, 1]))
-    assert module.test_step(clips, 0).keys() == {"TFI", "TFP", "CSCSR, single clips"}
+    tested = module.test_step(clips, 0)
+    assert tested["pictures"].keys() == tested["scores"].keys() == {"TFI", "TFP", "CSCSR, single clips"}
+    shown = psnr(module(clips["spikes"].flatten(0, 1)), clips["rgb"].flatten(0, 1)).reshape(-1, 3)[:, 0:3]
+    torch.testing.assert_close(tested["scores"]["CSCSR, single clips"]["psnr"], shown.mean(dim=1))
 
 
 def test_errors():
     with pytest.raises(ValueError, match="future: expected 0, as ClassicalDecoder takes every clip by itself, got 2"):
         SuperResolution(ClassicalDecoder(), future=2)
-    with pytest.raises(
-        ValueError, match=r"self_ensemble: expected 0 and 1 for a network that makes films, got 0.0 and 2"
-    ):
-        SuperResolution(RecurrentCSCSR(**TINY), self_ensemble=2)
     with pytest.raises(ValueError, match=r"frozen: expected parts of the network, such as motion, .* got nothing"):
         SuperResolution(RecurrentCSCSR(**TINY), frozen=["nothing"])

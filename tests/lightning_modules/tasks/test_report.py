@@ -5,21 +5,26 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from pytorch_lightning import Trainer
 
+from lightning_modules.data import StillScenes
+from lightning_modules.networks import CSCSR
 from lightning_modules.tasks import callbacks
 from lightning_modules.tasks.callbacks import TestReport
-from spikekit import read_picture
+from lightning_modules.tasks.super_resolution import SuperResolution
+from spikekit import psnr, read_picture
 
 
-def report_of(folder, clips, names, processes=1, pictures=8):
+def report_of(folder, clips, names, processes=1, count=8):
     """Report of clips that a network scores n + 0.5 and TFI n, where n counts them."""
-    report = TestReport(folder, pictures)
+    report = TestReport(folder, count)
     report.on_test_start(None, None)
-    width = len(report.columns())
+    columns = [column for column, _, _ in report.columns()]
     for n in range(clips):
-        report.score = lambda *_, n=n: {"CSCSR": [(n + 0.5,) * width], "TFI": [(float(n),) * width]}
-        report.rows = lambda *_, n=n: [[torch.full((3, 4, 4), n / 10)]]
-        report.on_test_batch_end(None, None, {}, {})
+        scores = {"CSCSR": torch.tensor([n + 0.5]), "TFI": torch.tensor([float(n)])}
+        scores = {method: dict.fromkeys(columns, value) for method, value in scores.items()}
+        pictures = {"TFI": torch.full((1, 3, 4, 4), n / 10)}
+        report.on_test_batch_end(None, None, {"scores": scores, "pictures": pictures}, {"rgb": pictures["TFI"]})
     report._gather = lambda _: None
     trainer = SimpleNamespace(
         world_size=processes, is_global_zero=True, datamodule=SimpleNamespace(test_names=names) if names else None
@@ -60,6 +65,19 @@ def test_of_many_clips_the_mean_alone_is_printed(more, tmp_path, capsys):
 
 
 def test_as_many_pictures_as_asked_for(tmp_path):
-    report_of(tmp_path, 3, None, pictures=2)
+    report_of(tmp_path, 3, None, count=2)
     shown = read_picture(tmp_path / "test.png")
     assert shown[0].unique().mul(10).round().tolist() in ([0, 1, 10], [0, 1])
+
+
+def test_scores_are_returned_to_python(tmp_path):
+    data = StillScenes(scale=2, patch=8, val_patch=12, val_clips=2, workers=0)
+    trainer = Trainer(logger=False, accelerator="cpu", enable_progress_bar=False, enable_model_summary=False)
+    module = SuperResolution(CSCSR(2, width=4, representation_width=4, features=1, stages=1, end_blocks=1))
+    [scores] = trainer.test(module, data, verbose=False)
+    assert {"test/psnr", "test/ssim"} <= scores.keys()
+    data.setup("test")
+    clips = [data.test_set[n] for n in range(2)]
+    with torch.no_grad():
+        known = [psnr(module(clip["spikes"][None]), clip["rgb"][None]).item() for clip in clips]
+    assert scores["test/psnr"] == pytest.approx(sum(known) / 2, abs=1e-4)

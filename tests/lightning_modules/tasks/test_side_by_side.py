@@ -4,11 +4,12 @@ from concurrent.futures import ThreadPoolExecutor
 
 import torch
 
-from lightning_modules.tasks.super_resolution import SuperResolution
+from lightning_modules.inference.predict import predict
+from lightning_modules.inference.presets import choose
 
 
 def test_pictures_made_in_and_by_several_threads_are_those_of_one():
-    model = SuperResolution.from_pretrained(speed="fast").eval()
+    network = choose(4, "fast").preset.build()
     generator = torch.Generator().manual_seed(0)
     clips = [
         (torch.rand(1, 41, 24 + 2 * n, 40, generator=generator) < 0.1 * (1 + n % 5)).to(torch.uint8) for n in range(8)
@@ -16,7 +17,7 @@ def test_pictures_made_in_and_by_several_threads_are_those_of_one():
 
     def picture(spikes):
         with torch.no_grad():  # a setting of each thread
-            return model(spikes)
+            return predict(network, spikes)
 
     expected = list(map(picture, clips))
     before = torch.get_num_threads()

@@ -89,7 +89,7 @@ def traded(shared, checkpoint, tmp_path_factory):
         "as it is:",
         f"trained: --ckpt_path {checkpoint}",
         "--model.network.motion ZeroFlow",
-        "small tiles: --model.tile 4",
+        "small tiles: --tile 4",
         f"TFI: {TFI}",
         "missing: --model.weights nowhere.safetensors",
     ]
@@ -254,7 +254,7 @@ def test_usual_settings_are_the_networks_of_the_package_and_the_decoders():
     assert [*settings][: len(networks)] == networks
     assert "Spike2Flow" in settings["cscsr_small_x4, Spike2Flow"].args
     assert settings["cscsr_small_x4, no tiles"].preset == Preset("cscsr_small_x4", tile=0)
-    two = ["--model.weights", "cscsr_tiny_x4", "--model.self_ensemble", "2"]
+    two = ["--model.weights", "cscsr_tiny_x4", "--self_ensemble", "2"]
     assert settings["cscsr_tiny_x4, self-ensemble of 2"].args == two
     assert settings["cscsr_tiny_x4, no motion"].preset == Preset("cscsr_tiny_x4", motion="ZeroFlow")
     assert len([name for name in settings if name.startswith("cscsr_tiny_x4")]) == 3
@@ -266,7 +266,7 @@ def test_usual_settings_are_the_networks_of_the_package_and_the_decoders():
 def test_usual_settings_of_ones_own_weights_take_the_place_of_the_package():
     own = {setting.name: setting for setting in usual_settings(4, ["--ckpt_path"])}
     assert own["own weights"].args == []
-    assert own["own weights, self-ensemble of 4"].args == ["--model.self_ensemble", "4"]
+    assert own["own weights, self-ensemble of 4"].args == ["--self_ensemble", "4"]
     assert own["TFI"].args[-2:] == ["--ckpt_path", "null"]
     tscnn = [setting.name for setting in usual_settings(4, ["--ckpt_path"], TSCNN(width=8, blocks=1))]
     ensembles = [f"own weights, self-ensemble of {views}" for views in (2, 4, 8)]
@@ -302,13 +302,13 @@ def test_settings_are_read_as_they_are_written(name, args):
 @pytest.mark.parametrize(
     ("typed", "preset"),
     [
-        ("--model.weights cscsr_small_x4 --model.tile=64", Preset("cscsr_small_x4", tile=64)),
+        ("--model.weights cscsr_small_x4 --tile=64", Preset("cscsr_small_x4", tile=64)),
         ("nothing:", Preset()),
         ("--model.network ClassicalDecoder --model.network.order 2", Preset(network="ClassicalDecoder", order=2)),
         ("-c my.yaml --model.weights cscsr_small_x4", None),
         ("--model.weights cscsr_small_x4 --model.weights cscsr_large_x4", None),
-        ("--model.weights cscsr_small_x4 --model.tile", None),
-        ("--model.weights cscsr_small_x4 --model.tile wide", None),
+        ("--model.weights cscsr_small_x4 --tile", None),
+        ("--model.weights cscsr_small_x4 --tile wide", None),
         ("--model.weights cscsr_small_x4 --model.network CSCSR", None),
     ],
 )
@@ -317,7 +317,7 @@ def test_what_is_typed_is_a_preset_where_columns_can_say_it(typed, preset):
 
 
 def test_a_setting_without_a_name_is_called_by_its_arguments():
-    assert read_setting("--model.tile  8") == ("--model.tile 8", ["--model.tile", "8"], Preset(tile=8))
+    assert read_setting("--tile  8") == ("--tile 8", ["--tile", "8"], Preset(tile=8))
     setting = read_setting("-c 'a: b.yaml'")
     assert setting.args == ["-c", "a: b.yaml"]
     assert read_setting(setting.text) == setting
@@ -328,7 +328,7 @@ def test_a_table_is_read_as_it_is_written(tmp_path, monkeypatch):
     rows, _ = some_rows(4, [(9.0, 9.0), (2.0, 2.0), (1.0, 1.0), (1.0, 3.0)])
     typed = [
         "lost: --model.weights cscsr_large_x4",
-        "one: --model.weights cscsr_small_x4 --model.self_ensemble 2",
+        "one: --model.weights cscsr_small_x4 --self_ensemble 2",
         "-c my.yaml --model.weights cscsr_small_x4",
         "tfi: --model.network ClassicalDecoder --model.network.method tfi",
     ]
@@ -346,10 +346,10 @@ def test_a_table_is_read_as_it_is_written(tmp_path, monkeypatch):
 
 MISTAKES = [
     (["--setting", "cscsr_small_x4"], "expected arguments of lightning test, or a name, a colon and such arguments"),
-    (["--setting", "a: --model.tile '8"], "cannot be read (No closing quotation)"),
-    (["--setting", "a:", "--setting", "a: --model.tile 8"], "two settings are called 'a'"),
+    (["--setting", "a: --tile '8"], "cannot be read (No closing quotation)"),
+    (["--setting", "a:", "--setting", "a: --tile 8"], "two settings are called 'a'"),
     (["--setting", "a: --model.network.widht 3"], "did you mean model.network.width?"),
-    (["--setting", "good:", "--setting", "a: --model.tile 3"], "a: tile: expected an even number"),
+    (["--setting", "good:", "--setting", "a: --tile 3"], "a: tile: expected an even number"),
     (["--setting", "a: --ckpt_path nowhere.ckpt"], "a: nowhere.ckpt: no such checkpoint"),
     (["--setting", "a: --data.motion 9"], "a: data.motion: expected 3.0, the same scenes for all, got 9.0"),
     (["--setting", "a: --model.network.scale 2"], "a: data.scale: expected 4, the same scenes for all, got 2"),
