@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from kornia.color import CFA
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from spikekit.check import check_planes, check_positive, check_whole
 from spikekit.color.cfa import bin_to_sensor, cfa_sites
 
 _CHUNK = 1 << 16  # positions sampled at a time: what they need stays in the cache
+_CHUNK_ELSEWHERE = 1 << 26  # on a GPU, where launches cost more
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,7 @@ class Motion:
     Convention:
         :math:`\tau` is the clock, counted from the middle of the clip, where the motion is the identity. Positions are
         (x, y), x right, y down, pixel centres at whole numbers. A positive rotation turns x towards y: clockwise on
-        the screen.
+        the screen. In a batch of scenes every number may have a value for each of them: arrays (B, 2) or (B,).
 
     Args:
         velocity: v, pixels per clock, (x, y).
@@ -43,20 +45,29 @@ class Motion:
         1.0
     """
 
-    velocity: tuple[float, float] = (0.0, 0.0)
-    rotation: float = 0.0
-    zoom: float = 1.0
-    center: tuple[float, float] = (0.0, 0.0)
-    acceleration: tuple[float, float] = (0.0, 0.0)
+    velocity: ArrayLike = (0.0, 0.0)
+    rotation: ArrayLike = 0.0
+    zoom: ArrayLike = 1.0
+    center: ArrayLike = (0.0, 0.0)
+    acceleration: ArrayLike = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        check_positive("zoom", self.zoom)
+        if isinstance(self.zoom, (int, float)):
+            check_positive("zoom", self.zoom)
+        elif not (np.asarray(self.zoom) > 0).all():
+            raise ValueError(f"zoom: expected numbers above 0, got {np.min(self.zoom)}")
 
     def _turn_and_shift(self, tau: Tensor) -> tuple[Tensor, Tensor]:
-        """Positions as complex numbers x + iy: every position goes to ``turn * position + shift``."""
-        center, velocity = complex(*self.center), complex(*self.velocity)
-        turn = torch.exp(tau * complex(math.log(self.zoom), self.rotation))
-        return turn, center + (velocity + complex(*self.acceleration) / 2 * tau) * tau - center * turn
+        """Positions as complex numbers x + iy: every position goes to ``turn * position + shift``; both (B, T)."""
+        center, velocity, acceleration = map(_points, (self.center, self.velocity, self.acceleration))
+        growth, rotation = (torch.from_numpy(np.atleast_1d(n)) for n in (np.log(self.zoom), np.float64(self.rotation)))
+        turn = torch.exp(tau * torch.complex(growth, rotation)[:, None])
+        return turn, center + (velocity + acceleration / 2 * tau) * tau - center * turn
+
+
+def _points(pairs: ArrayLike) -> Tensor:
+    """Pairs (x, y), or an array of them, as complex numbers x + iy, (B, 1)."""
+    return torch.view_as_complex(torch.from_numpy(np.array(pairs, "float64").reshape(-1, 1, 2)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +75,12 @@ class Layer:
     """A picture in motion: the background of a scene, or an object in front of it.
 
     Args:
-        picture: ``rgb`` (3, h, w), float32 or float64; (1, h, w) of a scene that only grey sensors see.
+        picture: ``rgb`` (3, h, w), float32 or float64; (1, h, w) of a scene that only grey sensors see; of a batch of
+            scenes (B, 3, h, w) or (B, 1, h, w).
         motion: how it moves.
-        position: (x, y) of the picture's pixel (0, 0) in the view, at the middle of the clip.
-        mask: (h, w), how much of the object there is, 0 to 1; 0 beyond its border. ``None`` for a background, which
-            has no end: beyond its border it is mirrored.
+        position: (x, y) of the picture's pixel (0, 0) in the view, at the middle of the clip; of a batch also (B, 2).
+        mask: (h, w), how much of the object there is, 0 to 1; 0 beyond its border; of a batch (B, h, w). ``None`` for
+            a background, which has no end: beyond its border it is mirrored.
 
     Raises:
         TypeError: not a float32 or float64 picture.
@@ -80,27 +92,32 @@ class Layer:
 
     picture: Tensor
     motion: Motion = Motion()
-    position: tuple[int, int] = (0, 0)
+    position: ArrayLike = (0, 0)
     mask: Tensor | None = None
 
     def __post_init__(self) -> None:
         check_planes("picture", self.picture, 3, "(3, h, w)", floating=True)
-        if self.picture.ndim != 3 or len(self.picture) not in (1, 3):
-            raise ValueError(f"picture: expected (3, h, w), or (1, h, w) of grey, got {tuple(self.picture.shape)}")
+        if self.picture.ndim > 4 or self.picture.shape[-3] not in (1, 3):
+            raise ValueError(
+                f"picture: expected (3, h, w), (1, h, w) of grey, or a batch of them, got {tuple(self.picture.shape)}"
+            )
         if self.picture.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"picture: expected float32 or float64, got {self.picture.dtype}")
-        size = tuple(self.picture.shape[1:])
+        size = tuple(self.picture.shape[:-3] + self.picture.shape[-2:])
         if self.mask is not None and getattr(self.mask, "shape", None) != size:
             got = tuple(self.mask.shape) if isinstance(self.mask, Tensor) else type(self.mask).__name__
             raise ValueError(f"mask: expected {size}, got {got}")
 
-    def _planes(self) -> tuple[Tensor, complex]:
-        """The planes to sample, and the position of their corner; an object gets a mask as last plane, and a rim."""
+    def _planes(self) -> tuple[Tensor, Tensor]:
+        """The planes to sample, (B, C, h, w), and the positions of their corners, (B, 1).
+
+        An object gets a mask as last plane, and a rim.
+        """
+        picture, corner = self.picture.reshape(-1, *self.picture.shape[-3:]), _points(self.position)
         if self.mask is None:
-            return self.picture, complex(*self.position)
-        picture = F.pad(self.picture, (1, 1, 1, 1), "replicate")
-        mask = F.pad(self.mask.to(self.picture), (1, 1, 1, 1))
-        return torch.cat([picture, mask[None]]), complex(*self.position) - (1 + 1j)
+            return picture, corner
+        mask = F.pad(self.mask.to(picture).reshape(-1, 1, *picture.shape[-2:]), (1, 1, 1, 1))
+        return torch.cat([F.pad(picture, (1, 1, 1, 1), "replicate"), mask], dim=1), corner - (1 + 1j)
 
 
 def _inside(position: Tensor, length: int, padding: str) -> Tensor:
@@ -113,26 +130,37 @@ def _inside(position: Tensor, length: int, padding: str) -> Tensor:
 
 
 def _sample(
-    planes: Tensor, corner: complex, turn: Tensor, shift: Tensor, rows: Tensor, columns: Tensor, padding: str
+    planes: Tensor, corner: Tensor, turn: Tensor, shift: Tensor, rows: Tensor, columns: Tensor, padding: str
 ) -> Tensor:
-    """Sample moved planes (C, h, w) at every one of ``rows`` x ``columns`` of the view: (n, C, rows, columns)."""
-    height, width = planes.shape[-2:]
+    """Sample moved planes (B, C, h, w) at every one of ``rows`` x ``columns`` of the view: (B, C, T, rows, columns).
+
+    All but the planes is known to the host, which decides and need not wait for a device.
+    """
+    scenes, _, height, width = planes.shape
+    frames, device = turn.shape[1], planes.device
     if (turn == 1).all() and (shift == 0).all() and all((axis == axis.round()).all() for axis in (rows, columns)):
         # at rest, pixels are copied, so that the ground truth has the picture's own values to the last bit
-        i = _inside(rows - corner.imag, height, padding)
-        j = _inside(columns - corner.real, width, padding)
-        return planes[:, i[:, None], j].repeat(len(turn), 1, 1, 1)
+        i = _inside(rows - corner.imag, height, padding).to(device).expand(scenes, -1)
+        j = _inside(columns - corner.real, width, padding).to(device).expand(scenes, -1)
+        which = torch.arange(scenes, device=device)[:, None, None]
+        seen = planes.movedim(1, -1)[which, i[:, :, None], j[:, None, :]].movedim(-1, 1)
+        return seen[:, :, None].expand(-1, -1, frames, -1, -1).clone()
     to_centre = corner + complex(width - 1, height - 1) / 2
+    turn, shift, to_centre, rows, columns = (part.to(device) for part in (turn, shift, to_centre, rows, columns))
 
     def normalized(position: Tensor) -> Tensor:
         kind = torch.complex64 if planes.dtype == torch.float32 else torch.complex128
         return torch.complex(position.real * (2 / width), position.imag * (2 / height)).to(kind)
 
     # Where the pixels of the view come from is affine: a part that the column gives plus one that the row gives.
-    across = normalized(columns / turn[:, None])
-    down = normalized((1j * rows - shift[:, None]) / turn[:, None] - to_centre)
-    grid = torch.view_as_real(across[:, None, :] + down[:, :, None])
-    return F.grid_sample(planes.expand(len(turn), *planes.shape), grid, "bilinear", padding, align_corners=False)
+    across = normalized(columns / turn[..., None])
+    down = normalized((1j * rows - shift[..., None]) / turn[..., None] - to_centre[..., None])
+    grid = torch.view_as_real(across[:, :, None, :] + down[:, :, :, None]).expand(scenes, -1, -1, -1, -1)
+    if scenes == 1:  # every clock for itself, for the threads of a CPU
+        seen = F.grid_sample(planes.expand(frames, -1, -1, -1), grid[0], "bilinear", padding, align_corners=False)
+        return seen.transpose(0, 1)[None]
+    seen = F.grid_sample(planes, grid.flatten(1, 2), "bilinear", padding, align_corners=False)
+    return seen.unflatten(2, (frames, -1))
 
 
 class Scene:
@@ -147,6 +175,9 @@ class Scene:
         A sensor pixel averages the s x s view pixels of its own colour, or their luminance where the sensor is grey,
         see :func:`spikekit.bin_to_sensor`; the
         sensor pixel (x, y) is centred at (s x + (s - 1) / 2, s y + (s - 1) / 2) of the view.
+
+        Layers of a batch make a batch of scenes, all of one size: what comes out has a leading dimension more. It is
+        computed where the pictures are, and on a GPU waits for nothing.
 
     Args:
         layers: the background, then the objects from back to front.
@@ -172,9 +203,10 @@ class Scene:
     def __init__(self, layers: Sequence[Layer], height: int, width: int, frames: int = 41) -> None:
         if not layers or layers[0].mask is not None or any(layer.mask is None for layer in layers[1:]):
             raise ValueError("layers: expected a background without a mask, then objects with one")
-        self.channels = len(layers[0].picture)
-        if any(len(layer.picture) != self.channels for layer in layers):
-            raise ValueError("layers: expected pictures of one number of channels, got some of 1 and some of 3")
+        kinds = {(layer.picture.shape[:-3], layer.picture.shape[-3]) for layer in layers}
+        if len(kinds) > 1:
+            raise ValueError(f"layers: expected pictures of one number of channels and scenes, got {kinds}")
+        ((self._batch, self.channels),) = kinds
         if height < 1 or width < 1 or frames < 1:
             raise ValueError(f"height, width, frames: expected at least 1, got {height}, {width}, {frames}")
         self.layers = list(layers)
@@ -191,8 +223,9 @@ class Scene:
         Returns:
             ``rgb`` of shape (3, height, width), or (1, height, width) where the pictures have one channel.
         """
-        rows, columns = self._axis(self.height), self._axis(self.width)
-        return self._render([*range(self.channels)], rows, columns, self._tau([clock]))[0]
+        rows, columns = _axis(self.height), _axis(self.width)
+        view = self._render([*range(self.channels)], rows, columns, self._tau([clock])).squeeze(2)
+        return view if self._batch else view[0]
 
     def light(self, pattern: str | CFA = "RGGB", *, scale: int, alpha: float = 1.0) -> Tensor:
         """Return the light that arrives at the sensor at every clock.
@@ -217,20 +250,23 @@ class Scene:
         sites, side = cfa_sites(pattern)
         if self.channels == 1 and side > 1:
             raise ValueError(f"pattern: expected grey for pictures of one channel, got {pattern}")
-        light = self.layers[0].picture.new_empty(self.frames, height, width)
+        scenes = len(self._planes[0][0])
+        light = self.layers[0].picture.new_empty(scenes, self.frames, height, width)
         for colour, row, column in sites:
             colours = [colour] if side > 1 else [*range(self.channels)]
-            rows = self._axis(self.height).reshape(height, scale)[row::side].flatten()
-            columns = self._axis(self.width).reshape(width, scale)[column::side].flatten()
+            rows = _axis(self.height).reshape(height, scale)[row::side].flatten()
+            columns = _axis(self.width).reshape(width, scale)[column::side].flatten()
             if 0 in (len(rows), len(columns)):
                 continue
-            chunk = max(1, _CHUNK // (len(rows) * len(columns)))
+            most = _CHUNK if light.device.type == "cpu" else _CHUNK_ELSEWHERE
+            chunk = max(1, most // (scenes * len(rows) * len(columns)))
             for start in range(0, self.frames, chunk):
                 clocks = range(start, min(start + chunk, self.frames))
-                seen = self._render(colours, rows, columns, self._tau(clocks))
-                seen = seen[:, 0] if side > 1 else bin_to_sensor(seen, pattern, scale=1)
-                light[start : clocks.stop, row::side, column::side] = F.avg_pool2d(seen, scale)
-        return light * alpha
+                seen = self._render(colours, rows, columns, self._tau(clocks)).movedim(1, 2)
+                seen = seen[:, :, 0] if side > 1 else bin_to_sensor(seen, pattern, scale=1)
+                light[:, start : clocks.stop, row::side, column::side] = F.avg_pool2d(seen, scale)
+        light = light.mul_(alpha)
+        return light if self._batch else light[0]
 
     def flow(self, clock: float, *, scale: int) -> Tensor:
         """Return the true flow from the middle to a clock, at the sensor's resolution.
@@ -250,25 +286,23 @@ class Scene:
             ValueError: a scale that does not divide the view.
         """
         height, width = self._sensor(scale)
-        rows, columns = self._axis(height) * scale + (scale - 1) / 2, self._axis(width) * scale + (scale - 1) / 2
-        here = columns + 1j * rows[:, None]
+        rows, columns = _axis(height) * scale + (scale - 1) / 2, _axis(width) * scale + (scale - 1) / 2
+        device = self.layers[0].picture.device
+        here = (columns + 1j * rows[:, None]).to(device)
         still = Motion()._turn_and_shift(self._tau([self.middle]))
         moved = torch.zeros_like(here)
         for layer, (planes, corner) in zip(self.layers, self._planes, strict=True):
-            turn, shift = layer.motion._turn_and_shift(self._tau([clock]))
+            turn, shift = (part.to(device)[..., None] for part in layer.motion._turn_and_shift(self._tau([clock])))
             moves = turn * here + shift - here
             if layer.mask is not None:
-                seen = _sample(planes[-1:], corner, *still, rows, columns, "border")[0, 0] >= 0.5
+                seen = _sample(planes[:, -1:], corner, *still, rows, columns, "border")[:, 0, 0] >= 0.5
                 moves = torch.where(seen, moves, moved)
             moved = moves
-        return torch.stack([moved.real, moved.imag]).to(self.layers[0].picture.dtype) / scale
+        flow = torch.stack([moved.real, moved.imag], dim=1).to(self.layers[0].picture.dtype) / scale
+        return flow.expand(len(self._planes[0][0]), -1, -1, -1) if self._batch else flow[0]
 
     def _tau(self, clocks: Sequence[float]) -> Tensor:
-        device = self.layers[0].picture.device
-        return torch.tensor(list(clocks), dtype=torch.float64, device=device) - self.middle
-
-    def _axis(self, length: int) -> Tensor:
-        return torch.arange(length, dtype=torch.float64, device=self.layers[0].picture.device)
+        return torch.tensor(list(clocks), dtype=torch.float64) - self.middle
 
     def _sensor(self, scale: int) -> tuple[int, int]:
         scale = check_whole("scale", scale)
@@ -277,29 +311,33 @@ class Scene:
         return self.height // scale, self.width // scale
 
     def _render(self, colours: list[int], rows: Tensor, columns: Tensor, tau: Tensor) -> Tensor:
-        """Evaluate some colours at ``rows`` x ``columns`` of the view: (n, colours, rows, columns)."""
+        """Evaluate some colours at ``rows`` x ``columns`` of the view: (B, colours, T, rows, columns)."""
         view = None
         for layer, (planes, corner) in zip(self.layers, self._planes, strict=True):
             turn, shift = layer.motion._turn_and_shift(tau)
             if view is None:
-                view = _sample(planes[colours], corner, turn, shift, rows, columns, "reflection")
+                view = _sample(planes[:, colours], corner, turn, shift, rows, columns, "reflection")
                 continue
             box = _touched(planes, corner, turn, shift, rows, columns)
             part = view[(..., *box)]
             if part.numel():
-                picked = planes[[*colours, -1]]
+                picked = planes[:, [*colours, -1]]
                 found = _sample(picked, corner, turn, shift, rows[box[0]], columns[box[1]], "border")
                 part.lerp_(found[:, :-1], found[:, -1:].expand(part.shape))
         return view
 
 
+def _axis(length: int) -> Tensor:
+    return torch.arange(length, dtype=torch.float64)
+
+
 def _touched(
-    planes: Tensor, corner: complex, turn: Tensor, shift: Tensor, rows: Tensor, columns: Tensor
+    planes: Tensor, corner: Tensor, turn: Tensor, shift: Tensor, rows: Tensor, columns: Tensor
 ) -> tuple[slice, slice]:
-    """Which of the rows and columns of the view moved planes can touch."""
+    """Which of the rows and columns of the view moved planes can touch, in any scene and at any clock."""
     height, width = planes.shape[-2:]
     ends = corner + torch.tensor([0, width - 1, 1j * (height - 1), width - 1 + 1j * (height - 1)]).to(turn)
-    ends = turn[:, None] * ends + shift[:, None]
+    ends = turn[..., None] * ends[:, None, :] + shift[..., None]
 
     def between(axis: Tensor, position: Tensor) -> slice:
         low, high = torch.searchsorted(axis.contiguous(), torch.stack([position.amin(), position.amax() + 1]))
