@@ -224,7 +224,7 @@ class Scene:
             ``rgb`` of shape (3, height, width), or (1, height, width) where the pictures have one channel.
         """
         rows, columns = _axis(self.height), _axis(self.width)
-        view = self._render([*range(self.channels)], rows, columns, self._tau([clock])).squeeze(2)
+        view = self._render(self._picked([*range(self.channels)]), self._moves([clock]), rows, columns).squeeze(2)
         return view if self._batch else view[0]
 
     def light(self, pattern: str | CFA = "RGGB", *, scale: int, alpha: float = 1.0) -> Tensor:
@@ -250,21 +250,22 @@ class Scene:
         sites, side = cfa_sites(pattern)
         if self.channels == 1 and side > 1:
             raise ValueError(f"pattern: expected grey for pictures of one channel, got {pattern}")
-        scenes = len(self._planes[0][0])
+        scenes, moves = len(self._planes[0][0]), self._moves(range(self.frames))
         light = self.layers[0].picture.new_empty(scenes, self.frames, height, width)
         for colour, row, column in sites:
-            colours = [colour] if side > 1 else [*range(self.channels)]
             rows = _axis(self.height).reshape(height, scale)[row::side].flatten()
             columns = _axis(self.width).reshape(width, scale)[column::side].flatten()
             if 0 in (len(rows), len(columns)):
                 continue
+            picked = self._picked([colour] if side > 1 else [*range(self.channels)])
             most = _CHUNK if light.device.type == "cpu" else _CHUNK_ELSEWHERE
             chunk = max(1, most // (scenes * len(rows) * len(columns)))
             for start in range(0, self.frames, chunk):
-                clocks = range(start, min(start + chunk, self.frames))
-                seen = self._render(colours, rows, columns, self._tau(clocks)).movedim(1, 2)
-                seen = seen[:, :, 0] if side > 1 else bin_to_sensor(seen, pattern, scale=1)
-                light[:, start : clocks.stop, row::side, column::side] = F.avg_pool2d(seen, scale)
+                clocks = slice(start, min(start + chunk, self.frames))
+                now = [(turn[:, clocks], shift[:, clocks]) for turn, shift in moves]
+                seen = self._render(picked, now, rows, columns)
+                seen = seen[:, 0] if side > 1 else bin_to_sensor(seen.movedim(1, 2), pattern, scale=1)
+                light[:, clocks, row::side, column::side] = F.avg_pool2d(seen, scale)
         light = light.mul_(alpha)
         return light if self._batch else light[0]
 
@@ -289,20 +290,30 @@ class Scene:
         rows, columns = _axis(height) * scale + (scale - 1) / 2, _axis(width) * scale + (scale - 1) / 2
         device = self.layers[0].picture.device
         here = (columns + 1j * rows[:, None]).to(device)
-        still = Motion()._turn_and_shift(self._tau([self.middle]))
+        still = Motion()._turn_and_shift(torch.zeros(1, dtype=torch.float64))
         moved = torch.zeros_like(here)
-        for layer, (planes, corner) in zip(self.layers, self._planes, strict=True):
-            turn, shift = (part.to(device)[..., None] for part in layer.motion._turn_and_shift(self._tau([clock])))
-            moves = turn * here + shift - here
-            if layer.mask is not None:
+        for (planes, corner), moves in zip(self._planes, self._moves([clock]), strict=True):
+            turn, shift = (part.to(device)[..., None] for part in moves)
+            away = turn * here + shift - here
+            if planes.shape[1] > self.channels:
                 seen = _sample(planes[:, -1:], corner, *still, rows, columns, "border")[:, 0, 0] >= 0.5
-                moves = torch.where(seen, moves, moved)
-            moved = moves
+                away = torch.where(seen, away, moved)
+            moved = away
         flow = torch.stack([moved.real, moved.imag], dim=1).to(self.layers[0].picture.dtype) / scale
         return flow.expand(len(self._planes[0][0]), -1, -1, -1) if self._batch else flow[0]
 
-    def _tau(self, clocks: Sequence[float]) -> Tensor:
-        return torch.tensor(list(clocks), dtype=torch.float64) - self.middle
+    def _moves(self, clocks: Sequence[float]) -> list[tuple[Tensor, Tensor]]:
+        """Turns and shifts of every layer, on the host."""
+        tau = torch.tensor(list(clocks), dtype=torch.float64) - self.middle
+        return [layer.motion._turn_and_shift(tau) for layer in self.layers]
+
+    def _picked(self, colours: list[int]) -> list[Tensor]:
+        """Some colours of every layer, and the masks of objects."""
+        chosen = slice(colours[0], colours[-1] + 1)
+        return [
+            planes[:, chosen] if n == 0 else torch.cat([planes[:, chosen], planes[:, -1:]], dim=1)
+            for n, (planes, _) in enumerate(self._planes)
+        ]
 
     def _sensor(self, scale: int) -> tuple[int, int]:
         scale = check_whole("scale", scale)
@@ -310,19 +321,19 @@ class Scene:
             raise ValueError(f"scale: expected a divisor of the view {self.height} x {self.width}, got {scale}")
         return self.height // scale, self.width // scale
 
-    def _render(self, colours: list[int], rows: Tensor, columns: Tensor, tau: Tensor) -> Tensor:
+    def _render(
+        self, picked: list[Tensor], moves: list[tuple[Tensor, Tensor]], rows: Tensor, columns: Tensor
+    ) -> Tensor:
         """Evaluate some colours at ``rows`` x ``columns`` of the view: (B, colours, T, rows, columns)."""
         view = None
-        for layer, (planes, corner) in zip(self.layers, self._planes, strict=True):
-            turn, shift = layer.motion._turn_and_shift(tau)
+        for planes, (_, corner), (turn, shift) in zip(picked, self._planes, moves, strict=True):
             if view is None:
-                view = _sample(planes[:, colours], corner, turn, shift, rows, columns, "reflection")
+                view = _sample(planes, corner, turn, shift, rows, columns, "reflection")
                 continue
             box = _touched(planes, corner, turn, shift, rows, columns)
             part = view[(..., *box)]
             if part.numel():
-                picked = planes[:, [*colours, -1]]
-                found = _sample(picked, corner, turn, shift, rows[box[0]], columns[box[1]], "border")
+                found = _sample(planes, corner, turn, shift, rows[box[0]], columns[box[1]], "border")
                 part.lerp_(found[:, :-1], found[:, -1:].expand(part.shape))
         return view
 
