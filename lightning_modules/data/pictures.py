@@ -107,11 +107,22 @@ def split_pictures(pictures: list[Path], seed: int) -> tuple[list[Path], list[Pa
     )
 
 
-@lru_cache(maxsize=16)
-def cached_picture(path: Path) -> Tensor:
-    """Read a picture, or give the one in memory; not to be written to.
+@lru_cache(maxsize=64)
+def read_shades(path: Path) -> Tensor:
+    """Read a picture as numbers of 8 bits, (3, h, w), or give the one in memory; not to be written to.
 
     Raises:
         ValueError: the file is not a picture; the message names it.
     """
-    return read_picture(path)
+    return to_shades(read_picture(path))
+
+
+def to_shades(rgb: Tensor) -> Tensor:
+    """Turn values of [0, 1] into numbers of 8 bits.
+
+    Example:
+        >>> import torch
+        >>> to_shades(torch.tensor([0.0, 0.5, 1.0])).tolist()
+        [0, 128, 255]
+    """
+    return (rgb * 255).round().byte()

@@ -4,37 +4,36 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import KW_ONLY, asdict, dataclass
+from dataclasses import KW_ONLY, asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 from torch.utils.data import Dataset
 
 from lightning_modules.data.cache import ClipCache, clip_key, file_digest, unpack_clip
 from lightning_modules.data.loading import ClipScenes, cut_key_frames
 from lightning_modules.data.margin import flow_margin, trim
-from lightning_modules.data.pictures import cached_picture, embedded_pictures, folder_pictures, split_pictures
-from lightning_modules.data.textures import outline_mask, texture
+from lightning_modules.data.pictures import embedded_pictures, folder_pictures, split_pictures
+from lightning_modules.data.rendering import Gallery, Pictures, draw_cut, render_scene, see
+from lightning_modules.data.textures import outline
 from lightning_modules.signatures import takes
-from spikekit import bin_to_sensor
 from spikekit.check import check_positive, check_whole
-from spikekit.color.cfa import GREY, cfa_pattern
+from spikekit.color.cfa import cfa_pattern
 from spikekit.scenes import analytic
-from spikekit.scenes.analytic import Layer, Motion, Scene
+from spikekit.scenes.analytic import Scene
 from spikekit.scenes.frame_sequence import SIMULATOR_VERSION
 from spikekit.sensor.noise import SensorNoise
-from spikekit.sensor.simulate import simulate_spikes
 
 #: what says how a clip looks, besides the sensor
-_CODE = [Path(__file__).with_name(f"{name}.py") for name in ("stills", "textures", "pictures")] + [
+_CODE = [Path(__file__).with_name(f"{name}.py") for name in ("stills", "rendering", "textures", "pictures")] + [
     Path(analytic.__file__)
 ]
 _TEXTURES = 0.3  # share of procedural pictures among embedded ones
+_ANGLES = 256  # at which an outline is known
 
 
 @dataclass(eq=False, repr=False)
@@ -106,9 +105,10 @@ class StillClips(Dataset):
 
     def __post_init__(self) -> None:
         self.pictures, self.brightness = list(self.pictures), tuple(self.brightness)
-        self.gains = self.gains and tuple(self.gains)
         self.flow_times, self.margin = tuple(self.flow_times), flow_margin(self.patch, self.flow_patch)
         _check(self)
+        self.gains = self.gains and tuple(self.gains)
+        self.sources = Pictures(self.pictures, self.textures)
         self.clocks = self.frames + (self.key_frames - 1) * self.every
 
     def __len__(self) -> int:
@@ -121,7 +121,7 @@ class StillClips(Dataset):
         ``spikes`` (K, N, H, W), ``rgb`` (K, 3, s h, s w) and ``every``, and no flow. The gain is ``alpha``, where there
         are ``gains``, and the level of the noise ``noise``, where there is any.
         """
-        return self._camera(index) | self._clip(index)
+        return self._clip(index) | self._camera(index)
 
     def _clip(self, index: int) -> dict[str, Tensor]:
         if self.cache is None:
@@ -133,7 +133,7 @@ class StillClips(Dataset):
     @cached_property
     def _source(self) -> str:
         """Digest of all that a clip is made of, besides its index."""
-        aside = {"pictures", "length", "cache"}
+        aside = {"pictures", "sources", "length", "cache"}
         options = {name: value for name, value in vars(self).items() if name not in aside}
         options["noise"] = self.noise and asdict(self.noise)
         files = [file_digest(path) for path in (*_CODE, *self.pictures)]
@@ -141,88 +141,156 @@ class StillClips(Dataset):
 
     def _make(self, index: int) -> dict[str, Tensor]:
         """Spikes of all key frames, (T, H, W), and truth, or flow and truth of the one."""
-        scene = self.scene(index)
-        spikes = self.spikes(index, scene)
+        drawn, gallery = self._alone(index)
+        return {name: part[0] for name, part in self.render(drawn, gallery).items()}
+
+    def _alone(self, index: int) -> tuple[dict[str, np.ndarray], Gallery]:
+        """Numbers of a scene, a batch of one, and the pictures that it is made of."""
+        drawn = {name: part[None] for name, part in self.draw(index).items()}
+        used, drawn["picture"] = np.unique(drawn["picture"], return_inverse=True)
+        drawn["picture"] = drawn["picture"].reshape(1, -1)
+        return drawn, Gallery.of([self.sources[n] for n in used])
+
+    def render(self, drawn: dict[str, np.ndarray], gallery: Gallery) -> dict[str, Tensor]:
+        """Return clips of drawn numbers, as they are before key frames are cut.
+
+        Args:
+            drawn: of :meth:`draw`, each with a leading dimension B.
+            gallery: the pictures, on the device that renders.
+        """
+        scene = self._scene(drawn, gallery)
+        light, noise = scene.light(self.pattern, scale=self.scale), self.noise or SensorNoise(photons=self.photons)
         middles = [self.frames // 2 + n * self.every for n in range(self.key_frames)]
-        rgb = torch.stack([trim(scene.rgb(middle), self.scale * self.margin) for middle in middles])
-        if self.key_frames > 1:
-            return {"spikes": spikes, "rgb": rgb}
-        flow = torch.stack([scene.flow(clock, scale=self.scale) for clock in self.flow_times])
-        return {"spikes": spikes, "rgb": rgb[0], "flow": trim(flow, self.margin)}
+        rgb = torch.stack([trim(scene.rgb(middle), self.scale * self.margin) for middle in middles], dim=1)
+        clips = {"spikes": see(light, drawn, noise), "rgb": rgb if self.key_frames > 1 else rgb[:, 0]}
+        if self.key_frames == 1:
+            flow = torch.stack([scene.flow(clock, scale=self.scale) for clock in self.flow_times], dim=1)
+            clips["flow"] = trim(flow, self.margin)
+        return clips | {name: torch.from_numpy(drawn[name]).to(rgb.device) for name in self._told}
+
+    @property
+    def _told(self) -> list[str]:
+        """What a clip says of its camera."""
+        return [name for name, varies in (("alpha", self.gains), ("noise", self.noise)) if varies]
+
+    def _camera(self, index: int) -> dict[str, Tensor]:
+        drawn = self._sensor(index) if self._told else {}
+        return {name: torch.tensor(drawn[name]) for name in self._told}
 
     def _cut(self, clip: dict[str, Tensor]) -> dict[str, Tensor]:
         return cut_key_frames(clip, self.key_frames, self.frames, self.every)
 
-    def _camera(self, index: int) -> dict[str, Tensor]:
-        """Gain and level of the noise of a clip, where they are not always the same."""
-        rng = self._rng(index, "spikes")
-        rng.integers(2**63)  # of the charge
-        told = {}
-        if self.noise is not None:
-            told["noise"] = torch.tensor(1 - rng.uniform() if self.augment else 1.0)
-        if self.gains is not None:
-            low, high = np.log(self.gains)
-            told["alpha"] = torch.tensor(np.exp(rng.uniform(low, high)) if self.augment else self.alpha)
-        return {name: value.float() for name, value in told.items()}
-
-    def spikes(self, index: int, scene: Scene) -> Tensor:
-        """Return what the sensor makes of the scene of a clip, uint8 (clocks, H, W)."""
-        camera = self._camera(index)
-        light = scene.light(self.pattern, scale=self.scale, alpha=float(camera.get("alpha", self.alpha)))
-        generator = torch.Generator().manual_seed(int(self._rng(index, "spikes").integers(2**63)))
-        noise = self.noise or SensorNoise(photons=self.photons)
-        if self.noise and self.augment:
-            noise = noise.scaled(float(camera["noise"]))
-        return simulate_spikes(light, noise=noise, generator=generator)
-
     def scene(self, index: int) -> Scene:
         """Return the scene of a clip, to look at other clocks or sizes than the clip has."""
-        rng = self._rng(index, "scene")
-        side, half = self.scale * (self.patch + 2 * self.margin), max(self.frames // 2, 1)
-        brightness = rng.uniform(*self.brightness)
-        middle = (side - 1) / 2
-        velocity = _in_disc(rng) * self.motion * self.scale / half
+        scene = self._scene(*self._alone(index))
+        alone = [
+            replace(layer, picture=layer.picture[0], mask=None if layer.mask is None else layer.mask[0])
+            for layer in scene.layers
+        ]
+        return Scene(alone, scene.height, scene.width, scene.frames)
 
-        # what comes into view: the corners by motion, rotation and zoom
-        longer = (self.clocks // 2) / half if self.key_frames > 1 else 1
-        turns = middle * math.sqrt(2) * (math.radians(self.rotation) + self.zoom)
-        reach = turns * longer + (self.motion * longer + self.bend * longer**2) * self.scale
-        margin = math.ceil(reach) + 2
-        background = self._picture(side + 2 * margin, rng, index) * brightness
-        layers = [Layer(background, self._motion(velocity, (middle, middle), half, rng), (-margin, -margin))]
-        for _ in range(rng.integers(self.objects + 1)):
+    def _scene(self, drawn: dict[str, np.ndarray], gallery: Gallery) -> Scene:
+        return render_scene(drawn, gallery, self.pattern, self._side, self._around, self.clocks)
+
+    @cached_property
+    def _side(self) -> int:
+        """Of the view, in its pixels."""
+        return self.scale * (self.patch + 2 * self.margin)
+
+    @cached_property
+    def _longer(self) -> float:
+        """How many times longer a film is away from its middle than a clip."""
+        return (self.clocks // 2) / max(self.frames // 2, 1) if self.key_frames > 1 else 1
+
+    @cached_property
+    def _around(self) -> int:
+        """What comes into view beside it: the corners by motion, rotation and zoom."""
+        turns = (self._side - 1) / 2 * math.sqrt(2) * (math.radians(self.rotation) + self.zoom)
+        reach = turns * self._longer + (self.motion * self._longer + self.bend * self._longer**2) * self.scale
+        return math.ceil(reach) + 2
+
+    def draw(self, index: int) -> dict[str, np.ndarray]:
+        """Draw the numbers of a scene, of its background and of its objects, which :meth:`render` makes a clip of."""
+        rng, side, half = self._rng(index, "scene"), self._side, max(self.frames // 2, 1)
+        middle = (side - 1) / 2
+        brightness = rng.uniform(*self.brightness)
+        velocity = _in_disc(rng) * self.motion * self.scale / half
+        around = side + 2 * self._around
+        layers = [self._layer(around, (-self._around, -self._around), velocity, (middle, middle), rng, index)]
+        for n in range(rng.integers(self.objects + 1)):
             size = max(4, round(side * rng.uniform(0.15, 0.5)))
-            picture = self._picture(size, rng) * brightness
-            x, y = (int(corner) for corner in rng.integers(-size // 2, side - size // 2, 2))
+            corner = rng.integers(-size // 2, side - size // 2, 2)
             moves = velocity + _in_disc(rng) * self.motion * self.scale / half
-            centre = (x + (size - 1) / 2, y + (size - 1) / 2)
-            layers.append(Layer(picture, self._motion(moves, centre, half, rng), (x, y), outline_mask(size, rng)))
-        return Scene(layers, side, side, self.clocks)
+            layers.append(self._layer(size, corner, moves, corner + (size - 1) / 2, rng))
+            radius = outline(np.linspace(-np.pi, np.pi, _ANGLES, endpoint=False), rng)
+            layers[n + 1]["outline"] = (radius / radius.max()).astype("float32")
+        # there are always as many, so that scenes fit into a batch; those of no size are none
+        layers += [_NONE] * (1 + self.objects - len(layers))
+        drawn = {name: np.stack([layer[name] for layer in layers]) for name in layers[0]}
+        drawn["outline"] = np.stack([layer["outline"] for layer in layers[1:]]) if self.objects else np.zeros((0, 0))
+        return drawn | {"brightness": np.float32(brightness)} | self._sensor(index)
+
+    def _layer(
+        self, side: int, corner: Any, velocity: Any, center: Any, rng: np.random.Generator, turn: int | None = None
+    ) -> dict[str, Any]:
+        """A random square out of a picture in motion: ``turn`` says whose turn it is, where pictures take turns."""
+        half, count = max(self.frames // 2, 1), len(self.pictures)
+        if self.textures and rng.uniform() < _TEXTURES:
+            which = count + int(rng.integers(self.sources.textures))
+        else:
+            which = int(rng.integers(count)) if self.augment or turn is None else turn % count
+        push = _in_disc(rng) * 2 * self.bend * self.scale / half**2
+        return {
+            "picture": which,
+            "side": side,
+            "cut": draw_cut(side, self.sources.size(which), rng, mirror=1.25 if self.augment else 1.0),
+            **(_recolour(rng) if self.augment else _AS_IT_IS),
+            "position": np.array(corner, "float64"),
+            "velocity": velocity,
+            "center": np.array(center, "float64"),
+            "rotation": math.radians(self.rotation * rng.uniform(-1, 1)) / half,
+            "zoom": (1 + self.zoom) ** (rng.uniform(-1, 1) / half),
+            "acceleration": push,
+        }
+
+    def _sensor(self, index: int) -> dict[str, np.ndarray]:
+        """What is random about the sensor that sees a scene."""
+        rng, side = self._rng(index, "spikes"), self.patch + 2 * self.margin
+        drawn = {"charge": rng.random((side, side), "float32"), "alpha": np.float32(self.alpha)}
+        if self.gains and self.augment:
+            drawn["alpha"] = np.float32(np.exp(rng.uniform(*np.log(self.gains))))
+        if self.photons is None and self.noise is None:
+            return drawn
+        drawn["photons"], drawn["electrons"] = rng.integers(2**62, size=2)
+        noise = self.noise or SensorNoise()
+        drawn["noise"] = np.float32(1 - rng.uniform() if self.noise and self.augment else 1)
+        for name, wanted in (("gain", noise.gain_spread), ("dark", noise.dark_current)):
+            if wanted:
+                drawn[name] = rng.standard_normal((side, side), "float32")
+        if noise.hot or noise.dead:
+            drawn["defects"] = rng.random((side, side), "float32")
+        return drawn
 
     def _rng(self, index: int, purpose: str) -> np.random.Generator:
         return np.random.default_rng([self.seed, self.augment, index, purpose == "spikes"])
 
-    def _motion(self, velocity: np.ndarray, centre: tuple[float, float], half: int, rng: np.random.Generator) -> Motion:
-        rotation = math.radians(self.rotation * rng.uniform(-1, 1)) / half
-        zoom = (1 + self.zoom) ** (rng.uniform(-1, 1) / half)
-        # without a bend nothing is drawn: a seed's clips stay what they were
-        bend = _in_disc(rng) * (2 * self.bend * self.scale / half**2) if self.bend else np.zeros(2)
-        return Motion(_pair(velocity), rotation, zoom, centre, _pair(bend))
 
-    def _picture(self, side: int, rng: np.random.Generator, turn: int | None = None) -> Tensor:
-        """A random square out of a picture: ``turn`` says whose turn it is, where pictures take turns."""
-        picture = self._rgb(side, rng, turn)
-        return bin_to_sensor(picture, GREY, scale=1)[None] if self.pattern == GREY else picture
-
-    def _rgb(self, side: int, rng: np.random.Generator, turn: int | None) -> Tensor:
-        if self.textures and rng.uniform() < _TEXTURES:
-            return texture(side, side, rng)
-        if self.augment or turn is None:
-            turn = int(rng.integers(len(self.pictures)))
-        picture = cached_picture(self.pictures[turn % len(self.pictures)])
-        if self.augment:
-            return _augment(_crop(picture, side, rng, mirror=1.25), rng)
-        return _crop(picture, side, rng, mirror=1.0)
+#: of a picture that is not changed
+_AS_IT_IS = {
+    "turn": np.zeros(3, bool),
+    "colours": np.arange(3),
+    "tint": np.repeat(np.float32([[0], [1]]), 3, axis=1),
+}
+_NONE = {
+    "picture": 0,
+    "side": 0,
+    "cut": np.ones((2, 4), "int32"),
+    **_AS_IT_IS,
+    **dict.fromkeys(("position", "velocity", "center", "acceleration"), np.zeros(2)),
+    "rotation": 0.0,
+    "zoom": 1.0,
+    "outline": np.zeros(_ANGLES, "float32"),
+}
 
 
 def _check(clips: StillClips) -> None:
@@ -244,21 +312,18 @@ def _check(clips: StillClips) -> None:
         ("every", clips.every >= 1, "at least 1 clock"),
         ("flow_times", all(0 <= t < clips.frames for t in clips.flow_times), f"clocks in [0, {clips.frames})"),
         ("photons", clips.photons is None or 1 <= clips.photons < math.inf, "1 or more, or null for no noise"),
+        ("photons", None in (clips.photons, clips.noise), "those of the noise instead"),
         (
             "gains",
             clips.gains is None or (len(clips.gains) == 2 and 0 < clips.gains[0] <= clips.gains[1] < math.inf),
             "two numbers 0 < low <= high, or null",
         ),
-        ("photons", None in (clips.photons, clips.noise), "those of the noise instead"),
+        ("noise", getattr(clips.noise, "calibration", None) is None, "no calibration, which is of one size of sensor"),
         ("seed", clips.seed >= 0, "0 or more"),
         ("length", clips.length >= 1, "at least 1 clip"),
     ):
         if not good:
             raise ValueError(f"{name}: expected {expected}, got {getattr(clips, name)}")
-
-
-def _pair(vector: np.ndarray) -> tuple[float, float]:
-    return float(vector[0]), float(vector[1])
 
 
 def _in_disc(rng: np.random.Generator) -> np.ndarray:
@@ -267,38 +332,13 @@ def _in_disc(rng: np.random.Generator) -> np.ndarray:
     return length * np.array([math.cos(angle), math.sin(angle)])
 
 
-def _crop(picture: Tensor, side: int, rng: np.random.Generator, mirror: float) -> Tensor:
-    """Cut a square at a random place and size; where the picture ends, it is mirrored.
-
-    The square is at most ``mirror`` times as long as the picture, as far as that is to be had without enlarging.
-    """
-    # Shrinking makes grain small and edges sharp. Enlarging blurs: only a picture below half the square's side is.
-    shortest = min(picture.shape[1:])
-    smallest = max(0.5, min(1.0, side / (mirror * shortest)), side / (2 * shortest))
-    factor = math.exp(rng.uniform(math.log(smallest), math.log(max(smallest, 1.0))))
-    for axis in (1, 2):
-        length = min(math.ceil(side / factor), picture.shape[axis])
-        picture = picture.narrow(axis, int(rng.integers(picture.shape[axis] - length + 1)), length)
-    size = [max(1, round(length * factor)) for length in picture.shape[1:]]
-    picture = F.interpolate(picture[None], size, mode="bicubic", antialias=True)[0].clamp(0, 1)
-    for axis in (1, 2):
-        length = picture.shape[axis]
-        index = (torch.arange(side) + int(rng.integers(max(length - side, 0) + 1))) % (2 * length)
-        picture = picture.index_select(axis, torch.minimum(index, 2 * length - 1 - index))
-    return picture
-
-
-def _augment(picture: Tensor, rng: np.random.Generator) -> Tensor:
-    """Mirror and turn at random; rarely, swap colours, or tint what is grey."""
-    flips = [axis for axis in (1, 2) if rng.uniform() < 0.5]
-    picture = picture.flip(flips).rot90(int(rng.integers(4)), (1, 2))
-    if rng.uniform() < 0.1:
-        picture = picture[torch.from_numpy(rng.permutation(3))]
+def _recolour(rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Mirror and turn at random; rarely, swap colours; how to tint what is grey."""
     dark, bright = np.sort(rng.uniform(0, 1, (2, 3)) ** [[2.0], [0.5]], axis=0)
-    if rng.uniform() < 0.5 and torch.equal(picture[0], picture[1]) and torch.equal(picture[0], picture[2]):
-        dark, bright = (torch.from_numpy(ends).float()[:, None, None] for ends in (dark, bright))
-        picture = dark + (bright - dark) * picture
-    return picture.contiguous()
+    changed = {"turn": rng.uniform(size=3) < 0.5}
+    changed["colours"] = rng.permutation(3) if rng.uniform() < 0.1 else _AS_IT_IS["colours"]
+    tint = rng.uniform() < 0.5
+    return changed | {"tint": np.stack([dark, bright]).astype("float32") if tint else _AS_IT_IS["tint"]}
 
 
 class StillScenes(ClipScenes):

@@ -20,9 +20,14 @@ def outline_mask(size: int, rng: np.random.Generator) -> Tensor:
     middle = (size - 1) / 2
     y, x = np.mgrid[:size, :size] - middle
     angle, distance = np.arctan2(y, x), np.hypot(y, x)
-    radius = [_ellipse, _polygon, _blob][rng.integers(3)](angle, rng)
+    radius = outline(angle, rng)
     edge = max(middle - 0.5, 0.5)
     return torch.from_numpy((0.5 + radius / radius.max() * edge - distance).clip(0, 1).astype("float32"))
+
+
+def outline(angle: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Draw an ellipse, a polygon or a blob: its radius at angles in [-pi, pi]."""
+    return [_ellipse, _polygon, _blob][rng.integers(3)](angle, rng)
 
 
 def _ellipse(angle: np.ndarray, rng: np.random.Generator) -> np.ndarray:

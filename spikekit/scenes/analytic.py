@@ -138,7 +138,8 @@ def _sample(
     """
     scenes, _, height, width = planes.shape
     frames, device = turn.shape[1], planes.device
-    if (turn == 1).all() and (shift == 0).all() and all((axis == axis.round()).all() for axis in (rows, columns)):
+    whole = turn[0, 0] == 1 and all((axis == axis.round()).all() for axis in (rows, columns))
+    if whole and (turn == 1).all() and (shift == 0).all():
         # at rest, pixels are copied, so that the ground truth has the picture's own values to the last bit
         i = _inside(rows - corner.imag, height, padding).to(device).expand(scenes, -1)
         j = _inside(columns - corner.real, width, padding).to(device).expand(scenes, -1)

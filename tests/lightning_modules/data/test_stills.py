@@ -11,9 +11,9 @@ import torch
 from skimage import io
 
 from lightning_modules.data.pictures import (
-    cached_picture,
     embedded_pictures,
     folder_pictures,
+    read_shades,
     split_pictures,
 )
 from lightning_modules.data.stills import StillClips, StillScenes
@@ -272,7 +272,7 @@ def test_key_frames_are_one_scene_that_moves_on():
     for n, rgb in enumerate(clip["rgb"]):
         assert rgb.equal(scene.rgb(20 + 10 * n))
     single = StillClips(embedded_pictures(), scale=2, patch=16, motion=2.0, bend=0.5, objects=1).scene(3)
-    assert single.layers[0].motion.velocity == scene.layers[0].motion.velocity  # as fast as in a single clip
+    assert (single.layers[0].motion.velocity == scene.layers[0].motion.velocity).all()  # as fast as in a single clip
 
 
 def test_margins_are_wide_enough():
@@ -284,10 +284,42 @@ def test_margins_are_wide_enough():
         corners = torch.tensor([[0.0, 0.0], [63.0, 0.0], [0.0, 63.0], [63.0, 63.0]], dtype=torch.float64)
         for clock in (0, 40):
             turn, shift = layer.motion._turn_and_shift(torch.tensor([clock - 20.0], dtype=torch.float64))
-            source = (torch.complex(corners[:, 0], corners[:, 1]) - shift) / turn - complex(*layer.position)
+            source = (torch.complex(corners[:, 0], corners[:, 1]) - shift) / turn - complex(*layer.position[0])
             places = torch.stack([source.real, source.imag])
             assert places.min() >= 0
             assert places.max() <= layer.picture.shape[1] - 1
+
+
+@pytest.mark.parametrize("options", [{}, {"pattern": "grey", "key_frames": 2}, {"alphas": (0.05, 1.0), "scale": 3}])
+def test_a_batch_has_the_clips_that_are_made_one_by_one(options):
+    noise = SensorNoise(gain_spread=0.05, dark_current=0.002, dark_spread=0.3, hot=0.001, dead=0.01)
+    clips = StillClips(embedded_pictures(), **{"scale": 2, "patch": 16, "noise": noise, "textures": True} | options)
+    drawn = [clips.draw(index) for index in range(12)]
+    drawn = {name: np.stack([one[name] for one in drawn]) for name in drawn[0]}
+    batch = clips.render(drawn, clips.sources.gallery("cpu"))
+    for index in range(12):
+        alone = clips[index]
+        spikes = clips._cut({"spikes": batch["spikes"][index]})["spikes"]
+        assert (alone["spikes"] != spikes).double().mean() < 1e-3
+        for name in batch.keys() - {"spikes"}:
+            torch.testing.assert_close(batch[name][index], alone[name], atol=1e-4, rtol=0)
+    assert 0.05 < batch["spikes"].float().mean() < 0.5
+
+
+def test_light_of_every_clip_is_between_the_bounds_and_truth_does_not_follow_it():
+    options = {"scale": 2, "patch": 16, "motion": 0.0, "objects": 0}
+    dim, plain = (
+        StillClips(embedded_pictures(), alphas=(0.05, 1), **options),
+        StillClips(embedded_pictures(), **options),
+    )
+    alphas = []
+    for index in range(20):
+        clip = dim[index]
+        assert torch.equal(clip["rgb"], plain[index]["rgb"])
+        ratio = clip["spikes"].float().mean() / plain[index]["spikes"].float().mean() * 0.4
+        alphas.append(float(clip["alpha"]))
+        assert abs(ratio - alphas[-1]) < 0.05
+    assert 0.05 <= min(alphas) < 0.15 < 0.5 < max(alphas) <= 1
 
 
 def test_embedded_pictures_are_disjoint():
@@ -325,15 +357,10 @@ def test_folder_without_validation_is_split(folder):
     assert split_pictures(many[:1], 0) == (many[:1], many[:1])
 
 
-def test_validation_takes_every_picture_in_turn(folder, monkeypatch):
+def test_validation_takes_every_picture_in_turn(folder):
     data = scenes(root=str(folder), val_root=str(folder), objects=0)
-    seen = []
-    monkeypatch.setattr(
-        "lightning_modules.data.stills.cached_picture", lambda path: seen.append(path) or torch.ones(3, 9, 9)
-    )
-    for i in range(5):
-        data.val_set[i]
-    assert seen == folder_pictures(folder)
+    seen = [int(data.val_set.draw(i)["picture"][0]) for i in range(7)]
+    assert seen == [0, 1, 2, 3, 4, 0, 1]
 
 
 def test_errors_say_what_is_wrong(folder, tmp_path):
@@ -401,7 +428,7 @@ def test_shared_pictures(where):
     data = scenes(root=str(root), patch=48)
     clip = data.train_set[0]
     assert clip["rgb"].shape == (3, 192, 192)
-    assert cached_picture(data.train_set.pictures[0]).std() > 0.01
+    assert read_shades(data.train_set.pictures[0]).float().std() > 2
 
 
 def test_grey_clips_are_the_luminance_of_the_same_scenes():
