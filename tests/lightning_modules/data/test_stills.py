@@ -290,7 +290,7 @@ def test_margins_are_wide_enough():
             assert places.max() <= layer.picture.shape[1] - 1
 
 
-@pytest.mark.parametrize("options", [{}, {"pattern": "grey", "key_frames": 2}, {"alphas": (0.05, 1.0), "scale": 3}])
+@pytest.mark.parametrize("options", [{}, {"pattern": "grey", "key_frames": 2}, {"gains": (0.05, 1.0), "scale": 3}])
 def test_a_batch_has_the_clips_that_are_made_one_by_one(options):
     noise = SensorNoise(gain_spread=0.05, dark_current=0.002, dark_spread=0.3, hot=0.001, dead=0.01)
     clips = StillClips(embedded_pictures(), **{"scale": 2, "patch": 16, "noise": noise, "textures": True} | options)
