@@ -308,10 +308,7 @@ def test_a_batch_has_the_clips_that_are_made_one_by_one(options):
 
 def test_light_of_every_clip_is_between_the_bounds_and_truth_does_not_follow_it():
     options = {"scale": 2, "patch": 16, "motion": 0.0, "objects": 0}
-    dim, plain = (
-        StillClips(embedded_pictures(), alphas=(0.05, 1), **options),
-        StillClips(embedded_pictures(), **options),
-    )
+    dim, plain = (StillClips(embedded_pictures(), gains=gains, **options) for gains in ((0.05, 1), None))
     alphas = []
     for index in range(20):
         clip = dim[index]
