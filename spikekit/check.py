@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,7 +24,8 @@ def check_planes(name: str, value: Tensor, ndim: int, shape: str, *, floating: b
         ValueError: too few dimensions, or one of the last ``ndim`` is empty.
     """
     if not isinstance(value, Tensor):
-        raise TypeError(f"{name}: expected a tensor of shape {shape}, got {type(value).__name__}")
+        remedy = "; torch.from_numpy makes a tensor of it" if isinstance(value, np.ndarray) else ""
+        raise TypeError(f"{name}: expected a tensor of shape {shape}, got {type(value).__name__}{remedy}")
     if value.ndim < ndim or 0 in value.shape[value.ndim - ndim :]:
         raise ValueError(f"{name}: expected a non-empty tensor of shape {shape}, got {tuple(value.shape)}")
     if value.is_complex() or (floating and not value.is_floating_point()):

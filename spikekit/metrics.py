@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from spikekit.check import check_planes
@@ -82,12 +81,29 @@ def ssim(rgb: Tensor, target: Tensor) -> Tensor:
     rgb, target = _pair(rgb, target)
     if rgb.shape[-2] < 7 or rgb.shape[-1] < 7:
         raise ValueError(f"rgb: expected at least 7 x 7 pixels, got {tuple(rgb.shape)}")
-    a, b = (picture.reshape(-1, *picture.shape[-3:]).double() for picture in (rgb, target))
-    mean_a, mean_b, mean_aa, mean_bb, mean_ab = (F.avg_pool2d(x, 7, stride=1) for x in (a, b, a * a, b * b, a * b))
-    sample = 49 / 48
-    var_a, var_b = sample * (mean_aa - mean_a * mean_a), sample * (mean_bb - mean_b * mean_b)
-    cov = sample * (mean_ab - mean_a * mean_b)
-    c1, c2 = 0.01**2, 0.03**2
-    similarity = (2 * mean_a * mean_b + c1) * (2 * cov + c2)
-    similarity = similarity / ((mean_a * mean_a + mean_b * mean_b + c1) * (var_a + var_b + c2))
-    return similarity.mean(dim=(-3, -2, -1)).to(rgb.dtype).reshape(rgb.shape[:-3])
+    height, width = rgb.shape[-2:]
+    planes = (picture.reshape(-1, height, width).unbind() for picture in (rgb, target))
+    # plane by plane, which stay in the cache
+    similar = torch.stack([_similarity(a.double(), b.double()) for a, b in zip(*planes, strict=True)])
+    return similar.reshape(rgb.shape[:-2]).mean(dim=-1).to(rgb.dtype)
+
+
+def _similarity(a: Tensor, b: Tensor) -> Tensor:
+    """Mean over the windows of two planes; numerator and denominator are multiples of those of the formula."""
+    sum_a, sum_b, both = _windows(a), _windows(b), _windows(a * b)
+    squares = _windows(torch.addcmul(a * a, b, b))
+    c1, c2 = 49**2 * 0.01**2, 49 * 48 * 0.03**2  # sample covariance: 48 in place of 49
+    product, norm = sum_a * sum_b + c1 / 2, torch.addcmul(c1 + sum_a * sum_a, sum_b, sum_b)
+    numerator = product * (49 * both + (c1 / 2 + c2 / 2) - product)
+    return 4 * (numerator / (norm * (49 * squares + (c1 + c2) - norm))).mean()
+
+
+def _windows(plane: Tensor) -> Tensor:
+    """Sums of all windows of 7 x 7 that lie inside, from sums of 2 and of 4 along either axis."""
+    for dim in (-2, -1):
+        length = plane.shape[dim]
+        two = plane.narrow(dim, 0, length - 1) + plane.narrow(dim, 1, length - 1)
+        four = two.narrow(dim, 0, length - 3) + two.narrow(dim, 2, length - 3)
+        windows = length - 6
+        plane = four.narrow(dim, 0, windows) + two.narrow(dim, 4, windows) + plane.narrow(dim, 6, windows)
+    return plane

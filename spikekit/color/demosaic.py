@@ -8,13 +8,7 @@ from kornia.color import CFA
 from torch import Tensor
 
 from spikekit.check import check_planes
-from spikekit.color.cfa import PatternModule, bayer_mask, bayer_sites, count_colors
-
-# Malvar, He and Cutler (2004), Fig. 2, in eighths: the estimate at the centre.
-_GREEN = [[0, 0, -1, 0, 0], [0, 0, 2, 0, 0], [-1, 2, 4, 2, -1], [0, 0, 2, 0, 0], [0, 0, -1, 0, 0]]
-_SAME_ROW = [[0, 0, 0.5, 0, 0], [0, -1, 0, -1, 0], [-1, 4, 5, 4, -1], [0, -1, 0, -1, 0], [0, 0, 0.5, 0, 0]]
-_SAME_COLUMN = [list(row) for row in zip(*_SAME_ROW, strict=True)]
-_DIAGONAL = [[0, 0, -1.5, 0, 0], [0, 2, 0, 2, 0], [-1.5, 0, 6, 0, -1.5], [0, 2, 0, 2, 0], [0, 0, -1.5, 0, 0]]
+from spikekit.color.cfa import PatternModule, bayer_sites, count_colors
 
 
 def demosaic(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
@@ -53,24 +47,54 @@ def demosaic(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
         Malvar, He and Cutler, High-quality linear interpolation for demosaicing of Bayer-patterned color images,
         ICASSP 2004. kornia's ``raw_to_rgb`` interpolates bilinearly.
     """
-    known = wide_mosaics(raw)[:, None]
+    known = wide_mosaics(raw)
     if count_colors(pattern) == 1:
         return raw.unsqueeze(-3).clone()
     height, width = raw.shape[-2:]
-    filters = known.new_tensor([_GREEN, _SAME_ROW, _SAME_COLUMN, _DIAGONAL])[:, None] / 8
-    with torch.autocast(raw.device.type, enabled=False):
-        filtered = F.conv2d(F.pad(known, (2, 2, 2, 2), "reflect"), filters)
-    green, same_row, same_column, diagonal = filtered.unbind(1)
-    known = known[:, 0]
-
-    red, _, blue = bayer_mask(height, width, pattern, device=raw.device, dtype=torch.bool)
+    padded = F.pad(F.pad(known[:, None], (2, 2, 2, 2), "reflect"), (0, width % 2, 0, height % 2))
+    phases = F.pixel_unshuffle(padded, 2)
+    cells = [[phases] * 4 for _ in range(3)]
     (_, red_row, _), *_ = bayer_sites(pattern)
-    in_red_row = (torch.arange(height, device=raw.device) % 2 == red_row)[:, None]
-    reds = torch.where(red, known, torch.where(blue, diagonal, torch.where(in_red_row, same_row, same_column)))
-    blues = torch.where(blue, known, torch.where(red, diagonal, torch.where(in_red_row, same_column, same_row)))
-    greens = torch.where(red | blue, green, known)
-    rgb = torch.stack([reds, greens, blues], dim=1)
-    return rgb.to(raw.dtype).reshape(*raw.shape[:-2], 3, height, width)
+    for colour, row, column in bayer_sites(pattern):
+        own, row_colour, column_colour, opposite = _fill_in(phases, row, column, green=colour == 1)
+        red, blue = (row_colour, column_colour) if row == red_row else (column_colour, row_colour)
+        found = (red, own, blue) if colour == 1 else (own, row_colour, opposite)[:: 1 - colour]
+        for cell, value in zip(cells, found, strict=True):
+            cell[2 * row + column] = value
+    rgb = F.pixel_shuffle(torch.stack([torch.stack(cell, dim=1) for cell in cells], dim=1).flatten(1, 2), 2)
+    return rgb[..., :height, :width].to(raw.dtype).reshape(*raw.shape[:-2], 3, height, width)
+
+
+def _fill_in(phases: Tensor, row: int, column: int, *, green: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Estimate what is missing at one site of all cells, by the filters of Malvar, He and Cutler (2004), Fig. 2.
+
+    Args:
+        phases: the four phases of mosaics that have two more pixels at each border, (B, 4, h + 2, w + 2).
+        row: of the site in its cell.
+        column: likewise.
+        green: whether the site is green.
+
+    Returns:
+        The site's own colour; at a green one, the colours of its row and of its column, else green twice; and the
+        colour of the diagonals, each (B, h, w).
+    """
+    height, width = phases.shape[-2] - 2, phases.shape[-1] - 2
+
+    def at(down: int, right: int) -> Tensor:
+        y, x = row + 2 + down, column + 2 + right
+        return phases[:, 2 * (y % 2) + x % 2, y // 2 : y // 2 + height, x // 2 : x // 2 + width]
+
+    own, sides, ends = at(0, 0), at(0, -1) + at(0, 1), at(-1, 0) + at(1, 0)
+    far_sides, far_ends = at(0, -2) + at(0, 2), at(-2, 0) + at(2, 0)
+    corners = at(-1, -1) + at(-1, 1) + at(1, -1) + at(1, 1)
+    if green:
+        same = torch.sub(own * 0.625, corners, alpha=0.125)
+        of_row = same.add(sides, alpha=0.5).sub(far_sides, alpha=0.125).add(far_ends, alpha=0.0625)
+        of_column = same.add(ends, alpha=0.5).sub(far_ends, alpha=0.125).add(far_sides, alpha=0.0625)
+        return own, of_row, of_column, own
+    far = far_sides + far_ends
+    near = (own * 0.5).add(sides + ends, alpha=0.25).sub(far, alpha=0.125)
+    return own, near, near, (own * 0.75).add(corners, alpha=0.25).sub(far, alpha=0.1875)
 
 
 def wide_mosaics(raw: Tensor) -> Tensor:

@@ -113,7 +113,9 @@ def _upsample(flow: Tensor, scale: int) -> Tensor:
     """In float32 or wider, so that halves are rounded once, at the end of everything."""
     planes = flow.reshape(-1, *flow.shape[-3:]).to(torch.promote_types(flow.dtype, torch.float32))
     if scale > 1:
-        planes = scale * F.interpolate(planes, scale_factor=scale, mode="bilinear", align_corners=False)
+        height, width = planes.shape[-2:]
+        size = scale * height, scale * width  # torch.compile takes no factor that is open
+        planes = F.interpolate(scale * planes, size=size, mode="bilinear", align_corners=False)
     return planes.reshape(*flow.shape[:-2], *planes.shape[-2:])
 
 

@@ -228,7 +228,7 @@ class Scene:
         view = self._render(self._picked([*range(self.channels)]), self._moves([clock]), rows, columns).squeeze(2)
         return view if self._batch else view[0]
 
-    def light(self, pattern: str | CFA = "RGGB", *, scale: int, alpha: float = 1.0) -> Tensor:
+    def light(self, pattern: str | CFA = "RGGB", *, scale: int, alpha: float = 0.4) -> Tensor:
         """Return the light that arrives at the sensor at every clock.
 
         Equals ``alpha * bin_to_sensor(scene.rgb(clock), pattern, scale=scale)``, but evaluates, of every view pixel,

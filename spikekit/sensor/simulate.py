@@ -32,9 +32,9 @@ class SpikeSensor:
         noise: what the sensor adds to the light; nothing when not given.
         threshold: charge of one spike.
         readout: frames of light for every frame of spikes.
-        seed: where chance begins, 0 or more.
+        seed: random seed, 0 or more.
         charge: charge at the start, broadcastable to :math:`(*, H, W)`, below the threshold.
-        clock: read-outs before the first, for what goes on where another sensor of the same seed stopped.
+        clock: read-outs before the first, to continue where another sensor of the same seed stopped.
 
     Raises:
         ValueError: a threshold that is not above 0, a read-out period below 1, a negative seed or clock.
@@ -88,6 +88,9 @@ class SpikeSensor:
                 differs from that of the light before or does not fit the charge.
         """
         check_planes("light", light, 3, "(*, T, H, W)", floating=True)
+        return self._expose(light)
+
+    def _expose(self, light: Tensor) -> Tensor:
         size, frames = light.shape[:-3] + light.shape[-2:], light.shape[-3]
         if self._pixels is None:
             self._pixels = NoisyPixels(self.noise, tuple(size), self.seed)
@@ -130,7 +133,7 @@ def simulate_spikes(
         noise: what the sensor adds to the light; nothing when not given.
         readout: frames of light for every frame of spikes; it divides T.
         charge: charge at the start, broadcastable to :math:`(*, H, W)`, below the threshold; random when not given.
-        generator: where chance comes from; torch's default one when not given.
+        generator: of random numbers; torch's default one when not given.
 
     Returns:
         ``spikes``, uint8, :math:`(*, T / \text{readout}, H, W)`.
@@ -156,4 +159,4 @@ def simulate_spikes(
     seed = 0
     if noise is not None:
         seed = int(torch.randint(2**63 - 1, (), generator=generator, device=light.device))
-    return SpikeSensor(noise, threshold=threshold, readout=readout, seed=seed, charge=charge).expose(light)
+    return SpikeSensor(noise, threshold=threshold, readout=readout, seed=seed, charge=charge)._expose(light)

@@ -112,7 +112,7 @@ def test_light_float32_whatever_the_chunks(monkeypatch):
     expected = torch.stack([bin_to_sensor(scene.rgb(t), scale=4) for t in range(9)])
     for chunk in (1, 500, 10**9):
         monkeypatch.setattr("spikekit.scenes.analytic._CHUNK", chunk)
-        torch.testing.assert_close(scene.light(scale=4), expected, atol=2e-5, rtol=0)
+        torch.testing.assert_close(scene.light(scale=4, alpha=1.0), expected, atol=2e-5, rtol=0)
 
 
 @pytest.mark.parametrize("frames", [1, 4, 41])
