@@ -6,6 +6,7 @@ import argparse
 import logging
 import os
 import sys
+import threading
 import warnings
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -383,9 +384,16 @@ def without_chatter() -> None:
         warnings.filterwarnings("ignore", nothing_to_do)
 
 
+def _quiet_about_disks(failed: threading.ExceptHookArgs) -> None:
+    """Say nothing of a thread that finds no room on a disk: TensorBoard's raises the same where it is written to."""
+    if not isinstance(failed.exc_value, OSError):
+        threading.__excepthook__(failed)
+
+
 def run(args: Sequence[str] | None, command: type[Command]) -> Command:
     """Run what was typed after ``lightning``, with one of Lightning's verbs; errors are raised."""
     without_chatter()
+    threading.excepthook = _quiet_about_disks
     if not rank_zero_only.rank:
         os.environ[_FIRST] = str(os.getpid())
     elif os.environ.get(_FIRST) == str(os.getppid()):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from functools import lru_cache
 from pathlib import Path
 
@@ -45,7 +46,7 @@ def existing_folder(root: str | Path, what: str) -> Path:
 
 
 def folder_pictures(root: str | Path) -> list[Path]:
-    """List the pictures of a folder and of all folders in it, sorted; hidden ones are left out.
+    """List the pictures of a folder and of all folders in it, linked ones too, sorted; hidden ones are left out.
 
     Args:
         root: the folder.
@@ -58,9 +59,15 @@ def folder_pictures(root: str | Path) -> list[Path]:
         NotADirectoryError: it is a file.
     """
     root = existing_folder(root, "pictures")
-    inside = sorted(root.rglob("*"))
-    found = [path for path in inside if path.suffix.lower() in _ENDINGS and path.is_file()]
-    found = [path for path in found if not any(part.startswith(".") for part in path.relative_to(root).parts)]
+    found, seen = [], set()
+    for folder, folders, names in os.walk(root, followlinks=True):
+        real = os.path.realpath(folder)
+        folders[:] = [] if real in seen else [name for name in folders if not name.startswith(".")]
+        if real not in seen:  # a link may lead back
+            paths = [Path(folder, name) for name in names if not name.startswith(".")]
+            found += [path for path in paths if path.suffix.lower() in _ENDINGS and path.is_file()]
+        seen.add(real)
+    found.sort()
     if not found:
         raise FileNotFoundError(f"{root}: no picture in this folder (looked for {' '.join(sorted(_ENDINGS))})")
     return found

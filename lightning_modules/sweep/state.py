@@ -46,7 +46,7 @@ def read_json(path: Path) -> dict[str, Any] | None:
     Raises:
         InputError: the file cannot be read, or is damaged; the message is one line and names it.
     """
-    return _read(path, _parse_json) if path.is_file() else None
+    return _read(path, json.loads) if path.is_file() else None
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -58,19 +58,25 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return _read(path, yaml.safe_load)
 
 
-def _parse_json(text: str) -> Any:
-    value = json.loads(text)
-    json.dumps(value, ensure_ascii=False).encode()  # half of a pair of surrogates could not be printed
-    return value
-
-
 def _read(path: Path, parse: Any) -> dict[str, Any]:
     try:
         value = parse(no_pipe(path).read_text(encoding="utf-8"))
+        _check_text(value)
         _check(value, _KINDS.get(path.name, dict), "")
     except Exception as error:  # what the parser of YAML raises depends on the text
         raise InputError(f"{path}: damaged ({one_line(error)[:300]}); delete it, or the folder") from error
     return value
+
+
+def _check_text(value: Any) -> None:
+    """Refuse text that a terminal would obey or could not show, such as an escape sequence."""
+    if isinstance(value, dict):
+        _check_text([*value, *value.values()])
+    elif isinstance(value, list):
+        for inner in value:
+            _check_text(inner)
+    elif isinstance(value, str) and not value.replace("\n", "").replace("\t", "").isprintable():
+        raise ValueError("expected text that can be printed, got control characters")
 
 
 def _check(value: Any, kind: Any, name: str) -> None:

@@ -63,6 +63,17 @@ def test_results_of_trials(fuzz, tmp_path):
     assert fuzz(read, lambda rng: fuzz.damage(_json(FINISHED), rng), RESULT, InputError, 250) > 100
 
 
+@pytest.mark.parametrize("where", ["method", "key", "trial.yaml"])
+def test_escape_sequences_do_not_reach_the_terminal(tmp_path, where):
+    odd = "a\x1b[2J"
+    value = {**FINISHED, "method": odd} if where == "method" else {**FINISHED, "metrics": {odd: {"psnr": 1.0}}}
+    path = tmp_path / ("trial.yaml" if where == "trial.yaml" else RESULT)
+    path.write_text(json.dumps(value))
+    with pytest.raises(InputError, match=f"^{path}: damaged .*control characters") as said:
+        (read_yaml if where == "trial.yaml" else read_json)(path)
+    assert "\x1b" not in str(said.value)
+
+
 def test_progress_of_trials(fuzz):
     def read(path):
         _standing(read_json(path))

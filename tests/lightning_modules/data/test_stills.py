@@ -457,3 +457,12 @@ def test_training_clips_say_the_gain_and_the_noise_of_their_camera():
     assert fixed[0]["alpha"] == torch.tensor(fixed.alpha)
     assert fixed[0]["noise"] == 1
     assert StillClips(embedded_pictures()[:2], patch=12)[0].keys() == {"spikes", "rgb", "flow"}
+
+
+def test_linked_folders_of_pictures_are_seen_and_links_that_lead_back_are_not_followed_for_ever(tmp_path):
+    for name in ("in/a.png", "out/b.png", "in/.hidden/c.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        io.imsave(tmp_path / name, np.zeros((4, 4, 3), "uint8"), check_contrast=False)
+    (tmp_path / "in" / "there").symlink_to(tmp_path / "out")
+    (tmp_path / "out" / "back").symlink_to(tmp_path / "in")
+    assert [path.name for path in folder_pictures(tmp_path / "in")] == ["a.png", "b.png"]

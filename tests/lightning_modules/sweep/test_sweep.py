@@ -278,8 +278,8 @@ def test_a_trial_that_fails_is_reported_and_the_others_go_on(typed, overlays, tm
     command = [*typed, "--over", *over, "--steps", "4", "-o", str(tmp_path)]
     with pytest.raises(SystemExit, match="lightning: sweep: 1 of 2 trials failed"):
         main(command)
-    # the last step's loss, or the weights after it: which of them is the first NaN depends on the processor
-    why = r"the loss is nan at step 4|.*best.ckpt: not written, as the training has diverged"
+    # a loss, or the weights after it: which is seen first depends on the processor and on its load
+    why = r"the loss is nan at step [1-4]|.*best.ckpt: not written, as the training has diverged"
     assert re.search(rf"diverges  FAILED: ({why})", capsys.readouterr().out)
     first, *_, last = table(tmp_path)
     assert re.match(why, first["failed"])
