@@ -19,44 +19,22 @@ from spikekit.sensor.quantization_noise import flicker
 #: sensor pixels along the side of a cell, the smallest part that is looked at by itself
 CELL = 16
 
-_GRAIN = 1e-4  # grain that a network leaves as well, in units of a white pixel
 _REMOVED = 0.4  # share of a pixel's own noise that smoothing removes
 _LEVELS = 1024  # how finely the noise of the sensor is tabulated
 
 
 class Activity(NamedTuple):
-    """Statistics of clips, cell by cell, summed over sensor pixels, in units of a squared white pixel.
+    """Statistics of clips, cell by cell, (B, h, w) each, summed over sensor pixels; a white pixel is 1.
 
     Args:
-        smooth: ``rgb`` :math:`(B, 3, H, W)`, the smoothed mean of all frames.
-        texture: what smoothing takes away from the mean, :math:`(B, h, w)`.
-        grain: noise of the mean, as far as a network would average it away, likewise.
-        change: from the beginning of the clip to its end, likewise.
-        area: sensor pixels of the cells, likewise.
+        texture: what smoothing takes away from the mean over time, squared.
+        change: from the beginning of the clip to its end, squared.
+        area: sensor pixels of the cells.
     """
 
-    smooth: Tensor
     texture: Tensor
-    grain: Tensor
     change: Tensor
     area: Tensor
-
-
-class Look(NamedTuple):
-    """Statistics of clips, cell by cell.
-
-    Args:
-        picture: smooth ``rgb`` :math:`(B, 3, s H, s W)`, all that flat parts need.
-        flat: squared error that a cell gets where ``picture`` stands for the network's, :math:`(B, h, w)`, summed over
-            its sensor pixels; a white pixel is 1.
-        still: likewise, where the network is told that nothing moves; at most ``flat``.
-        error: squared error of the network itself, :math:`(B)`, summed over the clip.
-    """
-
-    picture: Tensor
-    flat: Tensor
-    still: Tensor
-    error: Tensor
 
 
 @lru_cache(maxsize=4)
@@ -77,12 +55,11 @@ def _noise(frames: int) -> Tensor:
 
 
 def scene_activity(spikes: Tensor, pattern: str, alpha: float) -> Activity:
-    r"""Measure texture, grain and motion of clips.
+    r"""Measure texture and motion of clips.
 
     Two weighted sums over the frames contain nearly all of it: the mean light of every pixel, and its change from
-    beginning to end. Texture is what smoothing removes from the mean; grain, the noise of the mean, is large where it
-    is dark. Both and the change count only as far as they exceed what an ideal sensor shows of constant light. More
-    noise, as from a real sensor, looks like texture and motion, and goes through the network.
+    beginning to end. Texture is what smoothing removes from the mean. Both count only as far as they exceed what an
+    ideal sensor shows of constant light. More noise, as from a real sensor, looks like texture and motion.
 
     Args:
         spikes: :math:`(B, N, H, W)`, zeros and ones, any real dtype.
@@ -115,88 +92,52 @@ def _scene_activity(spikes: Tensor, pattern: str, alpha: float) -> Activity:
     trust = 1 / (around[_level(light)] + 1e-3 * alpha**2)
 
     area = _sum(torch.ones_like(light))
-    texture, grain = (_sum(part).clamp(min=0) / alpha**2 for part in (texture, grain))
-    grain = (grain - _GRAIN * area).clamp(min=0)
-    motion = (_sum((change.square() - jitter) * trust) / _sum(trust)).clamp(min=0) * area / alpha**2
-    return Activity(rgb / alpha, *(part[:, 0] for part in (texture, grain, motion, area)))
+    texture = _sum(texture).clamp(min=0) / alpha**2
+    change = (_sum((change.square() - jitter) * trust) / _sum(trust)).clamp(min=0) * area / alpha**2
+    return Activity(*(part[:, 0] for part in (texture, change, area)))
 
 
-def look(spikes: Tensor, scale: int, pattern: str, alpha: float, model: ErrorModel | None = None) -> Look:
-    """Analyse clips: what every part of the picture would lose by less work.
-
-    Args:
-        spikes: :math:`(B, N, H, W)`, zeros and ones, any real dtype.
-        scale: super-resolution factor s.
-        pattern: Bayer phase.
-        alpha: light of a white pixel per clock, in thresholds.
-        model: constants of the network that the work is spared, ``network.error_model``; careful ones when not given.
-
-    Returns:
-        What was seen, in cells of ``CELL`` sensor pixels, those at the right and at the bottom cut off.
-
-    Raises:
-        ValueError: not (B, N, H, W).
-
-    Example:
-        >>> seen = look(torch.ones(1, 41, 20, 40), scale=2, pattern="RGGB", alpha=1.0)
-        >>> seen.picture.shape, seen.flat.shape, bool(seen.picture.sub(1).abs().max() < 1e-5)
-        (torch.Size([1, 3, 40, 80]), torch.Size([1, 2, 3]), True)
-    """
-    seen = scene_activity(spikes, pattern, alpha)
-    flat, still, error = expected_errors(seen, ErrorModel() if model is None else model)
-    rgb = seen.smooth
-    if scale > 1:
-        with torch.autocast(spikes.device.type, enabled=False):
-            rgb = F.interpolate(rgb, scale_factor=scale, mode="bicubic", align_corners=False)
-    return Look(rgb, flat, still, error.sum(dim=(1, 2)))
-
-
-def expected_errors(seen: Activity, model: ErrorModel) -> tuple[Tensor, Tensor, Tensor]:
-    """Squared errors that statistics let expect, :math:`(B, h, w)` each.
+def expected_errors(seen: Activity, model: ErrorModel) -> tuple[Tensor, Tensor]:
+    """Return squared errors that statistics let expect, (B, h, w) each.
 
     Args:
         seen: the statistics.
         model: constants of a network.
 
     Returns:
-        What the smooth picture adds, what a network adds that is told that nothing moves, at most as much, and what the
-        network leaves itself.
+        What a network adds that is told that nothing moves, and what it leaves otherwise.
     """
-    flat = model.flat * seen.texture + model.grainy * seen.grain + model.blurred * seen.change
-    error = model.textured * seen.texture + model.moved * seen.change + model.faint * seen.area
-    return flat, torch.minimum(model.still * seen.change, flat), error
+    left = model.textured * seen.texture + model.moved * seen.change + model.faint * seen.area
+    return model.still * seen.change, left
 
 
-def required(seen: Look, tolerance: float) -> tuple[Tensor, Tensor]:
-    r"""Which cells need the network, and which of them its motion.
+def moving_cells(still: Tensor, error: Tensor, tolerance: float) -> Tensor:
+    r"""Return which cells need their motion.
 
-    Work that adds least to the squared error is skipped first, until the PSNR of the whole picture is expected to have
-    fallen by the tolerance:
+    That of the cells that lose least without it is left out first, until the PSNR of the whole picture is expected to
+    have fallen by the tolerance:
 
     .. math:: \Delta E \le (10^{tolerance / 10} - 1) \, E
 
     So a larger tolerance never needs more work. For several clips, the most demanding one decides.
 
     Args:
-        seen: by :func:`look`.
+        still: squared error that is added without motion, (B, h, w).
+        error: squared error of the network itself, likewise.
         tolerance: in dB, above 0.
 
     Returns:
-        ``network`` and ``motion``, booleans (h, w) on the CPU; motion only where the network is.
+        Booleans (h, w) on the CPU.
 
     Example:
-        >>> seen = look(torch.ones(1, 41, 32, 32), scale=2, pattern="RGGB", alpha=1.0)
-        >>> [cells.any().item() for cells in required(seen, 0.1)]
-        [False, False]
+        >>> moving_cells(torch.tensor([[[0.0, 1.0, 0.1]]]), torch.ones(1, 1, 3), 0.2)
+        tensor([[False,  True, False]])
     """
-    flat, still = seen.flat.flatten(1), seen.still.flatten(1)
-    added, order = torch.cat([still, flat], dim=1).sort(dim=1)
-    spent = torch.cat([still, flat - still], dim=1).gather(1, order).cumsum(dim=1)
-    fits = spent <= (10 ** (tolerance / 10) - 1) * seen.error[:, None]
+    added = still.flatten(1).sort(dim=1).values
+    fits = added.cumsum(dim=1) <= (10 ** (tolerance / 10) - 1) * error.flatten(1).sum(dim=1, keepdim=True)
     # everything that adds less than the first that does not fit
     limit = added.where(~fits, torch.inf).amin(dim=1)[:, None, None]
-    network, motion = (cells.ge(limit).any(dim=0).cpu() for cells in (seen.flat, seen.still))
-    return network, motion
+    return still.ge(limit).any(dim=0).cpu()
 
 
 def _smooth(light: Tensor, mask: Tensor, sigma: float) -> Tensor:

@@ -9,17 +9,15 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from lightning_modules.inference.scene_activity import CELL, look, required
+from lightning_modules.inference.scene_activity import CELL, expected_errors, moving_cells, scene_activity
 from lightning_modules.networks import Network
 
 #: side of a tile, in sensor pixels, where nothing else is asked for
 TILE = 200
 #: motion that is followed over the edge of a tile, in sensor pixels; what moves further is searched inside
 FAR = 48
-#: sensor pixels around the tiles that move in which motion is estimated, where a tolerance is given
+#: sensor pixels around what moves in which motion is estimated, where a tolerance is given
 AROUND = 24
-#: how far two parts are blended into each other, where a tolerance is given
-BLEND = 4
 
 
 @torch.no_grad()
@@ -38,17 +36,14 @@ def forward_in_tiles(
     and as far as motion reaches, is computed and thrown away. A network whose ``halo`` is None is run on the whole
     picture, whatever the tile and the tolerance.
 
-    With a tolerance the clip is looked at first, see :mod:`lightning_modules.inference.scene_activity`, and every tile
-    gets what it needs: a part without texture the smooth mean of all frames and no network, a tile without motion the
-    network but no flow and no search along it. Motion is estimated once, on the part around all tiles that move. Tiles
-    overlap by less, and are blended into each other.
+    With a tolerance the clip is looked at first, see :mod:`lightning_modules.inference.scene_activity`: motion is
+    estimated on the part around all that moves, and tiles without any get no flow and no search along it.
 
     Args:
         network: any of :mod:`lightning_modules.networks`.
         spikes: :math:`(B, N, H, W)`. Of several clips each part gets what the most demanding one needs.
-        tile: side of a tile in sensor pixels, even so that the Bayer phase is kept; 0 for no tiles. With a tolerance
-            it is a multiple of the cells that are looked at, the next smaller one.
-        tolerance: by how many dB the PSNR of the picture is expected to fall at most; 0 for everything everywhere.
+        tile: side of a tile in sensor pixels, even so that the Bayer phase is kept; 0 for no tiles.
+        tolerance: by how many dB the PSNR of the picture is expected to fall at most; 0 for motion everywhere.
         flow: as the network takes it; when not given, the network's own estimate.
         static: nothing moves, instead of a flow.
         done: called after every tile, with the share of them that is done.
@@ -58,16 +53,21 @@ def forward_in_tiles(
     """
     if network.halo is None:
         return network(spikes, flow, static)
-    if tolerance:
-        return _forward_where_needed(network, spikes, tile, tolerance, flow, static, done)
-    height, width = spikes.shape[-2:]
-    if not tile or max(height, width) <= tile:
+    if not 0 <= tolerance < math.inf:
+        raise ValueError(f"psnr_tolerance: expected 0 dB or more, got {tolerance}")
+    whole = Box(0, 0, *spikes.shape[-2:])
+    if tolerance and flow is None and not static and network.takes_flow and not network.motion.static:
+        flow = _flow_where_it_moves(network, spikes, tolerance, whole)
+        static = flow is None
+    if not tile or max(spikes.shape[-2:]) <= tile:
         return network(spikes, flow, static)
     flow = network.resolve_flow(spikes, flow, static)
-    whole = Box(0, 0, height, width)
 
     def run(outer: Box) -> Tensor:
-        return network(outer.of(spikes), None if flow is None else outer.of(flow), flow is None)
+        part = None if flow is None else outer.of(flow)
+        if tolerance and part is not None and not part.any():
+            part = None
+        return network(outer.of(spikes), part, part is None)
 
     return tiled(run, whole, tile, lambda box: reach(flow, box, whole, network.halo), network.scale, done)
 
@@ -143,64 +143,17 @@ def reach(flow: Tensor | None, box: Box, frame: Box, halo: int) -> int:
     return halo + 2 * math.ceil(near.nan_to_num().abs().amax().clamp(max=FAR).item() / 2)
 
 
-def _around(cells: Tensor) -> Box:
-    """Box around the cells that are true, in cells."""
-    rows, columns = (cells.any(dim=axis).nonzero() for axis in (1, 0))
-    return Box(int(rows[0]), int(columns[0]), int(rows[-1]) + 1, int(columns[-1]) + 1)
-
-
-def _boxes(network: Tensor, motion: Tensor, tile: int) -> dict[Box, bool]:
-    """The part of every tile of so many cells that needs the network, in cells, and whether it moves."""
-    boxes = {}
-    for top in range(0, network.shape[0], tile):
-        for left in range(0, network.shape[1], tile):
-            cells = network[top : top + tile, left : left + tile]
-            if cells.any():
-                box = _around(cells)
-                box = Box(top + box.top, left + box.left, top + box.bottom, left + box.right)
-                boxes[box] = bool(box.of(motion).any())
-    return boxes
-
-
-def _forward_where_needed(
-    network: Network,
-    spikes: Tensor,
-    tile: int,
-    tolerance: float,
-    given: Tensor | None,
-    static: bool,
-    done: Callable[[float], object] | None,
-) -> Tensor:
-    height, width = spikes.shape[-2:]
-    s, halo = network.scale, max(network.halo, 2 * BLEND)  # what is blended is seen as well
-    seen = look(spikes, s, network.pattern, network.settings["alpha"], network.error_model)
-    cells = required(seen, tolerance)
-    boxes = _boxes(*cells, max(tile // CELL, 1) if tile else max(cells[0].shape))
-    boxes = {Box(*(CELL * side for side in box)): moves for box, moves in boxes.items()}
-    whole, flow = Box(0, 0, height, width), None
-    if any(boxes.values()):
-        tops, lefts, bottoms, rights = zip(*(box for box, moves in boxes.items() if moves), strict=True)
-        around = Box(min(tops), min(lefts), max(bottoms), max(rights)).grown(AROUND, whole)
-        flow = network.resolve_flow(around.of(spikes), None if given is None else around.of(given), static)
-    rgb = seen.picture
-    for box, moves in _told(boxes.items(), done):
-        if moves and flow is not None:
-            outer = box.grown(reach(flow, box, around, halo), around)
-            part = network(outer.of(spikes), outer.of(flow, around[:2]))
-        else:
-            outer = box.grown(halo, whole)
-            part = network(outer.of(spikes), static=True)
-        inner = box.grown(BLEND, whole)
-        rows, columns = (
-            _ramp(begin, end, inner_begin, inner_end, s, rgb)
-            for begin, end, inner_begin, inner_end in zip(box[:2], box[2:], inner[:2], inner[2:], strict=True)
-        )
-        inner.of(rgb, scale=s).lerp_(inner.of(part.to(rgb), outer[:2], s), rows[:, None] * columns)
-    return rgb
-
-
-def _ramp(begin: int, end: int, inner_begin: int, inner_end: int, scale: int, like: Tensor) -> Tensor:
-    """Weights from the inner begin to the inner end: 1 from begin to end, falling to 0 over BLEND sensor pixels."""
-    at = torch.arange(scale * inner_begin, scale * inner_end, device=like.device, dtype=like.dtype) + 0.5
-    outside = torch.maximum(scale * begin - at, at - scale * end).clamp(min=0)
-    return 1 - outside / (scale * BLEND)
+def _flow_where_it_moves(network: Network, spikes: Tensor, tolerance: float, whole: Box) -> Tensor | None:
+    """The network's estimate in the part where something moves, zeros elsewhere; None where nothing does."""
+    network.check_spikes(spikes)
+    seen = scene_activity(spikes, network.pattern, network.settings["alpha"])
+    cells = moving_cells(*expected_errors(seen, network.error_model), tolerance)
+    if not cells.any():
+        return None
+    rows, columns = (cells.any(dim=axis).nonzero() * CELL for axis in (1, 0))
+    moving = Box(int(rows[0]), int(columns[0]), int(rows[-1]) + CELL, int(columns[-1]) + CELL).grown(0, whole)
+    near = moving.grown(AROUND, whole)
+    found = network.estimate_flow(near.of(spikes))
+    flow = found.new_zeros(*found.shape[:-2], whole.bottom, whole.right)
+    moving.of(flow).copy_(moving.of(found, near[:2]))
+    return flow

@@ -23,9 +23,6 @@ class ErrorModel:
     are the most careful of all weights of the package, for networks whose own were not measured.
 
     Args:
-        flat: added by a smooth picture instead of the network's, per texture.
-        grainy: likewise, per grain that a network would average away.
-        blurred: likewise, per change.
         still: added by a network that is told that nothing moves, per change.
         textured: left by the network itself, per texture.
         moved: likewise, per change.
@@ -35,9 +32,6 @@ class ErrorModel:
         ValueError: a constant that is no finite number of 0 or more.
     """
 
-    flat: float = 57.0
-    grainy: float = 1.7
-    blurred: float = 0.48
     still: float = 0.18
     textured: float = 0.07
     moved: float = 0.00068
