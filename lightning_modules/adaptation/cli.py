@@ -16,17 +16,17 @@ from lightning_modules.adaptation.lessons import ROOM, Lessons, make_lessons
 from lightning_modules.cli.command import without_chatter
 from lightning_modules.cli.errors import InputError, UsageError, VerbParser
 from lightning_modules.cli.folder_lock import check_folder, locked_folder
-from lightning_modules.cli.predict import RECORDING, add_recording
 from lightning_modules.inference.clips import RecordingClips
 from lightning_modules.inference.export import load_network
 from lightning_modules.inference.output import file_identity
-from lightning_modules.inference.reconstruct import precision_of
+from lightning_modules.inference.reconstruct import may_be_noisy, precision_of
 from lightning_modules.networks import Network, RecurrentCSCSR
 from lightning_modules.registry import find_model, list_models
 from lightning_modules.storage.pretrained import Weights, motion_of, settings_of, write_weights
 from spikekit.arguments import UsageError as SpikekitUsageError
 from spikekit.arguments import whole
-from spikekit.recording import Recording, open_recording
+from spikekit.cli import recordings
+from spikekit.recording import Recording
 from spikekit.timing import duration
 
 #: dB by which the held-out pictures have to come nearer to the teacher's
@@ -45,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
         "weights are kept. lightning predict --weights OUT/adapted.safetensors uses them; those of a noisy "
         "camera also serve its other recordings.",
     )
-    add_recording(made)
+    recordings.add_arguments(made)
     add = made.add_argument
     add("--weights", default="cscsr_small_x4", help="what to begin with; cscsr_small_x4 if not given")
     add(
@@ -75,9 +75,8 @@ def adapt(args: Sequence[str]) -> None:
     try:
         check_folder(asked.output)
         student = _student(weights).to(device)
-        described = {name: getattr(asked, name) for name in RECORDING}
-        recording = open_recording(asked.file, **described)
-        noisy = asked.calibration != "none" and recording.alpha is None and recording.calibration is None
+        recording = recordings.opened(asked)
+        noisy = asked.calibration != "none" and may_be_noisy(recording)
         clips, name = clips_and_teacher(recording, student, asked.teacher, noisy)
         known = {"recording": _identity(str(asked.file)), "sensor": _sensor(clips)}
         known |= {"weights": _identity(weights), "teacher": _identity(name), "steps": asked.steps}

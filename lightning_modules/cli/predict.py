@@ -26,15 +26,7 @@ from spikekit.io.video_output import check_film
 from spikekit.progress import progress
 from spikekit.timing import duration
 
-#: arguments of :func:`lightning_modules.reconstruct` that describe the recording
-RECORDING = "height", "width", "flip", "pattern", "camera", "calibration"
-
 _HOW = "tile", "psnr_tolerance", "self_ensemble", "future", "interpolated"
-
-
-def add_recording(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that describe a recording."""
-    recordings.add_arguments(parser)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -46,7 +38,7 @@ def parser() -> argparse.ArgumentParser:
         "trained for noisy sensors where nobody has measured this one. What is there already is not made again.",
         epilog="example: lightning predict FILE.dat --height 250 --width 400 --flip -o film.mp4",
     )
-    add_recording(made)
+    recordings.add_arguments(made)
     add = made.add_argument
     add("-o", "--output", required=True, metavar="OUT", help="a folder, a film (.mp4, .mov, .mkv, .gif) or a .png")
     add(
@@ -136,8 +128,8 @@ def _arguments(asked: argparse.Namespace, output: Path) -> dict[str, Any]:
     chosen = [option for option in ("speed", "budget") if getattr(asked, option) is not None]
     if named and chosen:
         raise UsageError(f"--{chosen[0]}: it chooses from the weights of the package, got {named[0]} as well")
-    names = ("speed", "budget", "scale", "frame", "white", "device", "precision", *RECORDING)
-    arguments = {name: getattr(asked, name) for name in names}
+    names = ("speed", "budget", "scale", "frame", "white", "device", "precision")
+    arguments = {name: getattr(asked, name) for name in names} | recordings.known(asked)
     if named:
         checkpoint = checkpoint_of(asked.ckpt_path, asked.config, output)
         arguments["network"] = configured_network(asked.config, asked.weights, checkpoint)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from spikekit import bayer_sites
 from spikekit.arguments import frames_of
+from spikekit.color.cfa import GREY
 from spikekit.recording import Recording, white_rate
 
 Item = TypeVar("Item")
@@ -51,7 +52,7 @@ class RecordingClips:
             raise ValueError(f"{path}: expected at least {frames} frames for a clip, got {total}")
         self.recording, self.frames = recording, frames
         self.top = self.left = 0
-        if not is_grey(recording) and crop_to != "grey":  # where red is says which of the four phases it is
+        if recording.pattern != GREY and crop_to != GREY:  # where red is says which of the four phases it is
             phase = recording.pattern or "RGGB"
             (_, row, column), (_, to_row, to_column) = bayer_sites(phase)[0], bayer_sites(crop_to)[0]
             self.top, self.left = (row - to_row) % 2, (column - to_column) % 2
@@ -89,11 +90,6 @@ class RecordingClips:
         clips = range(self.frames // 2, self.recording.frames - (self.frames - 1) // 2, EVERY)
         looks = sorted({clips[round(n)] for n in np.linspace(0, len(clips) - 1, _LOOKS)})
         return white_rate(torch.stack([clip.float().mean(0) for _, clip in self.in_order(looks)]).mean(0))
-
-
-def is_grey(recording: Recording) -> bool:
-    """Whether the camera is known to have no colours."""
-    return recording.pattern == "grey" or (recording.camera is not None and recording.pattern is None)
 
 
 def clips_around(

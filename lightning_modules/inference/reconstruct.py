@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lightning_modules.inference.clips import FRAMES, RecordingClips, film_groups, is_grey
+from lightning_modules.inference.clips import FRAMES, RecordingClips, film_groups
 from lightning_modules.inference.film import FilmFrame, FilmMaker
 from lightning_modules.inference.output import file_identity
 from lightning_modules.inference.presets import SPEEDS, Choice, Preset, choose
@@ -115,12 +115,13 @@ def reconstruct(
     recording = open_recording(
         path, height=height, width=width, flip=flip, pattern=pattern, camera=camera, calibration=calibration
     )
-    notes: list[str] = []
+    notes = [recording.note] if recording.note else []
     if network is None:
         white = RecordingClips(recording).white if white is None else white
-        measured = calibration == "none" or recording.alpha is not None or recording.calibration is not None
         speed = "balanced" if budget is None and speed is None else speed
-        preset, notes = _chosen(recording, speed, budget, scale, frame, white, not measured)
+        noisy = str(calibration) != "none" and may_be_noisy(recording)
+        preset, said = _chosen(recording, speed, budget, scale, frame, white, noisy)
+        notes += said
         how = {**preset.given("tile", "psnr_tolerance", "self_ensemble", "interpolated"), **how}
         network = preset.build()
     elif not isinstance(network, Network):
@@ -219,7 +220,7 @@ class Reconstruction:
     def _shown(self, rgb: Tensor) -> Tensor:
         """Light (3, H, W) in [0, 1], white being 1, as the camera shows it."""
         recording = self.clips.recording
-        if is_grey(recording) and len(rgb) == 3:
+        if recording.pattern == GREY and len(rgb) == 3:
             rgb = (rgb * rgb.new_tensor([0.25, 0.5, 0.25])[:, None, None]).sum(0, keepdim=True)
         rgb = rgb.expand(3, -1, -1)
         return rgb if recording.camera is None else replace(recording.camera, gain=1.0).display(rgb)
@@ -256,11 +257,17 @@ class Reconstruction:
 
 def _other_sensor(recording: Recording, pattern: str) -> str | None:
     """What to say where a grey camera meets weights for colours, or the other way round."""
-    if is_grey(recording) and pattern != GREY:
+    if recording.pattern == GREY and pattern != GREY:
         return f"the camera is grey, and the weights are for {pattern}: they see colours where there are none"
     if recording.pattern in PATTERNS and pattern == GREY:
         return f"the camera is {recording.pattern}, and the weights are for grey: they take its mosaic for texture"
     return None
+
+
+def may_be_noisy(recording: Recording) -> bool:
+    """Whether nobody has measured the sensor, or not in the dark, and no simulator says what it was."""
+    measured = recording.calibration
+    return recording.alpha is None and (measured is None or not measured.dark.any())
 
 
 def precision_of(device: torch.device) -> str:
@@ -357,9 +364,10 @@ def _sensor(preset: Preset, recording: Recording, scale: int, noisy: bool) -> li
     if not noisy:
         return []
     model = find_model(preset.weights or "")
-    measure = f"spikekit calibrate {recording.path} measures it, --calibration none takes it for ideal"
+    dark = ", with a recording in the dark," if recording.calibration is not None else ""
+    measure = f"spikekit calibrate{dark} measures it, --calibration none takes it for ideal"
     if model and model.noise:
-        return [f"nobody has measured this sensor: weights trained for noisy ones; {measure}"]
+        return [f"nobody has measured this sensor: weights trained for noisy ones, dB as for ideal ones; {measure}"]
     return [f"nobody has measured this sensor, and there are no weights for noisy ones at scale {scale}; {measure}"]
 
 

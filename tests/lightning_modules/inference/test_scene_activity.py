@@ -41,9 +41,7 @@ def test_a_still_clip_needs_no_motion_however_rich_it_is():
 def test_what_moves_is_found_where_it_moves():
     ground = Layer(noise(192, 192).repeat_interleave(2, 1)[:, :192] * 0.8)
     thing = Layer(noise(32, 32, 1), Motion(velocity=(0.8, 0.0)), (96, 32), torch.ones(32, 32))
-    rows, columns = (
-        moving(clip(Scene([ground, thing], 192, 192)), 0.05).nonzero().unbind(dim=1)
-    )
+    rows, columns = moving(clip(Scene([ground, thing], 192, 192)), 0.05).nonzero().unbind(dim=1)
     assert set(rows.tolist()) == {1}  # the object passes sensor rows 16 to 32, columns 40 to 72
     assert {3} <= set(columns.tolist()) <= {2, 3, 4}
 

@@ -130,7 +130,8 @@ def test_motion_is_only_where_something_moves():
     assert 0 < width < 192
     with torch.no_grad():
         still, moving = network(spikes, static=True), network(spikes, network.estimate_flow(spikes))
-    torch.testing.assert_close(rgb[..., 94:98], moving[..., 94:98], rtol=0, atol=1e-5)
+    inside = ..., slice(31, 33), slice(96, 110)
+    torch.testing.assert_close(rgb[inside], moving[inside], rtol=0, atol=1e-5)
     for others in (slice(0, 64), slice(152, None)):
         torch.testing.assert_close(rgb[..., others], still[..., others], rtol=0, atol=1e-5)
 
