@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
@@ -11,14 +10,13 @@ from typing import Any
 
 import torch
 
-from lightning_modules.adaptation.learn import CHECKPOINT, learn
+from lightning_modules.adaptation.learn import STATE, learn
 from lightning_modules.adaptation.lessons import ROOM, Lessons, make_lessons
-from lightning_modules.cli.command import without_chatter
 from lightning_modules.cli.errors import InputError, UsageError, VerbParser
 from lightning_modules.cli.folder_lock import check_folder, locked_folder
 from lightning_modules.inference.clips import RecordingClips
 from lightning_modules.inference.export import load_network
-from lightning_modules.inference.output import file_identity
+from lightning_modules.inference.output import check_place, file_identity
 from lightning_modules.inference.reconstruct import may_be_noisy, precision_of
 from lightning_modules.networks import Network, RecurrentCSCSR
 from lightning_modules.registry import find_model, list_models
@@ -31,6 +29,9 @@ from spikekit.timing import duration
 
 #: dB by which the held-out pictures have to come nearer to the teacher's
 LEAST_GAIN = 0.1
+
+#: file of the lessons
+LESSONS = "lessons.safetensors"
 
 _WRITTEN = "adapted.safetensors"
 _LEAST_SIDE = 4  # pixels of a recording
@@ -67,13 +68,14 @@ def adapt(args: Sequence[str]) -> None:
     Raises:
         InputError: a recording that is too short or cannot be read, unusable weights, or nothing was gained.
     """
-    without_chatter()
     asked = parser().parse_args(args)
     weights = asked.weights
     begin, written = perf_counter(), asked.output / _WRITTEN
     device = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         check_folder(asked.output)
+        for name in (LESSONS, STATE, _WRITTEN):
+            check_place(asked.output / name)
         student = _student(weights).to(device)
         recording = recordings.opened(asked)
         noisy = asked.calibration != "none" and may_be_noisy(recording)
@@ -82,9 +84,7 @@ def adapt(args: Sequence[str]) -> None:
         known |= {"weights": _identity(weights), "teacher": _identity(name), "steps": asked.steps}
         with locked_folder(asked.output, "adaptation"):
             lessons = _lessons(asked.output, known, student, name, clips)
-            how = {"accelerator": "gpu" if device == "cuda" else "cpu", "precision": precision_of(torch.device(device))}
-            how["enable_progress_bar"] = sys.stderr.isatty()
-            before, after = learn(student, lessons, asked.steps, asked.output, **how)
+            before, after = learn(student, lessons, asked.steps, asked.output, precision_of(torch.device(device)))
             said = (
                 f"{before:.2f} dB from the held-out pictures of {name} before, {after:.2f} dB after {asked.steps} steps"
             )
@@ -101,11 +101,11 @@ def adapt(args: Sequence[str]) -> None:
 
 def _lessons(folder: Path, known: dict[str, Any], student: Network, teacher: str, clips: RecordingClips) -> Lessons:
     """Return the lessons that are in a folder already, or make them."""
-    path = folder / "lessons.safetensors"
+    path = folder / LESSONS
     if path.is_file():
         return Lessons.read(path, known)
-    if (folder / CHECKPOINT).exists():
-        raise ValueError(f"{folder / CHECKPOINT}: expected the lessons of this training beside it; -o goes elsewhere")
+    if (folder / STATE).exists():
+        raise ValueError(f"{folder / STATE}: expected the lessons of this training beside it; -o goes elsewhere")
     device = next(student.parameters()).device
     lessons = make_lessons(student, load_network(teacher).to(device).eval(), clips)
     lessons.write(path, known)

@@ -2,49 +2,46 @@
 
 from __future__ import annotations
 
-import warnings
-from functools import partial
+import json
+from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from pytorch_lightning import Trainer
-from pytorch_lightning.callbacks import ModelCheckpoint
+import torch.nn.functional as F
+from safetensors import safe_open
+from safetensors.torch import save
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
 
 from lightning_modules.adaptation.lessons import HELD_OUT, Lessons
 from lightning_modules.inference.tiles import TILE, forward_in_tiles
 from lightning_modules.networks import Network
-from lightning_modules.tasks.checkpoint_io import Checkpoints
-from lightning_modules.tasks.resume import check_resume, load_weights_of
-from lightning_modules.tasks.super_resolution import SuperResolution
 from spikekit import psnr
+from spikekit.arguments import one_line
 from spikekit.color.cfa import GREY
+from spikekit.io.failures import no_pipe
+from spikekit.io.whole_file import whole_file
+from spikekit.progress import progress
 
 #: what is kept of a training that is interrupted
-CHECKPOINT = "last.ckpt"
+STATE = "state.safetensors"
 
 _PATCH, _BATCH, _RATE = 40, 4, 1e-3
 _RISING = 10  # steps until the rate is reached; then it falls to 0
-_EVERY = 20  # steps from one checkpoint to the next
-# of what Lightning would warn
-_KNOWN = r".*(no `val_dataloader`|exists and is not empty|not resumable|dirpath has changed)"
+_EVERY = 20  # steps from one state that is kept to the next
+_MOMENTS = "exp_avg", "exp_avg_sq"  # of Adam
 
 
-class _Patches(Dataset):
-    """Patches of lessons, by chance; which, only the index says, counted from ``start``."""
+class Patches:
+    """Patches of lessons, by chance; which, only the index says."""
 
-    def __init__(self, lessons: Lessons, pattern: str, scale: int, length: int, start: int = 0) -> None:
-        self.lessons, self.scale, self.length, self.start = lessons, scale, length, start
+    def __init__(self, lessons: Lessons, pattern: str, scale: int) -> None:
+        self.lessons, self.scale = lessons, scale
         self.symmetric = pattern in ("RGGB", "BGGR", GREY)  # transposed, it begins with the same colours
 
-    def __len__(self) -> int:
-        return self.length
-
     def __getitem__(self, index: int) -> dict[str, Tensor]:
-        rng = np.random.default_rng(self.start + index)
+        rng = np.random.default_rng(index)
         one, s = int(rng.integers(len(self.lessons))), self.scale
         sides = self.lessons.spikes.shape[-2:]
         size = min(*sides, _PATCH)
@@ -76,48 +73,101 @@ def likeness(network: Network, lessons: Lessons) -> float:
 
 
 def _rate(step: int, steps: int) -> float:
-    return min(1, (step + 1) / _RISING) * (1 - step / (steps + 1))
+    return _RATE * min(1, (step + 1) / _RISING) * (1 - step / (steps + 1))
 
 
-def learn(student: Network, lessons: Lessons, steps: int, folder: Path, **trainer: Any) -> tuple[float, float]:
-    """Train a network on lessons; it goes on where a training in the folder was interrupted.
+def learn(
+    student: Network, lessons: Lessons, steps: int, folder: Path, precision: str = "32-true"
+) -> tuple[float, float]:
+    """Train a network on lessons; a training in the folder that was interrupted is resumed.
 
     Args:
         student: what learns, in evaluation mode.
         lessons: those that are held out last.
         steps: how long.
-        folder: of the checkpoint ``last.ckpt``.
-        trainer: other arguments of Lightning's Trainer.
+        folder: of the state that is kept.
+        precision: ``"32-true"`` or ``"bf16-mixed"``.
 
     Returns:
         Likeness of the held-out pictures to the teacher's before and after, in dB.
+
+    Raises:
+        ValueError: what was kept is damaged, or of another network; the message is one line and names the file.
     """
     taught, held_out = lessons.part(slice(-HELD_OUT)), lessons.part(slice(-HELD_OUT, None))
     before = likeness(student, held_out)
-    schedule = partial(torch.optim.lr_scheduler.LambdaLR, lr_lambda=partial(_rate, steps=steps))
-    module = SuperResolution(student, partial(torch.optim.Adam, lr=_RATE), schedule)
     device = next(student.parameters()).device
-    last = ModelCheckpoint(folder, Path(CHECKPOINT).stem, every_n_train_steps=_EVERY, enable_version_counter=False)
-    running = Trainer(
-        max_steps=steps,
-        max_epochs=-1,
-        devices=1,
-        logger=False,
-        callbacks=[last],
-        plugins=[Checkpoints()],
-        enable_model_summary=False,
-        default_root_dir=folder,
-        **trainer,
-    )
-    seen, resumed = 0, None
-    if (folder / CHECKPOINT).is_file():
-        resumed = folder / CHECKPOINT
-        checkpoint = check_resume(resumed, module, running)
-        load_weights_of(checkpoint, resumed, module)
-        seen = _BATCH * checkpoint["global_step"]
-    patches = _Patches(taught, student.pattern, student.scale, _BATCH * steps, seen)
+    optimizer = torch.optim.Adam(student.parameters(), lr=_RATE)
+    path, first = folder / STATE, 0
+    if path.exists():
+        first = _read_state(path, student, optimizer, steps)
+    patches = Patches(taught, student.pattern, student.scale)
+    mixed = torch.autocast(device.type, torch.bfloat16) if precision == "bf16-mixed" else nullcontext()
     student.train()
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", _KNOWN)
-        running.fit(module, DataLoader(patches, _BATCH), ckpt_path=resumed and str(resumed))
-    return before, likeness(student.to(device).eval(), held_out)
+    for step in progress(range(first, steps), "steps", steps, initial=first):
+        batch = [patches[_BATCH * step + n] for n in range(_BATCH)]
+        clips, truth, flow = (_stacked(batch, name, device) for name in ("spikes", "rgb", "flow"))
+        optimizer.param_groups[0]["lr"] = _rate(step, steps)
+        optimizer.zero_grad()
+        with mixed:
+            loss = F.l1_loss(student(clips, flow), truth)
+        loss.backward()
+        optimizer.step()
+        if (step + 1) % _EVERY == 0 or step + 1 == steps:
+            _write_state(path, student, optimizer, step + 1)
+    return before, likeness(student.eval(), held_out)
+
+
+def _stacked(batch: list[dict[str, Tensor]], name: str, device: torch.device) -> Tensor | None:
+    return torch.stack([one[name] for one in batch]).to(device) if name in batch[0] else None
+
+
+def _tensors(student: Network, optimizer: torch.optim.Adam) -> dict[str, Tensor]:
+    """All that a training changes, by name: the weights, and two moments of each."""
+    found = {f"network.{name}": value for name, value in student.state_dict().items()}
+    for name, weight in student.named_parameters():
+        known = optimizer.state.get(weight, {})
+        found |= {f"{moment}.{name}": known.get(moment, torch.zeros_like(weight)) for moment in _MOMENTS}
+    return found
+
+
+def _write_state(path: Path, student: Network, optimizer: torch.optim.Adam, step: int) -> None:
+    tensors = {name: value.detach().cpu().clone() for name, value in _tensors(student, optimizer).items()}
+    with whole_file(path) as file:
+        file.write(save(tensors, {"step": json.dumps(step)}))
+
+
+def _read_state(path: Path, student: Network, optimizer: torch.optim.Adam, steps: int) -> int:
+    """Give network and optimizer the state that was kept, and return after how many steps it was."""
+    try:
+        with safe_open(no_pipe(path), "pt") as file:
+            step = json.loads((file.metadata() or {})["step"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        check_state(tensors, _tensors(student, optimizer))
+        if type(step) is not int or not 0 < step <= steps:
+            raise ValueError(f"step: expected 1 .. {steps}, got {step!r:.80}")
+    except Exception as error:  # what safetensors raises depends on the damage
+        raise ValueError(f"{path}: not a state that lightning adapt resumes from ({one_line(error)[:300]})") from error
+    own = {name: value for name, value in tensors.items() if name.startswith("network.")}
+    student.load_state_dict({name.removeprefix("network."): value for name, value in own.items()})
+    for name, weight in student.named_parameters():
+        moments = {moment: tensors[f"{moment}.{name}"].to(weight.device) for moment in _MOMENTS}
+        optimizer.state[weight] = {"step": torch.tensor(float(step)), **moments}
+    return step
+
+
+def check_state(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
+    """Refuse tensors of other names, shapes or dtypes than a file of ours has, or such that are not finite.
+
+    Raises:
+        ValueError: which of them it is.
+    """
+    for name in sorted({*found, *expected}):
+        if name not in found or name not in expected:
+            raise ValueError(f"{name:.80}: {'missing' if name in expected else 'unknown'}")
+        here, there = expected[name], found[name]
+        if (here.shape, here.dtype) != (there.shape, there.dtype):
+            wanted = f"{here.dtype} {tuple(here.shape)}"
+            raise ValueError(f"{name:.80}: expected {wanted}, got {there.dtype} {tuple(there.shape)}")
+        if not there.isfinite().all():
+            raise ValueError(f"{name:.80}: expected finite numbers, got NaN or Inf")

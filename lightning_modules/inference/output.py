@@ -66,9 +66,9 @@ class Output:
         if self.is_file and self.folder.is_symlink():  # in a stranger's folder it may lead anywhere
             raise PictureError(f"{self.folder}: expected a folder of pictures, got a link; -o goes elsewhere")
         if self.is_file:
-            _check_free(self.output)
+            check_place(self.output, follow=True)
         for path in self._paths.values():
-            _check_free(path, own=True)
+            _check_picture(path)
 
     def made(self) -> set[int]:
         """Return the frames whose pictures are there, made of the same, and whole."""
@@ -86,7 +86,7 @@ class Output:
         path = self._paths[frame]
         if not rgb.isfinite().all():  # it would be black there, and nothing would say why
             raise PictureError(f"{path}: expected a picture, the network makes NaN of this clip; nothing is written")
-        _check_free(path, own=True)
+        _check_picture(path)
         with writing(path, PictureError), whole_file(path) as file:
             file.write(png_bytes(rgb, {_NOTE: self._record}))
         return path
@@ -116,24 +116,29 @@ class Output:
             self.folder.rmdir()
 
 
-def _check_free(path: Path, own: bool = False) -> None:
-    """Refuse to write over what is no file, a stranger's link, or, among pictures, a file of somebody else.
+def check_place(path: Path, follow: bool = False) -> None:
+    """Refuse to write into a pipe or, where a name is ours and not the user's, through a link.
 
     Args:
         path: where a file is to be.
-        own: it is one of the pictures.
+        follow: whether a link may lead to it.
 
     Raises:
         PictureError: it is taken.
     """
     try:
-        mode = os.stat(path, follow_symlinks=not own).st_mode
+        mode = os.stat(path, follow_symlinks=follow).st_mode
     except (OSError, ValueError):
         return
     if not stat.S_ISREG(mode):
         kind = "a link" if stat.S_ISLNK(mode) else "a folder" if stat.S_ISDIR(mode) else "a pipe or a device"
-        raise PictureError(f"{path}: expected a place for a picture, got {kind}; -o goes elsewhere")
-    if own:
+        raise PictureError(f"{path}: expected a file or nothing, got {kind}; -o goes elsewhere")
+
+
+def _check_picture(path: Path) -> None:
+    """Refuse to write a picture where there is something else; it would be lost."""
+    check_place(path)
+    if path.exists():
         with suppress(Exception), quiet(), Image.open(path, formats=["PNG"]) as picture:
             if _NOTE in picture.info:
                 return

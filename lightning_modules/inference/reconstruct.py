@@ -115,13 +115,12 @@ def reconstruct(
     recording = open_recording(
         path, height=height, width=width, flip=flip, pattern=pattern, camera=camera, calibration=calibration
     )
-    notes = [recording.note] if recording.note else []
+    notes: list[str] = []
     if network is None:
         white = RecordingClips(recording).white if white is None else white
         speed = "balanced" if budget is None and speed is None else speed
         noisy = str(calibration) != "none" and may_be_noisy(recording)
-        preset, said = _chosen(recording, speed, budget, scale, frame, white, noisy)
-        notes += said
+        preset, notes = _chosen(recording, speed, budget, scale, frame, white, noisy)
         how = {**preset.given("tile", "psnr_tolerance", "self_ensemble", "interpolated"), **how}
         network = preset.build()
     elif not isinstance(network, Network):

@@ -4,7 +4,6 @@ import copy
 
 import pytest
 import torch
-from pytorch_lightning import Callback
 
 from lightning_modules.__main__ import main
 from lightning_modules.adaptation import cli
@@ -77,7 +76,7 @@ def test_patches_keep_place_time_and_motion_together(monkeypatch):
     rgb = spikes[:, 1:2].repeat_interleave(2, -1).repeat_interleave(2, -2).expand(1, 3, 24, 40)
     along = torch.stack([spikes[:, 0], spikes[:, 2]], dim=1)  # (1, 2, 12, 20)
     lessons = Lessons(spikes, rgb, torch.stack([along, along + 1000], dim=2), 1.0)
-    patches = learning._Patches(lessons, "RGGB", 2, 60)
+    patches = learning.Patches(lessons, "RGGB", 2)
     kinds = set()
     for number in range(60):
         patch = patches[number]
@@ -90,13 +89,13 @@ def test_patches_keep_place_time_and_motion_together(monkeypatch):
         assert clip[1, 0, 0] % 20 % 2 == clip[1, 0, 0] // 20 % 2 == 0  # the Bayer phase
         kinds.add((backwards, transposed))
     assert len(kinds) == 4
-    whole = [learning._Patches(lessons, "GRBG", 2, 60)[number]["spikes"][1] for number in range(60)]
+    whole = [learning.Patches(lessons, "GRBG", 2)[number]["spikes"][1] for number in range(60)]
     assert all(plane[0, 1] == plane[0, 0] + 1 for plane in whole)
 
 
 def test_a_student_comes_nearer_to_its_teacher_on_what_is_held_out(lessons, tmp_path):
     student = CSCSR.from_pretrained("cscsr_tiny_x4").eval()
-    before, after = learn(student, lessons, 10, tmp_path, enable_progress_bar=False)
+    before, after = learn(student, lessons, 10, tmp_path)
     assert after > before + 0.3
     assert not student.training
     fresh = CSCSR.from_pretrained("cscsr_tiny_x4").eval()
@@ -104,38 +103,91 @@ def test_a_student_comes_nearer_to_its_teacher_on_what_is_held_out(lessons, tmp_
     assert after == likeness(student, lessons.part(slice(-HELD_OUT, None)))
 
 
-class Killed(Callback):
-    def on_train_batch_end(self, trainer, *_):
-        if trainer.global_step == 5:
-            raise RuntimeError("killed")
+class KilledError(RuntimeError):
+    pass
 
 
-class Counted(Callback):
-    steps = 0
-
-    def on_train_batch_end(self, *_):
-        Counted.steps += 1
-
-
-def test_it_goes_on_where_it_was_interrupted(lessons, tmp_path, monkeypatch):
+def test_it_is_resumed_where_it_was_interrupted(lessons, tmp_path, monkeypatch):
     monkeypatch.setattr(learning, "_EVERY", 3)
     begun = CSCSR.from_pretrained("cscsr_tiny_x4").eval()
-    real = learning.Trainer
+    read, seen = learning.Patches.__getitem__, []
 
-    def trainer(extra):
-        return lambda callbacks, **how: real(callbacks=[*callbacks, extra], **how)
+    def until(last):
+        def getitem(patches, index):
+            if index == last:
+                raise KilledError
+            seen.append(index)
+            return read(patches, index)
 
-    monkeypatch.setattr(learning, "Trainer", trainer(Killed()))
-    with pytest.raises(RuntimeError, match="killed"):
-        learn(copy.deepcopy(begun), lessons, 8, tmp_path / "run", enable_progress_bar=False)
-    monkeypatch.setattr(learning, "Trainer", trainer(Counted()))
+        monkeypatch.setattr(learning.Patches, "__getitem__", getitem)
+
+    until(5 * 4)
+    with pytest.raises(KilledError):
+        learn(copy.deepcopy(begun), lessons, 8, tmp_path / "run")
     resumed, whole = copy.deepcopy(begun), copy.deepcopy(begun)
-    before, _ = learn(resumed, lessons, 8, tmp_path / "run", enable_progress_bar=False)
-    assert Counted.steps == 5  # after the third, which was the last to be kept
+    until(None)
+    seen.clear()
+    before, _ = learn(resumed, lessons, 8, tmp_path / "run")
+    assert seen == list(range(3 * 4, 8 * 4))  # after the third, which was the last to be kept
     assert before == likeness(begun, lessons.part(slice(-HELD_OUT, None)))
-    learn(whole, lessons, 8, tmp_path / "whole", enable_progress_bar=False)
+    learn(whole, lessons, 8, tmp_path / "whole")
     for one, other in zip(resumed.parameters(), whole.parameters(), strict=True):
         assert torch.allclose(one, other, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("kept", ["lessons.safetensors", "state.safetensors"])
+def test_what_is_kept_is_resumed_from_or_refused_in_one_line(lessons, tmp_path, fuzz, kept):
+    """Bytes and values damaged in any way; a kept file is read before anything is computed."""
+    student = CSCSR(4, width=4, representation_width=4, features=1, stages=1, end_blocks=1)
+    optimizer = torch.optim.Adam(student.parameters())
+    if kept == "state.safetensors":
+        learning._write_state(tmp_path / kept, student, optimizer, 3)
+    else:
+        lessons.write(tmp_path / kept, {})
+    whole = (tmp_path / kept).read_bytes()
+
+    def read(path):
+        if kept == "state.safetensors":
+            learning._read_state(path, student, optimizer, 8)
+        else:
+            Lessons.read(path, {})
+
+    read(tmp_path / kept)
+    fuzz(read, lambda rng: fuzz.damage(whole, rng), kept, cases=60, megabytes=600)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"spikes": torch.full((16, 41, 8, 8), 255, dtype=torch.uint8)},
+        {"rgb": torch.full((16, 3, 32, 32), float("nan"), dtype=torch.float16)},
+        {"flow": torch.full((16, 2, 2, 8, 8), 1e30)},
+        {"white": 0.0},
+    ],
+)
+def test_lessons_that_no_recording_gives_are_refused(tmp_path, wrong):
+    good = {
+        "spikes": torch.ones(16, 41, 8, 8, dtype=torch.uint8),
+        "rgb": torch.ones(16, 3, 32, 32, dtype=torch.float16),
+        "flow": torch.ones(16, 2, 2, 8, 8),
+        "white": 1.0,
+    }
+    Lessons(**good).write(tmp_path / "good.safetensors", {})
+    Lessons.read(tmp_path / "good.safetensors", {})
+    Lessons(**{**good, **wrong}).write(tmp_path / "bad.safetensors", {})
+    with pytest.raises(ValueError, match=r"bad\.safetensors: not lessons of lightning adapt"):
+        Lessons.read(tmp_path / "bad.safetensors", {})
+
+
+def test_nothing_is_written_through_links_or_into_pipes(recording, tmp_path):
+    (tmp_path / "secret").write_text("secret")
+    for name in ("lessons.safetensors", "state.safetensors", "adapted.safetensors"):
+        out = tmp_path / name.partition(".")[0]
+        out.mkdir()
+        (out / name).symlink_to(tmp_path / "secret")
+        with pytest.raises(SystemExit, match=f"{name}: expected a file or nothing, got a link"):
+            main(typed(recording, out))
+    assert (tmp_path / "secret").read_text() == "secret"
 
 
 def typed(recording, output, *more):
@@ -155,7 +207,7 @@ def test_the_command(recording, tmp_path, capsys, monkeypatch):
     assert any(not torch.equal(a, b) for a, b in zip(adapted.parameters(), shipped.parameters(), strict=True))
     first = written.read_bytes()
     written.unlink()
-    monkeypatch.setattr(learning._Patches, "__getitem__", None)
+    monkeypatch.setattr(learning.Patches, "__getitem__", None)
     main(asked)  # nothing is left to learn
     assert written.read_bytes() == first
     main(["predict", str(recording), "--weights", str(written), "--frame", "80", "-o", str(tmp_path / "a.png")])
@@ -251,15 +303,9 @@ def test_what_lies_in_the_folder_is_of_this_adaptation(recording, lessons, tmp_p
     with pytest.raises(SystemExit, match="weights: expected that of the adaptation in"):
         main(asked)
     kept.write_bytes(whole[:1000])
-    with pytest.raises(SystemExit, match=r"lessons\.safetensors: not the lessons of lightning adapt, or damaged ones"):
+    with pytest.raises(SystemExit, match=r"lessons\.safetensors: not lessons of lightning adapt"):
         main(asked)
     kept.unlink()
-    (tmp_path / "out" / "last.ckpt").write_bytes(b"")
-    with pytest.raises(SystemExit, match=r"last\.ckpt: expected the lessons of this training beside it"):
+    (tmp_path / "out" / "state.safetensors").write_bytes(b"")
+    with pytest.raises(SystemExit, match=r"state\.safetensors: expected the lessons of this training beside it"):
         main(asked)
-
-
-def test_a_checkpoint_that_no_training_wrote(lessons, tmp_path):
-    torch.save({"state_dict": {}}, tmp_path / "last.ckpt")
-    with pytest.raises(ValueError, match=r"last\.ckpt: not a checkpoint that training can go on with"):
-        learn(CSCSR.from_pretrained("cscsr_tiny_x4").eval(), lessons, 8, tmp_path, enable_progress_bar=False)
