@@ -84,7 +84,8 @@ def adapt(args: Sequence[str]) -> None:
         known |= {"weights": _identity(weights), "teacher": _identity(name), "steps": asked.steps}
         with locked_folder(asked.output, "adaptation"):
             lessons = _lessons(asked.output, known, student, name, clips)
-            before, after = learn(student, lessons, asked.steps, asked.output, precision_of(torch.device(device)))
+            precision = precision_of(torch.device(device)) if device == "cuda" else "32-true"
+            before, after = learn(student, lessons, asked.steps, asked.output, precision)
             said = (
                 f"{before:.2f} dB from the held-out pictures of {name} before, {after:.2f} dB after {asked.steps} steps"
             )

@@ -9,6 +9,7 @@ import torch
 
 from lightning_modules.inference import presets as speed
 from lightning_modules.inference.presets import SPEEDS, Choice, Preset, choices, choose, pace
+from lightning_modules.inference.tiles import TILE
 from lightning_modules.networks import CSCSR, RecurrentCSCSR
 from lightning_modules.registry import find_model
 from lightning_modules.storage.pretrained import settings_of
@@ -183,7 +184,7 @@ def test_memory_beyond_a_tile_is_that_of_the_picture_and_of_motion():
     for size, pixels in (((40, 50), 1), ((80, 100), 4), ((4000, 5000), 10_000)):
         found = {choice.name: choice.mib for choice in choices(3, size)}
         assert found["tfi"] == pytest.approx(2 * pixels)
-        tile, small = min(pixels, 256**2 / 2000), min(pixels, 144**2 / 2000)
+        tile, small = (min(pixels, (side + 2 * (CSCSR.halo + 48)) ** 2 / 2000) for side in (TILE, 16))
         assert found["all"] == pytest.approx((2 + motion) * pixels + (78 - motion) * tile)
         assert found["small tiles"] == pytest.approx((2 + motion) * pixels + (18 - motion) * small)
         assert found["no motion"] == pytest.approx(2 * pixels + 68 * tile)
