@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from lightning_modules.inference.clips import clips_around, film_groups
-from lightning_modules.inference.predict import predict
+from lightning_modules.inference.predict import check_options, predict
 from lightning_modules.inference.tiles import TILE, Box, reach, tiled
 from lightning_modules.networks import Network, RecurrentCSCSR
 from lightning_modules.networks.recurrent_cscsr import read_forward, read_from_end
@@ -176,6 +176,7 @@ class FilmMaker:
             raise ValueError(f"interpolated: expected 0, as {kind} estimates no motion of a clip, got {interpolated}")
         if self.carries_on and (how.get("psnr_tolerance") or how.get("self_ensemble", 1) > 1):
             raise ValueError(f"psnr_tolerance, self_ensemble: expected 0 and 1 for {kind}, got {how}")
+        check_options(**{name: how[name] for name in ("psnr_tolerance", "self_ensemble") if name in how})
         self.network, self.future, self.interpolated, self.tile, self._how = network, future, interpolated, tile, how
         self._last: _Made | None = None
         self._known: _Known | None = None

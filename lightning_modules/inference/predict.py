@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from itertools import count
 
 from torch import Tensor
 
+from lightning_modules.inference.self_ensemble import COUNTS
 from lightning_modules.inference.self_ensemble import self_ensemble as mean_of_views
 from lightning_modules.inference.tiles import TILE, forward_in_tiles
 from lightning_modules.networks import Network
@@ -49,6 +51,7 @@ def predict(
         >>> predict(ClassicalDecoder(scale=2), torch.ones(1, 41, 16, 16), self_ensemble=2).shape
         torch.Size([1, 3, 32, 32])
     """
+    check_options(psnr_tolerance, self_ensemble)
     views = count()
 
     def run(spikes: Tensor, flow: Tensor | None) -> Tensor:
@@ -61,3 +64,15 @@ def predict(
 
     rgb = mean_of_views(run, spikes, flow, network.pattern, network.scale, self_ensemble)
     return (rgb * exposure).clamp_(0, 1)
+
+
+def check_options(psnr_tolerance: float = 0.0, self_ensemble: int = 1) -> None:
+    """Refuse a tolerance or a number of views that cannot be.
+
+    Raises:
+        ValueError: which of them it is.
+    """
+    if not 0 <= psnr_tolerance < math.inf:
+        raise ValueError(f"psnr_tolerance: expected 0 dB or more, got {psnr_tolerance}")
+    if isinstance(self_ensemble, bool) or self_ensemble not in COUNTS:
+        raise ValueError(f"self_ensemble: expected one of {COUNTS}, got {self_ensemble!r}")

@@ -53,8 +53,6 @@ def forward_in_tiles(
     """
     if network.halo is None:
         return network(spikes, flow, static)
-    if not 0 <= tolerance < math.inf:
-        raise ValueError(f"psnr_tolerance: expected 0 dB or more, got {tolerance}")
     whole = Box(0, 0, *spikes.shape[-2:])
     if tolerance and flow is None and not static and network.takes_flow and not network.motion.static:
         flow = _flow_where_it_moves(network, spikes, tolerance, whole)
