@@ -5,7 +5,9 @@ from __future__ import annotations
 import pytest
 import pytorch_lightning as pl
 import torch
+import yaml
 
+from lightning_modules.__main__ import main
 from lightning_modules.data.stills import StillScenes
 from lightning_modules.networks import CSCSR, RecurrentCSCSR
 from lightning_modules.tasks.super_resolution import SuperResolution
@@ -50,3 +52,16 @@ def test_clips_of_little_light_do_not_outweigh_the_others(tmp_path):
 
     assert gradient_at((0.5, -0.5)).abs() < 1e-4
     assert gradient_at((0.5, -0.01)) > 0  # the small error pulls its own way harder: to the same share
+
+
+@pytest.mark.parametrize("scale", [1, 2, 3, 4])
+def test_configurations_of_grey_sensors_and_of_all_cameras(configs, scale, capsys):
+    files = [part for name in (f"x{scale}", "grey", "cameras") for part in ("-c", str(configs / f"{name}.yaml"))]
+    with pytest.raises(SystemExit):
+        main(["fit", *files, "--print_config"])
+    run = yaml.safe_load(capsys.readouterr().out)
+    network = CSCSR(**run["model"]["init_args"]["network"]["init_args"])
+    assert (network.scale, network.colors, network.config.noise) == (scale, 1, True)
+    data = run["data"]["init_args"]
+    assert data["pattern"] == "grey"
+    assert data["gains"] == [0.03, 1.0]
