@@ -60,7 +60,7 @@ class _StillFilm(nn.Module):
 
     def _meet(self, spikes: Tensor, flow: Tensor | None, state: Tensor, way: Tensor | None) -> tuple[Tensor, Tensor]:
         features = self.network.features(spikes, flow)
-        met = self.network.advance(features, spikes, [self.network.moved(state, way)])
+        met = self.network.advance(features, spikes, self.network.moved(state, way))
         state = torch.where((state != 0).any(), met, self.network.advance(features, spikes))
         return self.network.picture(state), state
 

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from lightning_modules.inference.clips import clips_around, film_groups
 from lightning_modules.inference.predict import check_options, predict
-from lightning_modules.inference.tiles import TILE, Box, reach, tiled
+from lightning_modules.inference.replay import run as run_replayed
+from lightning_modules.inference.tiles import TILE, TILE_ON_GPU, Box, reach, tiled
 from lightning_modules.networks import Network, RecurrentCSCSR
 from lightning_modules.networks.recurrent_cscsr import read_forward, read_from_end
 from spikekit import flow_warp, linear_motion, upsample_flow
@@ -148,7 +149,7 @@ class FilmMaker:
         network: any of :mod:`lightning_modules.networks`.
         future: key frames that a picture may wait for, of a network that carries a state on.
         interpolated: pictures between two that the network makes.
-        tile: side of the tiles in sensor pixels, 0 for none.
+        tile: side of the tiles in sensor pixels, 0 for none; when not given, what suits the network's device.
         how: ``psnr_tolerance``, ``self_ensemble`` and ``done`` of :func:`lightning_modules.inference.predict.predict`;
             a network that carries a state on takes none of them.
 
@@ -164,7 +165,9 @@ class FilmMaker:
         torch.Size([2, 3, 24, 20])
     """
 
-    def __init__(self, network: Network, future: int = 0, interpolated: int = 0, tile: int = TILE, **how: Any) -> None:
+    def __init__(
+        self, network: Network, future: int = 0, interpolated: int = 0, tile: int | None = None, **how: Any
+    ) -> None:
         kind = type(network).__name__
         self.carries_on = isinstance(network, RecurrentCSCSR)
         for name, number in (("future", future), ("interpolated", interpolated)):
@@ -177,7 +180,9 @@ class FilmMaker:
         if self.carries_on and (how.get("psnr_tolerance") or how.get("self_ensemble", 1) > 1):
             raise ValueError(f"psnr_tolerance, self_ensemble: expected 0 and 1 for {kind}, got {how}")
         check_options(**{name: how[name] for name in ("psnr_tolerance", "self_ensemble") if name in how})
-        self.network, self.future, self.interpolated, self.tile, self._how = network, future, interpolated, tile, how
+        self.network, self.future, self.interpolated, self._how = network, future, interpolated, how
+        on_gpu = any(part.is_cuda for part in network.parameters())
+        self.tile = (TILE_ON_GPU if on_gpu else TILE) if tile is None else tile
         self._last: _Made | None = None
         self._known: _Known | None = None
 
@@ -302,7 +307,7 @@ class FilmMaker:
 
     def _features(self, spikes: Tensor, flow: Tensor | None, whole: Box) -> Tensor:
         def run(outer: Box) -> Tensor:
-            features = self.network.features(outer.of(spikes), None if flow is None else outer.of(flow))
+            features = run_replayed(self.network.features, outer.of(spikes), None if flow is None else outer.of(flow))
             return self._halved(features, whole)
 
         return tiled(run, whole, self.tile, lambda box: reach(flow, box, whole, self.network.halo))
@@ -317,7 +322,8 @@ class FilmMaker:
 
         def run(outer: Box) -> Tensor:
             around = [moved(outer, *neighbor) for neighbor in neighbors]
-            state = self.network.advance(outer.of(features).to(self._dtype), outer.of(spikes), around)
+            seen = outer.of(features).to(self._dtype), outer.of(spikes)
+            state = run_replayed(self.network.advance, *seen, *around)
             return self._halved(state, whole)
 
         return tiled(run, whole, self.tile, lambda _: self.network.halo)

@@ -9,11 +9,14 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from lightning_modules.inference.replay import run as run_replayed
 from lightning_modules.inference.scene_activity import CELL, expected_errors, moving_cells, scene_activity
 from lightning_modules.networks import Network
 
 #: side of a tile, in sensor pixels, where nothing else is asked for
 TILE = 200
+#: on a GPU, which has more memory, and needs larger ones to be busy
+TILE_ON_GPU = 1024
 #: motion that is followed over the edge of a tile, in sensor pixels; what moves further is searched inside
 FAR = 48
 #: sensor pixels around what moves in which motion is estimated, where a tolerance is given
@@ -57,15 +60,14 @@ def forward_in_tiles(
     if tolerance and flow is None and not static and network.takes_flow and not network.motion.static:
         flow = _flow_where_it_moves(network, spikes, tolerance, whole)
         static = flow is None
-    if not tile or max(spikes.shape[-2:]) <= tile:
-        return network(spikes, flow, static)
     flow = network.resolve_flow(spikes, flow, static)
 
     def run(outer: Box) -> Tensor:
         part = None if flow is None else outer.of(flow)
         if tolerance and part is not None and not part.any():
             part = None
-        return network(outer.of(spikes), part, part is None)
+        seen = outer.of(spikes)
+        return network(seen, static=True) if part is None else run_replayed(network.__call__, seen, part)
 
     return tiled(run, whole, tile, lambda box: reach(flow, box, whole, network.halo), network.scale, done)
 

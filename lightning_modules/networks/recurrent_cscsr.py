@@ -211,7 +211,7 @@ class RecurrentCSCSR(CSCSR):
             ways = (None if flow is None else self.flow_to(flow[:, n], clocks) for clocks in (-every, every))
             around = zip((before, after), ways, strict=True)
             neighbors = [self.moved(state, way) for state, way in around if state is not None]
-            return self.advance(features[:, n], spikes[:, n], neighbors)
+            return self.advance(features[:, n], spikes[:, n], *neighbors)
 
         earlier, final, last = [], [], None
         for first in range(0, spikes.shape[1], size):
@@ -248,7 +248,7 @@ class RecurrentCSCSR(CSCSR):
         told = self._told(noise, spikes)
         return self.reconstruction.features(self._colors(spikes, flow, **told), **told)
 
-    def advance(self, features: Tensor, spikes: Tensor, neighbors: Sequence[Tensor] = ()) -> Tensor:
+    def advance(self, features: Tensor, spikes: Tensor, *neighbors: Tensor) -> Tensor:
         """Return the state of a key frame: its picture, as channels, and a memory.
 
         Args:
