@@ -20,7 +20,7 @@ from spikekit.decoders.dense import tfi, tfp
 from spikekit.metrics import psnr
 from spikekit.scenes.adaptive_sampling import Plan
 from spikekit.scenes.analytic import Layer, Motion, Scene
-from spikekit.scenes.frame_sequence import Film
+from spikekit.scenes.frame_sequence import FrameSequence
 from spikekit.sensor.simulate import simulate_spikes
 from spikekit.tables import table
 from spikekit.timing import peak_memory
@@ -122,8 +122,8 @@ def measure(
     ramp = torch.cat([torch.linspace(first, middle, CLOCKS + 1), torch.linspace(middle, last, CLOCKS + 1)[1:]])
     truth = truth * ramp[:, None, None]
 
-    def film(plan: Plan | None) -> Film:
-        return Film(frames, scale=scale, alpha=alpha, clocks=CLOCKS, plan=plan, **settings)
+    def film(plan: Plan | None) -> FrameSequence:
+        return FrameSequence(frames, scale=scale, alpha=alpha, clocks=CLOCKS, plan=plan, **settings)
 
     plans = None, _MOST
     timed = [[_timed(lambda plan=plan: film(plan).light()) for _ in range(rounds)] for plan in plans]

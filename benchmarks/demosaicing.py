@@ -17,7 +17,7 @@ from spikekit.decoders import tfi_at
 from spikekit.flow import linear_motion
 from spikekit.io import read_picture, read_video
 from spikekit.metrics import psnr
-from spikekit.scenes import Film
+from spikekit.scenes import FrameSequence
 from spikekit.warp import demosaic_along_motion
 
 FRAMES, TIMES, ENDS = 41, (10, 15, 20, 25, 30), (5, 35)
@@ -52,7 +52,7 @@ def film_row(folder: Path, clocks: int, alpha: float) -> list[float]:
     around = -(-(FRAMES // 2) // clocks)
     if middle < around or middle + around >= len(frames):
         raise ValueError(f"{folder}: expected {2 * around + 1} frames or more, got {len(frames)}")
-    film = Film(frames[middle - around : middle + around + 1], scale=1, alpha=alpha, clocks=clocks)
+    film = FrameSequence(frames[middle - around : middle + around + 1], scale=1, alpha=alpha, clocks=clocks)
     clip = film.clip(around, FRAMES)
     spikes = torch.cat(list(film.spikes(clip.first, FRAMES, seed=_SEED)))
     raw = torch.stack([tfi_at(spikes, n) for n in TIMES]) / alpha

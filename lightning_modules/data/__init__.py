@@ -1,6 +1,6 @@
 """Clips to train on, to judge by, and to reconstruct."""
 
-from lightning_modules.data.films import FilmClips, FilmScenes
+from lightning_modules.data.sequences import FilmScenes, SequenceClips
 from lightning_modules.data.stills import StillClips, StillScenes
 
-__all__ = ["FilmClips", "FilmScenes", "StillClips", "StillScenes"]
+__all__ = ["FilmScenes", "SequenceClips", "StillClips", "StillScenes"]

@@ -29,8 +29,8 @@ _REDS = ("{0}/{0}_orig", "{0}_orig", "{0}_orig_part*/{0}/{0}_orig", "{0}_orig_pa
 
 
 @dataclass(frozen=True)
-class FilmFiles:
-    """A film as files.
+class SequenceFiles:
+    """A frame sequence as files.
 
     Args:
         name: what it is called, such as ``walk`` or ``00001/0266``.
@@ -56,30 +56,30 @@ class Collection:
 
     Args:
         name: the data set.
-        train: films to learn from.
-        val: films to choose by.
-        test: films to judge by.
-        clips: clips of a film, as the paper has it.
-        scale: the only super-resolution factor that the films are for, if there is only one.
+        train: sequences to learn from.
+        val: sequences to choose by.
+        test: sequences to judge by.
+        clips: clips of a sequence, as the paper has it.
+        scale: the only super-resolution factor that the sequences are for, if there is only one.
     """
 
     name: str
-    train: tuple[FilmFiles, ...] = ()
-    val: tuple[FilmFiles, ...] = ()
-    test: tuple[FilmFiles, ...] = ()
+    train: tuple[SequenceFiles, ...] = ()
+    val: tuple[SequenceFiles, ...] = ()
+    test: tuple[SequenceFiles, ...] = ()
     clips: int = 1
     scale: int | None = None
 
 
-def find_films(root: str | Path, hold_out: Callable[[list], tuple[list, list]]) -> Collection:
+def find_sequences(root: str | Path, hold_out: Callable[[list], tuple[list, list]]) -> Collection:
     """Find out what is in a folder, by its files.
 
     Args:
         root: the folder: what the archives of a data set were unpacked into, or one folder further down.
-        hold_out: splits films that have no official split into those to train on and those to validate by.
+        hold_out: splits sequences that have no official split into those to train on and those to validate by.
 
     Returns:
-        The films; frames are not opened.
+        The sequences; frames are not opened.
 
     Raises:
         FileNotFoundError: there is no such folder, none of the layouts fits, or a listed sequence is missing; the
@@ -138,7 +138,7 @@ def _vimeo(root: Path) -> Collection | None:
     return Collection("Vimeo-90K", train, test, test, scale=4) if train or test else None
 
 
-def _septuplets(folder: Path, small: Path | None, listed: str, large: str = "sequences") -> tuple[FilmFiles, ...]:
+def _septuplets(folder: Path, small: Path | None, listed: str, large: str = "sequences") -> tuple[SequenceFiles, ...]:
     """Return the sequences of a list, which has ``00001/0001`` and the like in its lines."""
     if not (folder / listed).is_file():
         return ()
@@ -158,19 +158,21 @@ def _septuplets(folder: Path, small: Path | None, listed: str, large: str = "seq
             )
     frames = tuple(f"im{n}.png" for n in range(1, 8))
     return tuple(
-        FilmFiles(name, (small or folder / large) / name, frames, folder / large / name, 1 if small else 4, middle=3)
+        SequenceFiles(
+            name, (small or folder / large) / name, frames, folder / large / name, 1 if small else 4, middle=3
+        )
         for name in names
     )
 
 
-def _films(folders: Iterable[Path], only: str | None = None) -> tuple[FilmFiles, ...]:
+def _films(folders: Iterable[Path], only: str | None = None) -> tuple[SequenceFiles, ...]:
     """Return the folders inside some folders that hold pictures."""
-    films: dict[str, FilmFiles] = {}
+    films: dict[str, SequenceFiles] = {}
     for folder in folders:
         for name in [only] if only else _subfolders(folder):
             frames = tuple(sorted(_pictures(folder / name), key=natural))
             if frames:
-                films.setdefault(name, FilmFiles(name, folder / name, frames))
+                films.setdefault(name, SequenceFiles(name, folder / name, frames))
     return tuple(films[name] for name in sorted(films, key=natural))
 
 

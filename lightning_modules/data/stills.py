@@ -65,7 +65,7 @@ class StillClips(Dataset):
             are the centres of the first and of the last window.
         key_frames: clips that follow each other, of one scene, for a network that makes films.
         every: frames from the middle of one to the middle of the next.
-        seed: where chance begins.
+        seed: random seed.
         augment: mirror, turn and recolour the pictures. Without it the pictures take their turns, one an index.
         textures: take some of the pictures from :func:`lightning_modules.data.textures.texture`.
         length: what ``len`` says; any index from 0 on can be had.
@@ -363,7 +363,7 @@ class StillScenes(ClipScenes):
         batch_size: clips in a batch.
         workers: processes that make clips. Null takes one less than there are cores, sixteen at most: one core is left
             to training.
-        seed: where chance begins. The same seed gives the same clips, whatever the number of workers.
+        seed: random seed. The same seed gives the same clips, whatever the number of workers.
     """
 
     @takes(StillClips, "pictures", "augment", "textures", "length")

@@ -17,11 +17,11 @@ from lightning_modules.cli.errors import UsageError
 from lightning_modules.cost.measure import Row, Timed, attempt, measure_costs, running
 from lightning_modules.cost.runner import Runner
 from lightning_modules.data import FilmScenes, StillScenes
-from lightning_modules.data.films import FilmClips
+from lightning_modules.data.sequences import SequenceClips
 from lightning_modules.metrics.flicker import film_flicker
 from lightning_modules.metrics.image import measures
 from spikekit import Scene
-from spikekit.scenes.frame_sequence import FilmClip
+from spikekit.scenes.frame_sequence import SequenceClip
 
 #: pictures of a film; those between the first and the last count, which all have a neighbour on either side
 PICTURES = 5
@@ -118,14 +118,14 @@ def film_scenes(data: LightningDataModule, frames: int, every: int) -> Iterator[
             raise UsageError(
                 f"--film: expected a multiple of the {recipe.clocks} clocks of a source frame, got {every}"
             )
-        clips = FilmClips(data.found.test, recipe, data.clips or data.found.clips, cache=data.test_set.cache)
+        clips = SequenceClips(data.found.test, recipe, data.clips or data.found.clips, cache=data.test_set.cache)
         for n in range(len(clips)):
             yield _film_scene(clips[n]["spikes"], recipe.view(*clips.place(n)), every, recipe.scale)
     else:
         raise UsageError(f"--film: expected still pictures in motion or films at full size, got {type(data).__name__}")
 
 
-def _film_scene(spikes: Tensor, view: Scene | FilmClip, every: int, scale: int) -> FilmScene:
+def _film_scene(spikes: Tensor, view: Scene | SequenceClip, every: int, scale: int) -> FilmScene:
     before, after = view.middle - every, view.middle + every
     rgb = torch.stack([view.rgb(clock) for clock in (before, view.middle, after)])
     flow = torch.stack([view.flow(clock, scale=scale) for clock in (before, after)])

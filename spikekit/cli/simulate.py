@@ -134,7 +134,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     said = "which frame of the film is in the middle, from 0; that in its middle if not given"
     add("--frame", type=whole(0), metavar="M", help=said)
     option("readout", whole(1), "N", "clocks for every frame of the stream")
-    option("seed", whole(0), "N", "where chance begins: first charge and noise")
+    option("seed", whole(0), "N", "random seed: first charge and noise")
     said = "where the frames of a side-car are, if they have moved"
     add("--source", type=Path, default=None, metavar="PATH", help=said)
 

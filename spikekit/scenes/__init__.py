@@ -2,14 +2,14 @@
 
 from spikekit.scenes.adaptive_sampling import Plan, SceneProfile
 from spikekit.scenes.analytic import Layer, Motion, Scene
-from spikekit.scenes.frame_sequence import Film, FilmClip
+from spikekit.scenes.frame_sequence import FrameSequence, SequenceClip
 
 __all__ = [
-    "Film",
-    "FilmClip",
+    "FrameSequence",
     "Layer",
     "Motion",
     "Plan",
     "Scene",
     "SceneProfile",
+    "SequenceClip",
 ]

@@ -15,7 +15,7 @@ class Interval:
     """Two neighbouring frames and the light between them, computed on demand.
 
     Args:
-        film: the :class:`spikekit.Film` that it is a part of, whose settings count.
+        film: the :class:`spikekit.FrameSequence` that it is a part of, whose settings count.
         first: ``rgb`` (3, H, W), its sides multiples of ``2 * film.scale``.
         second: the next frame.
     """

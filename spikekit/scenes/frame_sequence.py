@@ -27,7 +27,7 @@ SIMULATOR_VERSION = 1
 _KEPT = 2  # frames and intervals that stay in memory: a clip and its flow look at two intervals
 
 
-class Film:
+class FrameSequence:
     r"""A sequence of frames, seen by a colour spike camera.
 
     Convention:
@@ -65,7 +65,7 @@ class Film:
 
     Example:
         >>> picture = torch.rand(3, 34, 41)
-        >>> film = Film([picture.roll(n, -1) for n in range(3)], scale=4)
+        >>> film = FrameSequence([picture.roll(n, -1) for n in range(3)], scale=4)
         >>> film.height, film.width, film.clock_count
         (32, 40, 41)
         >>> bool((film.rgb(1) == picture.roll(1, -1)[:, :32, :40]).all())
@@ -186,7 +186,7 @@ class Film:
             count: how many, a multiple of ``readout``; up to the film's end when not given.
             noise: what the sensor adds, see :class:`spikekit.SensorNoise`.
             readout: clocks for every frame of spikes, see :class:`spikekit.SpikeSensor`.
-            seed: where chance begins: the first charge and all noise.
+            seed: random seed: the first charge and all noise.
             chunk: clocks of light that are held.
 
         Returns:
@@ -199,7 +199,7 @@ class Film:
         count = self._count(first, count) // readout * readout if count is None else count
         return map(sensor.expose, self.chunks(first, count, chunk=-(-check_whole("chunk", chunk) // readout) * readout))
 
-    def clip(self, frame: int, frames: int = 41) -> FilmClip:
+    def clip(self, frame: int, frames: int = 41) -> SequenceClip:
         """Return a clip that is centred on a source frame.
 
         Args:
@@ -219,7 +219,7 @@ class Film:
                 f"frame: a clip of {frames} clocks, {self.clocks} an interval, needs frames {first} to {last} of "
                 f"0 to {len(self.frames) - 1}, got {frame}"
             )
-        return FilmClip(self, frame, frames)
+        return SequenceClip(self, frame, frames)
 
     def profile(self, interval: int | None = None) -> SceneProfile:
         """Profile the change between frame ``interval`` and the next, or in the whole film.
@@ -334,16 +334,16 @@ def _keep(kept: dict[int, Any], index: int, value: Any) -> None:
 
 
 @dataclass(frozen=True)
-class FilmClip:
-    """Some clocks of a film around a source frame: a scene like :class:`spikekit.Scene`, see :meth:`Film.clip`.
+class SequenceClip:
+    """Some clocks around a source frame: a scene like :class:`spikekit.Scene`, see :meth:`FrameSequence.clip`.
 
     Args:
-        film: the film.
+        sequence: that it is a part of.
         frame: the source frame at the middle.
         frames: clocks of the clip.
     """
 
-    film: Film
+    sequence: FrameSequence
     frame: int
     frames: int = 41
 
@@ -354,18 +354,18 @@ class FilmClip:
 
     @property
     def first(self) -> int:
-        """The clip's first clock in the film."""
-        return self.frame * self.film.clocks - self.middle
+        """The clip's first clock in the sequence."""
+        return self.frame * self.sequence.clocks - self.middle
 
     @property
     def height(self) -> int:
         """Rows of the view."""
-        return self.film.height
+        return self.sequence.height
 
     @property
     def width(self) -> int:
         """Columns of the view."""
-        return self.film.width
+        return self.sequence.width
 
     def rgb(self, clock: int) -> Tensor:
         """Return the view at a clock that has a source frame: at the middle, the ground truth.
@@ -373,10 +373,10 @@ class FilmClip:
         Raises:
             ValueError: a clock without one.
         """
-        frame, phase = divmod(self.first + clock, self.film.clocks)
+        frame, phase = divmod(self.first + clock, self.sequence.clocks)
         if phase:
             raise ValueError(f"clock: expected that of a source frame, as {self.middle}, got {clock}")
-        return self.film.rgb(frame)
+        return self.sequence.rgb(frame)
 
     def light(
         self, pattern: str | CFA | None = None, *, scale: int | None = None, alpha: float | None = None
@@ -384,25 +384,25 @@ class FilmClip:
         """Return the light at every clock, (frames, height / scale, width / scale).
 
         Args:
-            pattern: that of the film, if given; so are the others.
-            scale: that of the film.
-            alpha: that of the film.
+            pattern: that of the sequence, if given; so are the others.
+            scale: that of the sequence.
+            alpha: that of the sequence.
 
         Raises:
-            ValueError: another pattern, scale or alpha than the film's.
+            ValueError: another pattern, scale or alpha than the sequence's.
         """
         wanted = pattern and cfa_pattern(pattern), scale, alpha
-        own = self.film.pattern, self.film.scale, self.film.alpha
+        own = self.sequence.pattern, self.sequence.scale, self.sequence.alpha
         if any(value is not None and value != has for value, has in zip(wanted, own, strict=True)):
-            raise ValueError(f"pattern, scale, alpha: expected those of the film, {own}, got {wanted}")
-        return self.film.light(self.first, self.frames)
+            raise ValueError(f"pattern, scale, alpha: expected those of the sequence, {own}, got {wanted}")
+        return self.sequence.light(self.first, self.frames)
 
     def flow(self, clock: float, *, scale: int | None = None) -> Tensor:
-        """Return the flow from the middle to a clock, see :meth:`Film.flow`.
+        """Return the flow from the middle to a clock, see :meth:`FrameSequence.flow`.
 
         Raises:
-            ValueError: another scale than the film's, or as :meth:`Film.flow`.
+            ValueError: another scale than the sequence's, or as :meth:`FrameSequence.flow`.
         """
-        if scale not in (None, self.film.scale):
-            raise ValueError(f"scale: expected that of the film, {self.film.scale}, got {scale}")
-        return self.film.flow(self.frame, self.first + clock)
+        if scale not in (None, self.sequence.scale):
+            raise ValueError(f"scale: expected that of the sequence, {self.sequence.scale}, got {scale}")
+        return self.sequence.flow(self.frame, self.first + clock)

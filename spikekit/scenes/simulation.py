@@ -25,7 +25,7 @@ from spikekit.io.video import VideoFrames, read_video
 from spikekit.io.whole_file import whole_file
 from spikekit.progress import progress
 from spikekit.scenes.adaptive_sampling import Plan, SceneProfile
-from spikekit.scenes.frame_sequence import Film
+from spikekit.scenes.frame_sequence import FrameSequence
 from spikekit.sensor.noise import SensorNoise
 
 _SHOWN = 2  # intervals whose plans are told one by one
@@ -44,7 +44,7 @@ class Settings:
         frame: the source frame at the middle of a clip; the middle one when not given.
         frames: frames of the stream; ``None`` for the whole film.
         readout: clocks for every frame of the stream.
-        seed: where chance begins.
+        seed: random seed.
         plan: what is modelled: ``scene`` for what the scene requires, ``everything``, or a number of latent frames.
         tolerance: share of the spikes that may change by not modelling more, under this name in side-cars.
         step: displacement between latent frames, in sensor pixels.
@@ -78,12 +78,12 @@ class Settings:
                 f"got {self.plan}"
             )
 
-    def film(self, frames: Sequence[Tensor]) -> Film:
+    def film(self, frames: Sequence[Tensor]) -> FrameSequence:
         """Return the film of these frames."""
         plan = None
         if self.plan != "scene":
             plan = Plan.everything(self.clocks) if self.plan == "everything" else Plan(self.plan)
-        return Film(
+        return FrameSequence(
             frames,
             scale=self.scale,
             pattern=self.pattern,
@@ -278,7 +278,7 @@ def simulate(source: Source, settings: Settings, output: Path, replayed: Sidecar
     return _report(source, settings, film, sidecar, bits, [*_plan_lines(plans, source), *told], output)
 
 
-def _check_calibration(settings: Settings, film: Film, replayed: Sidecar | None) -> None:
+def _check_calibration(settings: Settings, film: FrameSequence, replayed: Sidecar | None) -> None:
     """Refuse the calibration of a sensor of another size, or one that has changed."""
     known = settings.noise.calibration
     sensor = film.height // settings.scale, film.width // settings.scale
@@ -302,7 +302,7 @@ def _calibration(settings: Settings, noise: SensorNoise, output: Path) -> str | 
 
 
 def _look(
-    source: Source, film: Film, pictures: dict[int, Path], part: Path, output: Path, replayed: Sidecar | None
+    source: Source, film: FrameSequence, pictures: dict[int, Path], part: Path, output: Path, replayed: Sidecar | None
 ) -> dict[str, str]:
     """Read every frame once, so that a damaged one shows now; write the truth; return the hashes of the frames."""
     expected = None if replayed is None else replayed.source["frames"]
@@ -324,7 +324,7 @@ def _look(
     return prints
 
 
-def _needed_noise(source: Source, settings: Settings, film: Film) -> tuple[SensorNoise, list[str]]:
+def _needed_noise(source: Source, settings: Settings, film: FrameSequence) -> tuple[SensorNoise, list[str]]:
     """Return the noise that changes spikes, and a line about it."""
     if settings.noise == SensorNoise():
         return settings.noise, []
@@ -337,7 +337,13 @@ def _needed_noise(source: Source, settings: Settings, film: Film) -> tuple[Senso
 
 
 def _expose(
-    source: Source, settings: Settings, film: Film, noise: SensorNoise, part: Path, output: Path, plans: list[Plan]
+    source: Source,
+    settings: Settings,
+    film: FrameSequence,
+    noise: SensorNoise,
+    part: Path,
+    output: Path,
+    plans: list[Plan],
 ) -> tuple[tuple[int, int, int], int, str]:
     """Write the stream; return its shape, how many bits are set, and its hash."""
     digest = hashlib.sha256()
@@ -389,7 +395,7 @@ def _plan_lines(plans: list[Plan], source: Source) -> list[str]:
 
 
 def _report(
-    source: Source, settings: Settings, film: Film, sidecar: Sidecar, bits: int, plan: list[str], output: Path
+    source: Source, settings: Settings, film: FrameSequence, sidecar: Sidecar, bits: int, plan: list[str], output: Path
 ) -> list[str]:
     frames, height, width = (sidecar.stream[key] for key in ("frames", "height", "width"))
     stored, seen = (source.used.height, source.used.width), (film.height, film.width)

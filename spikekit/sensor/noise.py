@@ -261,7 +261,7 @@ class NoisyPixels:
     Args:
         noise: its sources.
         size: (*, H, W), how many pixels there are.
-        seed: where chance begins, 0 or more.
+        seed: random seed, 0 or more.
     """
 
     def __init__(self, noise: SensorNoise, size: tuple[int, ...], seed: int) -> None:

@@ -5,7 +5,7 @@ from inspect import Parameter, signature
 import pytest
 
 from lightning_modules.data import FilmScenes, StillClips, StillScenes
-from lightning_modules.data.films import ClipRecipe
+from lightning_modules.data.sequences import ClipRecipe
 from lightning_modules.signatures import takes
 
 

@@ -5,8 +5,8 @@ import re
 import pytest
 import torch
 
-from lightning_modules.data.films import ClipRecipe, FilmClips, FilmScenes
-from lightning_modules.data.layouts import find_films
+from lightning_modules.data.layouts import find_sequences
+from lightning_modules.data.sequences import ClipRecipe, FilmScenes, SequenceClips
 from spikekit import mosaic, read_picture
 
 SMALL = {"scale": 2, "patch": 8, "batch_size": 2, "workers": 0}
@@ -23,7 +23,7 @@ def names(films):
 
 
 def found(root):
-    return find_films(root, lambda films: (films[1:], films[:1]))
+    return find_sequences(root, lambda films: (films[1:], films[:1]))
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,7 @@ def test_vid4_is_for_tests(tmp_path, folder, write_film):
     assert names(films.test) == ["city", "walk"]
     assert films.test[1].folder == tmp_path / folder / "walk"
     assert scenes(tmp_path, "test").test_names == ["city/00000002", "walk/00000002"]
-    with pytest.raises(FileNotFoundError, match=r"Vid4 without films for fit \(train\)"):
+    with pytest.raises(FileNotFoundError, match=r"Vid4 without sequences for fit \(train\)"):
         scenes(tmp_path, "fit")
 
 
@@ -129,7 +129,7 @@ def test_vimeo_made_small(tmp_path, septuplets):
     assert clip["spikes"].shape == (41, 16, 24)
     data = scenes(tmp_path, "test", scale=4, clips=3)
     assert data.test_names == ["00001/0001/im4"]
-    assert [FilmClips(data.found.test, ClipRecipe(seed=seed), patch=8).names for seed in range(5)] == [
+    assert [SequenceClips(data.found.test, ClipRecipe(seed=seed), patch=8).names for seed in range(5)] == [
         ["00001/0001/im4"]
     ] * 5
     small = torch.nn.functional.interpolate(truth[None], scale_factor=0.25, mode="bicubic", antialias=True)[0]
@@ -163,7 +163,7 @@ def test_what_is_missing_is_shown(tmp_path, reds):
     with pytest.raises(NotADirectoryError, match="expected a folder of films, got a file"):
         found(tmp_path / "file")
     reds(tmp_path / "reds", scenes=(1, 0))
-    with pytest.raises(FileNotFoundError, match=r"REDS without films for fit \(val\)"):
+    with pytest.raises(FileNotFoundError, match=r"REDS without sequences for fit \(val\)"):
         scenes(tmp_path / "reds", "fit")
 
 
@@ -210,6 +210,6 @@ def test_bad_files_are_named(tmp_path, write_film):
     with pytest.raises(ValueError, match="expected 32 x 48"):
         clips[1]
     write_film(tmp_path / "b", 3)
-    train = FilmClips(found(tmp_path / "b").test, ClipRecipe(scale=2), patch=18)
+    train = SequenceClips(found(tmp_path / "b").test, ClipRecipe(scale=2), patch=18)
     with pytest.raises(ValueError, match=r"patch: expected at most 16, as .* gives 16 x 24 sensor pixels at scale 2"):
         train[0]

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from lightning_modules.data.films import ClipRecipe
-from lightning_modules.data.layouts import FilmFiles
-from spikekit import Blend, Film, SensorNoise, write_picture
+from lightning_modules.data.layouts import SequenceFiles
+from lightning_modules.data.sequences import ClipRecipe
+from spikekit import Blend, FrameSequence, SensorNoise, write_picture
 from spikekit.scenes.frame_sequence import SIMULATOR_VERSION
 
 #: by version, of which only the newest is ever tried
@@ -37,7 +37,7 @@ def film(tmp_path):
         shade = 255 - 32 * (n % 2)
         names.append(f"{n}.bmp")
         write_picture(tmp_path / names[-1], torch.from_numpy(np.roll(blocks, 2 * n, 1) * shade).permute(2, 0, 1) / 255)
-    return FilmFiles("film", tmp_path, tuple(names))
+    return SequenceFiles("film", tmp_path, tuple(names))
 
 
 def test_spikes_and_truth(film):
@@ -63,7 +63,7 @@ def test_latent_frames_and_flow():
     y, x = np.mgrid[:48, :64]
     waves = [np.sin((x - 3 * n) / 5 + k) * np.cos(y / 4 - k) for n in range(3) for k in range(3)]
     frames = torch.from_numpy(np.stack(waves).reshape(3, 3, 48, 64)).float() * 0.4 + 0.5
-    seen = Film(frames, scale=2)
+    seen = FrameSequence(frames, scale=2)
     for name, planes, near in (("light", seen.light(13, 1), 3e-4), ("flow", seen.clip(1, 21).flow(2), 3e-3)):
         found = planes[:, 5::8, 6::10].flatten().tolist()
         assert found == pytest.approx(EXPECTED[name], abs=near), CHANGED

@@ -18,7 +18,7 @@ from spikekit import Calibration, read_picture, read_spikes, tfp, write_calibrat
 from spikekit.cli.command import main
 from spikekit.io.sidecar import find_sidecar, published, read_sidecar
 from spikekit.scenes.adaptive_sampling import Plan
-from spikekit.scenes.frame_sequence import Film
+from spikekit.scenes.frame_sequence import FrameSequence
 from spikekit.scenes.simulation import Settings, Source, build
 from spikekit.sensor.noise import DEAD, HOT
 
@@ -136,11 +136,11 @@ def test_a_clip(film, capsys):
     assert list(known.source["frames"]) == ["f1.png", "f2.png", "f3.png"]
     assert known.settings["frame"] == 2
     assert [interval["latent"] for interval in known.plan["intervals"]] == [
-        Film(frames(5), scale=2, pattern="GBRG").plan(n).latent for n in (1, 2)
+        FrameSequence(frames(5), scale=2, pattern="GBRG").plan(n).latent for n in (1, 2)
     ]
 
     assert (io.imread("made/a.png") == io.imread("film/f2.png")[:32, :36]).all()
-    whole = Film(frames(5), scale=2, pattern="GBRG")
+    whole = FrameSequence(frames(5), scale=2, pattern="GBRG")
     spikes = read_spikes("made/a.dat", 16, 18)
     assert spikes.equal(torch.cat(list(whole.spikes(20, 41, seed=3))))
     light = whole.light(20, 41).mean(0)
@@ -177,7 +177,7 @@ def test_one_picture_stands_still(film, source):
     simulate(source, "-o", "a.dat", "--scale", 2)
     assert believed(Path("a.dat"))
     spikes = read_spikes("a.dat", 16, 18)
-    assert (spikes.sum(0) - 41 * Film(frames(2)[1:], scale=2).light()[0]).abs().max() < 1
+    assert (spikes.sum(0) - 41 * FrameSequence(frames(2)[1:], scale=2).light()[0]).abs().max() < 1
 
 
 def test_noise_that_changes_nothing_is_left_out(film, capsys):
@@ -265,11 +265,11 @@ def test_what_is_no_interpolation_is_refused(film, fails):
         2, film, "-o", "a.dat", "--scale", 2, "--interpolation", "builtins.dict"
     )
     with pytest.raises(TypeError):
-        next(iter(Film(frames(2), scale=2, interpolation=0, plan=Plan(3)).spikes(0, 20)))
+        next(iter(FrameSequence(frames(2), scale=2, interpolation=0, plan=Plan(3)).spikes(0, 20)))
 
 
 def test_the_defaults_are_those_of_the_film():
-    film = Film(frames(1), scale=2)
+    film = FrameSequence(frames(1), scale=2)
     settings = Settings(scale=2)
     for name in ("pattern", "alpha", "clocks", "step"):
         assert getattr(settings, name) == getattr(film, name)

@@ -10,7 +10,7 @@ from spikekit import PATTERNS, bin_to_sensor, psnr, read_spikes, tfi, tfp, write
 from spikekit.flow.interpolate import Blend, Still
 from spikekit.scenes.adaptive_sampling import Plan
 from spikekit.scenes.analytic import Layer, Motion, Scene
-from spikekit.scenes.frame_sequence import Film
+from spikekit.scenes.frame_sequence import FrameSequence
 from spikekit.sensor.noise import SensorNoise
 from spikekit.sensor.simulate import SpikeSensor, simulate_spikes
 
@@ -64,7 +64,7 @@ def moving(x, y=0.0, frames=3, size=64, scale=2, **settings):
     picture = smooth(size, size, settings.pop("cut", 0.15))
     shots = [exact.shifted(picture, float(n)).clamp(0, 1) for n in range(frames)]
     motion = Shift(x / 2, y / 2)
-    return Film(shots, scale=scale, interpolation=exact, motion=motion, **settings)
+    return FrameSequence(shots, scale=scale, interpolation=exact, motion=motion, **settings)
 
 
 # --- truth and light --------------------------------------------------------------------------------------------------
@@ -72,7 +72,7 @@ def moving(x, y=0.0, frames=3, size=64, scale=2, **settings):
 
 def test_truth_is_the_frame_from_the_top_left():
     frames = [torch.rand(3, 37, 50) for _ in range(3)]
-    film = Film(frames, scale=3)
+    film = FrameSequence(frames, scale=3)
     assert (film.height, film.width, film.clock_count) == (36, 48, 41)
     for n in range(3):
         assert film.rgb(n).equal(frames[n][:, :36, :48])
@@ -81,7 +81,7 @@ def test_truth_is_the_frame_from_the_top_left():
 
 def test_truth_is_a_copy():
     frames = [torch.rand(3, 8, 8) for _ in range(2)]
-    film = Film(frames, scale=2)
+    film = FrameSequence(frames, scale=2)
     film.rgb(0).zero_()
     assert film.rgb(0).equal(frames[0])
     assert frames[0].any()
@@ -91,7 +91,7 @@ def test_truth_is_a_copy():
 @pytest.mark.parametrize("latent", [1, 2, 4, 19])
 def test_light_is_that_of_latent_frames_blended(pattern, latent):
     frames = [torch.rand(3, 16, 12) for _ in range(3)]
-    film = Film(frames, scale=2, pattern=pattern, alpha=0.7, interpolation=Fade(), plan=Plan(latent))
+    film = FrameSequence(frames, scale=2, pattern=pattern, alpha=0.7, interpolation=Fade(), plan=Plan(latent))
     light = film.light()
     assert light.shape == (41, 8, 6)
     steps = latent + 1
@@ -115,7 +115,7 @@ def test_light_is_that_of_latent_frames_blended(pattern, latent):
 
 def test_without_latent_frames_the_ends_are_blended():
     frames, interpolation = [torch.rand(3, 8, 8) for _ in range(2)], Fade()
-    light = Film(frames, scale=2, clocks=8, interpolation=interpolation, plan=Plan()).light()
+    light = FrameSequence(frames, scale=2, clocks=8, interpolation=interpolation, plan=Plan()).light()
     torch.testing.assert_close(light[2], torch.lerp(light[0], light[8], 0.25))
     assert interpolation.calls == []
 
@@ -124,7 +124,7 @@ def test_a_region_is_interpolated_and_the_rest_blended():
     frames, interpolation = [torch.rand(3, 32, 48) for _ in range(2)], Fade()
 
     def light(plan):
-        return Film(frames, scale=2, pattern="GBRG", interpolation=interpolation, plan=plan).light()
+        return FrameSequence(frames, scale=2, pattern="GBRG", interpolation=interpolation, plan=plan).light()
 
     part, whole, blended = light(Plan(19, (4, 6, 8, 10))), light(Plan(19)), light(Plan())
     assert interpolation.calls[0] == (3, 16, 20)
@@ -165,14 +165,14 @@ def test_frames_are_read_when_they_are_needed():
             return super().__getitem__(index)
 
     frames = Frames(torch.rand(3, 8, 8) for _ in range(9))
-    film = Film(frames, scale=2, plan=Plan())
+    film = FrameSequence(frames, scale=2, plan=Plan())
     assert frames.read == (0,)
     film.clip(5).light()
     assert frames.read == (0, 4, 5, 6)
 
 
 def test_a_film_of_one_frame():
-    film = Film([torch.rand(3, 8, 8)], scale=2)
+    film = FrameSequence([torch.rand(3, 8, 8)], scale=2)
     assert film.light().shape == (1, 4, 4)
     assert film.profile().static == 1
     assert film.flow(0, 0).equal(torch.zeros(2, 4, 4))
@@ -180,8 +180,8 @@ def test_a_film_of_one_frame():
 
 def test_a_film_goes_to_other_processes():
     film = moving(3.0)
-    copy = pickle.loads(pickle.dumps(Film(film.frames, scale=2, plan=Plan())))
-    assert copy.light().equal(Film(film.frames, scale=2, plan=Plan()).light())
+    copy = pickle.loads(pickle.dumps(FrameSequence(film.frames, scale=2, plan=Plan())))
+    assert copy.light().equal(FrameSequence(film.frames, scale=2, plan=Plan()).light())
 
 
 # --- plans ------------------------------------------------------------------------------------------------------------
@@ -189,7 +189,7 @@ def test_a_film_goes_to_other_processes():
 
 def test_a_static_film_costs_no_interpolation():
     picture = torch.rand(3, 16, 16)
-    film = Film([picture] * 3, scale=2, interpolation=Fade(), motion=Shift(1.0))
+    film = FrameSequence([picture] * 3, scale=2, interpolation=Fade(), motion=Shift(1.0))
     light = film.light()
     assert film.interpolation.calls == []
     assert film.motion.calls == []
@@ -205,7 +205,7 @@ def test_a_slow_film_costs_no_interpolation():
 
 def test_a_cut_is_a_cut():
     frames = [smooth(64, 64, seed=n) for n in range(2)]
-    light = Film(frames, scale=2).light()
+    light = FrameSequence(frames, scale=2).light()
     assert light[:10].equal(light[:1].expand(10, -1, -1))
     assert light[10:].equal(light[-1:].expand(11, -1, -1))
 
@@ -214,8 +214,8 @@ def test_a_cut_is_a_cut():
 def test_interpolations_without_motion_need_no_profile(interpolation):
     motion = Shift(1.0)
     frames = list(torch.rand(2, 3, 16, 16))
-    planned = Film(frames, scale=2, interpolation=interpolation, motion=motion).light()
-    everything = Film(frames, scale=2, interpolation=interpolation, plan=Plan.everything(20)).light()
+    planned = FrameSequence(frames, scale=2, interpolation=interpolation, motion=motion).light()
+    everything = FrameSequence(frames, scale=2, interpolation=interpolation, plan=Plan.everything(20)).light()
     torch.testing.assert_close(planned, everything)
     assert motion.calls == []
 
@@ -240,7 +240,7 @@ def test_settings_overrule_the_plan():
 def test_every_interval_has_its_own_plan():
     exact = Shift(2.0)
     still, moved = smooth(64, 64), exact.shifted(smooth(64, 64), 1.0).clamp(0, 1)
-    film = Film([still, still, moved], scale=2, interpolation=exact, motion=Shift(0.5))
+    film = FrameSequence([still, still, moved], scale=2, interpolation=exact, motion=Shift(0.5))
     assert film.plan(0).latent == 0
     assert film.plan(1).latent > 0
     assert film.profile(0).static == 1
@@ -292,7 +292,7 @@ def test_flow_is_that_of_the_scene():
     motion = Motion((0.3, -0.15))
     scene = Scene([Layer(torch.rand(3, 80, 80), motion, (-20, -20))], 32, 32, frames=41)
     frames = [scene.rgb(clock) for clock in (0, 10, 20, 30, 40)]
-    film = Film(frames, scale=4, clocks=10, interpolation=Shift(3.0, -1.5), motion=Shift(3.0 / 8, -1.5 / 8))
+    film = FrameSequence(frames, scale=4, clocks=10, interpolation=Shift(3.0, -1.5), motion=Shift(3.0 / 8, -1.5 / 8))
     for clock in (0, 3, 10, 20, 25, 33.5, 40):
         torch.testing.assert_close(film.flow(2, clock), scene.flow(clock, scale=4), atol=1e-5, rtol=0)
         torch.testing.assert_close(film.clip(2).flow(clock), scene.flow(clock, scale=4), atol=1e-5, rtol=0)
@@ -308,14 +308,16 @@ def test_flows_are_followed():
         one[0] = 4.0
         return SimpleNamespace(forward=one if first.mean() < 0.1 else far, backward=None)
 
-    film = Film([torch.full((3, 8, 32), value) for value in (0.0, 0.5, 1.0)], scale=2, interpolation=interpolation)
+    film = FrameSequence(
+        [torch.full((3, 8, 32), value) for value in (0.0, 0.5, 1.0)], scale=2, interpolation=interpolation
+    )
     film.fixed = Plan()
     expected = (4 + (torch.arange(32.0) + 4).clamp(max=31)).reshape(16, 2).mean(1) / 2
     torch.testing.assert_close(film.flow(0, 40)[0], expected.expand(4, 16))
 
 
 def test_where_nothing_moves_flow_is_zero_and_costs_nothing():
-    film = Film([torch.ones(3, 8, 8)] * 3, scale=2, interpolation=Fade())
+    film = FrameSequence([torch.ones(3, 8, 8)] * 3, scale=2, interpolation=Fade())
     assert film.flow(1, 33).equal(torch.zeros(2, 4, 4))
     assert film.interpolation.calls == []
 
@@ -364,7 +366,7 @@ FRAMES = [torch.rand(3, 8, 8) for _ in range(3)]
 
 
 def film_of(frames=FRAMES, **settings):
-    return Film(frames, **{"scale": 2, **settings})
+    return FrameSequence(frames, **{"scale": 2, **settings})
 
 
 @pytest.mark.parametrize(
@@ -406,4 +408,4 @@ def test_errors(make, message):
 
 def test_frames_are_tensors_of_floats():
     with pytest.raises(TypeError, match=r"frames\[0\]: expected a floating-point tensor, got torch.uint8"):
-        Film([torch.zeros(3, 8, 8, dtype=torch.uint8)], scale=2)
+        FrameSequence([torch.zeros(3, 8, 8, dtype=torch.uint8)], scale=2)

@@ -12,10 +12,10 @@ import pytest
 import torch
 from skimage import io
 
-from lightning_modules.data import films
-from lightning_modules.data.films import ClipRecipe, FilmScenes
-from lightning_modules.data.layouts import find_films
+from lightning_modules.data import sequences
+from lightning_modules.data.layouts import find_sequences
 from lightning_modules.data.loading import load_clips
+from lightning_modules.data.sequences import ClipRecipe, FilmScenes
 from lightning_modules.data.stills import StillScenes
 from spikekit import bin_to_sensor, read_picture
 from spikekit.flow.interpolate import FlowInterpolation
@@ -309,19 +309,19 @@ def test_a_recipe_takes_a_scale_of_numpy():
 
 
 def test_keys_tell_versions_and_kinds_of_films_apart(film, tmp_path, monkeypatch):
-    (one,) = find_films(film, lambda found: (found, found)).test
+    (one,) = find_sequences(film, lambda found: (found, found)).test
     recipe = ClipRecipe()
     keys = {recipe.key(kind, 2) for kind in (one, replace(one, shrink=4), replace(one, truth=one.folder))}
     keys.add(ClipRecipe(interpolation=First()).key(one, 2))
     assert recipe.key(replace(one, name="other"), 2) in keys
-    monkeypatch.setattr(films, "SIMULATOR_VERSION", films.SIMULATOR_VERSION + 1)
+    monkeypatch.setattr(sequences, "SIMULATOR_VERSION", sequences.SIMULATOR_VERSION + 1)
     keys.add(recipe.key(one, 2))
     assert len(keys) == 5
 
 
 def test_an_interpolation_of_ones_own_that_changes_makes_another_clip(film, tmp_path, monkeypatch):
     """That of the package has the version of the simulator instead."""
-    (one,) = find_films(film, lambda found: (found, found)).test
+    (one,) = find_sequences(film, lambda found: (found, found)).test
     monkeypatch.syspath_prepend(tmp_path)
     written = tmp_path / "mine_own.py"
     written.write_text("class Mine:\n    pass\n\n\ndef halfway(first, second):\n    pass\n")

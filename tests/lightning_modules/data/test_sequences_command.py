@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from lightning_modules.__main__ import main
-from lightning_modules.data.films import FilmScenes
+from lightning_modules.data.sequences import FilmScenes
 from spikekit import psnr
 
 SHARED = Path(__file__).parents[3].parent / "shared" / "data"
@@ -107,7 +107,7 @@ def test_fit_on_vimeo_and_on_films_without_flow(tmp_path, command, capsys, write
         ("fit", "films", ["--data.root", "nowhere"], "nowhere: no such folder of films"),
         ("fit", "films", ["--data.root", "."], "expected one of\n  REDS 120 fps   train/train_orig/000/"),
         ("test", "films", ["--data.root", "vid4", "--data.pattern", "BGGR"], "data.pattern: expected RGGB"),
-        ("fit", "films", ["--data.root", "vid4"], "Vid4 without films for fit"),
+        ("fit", "films", ["--data.root", "vid4"], "Vid4 without sequences for fit"),
         ("predict", "films", ["--data.root", "vid4"], "--data Recording --data.path FILE"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Clips simulated from films: REDS, Vid4, Vimeo-90K, or any folder of frames."""
+"""Clips simulated from frame sequences: REDS, Vid4, Vimeo-90K, or any folder of frames."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from lightning_modules.data.cache import ClipCache, clip_key, file_digest, pack_clip, unpack_clip
-from lightning_modules.data.layouts import EXPECTED, Collection, FilmFiles, find_films
+from lightning_modules.data.layouts import EXPECTED, Collection, SequenceFiles, find_sequences
 from lightning_modules.data.loading import ClipScenes, cut_key_frames
 from lightning_modules.data.margin import flow_margin, trim
 from lightning_modules.data.pictures import split_pictures
@@ -29,13 +29,13 @@ from spikekit.check import check_positive, check_whole
 from spikekit.color.cfa import GREY, cfa_pattern
 from spikekit.flow.interpolate import FlowInterpolation
 from spikekit.io.video import read_video
-from spikekit.scenes.frame_sequence import SIMULATOR_VERSION, Film, FilmClip
+from spikekit.scenes.frame_sequence import SIMULATOR_VERSION, FrameSequence, SequenceClip
 from spikekit.sensor.noise import SensorNoise
 
 
 @dataclass(frozen=True)
 class ClipRecipe:
-    """How a clip is made from a film; the same frames give the same clip, in whatever process and order.
+    """How a clip is made from a sequence of frames; the same frames give the same clip, in whatever process and order.
 
     Args:
         scale: super-resolution factor.
@@ -49,7 +49,7 @@ class ClipRecipe:
         interpolation: what makes frames between two source frames, by its class path; motion-compensated, without
             weights, when null.
         noise: what the sensor adds, such as ``{photons: 1000}``; nothing when null.
-        seed: where chance begins.
+        seed: random seed.
 
     Raises:
         ValueError: an argument that makes no sense; the message names it.
@@ -87,18 +87,18 @@ class ClipRecipe:
         more = self.key_frames // 2
         return -(-(self.frames // 2) // self.clocks) + more, -(-((self.frames - 1) // 2) // self.clocks) + more
 
-    def files(self, film: FilmFiles, middle: int) -> list[Path]:
+    def files(self, sequence: SequenceFiles, middle: int) -> list[Path]:
         """Return the files that a clip is made of, the truth last where it is a file of its own."""
         before, after = self.reach
-        paths = [film.folder / name for name in film.frames[middle - before : middle + after + 1]]
-        return paths if film.truth is None else [*paths, film.truth / film.frames[middle]]
+        paths = [sequence.folder / name for name in sequence.frames[middle - before : middle + after + 1]]
+        return paths if sequence.truth is None else [*paths, sequence.truth / sequence.frames[middle]]
 
-    def key(self, film: FilmFiles, middle: int) -> str:
+    def key(self, sequence: SequenceFiles, middle: int) -> str:
         """Return the name of a clip in a cache."""
         return clip_key(
             simulator=SIMULATOR_VERSION,
-            files=[file_digest(path) for path in self.files(film, middle)],
-            shrink=film.shrink,
+            files=[file_digest(path) for path in self.files(sequence, middle)],
+            shrink=sequence.shrink,
             interpolation=_interpolation_digest(self.interpolation),
             noise=asdict(self.noise),
             pattern=self.pattern,
@@ -106,32 +106,32 @@ class ClipRecipe:
             **{name: getattr(self, name) for name in ("scale", "frames", "alpha", "clocks", "key_frames", "seed")},
         )
 
-    def clip(self, film: FilmFiles, middle: int) -> dict[str, Tensor]:
+    def clip(self, sequence: SequenceFiles, middle: int) -> dict[str, Tensor]:
         """Simulate a clip around a source frame.
 
         Args:
-            film: the film.
+            sequence: the frames, as files.
             middle: which of its frames is in the middle.
 
         Returns:
             ``spikes`` uint8 (N, H, W), ``rgb`` (3, s H, s W), the truth, and ``flow`` (times, 2, H, W), in sensor
-            pixels, all of the whole view. Where the film is cut, nothing can be followed, and flow is 0. Of several
+            pixels, all of the whole view. Where the sequence is cut, nothing can be followed, and flow is 0. Of several
             key frames K all their clocks as ``spikes``, and ``rgb`` (K, 3, s H, s W).
 
         Raises:
             spikekit.io.video.VideoError: a file that cannot be read; the message names it.
             ValueError: frames too small for the sensor, or a truth of another size than theirs.
         """
-        paths, pictures = self.files(film, middle), self._pictures(film, middle)
-        clip = self._view(film, pictures)
+        paths, pictures = self.files(sequence, middle), self._pictures(sequence, middle)
+        clip = self._view(sequence, pictures)
         chance = self._chance(paths)
-        spikes = torch.cat(list(clip.film.spikes(clip.first, clip.frames, noise=self.noise, seed=chance)))
+        spikes = torch.cat(list(clip.sequence.spikes(clip.first, clip.frames, noise=self.noise, seed=chance)))
         if self.key_frames > 1:
             key_frames = (
                 clip.middle + n * self.clocks for n in range(-(self.key_frames // 2), self.key_frames // 2 + 1)
             )
             return {"spikes": spikes, "rgb": self._seen(torch.stack([clip.rgb(clock) for clock in key_frames]))}
-        if film.truth is None:
+        if sequence.truth is None:
             rgb = clip.rgb(clip.middle)
         else:
             rgb = _truth(paths[-1], tuple(pictures[0].shape[1:]), self.scale, spikes)
@@ -144,27 +144,27 @@ class ClipRecipe:
         """Colours as they are, or their luminance, (*, 1, s H, s W), where the sensor sees no more."""
         return bin_to_sensor(rgb, GREY, scale=1).unsqueeze(-3) if self.pattern == GREY else rgb
 
-    def view(self, film: FilmFiles, middle: int) -> FilmClip:
+    def view(self, sequence: SequenceFiles, middle: int) -> SequenceClip:
         """Return what the camera sees around a source frame.
 
         Args:
-            film: the film.
+            sequence: the frames, as files.
             middle: which of its frames is in the middle.
 
         Raises:
             spikekit.io.video.VideoError: a file that cannot be read; the message names it.
             ValueError: frames too small for the sensor.
         """
-        return self._view(film, self._pictures(film, middle))
+        return self._view(sequence, self._pictures(sequence, middle))
 
-    def _pictures(self, film: FilmFiles, middle: int) -> list[Tensor]:
-        paths = self.files(film, middle)[: sum(self.reach) + 1]
-        return [_shrunk(read_video(path)[0], film.shrink) for path in paths]
+    def _pictures(self, sequence: SequenceFiles, middle: int) -> list[Tensor]:
+        paths = self.files(sequence, middle)[: sum(self.reach) + 1]
+        return [_shrunk(read_video(path)[0], sequence.shrink) for path in paths]
 
-    def _view(self, film: FilmFiles, pictures: list[Tensor]) -> FilmClip:
-        seen = Film(
+    def _view(self, sequence: SequenceFiles, pictures: list[Tensor]) -> SequenceClip:
+        seen = FrameSequence(
             pictures,
-            scale=self.scale if film.truth is None else 1,
+            scale=self.scale if sequence.truth is None else 1,
             pattern=self.pattern,
             alpha=self.alpha,
             clocks=self.clocks,
@@ -176,13 +176,13 @@ class ClipRecipe:
         """Cut what :meth:`clip` returned into the clips of its key frames, (K, N, H, W), ``every`` clocks apart."""
         return cut_key_frames(clip, self.key_frames, self.frames, self.clocks)
 
-    def _flow(self, clip: FilmClip, time: int) -> Tensor:
+    def _flow(self, clip: SequenceClip, time: int) -> Tensor:
         try:
             return clip.flow(time)
         except ValueError:
             if not isinstance(self.interpolation, FlowInterpolation):
                 raise
-            return torch.zeros(2, clip.height // clip.film.scale, clip.width // clip.film.scale)  # beyond a cut
+            return torch.zeros(2, clip.height // clip.sequence.scale, clip.width // clip.sequence.scale)  # beyond a cut
 
     def _chance(self, paths: list[Path]) -> int:
         """A seed for the sensor that depends on what the frames show, not on where they lie."""
@@ -218,8 +218,8 @@ def _truth(path: Path, size: tuple[int, int], scale: int, spikes: Tensor) -> Ten
     return rgb[:, : scale * spikes.shape[1], : scale * spikes.shape[2]]
 
 
-class FilmClips(Dataset):
-    """Clips of films, around some frames of each.
+class SequenceClips(Dataset):
+    """Clips of sequences, around some frames of each.
 
     The frames that a clip can have in its middle are cut into as many parts of one length as there are clips. Whole
     clips stand in the middle of a part. Patches stand at a frame of it that the seed chooses once, so that a
@@ -227,21 +227,21 @@ class FilmClips(Dataset):
     even offsets, which keep the Bayer phase. Which clip, the seed and the index say, in whatever process and order.
 
     Args:
-        films: what was found by :func:`lightning_modules.data.layouts.find_films`.
+        sequences: what was found by :func:`lightning_modules.data.layouts.find_sequences`.
         recipe: how clips are made.
-        clips: clips of a film; fewer where it has too few frames, and one of a film with a middle of its own.
+        clips: clips of a sequence; fewer where it has too few frames, and one of a sequence with a middle of its own.
         patch: side of a patch in sensor pixels; None for whole clips.
         cache: where clips are kept; None to simulate each whenever it is asked for.
         flow_patch: smallest side of the spikes of a patch, which reach beyond it as far as that takes and the view
             goes, for an estimate of motion; truth and flow are those of the patch.
 
     Raises:
-        ValueError: no films, a film too short for a clip, a number of clips or a patch below 1.
+        ValueError: no sequences, one too short for a clip, a number of clips or a patch below 1.
     """
 
     def __init__(
         self,
-        films: Sequence[FilmFiles],
+        sequences: Sequence[SequenceFiles],
         recipe: ClipRecipe,
         clips: int = 1,
         patch: int | None = None,
@@ -252,17 +252,19 @@ class FilmClips(Dataset):
         check_whole("clips", clips)
         if patch is not None:
             check_whole("patch", patch)
-        if not films:
-            raise ValueError("films: expected at least one, got none")
-        self.places = [(film, *part) for film in films for part in self._parts(film, clips)]
+        if not sequences:
+            raise ValueError("sequences: expected at least one, got none")
+        self.places = [(sequence, *part) for sequence in sequences for part in self._parts(sequence, clips)]
 
-    def _parts(self, film: FilmFiles, clips: int) -> list[tuple[int, int]]:
+    def _parts(self, sequence: SequenceFiles, clips: int) -> list[tuple[int, int]]:
         before, after = self.recipe.reach
-        count, needed = len(film.frames) - before - after, before + after + 1
+        count, needed = len(sequence.frames) - before - after, before + after + 1
         if count < 1:
-            raise ValueError(f"{film.folder}: expected at least {needed} frames for a clip, got {len(film.frames)}")
-        if film.middle is not None:
-            return [(film.middle, film.middle + 1)]
+            raise ValueError(
+                f"{sequence.folder}: expected at least {needed} frames for a clip, got {len(sequence.frames)}"
+            )
+        if sequence.middle is not None:
+            return [(sequence.middle, sequence.middle + 1)]
         clips = min(clips, count)
         return [(before + part * count // clips, before + (part + 1) * count // clips) for part in range(clips)]
 
@@ -271,17 +273,17 @@ class FilmClips(Dataset):
 
     @property
     def names(self) -> list[str]:
-        """Film and middle frame of every clip."""
+        """Sequence and middle frame of every clip."""
         places = (self.place(index) for index in range(len(self)))
-        return [f"{film.name}/{Path(film.frames[middle]).stem}" for film, middle in places]
+        return [f"{sequence.name}/{Path(sequence.frames[middle]).stem}" for sequence, middle in places]
 
-    def place(self, index: int) -> tuple[FilmFiles, int]:
-        """Return the film and the middle frame of a clip, without regard to the shuffling of patches."""
-        film, first, end = self.places[index]
+    def place(self, index: int) -> tuple[SequenceFiles, int]:
+        """Return the sequence and the middle frame of a clip, without regard to the shuffling of patches."""
+        sequence, first, end = self.places[index]
         if self.patch is None:
-            return film, (first + end) // 2
-        rng = np.random.default_rng([self.recipe.seed, zlib.crc32(film.name.encode()), first])
-        return film, int(rng.integers(first, end))
+            return sequence, (first + end) // 2
+        rng = np.random.default_rng([self.recipe.seed, zlib.crc32(sequence.name.encode()), first])
+        return sequence, int(rng.integers(first, end))
 
     def __getitem__(self, index: int) -> dict[str, Tensor]:
         """Return a clip, see :meth:`ClipRecipe.clip`; of patches, any index from 0 on can be had."""
@@ -292,19 +294,20 @@ class FilmClips(Dataset):
         place = self.place(int(order[index_in_turn]))
         return self._clip(*place, np.random.default_rng([self.recipe.seed, index, 1]))
 
-    def _clip(self, film: FilmFiles, middle: int, rng: np.random.Generator | None) -> dict[str, Tensor]:
+    def _clip(self, sequence: SequenceFiles, middle: int, rng: np.random.Generator | None) -> dict[str, Tensor]:
         if self.cache is None:
-            packed = pack_clip(self.recipe.clip(film, middle))
+            packed = pack_clip(self.recipe.clip(sequence, middle))
         else:
-            packed = self.cache.packed(self.recipe.key(film, middle), lambda: self.recipe.clip(film, middle))
+            key = self.recipe.key(sequence, middle)
+            packed = self.cache.packed(key, lambda: self.recipe.clip(sequence, middle))
         scale = self.recipe.scale
         height, width = (length // scale for length in packed["rgb"].shape[-2:])
         part, margin = (0, 0, height, width), 0
         if rng is not None:
             if self.patch > min(height, width):
                 raise ValueError(
-                    f"patch: expected at most {min(height, width)}, as {film.folder} gives {height} x {width} sensor "
-                    f"pixels at scale {scale}, got {self.patch}"
+                    f"patch: expected at most {min(height, width)}, as {sequence.folder} gives {height} x {width} "
+                    f"sensor pixels at scale {scale}, got {self.patch}"
                 )
             margin = min(flow_margin(self.patch, self.flow_patch), (min(height, width) - self.patch) // 4 * 2)
             side = self.patch + 2 * margin
@@ -316,22 +319,22 @@ class FilmClips(Dataset):
 
 
 class FilmScenes(ClipScenes):
-    """Clips of films, seen by a simulated camera: REDS, Vid4, Vimeo-90K, or any folder of frame folders.
+    """Clips of frame sequences, seen by a simulated camera: REDS, Vid4, Vimeo-90K, or any folder of frame folders.
 
     The contents of ``root`` determine which data set it is. Of the 120-fps REDS, 240 scenes train and 30 validate and
     test, 5 clips each. Vid4 is for tests. Vimeo-90K is for a scale of 4: the camera sees its low-resolution sequences,
     which are the official ones of its test set, or those of a folder ``BIx4`` beside ``sequences``, or made here; the
-    truth is the full-size frame in the middle. Of other films one in twenty validates, and all are tested.
+    truth is the full-size frame in the middle. Of other sequences one in twenty validates, and all are tested.
 
     Training takes patches, everything else whole views, cut at the bottom and at the right to multiples of twice the
     scale. The whole view is simulated also for a patch, which takes seconds where frames are large: give a ``cache``.
 
-    Besides its own arguments it has those of :class:`~lightning_modules.data.films.ClipRecipe`.
+    Besides its own arguments it has those of :class:`~lightning_modules.data.sequences.ClipRecipe`.
 
     Args:
         root: folder of the data set, with what its archives hold.
         patch: side of a training clip in sensor pixels.
-        clips: clips of a film, spread over it. Null for 5 of REDS and of other films, 1 of Vid4 and Vimeo-90K.
+        clips: clips of a sequence, spread over it. Null for 5 of REDS and of others, 1 of Vid4 and Vimeo-90K.
         flow: give the interpolation's flow from the middle to ``flow_times``. False for an interpolation that has
             none; training then uses the network's own estimator.
         flow_times: frames to which the flow is given.
@@ -341,7 +344,7 @@ class FilmScenes(ClipScenes):
             by the code of the simulator. It is never emptied: delete it, or files in it, at any time. Null for none.
         batch_size: training clips in a batch; everything else goes one by one.
         workers: processes that make clips. Null takes one less than there are cores, sixteen at most.
-        seed: where chance begins. The same seed gives the same clips, whatever the number of workers.
+        seed: random seed. The same seed gives the same clips, whatever the number of workers.
     """
 
     @takes(ClipRecipe)
@@ -367,7 +370,7 @@ class FilmScenes(ClipScenes):
         self.found: Collection | None = None
 
     def setup(self, stage: str | None = None) -> None:
-        """Find the films.
+        """Find the sequences.
 
         Args:
             stage: ``fit``, ``validate``, ``test``; all that is there when not given.
@@ -376,12 +379,12 @@ class FilmScenes(ClipScenes):
             FileNotFoundError: the folder is missing, or has not what the stage needs; the message shows what was
                 expected.
             OSError: the cache cannot be made.
-            ValueError: an argument that makes no sense, or a film too short for a clip.
+            ValueError: an argument that makes no sense, or a sequence too short for a clip.
         """
         recipe = ClipRecipe(**self.options)
         check_whole("batch_size", self.batch_size)
         if self.found is None:
-            self.found = find_films(self.root, lambda films: split_pictures(films, self.seed))
+            self.found = find_sequences(self.root, lambda found: split_pictures(found, self.seed))
         found = self.found
         if found.scale not in (None, recipe.scale):
             raise ValueError(
@@ -392,15 +395,15 @@ class FilmScenes(ClipScenes):
         missing = [split for split in needed if not getattr(found, split)]
         if missing:
             raise FileNotFoundError(
-                f"{self.root}: {found.name} without films for {stage} ({missing[0]}); expected one of\n{EXPECTED}"
+                f"{self.root}: {found.name} without sequences for {stage} ({missing[0]}); expected one of\n{EXPECTED}"
             )
         clips, cache = self.clips or found.clips, self.cache and ClipCache(self.cache)
         if found.train:
-            self.train_set = FilmClips(found.train, recipe, clips, self.patch, cache or None, self.flow_patch)
+            self.train_set = SequenceClips(found.train, recipe, clips, self.patch, cache or None, self.flow_patch)
         if found.val:
-            self.val_set = FilmClips(found.val, recipe, clips, None, cache or None)
+            self.val_set = SequenceClips(found.val, recipe, clips, None, cache or None)
         if found.test:
-            self.test_set = FilmClips(found.test, recipe, clips, None, cache or None)
+            self.test_set = SequenceClips(found.test, recipe, clips, None, cache or None)
         if stage == "fit" and self.train_clips < self.batch_size:
             raise ValueError(
                 f"batch_size: expected at most the {self.train_clips} training clips of {self.root}, got "
@@ -414,5 +417,5 @@ class FilmScenes(ClipScenes):
 
     @property
     def test_names(self) -> list[str]:
-        """Film and frame of every test clip."""
+        """Sequence and frame of every test clip."""
         return self.test_set.names
