@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -73,7 +74,7 @@ def ending_in(*endings: str, said: str) -> Callable[[str], Path]:
     """Return an argument type: a file with one of some endings, which ``said`` describes in the message."""
 
     def read(text: str) -> Path:
-        path = Path(text)
+        path = home_path(text)
         if path.suffix.lower() not in endings:
             raise argparse.ArgumentTypeError(f"expected {said}, got {text}")
         return path
@@ -84,4 +85,14 @@ def ending_in(*endings: str, said: str) -> Callable[[str], Path]:
 def one_line(error: BaseException) -> str:
     """Return an error's message on one line, without characters that a terminal would interpret."""
     text = getattr(error, "strerror", None) or str(error).strip() or type(error).__name__
-    return "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
+    return printable(" ".join(text.split()))
+
+
+def printable(text: str) -> str:
+    """Return a line without characters that a terminal would interpret: names of files can hold any."""
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def home_path(path: str | os.PathLike[str]) -> Path:
+    """Return a path with the home folder in place of ``~``, which a shell leaves alone in quotes and behind ``=``."""
+    return Path(os.path.expanduser(path))

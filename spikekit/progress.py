@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
+from spikekit.arguments import printable
+
 if TYPE_CHECKING:
     from tqdm import tqdm
 
@@ -30,4 +32,4 @@ def progress(things: Iterable[Any] | None = None, what: str = "", total: float |
     """
     from tqdm import tqdm
 
-    return tqdm(things, what, total, **{"disable": None, "leave": False, "delay": AFTER, **how})
+    return tqdm(things, printable(what), total, **{"disable": None, "leave": False, "delay": AFTER, **how})

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spikekit.arguments import UsageError
+from spikekit.arguments import UsageError, home_path
 from spikekit.calibration.calibration import Calibration
 from spikekit.calibration.files import ENDING, read_calibration
 from spikekit.calibration.spikes import correct_spikes
 from spikekit.color.cfa import GREY, cfa_pattern
-from spikekit.io.cameras import CAMERAS, Camera
+from spikekit.io.cameras import Camera, usual_sizes
 from spikekit.io.cameras import camera as load_camera
 from spikekit.io.files import iter_spikes, read_spikes, spikes_shape
 from spikekit.io.formats import SpikeFileError
@@ -134,7 +134,7 @@ def open_recording(
     """Open a recording with all that is known of it.
 
     Args:
-        path: a file ending in ``.dat`` or ``.npz``.
+        path: a file ending in ``.dat``, ``.npy`` or ``.npz``.
         height: rows of a frame; a ``.dat`` without side-car or camera needs it.
         width: columns of a frame; likewise.
         flip: whether the frames are stored upside down.
@@ -159,8 +159,8 @@ def open_recording(
         >>> street.frames, street.size, street.note
         (5, (250, 400), '250 x 400 is the size of the camera vidar, which stores frames upside down: --flip turns them')
     """
-    recording = _described(Path(path).expanduser(), height, width, flip, pattern, camera)
-    file = own_calibration(recording.path) if calibration is None else Path(calibration).expanduser()
+    recording = _described(home_path(path), height, width, flip, pattern, camera)
+    file = own_calibration(recording.path) if calibration is None else home_path(calibration)
     if str(calibration) == "none" or (calibration is None and not file.is_file()):
         return recording
     known = read_calibration(file)
@@ -197,7 +197,10 @@ def _described(
     if path.suffix.lower() == ".dat" and path.is_file() and None in (height, width):
         raise UsageError(_without_size(path))
     frames, *size = spikes_shape(path, height, width)
-    return Recording(path, frames, tuple(size), flip, pattern, note="" if flip else _upside_down(*size))
+    note = "" if flip else _upside_down(*size)
+    if height is width is None and _long(*size) > 3 and _long(frames, size[0]) < 2:
+        note = f"read as {frames} frames of {size[0]} x {size[1]}; if the array is (H, W, T), turn it to (T, H, W)"
+    return Recording(path, frames, tuple(size), flip, pattern, note=note)
 
 
 def _of_camera(path: Path, known: Camera, pattern: str | None) -> Recording:
@@ -213,24 +216,20 @@ def _of_camera(path: Path, known: Camera, pattern: str | None) -> Recording:
     raise wrong
 
 
-def _usual_sizes() -> dict[tuple[int, int], list[Camera]]:
-    """Return the known cameras by (height, width) of their frames as they are stored."""
-    sizes: dict[tuple[int, int], list[Camera]] = {}
-    for known in map(load_camera, CAMERAS):
-        for width in dict.fromkeys((known.width, known.stored_width)):
-            sizes.setdefault((known.height, width), []).append(known)
-    return dict(sorted(sizes.items()))
+def _long(height: int, width: int) -> float:
+    """Return how much longer one side is than the other."""
+    return max(height, width) / min(height, width)
 
 
 def _upside_down(height: int, width: int) -> str:
     """Say that frames of this size are likely to be stored upside down; nothing where they are not."""
-    names = [known.name for known in _usual_sizes().get((height, width), []) if known.flip]
+    names = [known.name for known in usual_sizes().get((height, width), []) if known.flip]
     said = f"{height} x {width} is the size of the camera {' and '.join(names)}"
     return f"{said}, which stores frames upside down: --flip turns them" if names else ""
 
 
 def _without_size(path: Path) -> str:
-    size, usual = path.stat().st_size, _usual_sizes()
+    size, usual = path.stat().st_size, usual_sizes()
     fits = {}
     for (height, width), known in usual.items():
         frames, rest = divmod(size, -(-height * width // 8))

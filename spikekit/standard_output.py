@@ -7,12 +7,20 @@ import io
 import os
 import sys
 from contextlib import suppress
+from typing import IO
+
+from spikekit.arguments import printable
 
 #: exit status of a command that was still printing when its reader went, as a shell has it: 128 + SIGPIPE
 BROKEN_PIPE = 141
 
 #: errors of a full disk, which the system reports without a name
 FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)
+
+
+def say(text: str, file: IO[str] | None = None) -> None:
+    """Print lines in which names of files, which can hold any character, may stand."""
+    print(*map(printable, text.splitlines()), sep="\n", file=file)
 
 
 def stop_printing() -> None:

@@ -13,6 +13,7 @@ from spikekit.color.cfa import bayer_sites
 from spikekit.sensor.noise import HOT, WORKS
 
 _NEIGHBORS = 4
+_LEAST_GAIN = 1e-4  # so that light is finite, in half precision as well
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +29,8 @@ class Calibration:
         inverse of its distance.
 
     Args:
-        gain: g, (H, W), above 0.
-        dark: d, (H, W), in spikes a clock, 0 or more.
+        gain: g, (H, W), 1e-4 to 1e4.
+        dark: d, (H, W), in spikes a clock, 0 to 1.
         defects: (H, W), uint8: 0 for a pixel that works, 1 for a dead one, 2 for a hot one.
 
     Raises:
@@ -60,14 +61,14 @@ class Calibration:
                 got = f"{tuple(plane.shape)} of {plane.dtype}"
                 raise ValueError(f"{name}: expected (H, W) of {kind}, all of one size, got {got}")
         for name, good in {
-            "gain": (self.gain > 0) & self.gain.isfinite(),
-            "dark": (self.dark >= 0) & self.dark.isfinite(),
+            "gain": (self.gain >= _LEAST_GAIN) & (self.gain <= 1 / _LEAST_GAIN),
+            "dark": (self.dark >= 0) & (self.dark <= 1),
             "defects": self.defects <= HOT,
         }.items():
             if not good.all():
                 expected = {
-                    "gain": "finite numbers above 0",
-                    "dark": "finite numbers, 0 or more",
+                    "gain": f"{_LEAST_GAIN:g} to {1 / _LEAST_GAIN:g}",
+                    "dark": "0 to 1",
                     "defects": "0, 1 or 2",
                 }
                 raise ValueError(f"{name}: expected {expected[name]}, got {getattr(self, name)[~good][0].item():g}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from spikekit.arguments import one_line
+from spikekit.arguments import home_path, one_line
 from spikekit.calibration.calibration import Calibration
 from spikekit.io.failures import no_pipe
 from spikekit.io.images import MOST_PIXELS
@@ -66,7 +66,7 @@ def read_calibration(path: str | Path) -> Calibration:
     from safetensors import SafetensorError, safe_open
 
     try:
-        with safe_open(no_pipe(path), "pt") as file:
+        with safe_open(no_pipe(home_path(path)), "pt") as file:
             kind = (file.metadata() or {}).get("kind")
             if kind != _KIND:
                 raise ValueError(f"expected {_KIND}, got {str(kind)[:80]}")

@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
-from spikekit.arguments import UsageError
+from spikekit.arguments import UsageError, home_path
 from spikekit.calibration.calibration import Calibration
 from spikekit.calibration.files import ENDING, read_calibration, write_calibration
 from spikekit.calibration.in_motion import (
@@ -27,6 +27,7 @@ from spikekit.io.files import iter_spikes
 from spikekit.progress import progress
 from spikekit.recording import Recording, open_recording, own_calibration
 from spikekit.sensor.noise import DEAD, HOT, WORKS
+from spikekit.standard_output import say
 
 _LEAST_FRAMES = 100
 _CHUNK = 1 << 24  # pixels that are counted at a time
@@ -74,7 +75,7 @@ def run(args: argparse.Namespace) -> None:
         print(f"dark rate    {dark.mean():.2g} spikes a frame, {dark.std():.2g} apart, known to {found.dark_error:.1g}")
     for name, kind in (("dead", DEAD), ("hot", HOT)):
         print(f"{name:12} {int((known.defects == kind).sum())} of {works.numel()} pixels")
-    print(f"{output}: {', '.join(f'{name} {half[0].frames + half[1].frames} frames' for name, half in seen.items())}")
+    say(f"{output}: {', '.join(f'{name} {half[0].frames + half[1].frames} frames' for name, half in seen.items())}")
 
 
 def _open(args: argparse.Namespace, path: Path) -> Recording:
@@ -133,6 +134,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     recordings.add_arguments(parser, calibration=False)
     add = parser.add_argument
-    add("--flat", type=Path, metavar="FILE", help="a recording of even light, by the same camera")
-    add("--dark", type=Path, metavar="FILE", help="a recording in the dark, by the same camera")
-    add("-o", "--output", type=Path, metavar="OUT", help=f"the file to write; NAME{ENDING} beside FILE if not given")
+    add("--flat", type=home_path, metavar="FILE", help="a recording of even light, by the same camera")
+    add("--dark", type=home_path, metavar="FILE", help="a recording in the dark, by the same camera")
+    add(
+        "-o",
+        "--output",
+        type=home_path,
+        metavar="OUT",
+        help=f"the file to write; NAME{ENDING} beside FILE if not given",
+    )

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import signal
 import sys
-from collections.abc import Sequence
-from contextlib import suppress
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import Any, NoReturn
 
 from spikekit._version import __version__
-from spikekit.arguments import UsageError, one_line
+from spikekit.arguments import UsageError, one_line, printable
 from spikekit.completion import OPTION, completion
 from spikekit.extras import remedy
 from spikekit.standard_output import BROKEN_PIPE, stop_printing
@@ -21,7 +23,7 @@ VERBS = {
     "info": ("what a recording holds", "info street.dat --height 250 --width 400"),
     "decode": (
         "the picture of one frame, or of many",
-        "decode water.dat --height 1000 --width 1000 --flip --pattern BGGR --method tfi -o water.png",
+        "decode water.dat --height 1000 --width 1000 --flip --pattern BGGR -o water.png",
     ),
     "simulate": ("a stream of a film", "simulate walk -o walk.dat --scale 4"),
     "calibrate": (
@@ -33,8 +35,49 @@ VERBS = {
 }
 
 
+class _Terminated(BaseException):
+    """The command was asked to end, by SIGTERM."""
+
+
+def _terminate(*_: Any) -> NoReturn:
+    raise _Terminated
+
+
+@contextmanager
+def _ending_on_request() -> Iterator[None]:
+    """Unwind on SIGTERM, so that half files go; leave alone what somebody else has set, and other threads."""
+    ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    if ours:
+        signal.signal(signal.SIGTERM, _terminate)
+    try:
+        yield
+    finally:
+        if ours:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return 0, 1 for a file that cannot be used, or 2 for a command line that cannot."""
+    """Run the command line.
+
+    Returns:
+        0; 1 for a file that cannot be used, 2 for a command line that cannot, and as a shell has it 130 for Ctrl-C, 141
+        for output that nobody reads any more, 143 for SIGTERM. What was whole by then has been written.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(AttributeError):  # in a notebook, which shows any name
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        with _ending_on_request():
+            return _run(argv)
+    except KeyboardInterrupt:
+        print("spikekit: interrupted", file=sys.stderr)
+        return 128 + signal.SIGINT
+    except _Terminated:
+        print("spikekit: terminated", file=sys.stderr)
+        return 128 + signal.SIGTERM
+
+
+def _run(argv: Sequence[str] | None) -> int:
     try:
         with suppress(SystemExit):  # --help
             words = sys.argv[1:] if argv is None else list(argv)
@@ -49,7 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2 if isinstance(error, UsageError) else 1
     except OSError as error:
         if error.filename is not None:
-            print(f"spikekit: {error.filename}: {one_line(error)}", file=sys.stderr)
+            print(f"spikekit: {printable(str(error.filename))}: {one_line(error)}", file=sys.stderr)
             return 1
         stop_printing()  # nobody reads it, or it finds no room
         if isinstance(error, BrokenPipeError):
@@ -61,8 +104,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         print(f"spikekit: {line}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        return 130
     return 0
 
 

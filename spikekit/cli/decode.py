@@ -21,6 +21,7 @@ from spikekit.io.sidecar import check_unclaimed
 from spikekit.io.video import PICTURE_ENDINGS
 from spikekit.progress import progress
 from spikekit.recording import Recording, white_rate
+from spikekit.standard_output import say
 
 #: Frames that TFP averages when nothing else is said.
 TFP_WINDOW = 41
@@ -34,6 +35,8 @@ _NUMBER = "{frame}"
 
 def run(args: argparse.Namespace) -> None:
     """Write the picture of one frame, or of many, reading only as much around each as the method needs."""
+    if args.method is None:
+        args.method = "tfi" if args.window is None and args.order == 1 else "tfp"
     decoder = DECODERS[args.method]
     if args.window is not None and ("window" not in decoder.options or args.window % 2 == 0):
         methods = _with_option("window")
@@ -67,12 +70,12 @@ def run(args: argparse.Namespace) -> None:
         picture = raw if recording.bayer is None else demosaic(raw, recording.bayer)
         picture = recording.show(picture, known=alpha is not None)
         with writing(paths[n], wrong=Exception):  # what a picture library raises depends on the ending
-            write_picture(paths[n], picture)
+            write_picture(paths[n], picture, bits=args.bits, quality=args.quality)
     if len(chosen) == 1:
         first, last = _span(key, reach, frames)
-        print(f"{paths[key]}: frame {key} of {frames} by {args.method} from frames {first} .. {last}, {scaling}")
+        say(f"{paths[key]}: frame {key} of {frames} by {args.method} from frames {first} .. {last}, {scaling}")
     else:
-        print(
+        say(
             f"{args.output}: {len(chosen)} pictures of frames {chosen[0]} .. {chosen[-1]} of {frames}, {chosen.step} "
             f"apart, by {args.method} from up to {reach} frames on each side, all {scaling}"
         )
@@ -88,11 +91,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add(
         "--method",
-        required=True,
         choices=DECODERS,
         help="by the interval between the two spikes around the frame, or by the number of spikes in a window around "
         f"it; tfi looks up to {TFI_REACH} frames to each side, and a pixel with no spike there is taken to have fired "
-        "just outside",
+        "just outside. If not given, tfi, whose window follows the light, so that it fits dim and bright recordings "
+        "alike; tfp where --window or --order is given",
     )
     add(
         "-o",
@@ -103,6 +106,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="OUT.png",
         help=f"the picture to write; {_NUMBER} in it becomes the number of the frame, with leading zeros",
     )
+    add("--bits", type=int, choices=(8, 16), default=8, help="of a .png or .tif; 8 if not given")
+    add("--quality", type=whole(1), metavar="Q", help="of a .jpg, 1 to 100")
     add(
         "--frame",
         type=_frames,

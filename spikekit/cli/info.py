@@ -7,6 +7,7 @@ import argparse
 from torch import Tensor
 
 from spikekit.cli import recordings
+from spikekit.standard_output import say
 
 #: Clocks a second of the cameras.
 CLOCK_HZ = 20_000
@@ -20,9 +21,11 @@ def run(args: argparse.Namespace) -> None:
     pixels, spikes = counts.numel(), int(counts.sum())
     rates = counts.double() / frames
     dead, full = int((counts == 0).sum()), int((counts == frames).sum())
-    packed = args.file.suffix.lower() == ".dat"
-    print(f"file         {args.file}")
-    print(f"format       {'.dat, 8 pixels a byte, no header' if packed else '.npz, an array of zeros and ones'}")
+    ending = args.file.suffix.lower()
+    say(f"file         {args.file}")
+    print(
+        f"format       {ending}, {'8 pixels a byte, no header' if ending == '.dat' else 'an array of zeros and ones'}"
+    )
     print(f"size         {height} x {width} (H x W), {args.file.stat().st_size} bytes")
     print(f"frames       {frames}, {1e3 * frames / CLOCK_HZ:g} ms at {CLOCK_HZ // 1000} kHz")
     print(f"bits set     {spikes} of {pixels * frames}, {spikes / (pixels * frames):.2%}")

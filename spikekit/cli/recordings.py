@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 import sys
 from inspect import signature
-from pathlib import Path
 from typing import Any
 
-from spikekit.arguments import whole
+from spikekit.arguments import home_path, whole
 from spikekit.calibration.files import ENDING
 from spikekit.color.cfa import GREY, PATTERNS
 from spikekit.io.cameras import CAMERAS
 from spikekit.recording import Recording, open_recording
+from spikekit.standard_output import say
 
 _OPTIONS = [name for name in signature(open_recording).parameters if name != "path"]
 
@@ -25,7 +25,7 @@ def add_arguments(parser: Any, *, calibration: bool = True) -> None:
         calibration: whether the verb corrects pixels.
     """
     add = parser.add_argument
-    add("file", type=Path, metavar="FILE", help="a recording, .dat (8 pixels a byte, no header) or .npz")
+    add("file", type=home_path, metavar="FILE", help="a recording, .dat (8 pixels a byte, no header), .npy or .npz")
     add("--height", type=whole(1), metavar="H", help="rows of a frame; a .dat without side-car or camera needs it")
     add("--width", type=whole(1), metavar="W", help="columns of a frame; likewise")
     add("--flip", action="store_true", help="the frames are stored upside down, as real cameras do")
@@ -66,5 +66,5 @@ def opened(args: argparse.Namespace) -> Recording:
     """Open the recording that the arguments name, and print its note to stderr."""
     recording = open_recording(args.file, **known(args))
     if recording.note:
-        print(f"note: {recording.note}", file=sys.stderr)
+        say(f"note: {recording.note}", sys.stderr)
     return recording

@@ -9,13 +9,15 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from spikekit.arguments import UsageError, ending_in, positive, whole
+from spikekit.arguments import UsageError, ending_in, home_path, positive, whole
 from spikekit.calibration.files import read_calibration
 from spikekit.color.cfa import PATTERNS
+from spikekit.io.files import RECORDING_ENDINGS
 from spikekit.io.sidecar import Sidecar, read_sidecar
 from spikekit.io.video import VideoError
 from spikekit.scenes.simulation import Settings, Source, build, is_own, simulate
 from spikekit.sensor.noise import SensorNoise
+from spikekit.standard_output import say
 
 _NOISE = {
     "photons": "electrons that make a threshold: light comes in photons",
@@ -59,7 +61,7 @@ def run(args: argparse.Namespace) -> None:
         source = Source(path, settings)
         build(settings.interpolation)
     for line in simulate(source, settings, args.output, replayed):
-        print(line)
+        say(line)
 
 
 @contextmanager
@@ -120,9 +122,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     def option(name: str, kind: Callable[[str], Any], metavar: str, said: str, to: Any = parser) -> None:
         to.add_argument(f"--{name}", type=kind, metavar=metavar, help=f"{said}; {getattr(Settings, name)} if not given")
 
-    add("input", type=Path, metavar="INPUT", help="a folder of pictures, a video file, a picture, or a side-car")
-    stream = ending_in(".dat", ".npz", said="a stream that ends in .dat or .npz")
-    add("-o", "--output", required=True, type=stream, metavar="OUT.dat", help="the stream to write, .dat or .npz")
+    add("input", type=home_path, metavar="INPUT", help="a folder of pictures, a video file, a picture, or a side-car")
+    stream = ending_in(*RECORDING_ENDINGS, said=f"a stream that ends in {', '.join(RECORDING_ENDINGS)}")
+    add("-o", "--output", required=True, type=stream, metavar="OUT.dat", help="the stream to write")
     add("--scale", type=whole(1), metavar="S", help="pixels of a frame that a sensor pixel is wide")
     said = f"Bayer phase of the sensor; {Settings.pattern} if not given"
     add("--pattern", type=str.upper, choices=PATTERNS, help=said)
@@ -136,7 +138,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option("readout", whole(1), "N", "clocks for every frame of the stream")
     option("seed", whole(0), "N", "random seed: first charge and noise")
     said = "where the frames of a side-car are, if they have moved"
-    add("--source", type=Path, default=None, metavar="PATH", help=said)
+    add("--source", type=home_path, default=None, metavar="PATH", help=said)
 
     model = parser.add_argument_group("what is modelled")
     said = "what the scene requires, every clock and all noise, or K latent frames between two frames"

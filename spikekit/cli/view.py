@@ -29,6 +29,7 @@ from spikekit.io.sidecar import check_unclaimed
 from spikekit.io.whole_file import whole_file
 from spikekit.progress import progress
 from spikekit.recording import Recording, white_rate
+from spikekit.standard_output import say
 
 #: Frames on each side of the one in the middle that are looked at.
 REACH = 200
@@ -74,7 +75,7 @@ def run(args: argparse.Namespace) -> None:
             data = _page(moment, starts, window, pictures, hint).encode()
     with writing(args.output), whole_file(args.output) as file:
         file.write(data)
-    print(f"{args.output}: frames {begin} .. {end - 1} of {shown.frames}, {moment.said}")
+    say(f"{args.output}: frames {begin} .. {end - 1} of {shown.frames}, {moment.said}")
     if hint:
         print(hint)
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import dataclass, fields
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from spikekit.arguments import one_line
+from spikekit.arguments import home_path, one_line
 from spikekit.check import check_planes, check_positive, check_whole
 from spikekit.color.cfa import bayer_pattern
 from spikekit.io.failures import no_pipe
@@ -178,7 +179,7 @@ def camera(name: str | Path) -> Camera:
     own = str(name).endswith(".json")
     if not own and name not in CAMERAS:
         raise ValueError(f"camera: expected {', '.join(CAMERAS)}, or a .json file, got {name}")
-    file = Path(name) if own else _PRESETS / f"{name}.json"
+    file = home_path(name) if own else _PRESETS / f"{name}.json"
     try:
         if own:
             no_pipe(file)
@@ -195,6 +196,16 @@ def camera(name: str | Path) -> Camera:
         return Camera(**{"name": file.name.removesuffix(".json")} | {key: _frozen(data[key]) for key in wanted})
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"{name}: {one_line(error)[:300]}") from error
+
+
+@cache
+def usual_sizes() -> dict[tuple[int, int], list[Camera]]:
+    """Return the cameras of :data:`CAMERAS` by (height, width) of their frames as they are stored."""
+    sizes: dict[tuple[int, int], list[Camera]] = {}
+    for known in map(camera, CAMERAS):
+        for width in dict.fromkeys((known.width, known.stored_width)):
+            sizes.setdefault((known.height, width), []).append(known)
+    return dict(sorted(sizes.items()))
 
 
 def _frozen(value: object) -> object:

@@ -1,4 +1,4 @@
-"""Recordings on disk: the field's packed ``.dat`` and NumPy's ``.npz``, read and written in bounded memory."""
+"""Recordings on disk: ``.dat``, ``.npy`` and ``.npz``, read and written in bounded memory."""
 
 from __future__ import annotations
 
@@ -12,23 +12,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from spikekit.arguments import home_path
 from spikekit.check import check_index, check_planes, check_whole
 from spikekit.io.formats import (
     SpikeFileError,
     Wanted,
+    array_blocks,
+    array_shape,
     binary,
     dat_blocks,
     dat_bytes,
     dat_shape,
-    npz_blocks,
-    npz_shape,
     reading,
     stored_blocks,
-    write_npz,
+    write_array,
     writing,
 )
 from spikekit.io.images import MOST_PIXELS
 from spikekit.io.whole_file import whole_file
+
+#: Endings of recordings.
+RECORDING_ENDINGS = (".dat", ".npy", ".npz")
 
 # Pixels that are written at a time, so that a tensor of any dtype needs no copy of itself as bits.
 _BLOCK = 1 << 22
@@ -48,17 +52,17 @@ def read_spikes(
 
     Convention:
         ``.dat`` has no header: frame after frame, row by row, 8 neighbouring pixels a byte, the leftmost in the least
-        significant bit. Where 8 does not divide H x W, every frame is padded to whole bytes. ``.npz`` holds one array
-        (T, H, W) of zeros and ones, named ``spk`` or ``spikes``, or the only 3-D array of the file.
+        significant bit. Where 8 does not divide H x W, every frame is padded to whole bytes. ``.npy`` holds one array
+        (T, H, W) of zeros and ones, ``.npz`` one named ``spk`` or ``spikes``, or else its only 3-D array.
 
-        Real cameras store frames upside down, which neither format records: ``flip`` turns them. Pixel (0, 0) of the
+        Real cameras store frames upside down, which no format records: ``flip`` turns them. Pixel (0, 0) of the
         result is then the top left of the scene, and the Bayer phase counts from there.
 
         Of a ``.dat``, only the bytes of the frames asked for are read.
 
     Args:
-        path: a file ending in ``.dat`` or ``.npz``.
-        height: rows; needed for ``.dat``, checked against the file for ``.npz``.
+        path: a file ending in ``.dat``, ``.npy`` or ``.npz``.
+        height: rows; needed for ``.dat``, checked against the file for the others.
         width: columns; likewise.
         flip: turn the stored frames upside down.
         start: the first frame to read.
@@ -102,8 +106,8 @@ def iter_spikes(
         at the call, not at the first frame.
 
     Args:
-        path: a file ending in ``.dat`` or ``.npz``.
-        height: rows; needed for ``.dat``, checked against the file for ``.npz``.
+        path: a file ending in ``.dat``, ``.npy`` or ``.npz``.
+        height: rows; needed for ``.dat``, checked against the file for the others.
         width: columns; likewise.
         flip: turn the stored frames upside down.
         start: the first frame to read.
@@ -137,8 +141,8 @@ def spikes_shape(path: str | Path, height: int | None = None, width: int | None 
     """Return (T, H, W) of a recording without reading its frames.
 
     Args:
-        path: a file ending in ``.dat`` or ``.npz``.
-        height: rows; needed for ``.dat``, checked against the file for ``.npz``.
+        path: a file ending in ``.dat``, ``.npy`` or ``.npz``.
+        height: rows; needed for ``.dat``, checked against the file for the others.
         width: columns; likewise.
 
     Returns:
@@ -155,7 +159,7 @@ def spikes_shape(path: str | Path, height: int | None = None, width: int | None 
         ...     spikes_shape(f"{folder}/clip.npz")
         (5, 3, 7)
     """
-    path = Path(path)
+    path = home_path(path)
     height = None if height is None else check_index("height", height)
     width = None if width is None else check_index("width", width)
     with reading(path):
@@ -166,7 +170,7 @@ def spikes_shape(path: str | Path, height: int | None = None, width: int | None 
         size = path.stat().st_size
     if size == 0:
         raise SpikeFileError(f"{path}: an empty file, 0 bytes")
-    shape = dat_shape(path, size, height, width) if _check_suffix(path) == ".dat" else npz_shape(path, height, width)
+    shape = dat_shape(path, size, height, width) if _check_suffix(path) == ".dat" else array_shape(path, height, width)
     if shape[1] * shape[2] > MOST_PIXELS:  # what is packed well takes little of a disk, and all memory
         raise SpikeFileError(f"{path}: expected frames of at most {MOST_PIXELS} pixels, got {shape[1]} x {shape[2]}")
     return shape
@@ -179,11 +183,11 @@ def write_spikes(path: str | Path, spikes: Tensor | Iterable[Tensor], *, flip: b
         Formats as in :func:`read_spikes`; the array of an ``.npz`` is called ``spk``. The file appears under its name
         once it is complete, so a run that is killed leaves no half recording.
 
-        A recording that does not fit in memory can be passed in chunks of any lengths; one chunk is held at a time. An
-        ``.npz`` stores its length before its frames, so they are kept on disk, packed, until the last has arrived.
+        A recording that does not fit in memory can be passed in chunks of any lengths; one chunk is held at a time. A
+        NumPy file stores its length before its frames, so they are kept on disk, packed, until the last has arrived.
 
     Args:
-        path: where to, ending in ``.dat`` or ``.npz``.
+        path: where to, ending in ``.dat``, ``.npy`` or ``.npz``.
         spikes: (T, H, W), zeros and ones, any real dtype; or an iterable of such chunks, or of frames (H, W).
         flip: store the frames upside down, as real cameras do.
 
@@ -207,19 +211,21 @@ def write_spikes(path: str | Path, spikes: Tensor | Iterable[Tensor], *, flip: b
         ...     spikes_shape(f"{folder}/long.dat", 3, 7)
         (900, 3, 7)
     """
-    path = Path(path)
+    path = home_path(path)
     suffix = _check_suffix(path)
     with _opened(path) as file:
         if suffix == ".dat":
             _write_bits(path, file, spikes, flip)
             return
-        with writing(path):  # the header of an .npz says how many frames there are; a file without a name needs no care
+        with writing(
+            path
+        ):  # the header of an array says how many frames there are; a file without a name needs no care
             bits = tempfile.TemporaryFile(dir=path.parent)  # noqa: SIM115
         with bits:
             frames, height, width = _write_bits(path, bits, spikes, flip)
             with writing(path):
                 stored = stored_blocks(bits, Wanted(path, height, width, 0, frames, 1))
-                write_npz(file, (frames, height, width), stored)
+                write_array(file, suffix, (frames, height, width), stored)
 
 
 @contextmanager
@@ -284,18 +290,20 @@ def _open(
     packed: bool,
 ) -> Iterator[np.ndarray]:
     """Check everything but the frames themselves; return them, ``chunk`` at a time or all at once."""
-    path = Path(path)
+    path = home_path(path)
     total, height, width = spikes_shape(path, height, width)
     start = check_index("start", start)
     frames = total - start if frames is None else check_index("frames", frames)
     if start < 0 or frames < 1 or start + frames > total:
         raise SpikeFileError(f"{path}: expected frames within 0 .. {total - 1}, got {frames} from frame {start} on")
-    read = dat_blocks if path.suffix.lower() == ".dat" else npz_blocks
+    read = dat_blocks if path.suffix.lower() == ".dat" else array_blocks
     return read(Wanted(path, height, width, start, frames, chunk or frames, flip, packed))
 
 
 def _check_suffix(path: Path) -> str:
     suffix = path.suffix.lower()
-    if suffix not in (".dat", ".npz"):
-        raise SpikeFileError(f"{path}: expected a recording that ends in .dat or .npz, got {suffix or 'no ending'}")
+    if suffix not in RECORDING_ENDINGS:
+        raise SpikeFileError(
+            f"{path}: expected a recording that ends in {', '.join(RECORDING_ENDINGS)}, got {suffix or 'no ending'}"
+        )
     return suffix

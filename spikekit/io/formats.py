@@ -1,11 +1,12 @@
-"""The bytes of recordings: the field's packed ``.dat`` and NumPy's ``.npz``, in blocks of frames."""
+"""The bytes of recordings: the field's packed ``.dat`` and NumPy's ``.npy`` and ``.npz``, in blocks of frames."""
 
 from __future__ import annotations
 
+import io
 import math
 import zipfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import IO, NamedTuple
 import numpy as np
 
 from spikekit.io import failures
+from spikekit.io.cameras import usual_sizes
 from spikekit.io.quiet import quiet
 
 # What the field calls the array of a recording; without either name, the only 3-D array is taken.
@@ -21,6 +23,9 @@ _ARRAY_NAMES = ("spk", "spikes")
 
 # Deflate makes at most 1,032 bytes of one.
 _MOST_DEFLATED = 1032
+
+# Bytes of the header of an array, at most, as NumPy has it.
+_LONGEST_HEADER = 10_000
 
 # Bytes that are held of an array in Fortran order: as bits, and as they are read.
 _HELD, _PIECE = 1 << 26, 1 << 22
@@ -126,22 +131,25 @@ def _frame_bytes(height: int, width: int) -> int:
     return -(-height * width // 8)
 
 
-# --- .npz -------------------------------------------------------------------------------------------------------------
+# --- .npy and .npz ----------------------------------------------------------------------------------------------------
 
 
-def npz_shape(path: Path, height: int | None, width: int | None) -> tuple[int, int, int]:
+def array_shape(path: Path, height: int | None, width: int | None) -> tuple[int, int, int]:
     """Return (T, H, W) of the recording in a file."""
-    with _npz_array(path) as (_, shape, _, _):
+    with _array(path) as (_, shape, _, _):
         pass
+    sizes = usual_sizes() if height is width is None else {(height, width)}
+    if shape[:2] in sizes and shape[1:] not in sizes:
+        raise SpikeFileError(f"{path}: expected an array (T, H, W), got {shape}, which looks like (H, W, T)")
     if height not in (None, shape[1]) or width not in (None, shape[2]):
         raise SpikeFileError(f"{path}: holds frames of {shape[1]} x {shape[2]}, got height {height} and width {width}")
     return shape
 
 
-def npz_blocks(wanted: Wanted) -> Iterator[np.ndarray]:
+def array_blocks(wanted: Wanted) -> Iterator[np.ndarray]:
     """Read blocks of frames (N, H, W), uint8."""
     path, height, width, start, frames = wanted[:5]
-    with _npz_array(path) as (stream, shape, dtype, fortran):
+    with _array(path) as (stream, shape, dtype, fortran):
         if fortran:
             planes = _fortran_planes(stream, path, shape, dtype, range(start, start + frames))
         else:
@@ -179,20 +187,26 @@ def _fortran_planes(
             yield (bits[:, n // 8] >> n % 8 & 1).reshape(width, height).T
 
 
-def write_npz(file: IO[bytes], shape: tuple[int, int, int], blocks: Iterable[np.ndarray]) -> None:
-    """Write blocks of frames, (T, H, W) in all, to an open file."""
-    with (
-        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive,
-        archive.open(f"{_ARRAY_NAMES[0]}.npy", "w", force_zip64=True) as stream,
-    ):
-        np.lib.format.write_array_header_1_0(stream, {"descr": "|u1", "fortran_order": False, "shape": shape})
+def write_array(file: IO[bytes], ending: str, shape: tuple[int, int, int], blocks: Iterable[np.ndarray]) -> None:
+    """Write blocks of frames, (T, H, W) in all, to an open ``.npy`` or ``.npz``."""
+    with ExitStack() as stack:
+        if ending == ".npz":
+            archive = stack.enter_context(zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED))
+            file = stack.enter_context(archive.open(f"{_ARRAY_NAMES[0]}.npy", "w", force_zip64=True))
+        np.lib.format.write_array_header_1_0(file, {"descr": "|u1", "fortran_order": False, "shape": shape})
         for block in blocks:
-            stream.write(block)
+            file.write(block)
 
 
 @contextmanager
-def _npz_array(path: Path) -> Iterator[tuple[IO[bytes], tuple[int, int, int], np.dtype, bool]]:
-    """Open the recording in an ``.npz`` at its first number: the stream, shape, dtype, and whether in Fortran order."""
+def _array(path: Path) -> Iterator[tuple[IO[bytes], tuple[int, int, int], np.dtype, bool]]:
+    """Open the array of a recording at its first number: the stream, shape, dtype, and whether in Fortran order."""
+    if path.suffix.lower() == ".npy":
+        with reading(path), open(path, "rb") as stream:
+            shape, fortran, dtype = _npy_header(stream)
+            _check_array(path, "the array", shape, dtype, path.stat().st_size - stream.tell())
+            yield stream, shape, dtype, fortran
+        return
     with reading(path), zipfile.ZipFile(path) as archive:
         headers = {}
         for member in archive.infolist():
@@ -214,18 +228,23 @@ def _npz_array(path: Path) -> Iterator[tuple[IO[bytes], tuple[int, int, int], np
         member, shape, fortran, dtype = headers[name]
         if member.file_size > _most_bytes(member, path.stat().st_size):
             raise SpikeFileError(f"{path}: damaged, {name} claims {member.file_size} bytes of {member.compress_size}")
-        if dtype.kind not in "buif":
-            raise SpikeFileError(f"{path}: expected an array of zeros and ones, got {name} of type {dtype}")
-        if 0 in shape:
-            raise SpikeFileError(f"{path}: an empty recording, {name} is {shape}")
         with archive.open(member) as stream:
             _npy_header(stream)
-            present, needed = member.file_size - stream.tell(), math.prod(shape) * dtype.itemsize
-            if present != needed:
-                raise SpikeFileError(
-                    f"{path}: truncated, {name} of {shape} takes {needed} bytes, the file holds {present}"
-                )
+            _check_array(path, name, shape, dtype, member.file_size - stream.tell())
             yield stream, shape, dtype, fortran
+
+
+def _check_array(path: Path, name: str, shape: tuple[int, ...], dtype: np.dtype, present: int) -> None:
+    """Raise unless an array is a recording, and its file holds as many bytes as its header promises."""
+    if len(shape) != 3 or dtype.kind not in "buif":
+        raise SpikeFileError(
+            f"{path}: expected an array (T, H, W) of zeros and ones, got {name} {shape} of type {dtype}"
+        )
+    if 0 in shape:
+        raise SpikeFileError(f"{path}: an empty recording, {name} is {shape}")
+    needed = math.prod(shape) * dtype.itemsize
+    if present != needed:
+        raise SpikeFileError(f"{path}: truncated, {name} of {shape} takes {needed} bytes, the file holds {present}")
 
 
 def _most_bytes(member: zipfile.ZipInfo, size: int) -> int:
@@ -235,7 +254,11 @@ def _most_bytes(member: zipfile.ZipInfo, size: int) -> int:
 
 
 def _npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Read the header of an array; one of many blanks would take all memory before NumPy sees that it is too long."""
     with quiet():
         version = np.lib.format.read_magic(stream)
+        length = stream.read(2 if version == (1, 0) else 4)
+        if int.from_bytes(length, "little") > _LONGEST_HEADER:
+            raise ValueError(f"a header of more than {_LONGEST_HEADER} bytes")
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        return read(stream)
+        return read(io.BytesIO(length + stream.read(int.from_bytes(length, "little"))))

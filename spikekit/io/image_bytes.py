@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import struct
+import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,23 +21,25 @@ class PictureError(ValueError):
     """A picture that cannot be read or written; the message is one line and names the file."""
 
 
-def to_bytes(image: Tensor) -> Tensor:
-    """Round an image (*, 3, H, W) or (H, W) in [0, 1] to 8 bits, clamped, NaN being black: (*, H, W, 3) or (H, W).
+def to_bytes(image: Tensor, bits: int = 8) -> Tensor:
+    """Round an image (*, 3, H, W) or (H, W) in [0, 1] to 8 or 16 bits: (*, H, W, 3) or (H, W).
 
-    One that has 8 bits already keeps them.
+    Values are clamped, NaN is black. An image that has 8 bits already keeps them.
     """
     pixels = image.detach().cpu()
     if pixels.dtype != torch.uint8:
-        pixels = pixels.float().nan_to_num(0).clamp_(0, 1).mul_(255).round_().to(torch.uint8)
+        kind = torch.uint8 if bits == 8 else torch.uint16
+        pixels = pixels.float().nan_to_num(0).clamp_(0, 1).mul_((1 << bits) - 1).round_().to(kind)
     return pixels if pixels.ndim == 2 else pixels.movedim(-3, -1).contiguous()
 
 
-def png_bytes(image: Tensor, notes: Mapping[str, str] | None = None) -> bytes:
+def png_bytes(image: Tensor, notes: Mapping[str, str] | None = None, *, bits: int = 8) -> bytes:
     """Return the PNG file of an image.
 
     Args:
         image: (3, H, W) or (H, W), floating, [0, 1], or uint8.
-        notes: texts that stand in front of the pixels, by name; :func:`png_notes` reads them.
+        notes: texts that stand in front of the pixels, by name, both ASCII; :func:`png_notes` reads them.
+        bits: 8 or 16.
 
     Returns:
         The bytes of the file.
@@ -44,12 +48,31 @@ def png_bytes(image: Tensor, notes: Mapping[str, str] | None = None) -> bytes:
         >>> png_bytes(torch.zeros(3, 4, 6))[1:4]
         b'PNG'
     """
+    if bits == 16 and image.ndim == 3:  # which Pillow does not write
+        return _png16(to_bytes(image, 16).numpy(), notes or {})
     from PIL.PngImagePlugin import PngInfo
 
     said = PngInfo()
     for name, text in (notes or {}).items():
         said.add_text(name, text)
-    return picture_bytes(image, ".png", pnginfo=said)
+    return _pillow_bytes(to_bytes(image, bits), "PNG", pnginfo=said)
+
+
+def _png16(pixels: np.ndarray, notes: Mapping[str, str]) -> bytes:
+    """Return the PNG of an array (H, W, 3), uint16."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    height, width, _ = pixels.shape
+    # filter 1 of the format: every byte less that of the pixel to its left
+    rows = pixels.astype(">u2").view(np.uint8).reshape(height, width, 6)
+    rows = np.diff(rows, axis=1, prepend=np.zeros((height, 1, 6), np.uint8)).reshape(height, -1)
+    rows = np.pad(rows, [(0, 0), (1, 0)], constant_values=1)
+    header = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
+    texts = b"".join(chunk(b"tEXt", f"{name}\0{text}".encode("latin-1")) for name, text in notes.items())
+    body = chunk(b"IHDR", header) + texts + chunk(b"IDAT", zlib.compress(rows.tobytes(), 2)) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + body
 
 
 def png_notes(path: str | Path) -> dict[str, str]:
@@ -78,19 +101,20 @@ def png_pixels(path: str | Path) -> Tensor:
         raise PictureError(f"{path}: not a picture that can be read ({one_line(error)})") from error
 
 
-def picture_bytes(image: Tensor, ending: str, **how: Any) -> bytes:
+def picture_bytes(image: Tensor, ending: str, *, bits: int = 8, quality: int | None = None) -> bytes:
     """Return the file of an image.
 
     Args:
         image: (3, H, W) or (H, W), floating, [0, 1].
         ending: names the format, such as ``".png"``.
-        how: more arguments of Pillow.
+        bits: 8, or 16 in PNG and TIFF.
+        quality: of JPEG and WebP, 1 to 100; Pillow's own when not given.
 
     Returns:
         The bytes of the file.
 
     Raises:
-        ValueError: no format that Pillow writes has this ending.
+        ValueError: no format that Pillow writes has this ending, or it has no such bits or quality.
 
     Example:
         >>> picture_bytes(torch.zeros(3, 4, 6), ".JPG")[:2].hex()
@@ -99,11 +123,31 @@ def picture_bytes(image: Tensor, ending: str, **how: Any) -> bytes:
     from PIL import Image
 
     formats = {name: kind for name, kind in Image.registered_extensions().items() if kind in Image.SAVE}
-    if ending.lower() not in formats:
+    kind = formats.get(ending.lower())
+    if kind is None:
         raise ValueError(f"expected a name that ends like that of a picture, such as .png, got {ending or 'no ending'}")
+    if bits not in (8, 16) or (bits == 16 and kind not in ("PNG", "TIFF")):
+        raise ValueError(f"bits: expected 8, or 16 in .png and .tif, got {bits} in {ending}")
+    if quality is not None and (kind not in ("JPEG", "WEBP") or not 1 <= quality <= 100):
+        raise ValueError(f"quality: expected 1 to 100, of .jpg and .webp, got {quality} of {ending}")
+    if kind == "PNG":
+        return png_bytes(image, bits=bits)
+    pixels = to_bytes(image, bits)
+    if bits == 16:
+        from tifffile import imwrite
+
+        file = io.BytesIO()
+        imwrite(file, pixels.numpy(), photometric="rgb" if pixels.ndim == 3 else "minisblack")
+        return file.getvalue()
+    return _pillow_bytes(pixels, kind, **({} if quality is None else {"quality": quality}))
+
+
+def _pillow_bytes(pixels: Tensor, kind: str, **how: Any) -> bytes:
+    from PIL import Image
+
     file = io.BytesIO()
     # of PNG: a fifth of the time of Pillow's own level 6, for files that are 15 % longer
-    Image.fromarray(to_bytes(image).numpy()).save(file, formats[ending.lower()], compress_level=2, **how)
+    Image.fromarray(pixels.numpy()).save(file, kind, compress_level=2, **how)
     return file.getvalue()
 
 

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Sequence
 from contextlib import suppress
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from kornia.color import hsv_to_rgb
 from torch import Tensor
 
-from spikekit.arguments import one_line
+from spikekit.arguments import home_path, one_line
 from spikekit.check import check_picture, check_planes, check_positive
 from spikekit.io.image_bytes import PictureError, picture_bytes
 from spikekit.io.quiet import quiet
@@ -22,18 +24,20 @@ from spikekit.io.whole_file import whole_file
 #: Pixels of the largest picture that is read: a few bytes can claim more than there is memory.
 MOST_PIXELS = 1 << 27
 
+_ORIENTATION = 0x0112  # the tag of EXIF and TIFF
 _FARTHEST = 1e9  # the length of what is infinite
 
 
 def read_picture(path: str | Path) -> Tensor:
-    """Read a picture file as a colour image.
+    """Read a picture file as a colour image, upright as its EXIF says.
 
-    Grey pictures get three equal channels, 16-bit files keep their depth (where they are grey, or RGB with or without
-    alpha). Alpha is laid over white, as a page shows it; dropping it would bring up colours that nobody was meant to
-    see, and where it is opaque it changes nothing. Values stay gamma-encoded as in the file.
+    Grey pictures get three equal channels, 16-bit files keep their depth (but for grey ones with alpha, CMYK, and
+    colour TIFFs that only Pillow can unpack, which get 8 bits). Alpha is laid over white, as a page shows it; dropping
+    it would bring up colours that nobody was meant to see, and where it is opaque it changes nothing. Values stay
+    gamma-encoded as in the file.
 
     Args:
-        path: a PNG, JPEG, TIFF (its first page) or any other file that Pillow reads.
+        path: a PNG, JPEG, TIFF (its first page), PNM or any other file that Pillow reads.
 
     Returns:
         ``rgb`` of shape (3, H, W), float32, in [0, 1].
@@ -49,27 +53,60 @@ def read_picture(path: str | Path) -> Tensor:
         ...     read_picture(f"{folder}/grey.png").shape
         torch.Size([3, 4, 6])
     """
-    from skimage import color, util
-
-    if not Path(path).is_file():
+    path = home_path(path)
+    if not path.is_file():  # nor a pipe, which would be waited for
         raise FileNotFoundError(f"{path}: no such picture")
     try:
         with quiet():
-            pixels = util.img_as_float32(_pixels(path))
-        if pixels.ndim == 3 and pixels.shape[-1] == 4:
-            pixels = color.rgba2rgb(pixels)
-        elif pixels.ndim == 2 or pixels.shape[-1] == 1:
-            pixels = color.gray2rgb(pixels.reshape(pixels.shape[:2]))
+            pixels, turned = _pixels(path)
+        pixels = _UPRIGHT.get(turned, np.asarray)(pixels)
+        if pixels.ndim != 3 or 0 in pixels.shape or pixels.shape[-1] > 4:
+            raise ValueError(f"expected a grey or colour picture, got an array of shape {pixels.shape}")
     except Exception as error:
         said = one_line(error).removeprefix(f"{path}: ")[:300]
         raise PictureError(f"{path}: not a picture that can be read ({said})") from error
-    if pixels.ndim != 3 or pixels.shape[-1] != 3 or 0 in pixels.shape:
-        raise PictureError(f"{path}: expected a grey or colour picture, got an array of shape {pixels.shape}")
-    return torch.from_numpy(pixels.astype("float32")).permute(2, 0, 1).contiguous()
+    colors = pixels.shape[-1] - 1 + pixels.shape[-1] % 2
+    if colors < pixels.shape[-1]:
+        alpha = pixels[..., colors:]
+        pixels = np.clip((1 - alpha) + alpha * pixels[..., :colors], 0, 1)
+    return torch.from_numpy(pixels.astype("float32")).permute(2, 0, 1).expand(3, -1, -1).contiguous()
 
 
-def _pixels(path: str | Path) -> np.ndarray:
-    """Read the numbers of a file: (H, W), (H, W, 3) or (H, W, 4), red first, alpha last, in its own depth.
+#: What turns rows and columns (H, W, C) upright, by the orientation of EXIF.
+_UPRIGHT = {
+    2: np.fliplr,
+    3: lambda pixels: pixels[::-1, ::-1],
+    4: np.flipud,
+    5: lambda pixels: pixels.swapaxes(0, 1),
+    6: lambda pixels: np.rot90(pixels, -1),
+    7: lambda pixels: pixels[::-1, ::-1].swapaxes(0, 1),
+    8: np.rot90,
+}
+
+
+def picture_size(path: str | Path) -> tuple[int, int] | None:
+    """Return (H, W) of a picture by its header alone, upright; ``None`` of what has no header that can be read."""
+    from PIL import Image
+
+    if not Path(path).is_file():  # a pipe would be waited for
+        return None
+    try:
+        with quiet(), Image.open(path) as picture:
+            tiff = picture.tag_v2 if picture.format == "TIFF" else {}  # whose size some versions have turned already
+            width, height = tiff.get(256, picture.width), tiff.get(257, picture.height)
+            return (width, height) if _orientation(picture) >= 5 else (height, width)
+    except Exception:
+        return None
+
+
+def _orientation(picture: Any) -> int:
+    with suppress(Exception):  # what EXIF is damaged says nothing
+        return picture.getexif().get(_ORIENTATION, 1)
+    return 1
+
+
+def _pixels(path: Path) -> tuple[np.ndarray, int]:
+    """Read the numbers of a file, (H, W, C), 0 to 1, not multiplied by alpha, and its orientation.
 
     By what the file says that it is, and by one library each: one that tries others would hand what no picture is to
     FFmpeg, for which some files are lists of others to open.
@@ -78,52 +115,97 @@ def _pixels(path: str | Path) -> np.ndarray:
 
     with open(path, "rb") as file:
         head = file.read(26)
-    if head[:2] in (b"II", b"MM"):
-        return _tiff_pixels(path)
+    if head[:2] in (b"II", b"MM") and (plain := _plain_tiff(path)) is not None:
+        return plain
     with Image.open(path) as picture:
         _check_pixels(picture.height * picture.width)
         if head.startswith(b"\x89PNG") and head[24:] in (b"\x10\x02", b"\x10\x06"):
             # 16 bits in colour, of which Pillow would keep 8
             from kornia_rs.io import read_image_png_u16
 
-            return read_image_png_u16(str(path), "rgb" if head[25] == 2 else "rgba")
-        if picture.mode == "I" and picture.format == "PNG":  # 16 bits, as older versions of Pillow say it
-            return np.asarray(picture).astype(np.uint16)
-        if picture.mode in ("1", "L", "I", "F", "RGB", "RGBA") or picture.mode.startswith("I;16"):
-            return np.asarray(picture)
-        return np.asarray(picture.convert("RGBA" if picture.has_transparency_data else "RGB"))
+            pixels = _unit(read_image_png_u16(str(path), "rgb" if head[25] == 2 else "rgba"), 16)
+        elif picture.format == "PPM" and picture.mode == "RGB" and (most := picture.tile[0].args[1]) not in ("G", 255):
+            # likewise, but the numbers are those of a grey picture three times as wide
+            with open(path, "rb") as file:
+                file.seek(picture.tile[0].offset)
+                kind = b"P2" if head[1:2] == b"3" else b"P5"
+                grey = b"%s %d %d %d\n%s" % (kind, 3 * picture.width, picture.height, most, file.read())
+            with Image.open(io.BytesIO(grey), formats=["PPM"]) as wide:
+                pixels = _unit(np.asarray(wide), 8 if wide.mode == "L" else 16)
+            pixels = pixels.reshape(picture.height, picture.width, 3)
+        elif picture.mode.startswith("I;16") or (picture.mode == "I" and picture.format in ("PNG", "PPM")):
+            tags = getattr(picture, "tag_v2", {})
+            pixels = _unit(np.asarray(picture), tags.get(258, (16,))[0])
+            pixels = 1 - pixels if tags.get(262) == 0 else pixels  # white is 0
+        elif picture.mode == "F":
+            pixels = np.asarray(picture)
+        elif picture.mode == "I":
+            raise ValueError(f"expected 8 or 16 bits, or floating point, got {picture.format} of integers")
+        else:
+            pixels = _unit(np.asarray(picture.convert("RGBA" if picture.has_transparency_data else "RGB")), 8)
+        turned = _orientation(picture)  # a TIFF is upright once it is loaded
+    return pixels.reshape(*pixels.shape[:2], -1), turned
 
 
-def _tiff_pixels(path: str | Path) -> np.ndarray:
-    """Read the first page of a TIFF."""
-    from PIL import Image
+def _plain_tiff(path: Path) -> tuple[np.ndarray, int] | None:
+    """Read the first page of a TIFF in its own depth, which Pillow would cut; ``None`` of what only Pillow reads."""
     from tifffile import TiffFile
 
-    with suppress(OSError, SyntaxError), Image.open(path) as picture:
-        if picture.mode in ("P", "PA", "LA", "CMYK", "YCbCr", "LAB"):
-            _check_pixels(picture.height * picture.width)
-            return np.asarray(picture.convert("RGBA" if picture.has_transparency_data else "RGB"))
     with TiffFile(path) as file:
         page = file.pages.first
+        bits, photometric = int(np.max(page.bitspersample)), int(page.photometric)
+        if (bits in (1, 2, 4) and photometric < 2) or photometric not in (0, 1, 2):  # white is 0, black is 0, RGB
+            return None
         _check_pixels(max(math.prod(page.shape), math.prod(page.chunks)) / 4)  # of up to four channels
-        return page.asarray()
+        try:
+            pixels = page.asarray()
+        except ValueError as error:
+            if "imagecodecs" in str(error):  # LZW, JPEG and others, for which tifffile needs another package
+                return None
+            raise
+        if pixels.ndim == 3 and page.planarconfig == 2:
+            pixels = np.moveaxis(pixels, 0, -1)
+        pixels = pixels.reshape(*pixels.shape[:2], -1) if pixels.ndim < 4 else pixels
+        pixels = pixels if pixels.dtype.kind == "f" else _unit(pixels, bits)
+        extra = tuple(map(int, page.extrasamples))
+        turned = page.tags.valueof(_ORIENTATION, 1)
+    colors = pixels.shape[-1] - len(extra)
+    if photometric == 0:
+        pixels[..., :colors] = 1 - pixels[..., :colors]
+    if extra[:1] == (1,):  # colours are multiplied by alpha
+        alpha = pixels[..., colors : colors + 1]
+        pixels[..., :colors] /= np.where(alpha > 0, alpha, 1)
+    return pixels[..., : colors + (extra[:1] in ((1,), (2,)))], turned
+
+
+def _unit(pixels: np.ndarray, bits: int) -> np.ndarray:
+    """Return whole numbers of so many bits as 0 to 1, float32."""
+    if pixels.dtype.kind not in "ui" or bits > 32:
+        raise ValueError(f"expected whole numbers of at most 32 bits or floating point, got {pixels.dtype}")
+    if pixels.dtype.kind == "i" and pixels.min() < 0:
+        raise ValueError(f"expected numbers from 0 on, got {pixels.min()}")
+    kind = np.float32 if bits <= 16 else np.float64
+    return np.multiply(pixels, 1 / (2**bits - 1), dtype=kind).astype(np.float32, copy=False)
 
 
 def _check_pixels(count: float) -> None:
+    """A file of a few bytes can claim more pixels than there is memory."""
     if count > MOST_PIXELS:
         raise ValueError(f"expected at most {MOST_PIXELS} pixels, got {count:.0f}")
 
 
-def write_picture(path: str | Path, image: Tensor) -> None:
+def write_picture(path: str | Path, image: Tensor, *, bits: int = 8, quality: int | None = None) -> None:
     """Write an image to a file; the folder is made when it is missing.
 
     Args:
         path: where to; the ending names the format, PNG for lossless.
-        image: (3, H, W) or (H, W), floating, [0, 1]; clamped, and rounded to 8 bits; NaN is black.
+        image: (3, H, W) or (H, W), floating, [0, 1]; clamped, and rounded to ``bits``; NaN is black.
+        bits: 8, or 16 in PNG and TIFF.
+        quality: of JPEG and WebP, 1 to 100; Pillow's own when not given.
 
     Raises:
         TypeError: ``image`` is not a floating-point tensor.
-        ValueError: ``image`` has another shape, or the ending is of no format.
+        ValueError: ``image`` has another shape, the ending is of no format, or the format has no such bits or quality.
         OSError: the file cannot be written; what was there before, or nothing, is then there.
 
     Example:
@@ -134,7 +216,8 @@ def write_picture(path: str | Path, image: Tensor) -> None:
         [1.0, 0.0, 0.0]
     """
     check_picture("image", image, "(3, H, W) or (H, W)", grey=True)
-    data = picture_bytes(image, Path(path).suffix)
+    path = home_path(path)
+    data = picture_bytes(image, path.suffix, bits=bits, quality=quality)
     with whole_file(path) as file:
         file.write(data)
 

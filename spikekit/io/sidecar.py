@@ -21,7 +21,7 @@ import torch
 from spikekit.arguments import one_line
 from spikekit.color.cfa import PATTERNS
 from spikekit.io.failures import no_pipe, writing
-from spikekit.io.whole_file import flush_folder
+from spikekit.io.whole_file import flush_folder, hidden_name
 
 #: What the first line of a side-car says it is.
 KIND = "spikekit simulation 1"
@@ -229,7 +229,7 @@ def published(output: Path) -> Iterator[Path]:
         ValueError: the folder cannot be made, something cannot be moved, or the place of the side-car is taken by
             something else.
     """
-    target, last = output.parent, output.with_suffix(".json")
+    target, last, hidden = output.parent, output.with_suffix(".json"), hidden_name(output.name)
     if last.exists():
         stream = read_sidecar(last).stream["file"]  # raises where the file is something else
         if stream != output.name:
@@ -238,11 +238,11 @@ def published(output: Path) -> Iterator[Path]:
         with writing(output):
             target.mkdir(parents=True, exist_ok=True)
             with _locked(target):
-                for other in target.glob(f".{glob.escape(output.name)}.*.part"):
+                for other in target.glob(f"{glob.escape(hidden)}.*.part"):
                     with _locked(other, wait=False) as dead:
                         if dead:
                             shutil.rmtree(other, ignore_errors=True)
-                part = Path(tempfile.mkdtemp(".part", f".{output.name}.", target))
+                part = Path(tempfile.mkdtemp(".part", f"{hidden}.", target))
                 stack.callback(shutil.rmtree, part, ignore_errors=True)
                 stack.enter_context(_locked(part))
         yield part

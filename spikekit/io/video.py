@@ -6,8 +6,10 @@ import copy
 import operator
 import os
 import re
+import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, overload
@@ -16,13 +18,13 @@ from weakref import WeakSet
 import torch
 from torch import Tensor
 
+from spikekit.arguments import home_path
 from spikekit.check import check_whole
 from spikekit.io.failures import no_pipe, reading
-from spikekit.io.images import MOST_PIXELS, read_picture
-from spikekit.io.quiet import quiet
+from spikekit.io.images import MOST_PIXELS, picture_size, read_picture
 
 #: Endings of pictures, which may stand for frames.
-PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".pnm")
 
 #: Endings of video files, which PyAV reads.
 VIDEO_ENDINGS = (".mp4", ".m4v", ".mkv", ".webm", ".avi", ".mov", ".y4m", ".mpg", ".mpeg", ".ts", ".wmv", ".flv")
@@ -45,13 +47,13 @@ class VideoFrames(Sequence[Tensor]):
     """The frames of a folder of pictures or of a video file, each read when it is asked for.
 
     Convention:
-        A frame is ``rgb`` (3, H, W), float32, in [0, 1], gamma-encoded as it was stored. Grey pictures get three equal
-        channels, alpha is laid over white (an opaque one changes nothing), 16-bit files keep their depth; see
-        :func:`spikekit.read_picture`. All frames have the size of the first.
+        A frame is ``rgb`` (3, H, W), float32, in [0, 1], gamma-encoded as it was stored and upright as the file says.
+        Grey pictures get three equal channels, alpha is laid over white (an opaque one changes nothing), 16-bit files
+        keep their depth; see :func:`spikekit.read_picture`. All frames have the size of the first.
 
-        In a folder the pictures are the PNG, JPEG, BMP and TIFF files, told by their endings, in natural order (``f2``
-        before ``f10``); folders, hidden files and files with other endings are left out. A single picture is a film
-        of one frame.
+        In a folder the pictures are the PNG, JPEG, BMP, TIFF and PNM files, told by their endings, in natural order
+        (``f2`` before ``f10``); folders, hidden files and files with other endings are left out. A single picture is a
+        film of one frame.
 
         Video files need PyAV (``pip install '.[video]'``). Frames are counted without decoding them. Reading on
         is cheap, a few frames back too; further back the file is decoded from its start again, so that frame n is
@@ -89,7 +91,7 @@ class VideoFrames(Sequence[Tensor]):
 
     def __init__(self, path: str | Path, *, start: int = 0, count: int | None = None) -> None:
         start = operator.index(start)
-        self._source = _open(Path(path))
+        self._source = _open(home_path(path))
         total = self._source.count
         stop = total if count is None else start + check_whole("count", count)
         if start < 0 or start >= total or stop > total:
@@ -195,7 +197,7 @@ class _Pictures:
     def __init__(self, path: Path, files: list[Path]) -> None:
         self.path, self.files, self.count = path, files, len(files)
         # what has no header that can be read is damaged, and raises when it is its turn
-        sizes = {file: size for file in files if (size := _header_size(file))}
+        sizes = {file: size for file in files if (size := picture_size(file))}
         if not sizes:
             sizes = {files[0]: tuple(_load(files[0]).shape[1:])}
         self.like, self.size = next(iter(sizes.items()))
@@ -214,18 +216,6 @@ class _Pictures:
         rgb = _load(self.files[index])
         self._check_size(self.files[index], tuple(rgb.shape[1:]))
         return rgb
-
-
-def _header_size(file: Path) -> tuple[int, int] | None:
-    from PIL import Image
-
-    if not file.is_file():  # a pipe would be waited for
-        return None
-    try:
-        with quiet(), Image.open(file) as picture:
-            return picture.height, picture.width
-    except Exception:
-        return None
 
 
 def _load(file: Path) -> Tensor:
@@ -270,7 +260,8 @@ class _Film:
                 raise VideoError(f"{path}: expected a video, got none that can be decoded")
             total = sum(packet.size > 0 and not packet.is_discard for packet in container.demux(stream))
             total = max(total, stream.frames)  # what the header promises and the file lacks is told when it is reached
-            self.size = stream.height, stream.width
+            self.turns = _turns(path)
+            self.size = (stream.height, stream.width)[:: -1 if self.turns % 2 else 1]
             self.fps = float(stream.average_rate) if stream.average_rate else None
         if not total or 0 in self.size:
             raise VideoError(f"{path}: expected frames, got none")
@@ -281,12 +272,16 @@ class _Film:
 
     def _rewind(self) -> None:
         _films.add(self)
+        self._lock = threading.Lock()  # of a decoder that two threads would crash, and that a fork may leave held
+        self._forget()
+
+    def _forget(self) -> None:
         self._decoder: Iterator[Any] | None = None
         self._next = 0
         self._kept: deque[Any] = deque(maxlen=_KEPT)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name in ("path", "size", "fps", "count")}
+        return {name: value for name, value in vars(self).items() if name in ("path", "size", "fps", "count", "turns")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -296,8 +291,12 @@ class _Film:
         return f"{index:0{len(str(self.count - 1))}}"
 
     def read(self, index: int) -> Tensor:
+        with self._lock:
+            return torch.rot90(self._decode(index), self.turns, (-2, -1)).contiguous()
+
+    def _decode(self, index: int) -> Tensor:
         if index < self._next - len(self._kept):
-            self._rewind()
+            self._forget()
         if self._decoder is None and self._next <= index:
             self._decoder = _decoded(self.path)
         while self._next <= index:
@@ -308,14 +307,14 @@ class _Film:
                         raise VideoError(f"{self.path}: ends after {self._next} of {self.count} frames")
                     if frame.is_corrupt:
                         raise VideoError(f"{self.path}: frame {self._next}: damaged")
-                    if (frame.height, frame.width) != self.size:
-                        height, width = self.size
+                    height, width = self.size[:: -1 if self.turns % 2 else 1]
+                    if (frame.height, frame.width) != (height, width):
                         raise VideoError(
                             f"{self.path}: frame {self._next}: expected {height} x {width} (H x W) as before, got "
                             f"{frame.height} x {frame.width}"
                         )
             except VideoError:
-                self._rewind()  # whoever asks for an earlier frame again gets it
+                self._forget()  # whoever asks for an earlier frame again gets it
                 raise
             self._kept.append(frame)
             self._next += 1
@@ -323,6 +322,13 @@ class _Film:
             self._decoder = None  # whose file is closed with it
         with _reading(self.path, what=f"frame {index}: "):
             return _rgb(self._kept[index - self._next])
+
+
+def _turns(path: Path) -> int:
+    """Return by how many quarter turns, counterclockwise, the first frame has to be turned to be upright."""
+    with suppress(Exception):  # a frame that is damaged says so when it is asked for
+        return round(next(_decoded(path)).rotation / 90) % 4
+    return 0
 
 
 def _decoded(path: Path) -> Iterator[Any]:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from spikekit.arguments import home_path
 from spikekit.check import check_picture, check_positive
 from spikekit.io.failures import writing
 from spikekit.io.image_bytes import to_bytes
@@ -75,6 +76,7 @@ def write_video(path: str | Path, frames: Iterable[Tensor], fps: float = 25.0) -
         ...     len(film), film.fps, film.height, film.width
         (10, 5.0, 16, 24)
     """
+    path = home_path(path)
     check_film(path)
     check_positive("fps", fps)
     pictures = _pictures(path, frames)
@@ -86,7 +88,7 @@ def write_video(path: str | Path, frames: Iterable[Tensor], fps: float = 25.0) -
         import av
 
         with av.open(file.name, "w", format=FILM_FORMATS[Path(path).suffix.lower()]) as container:
-            encode(container, chain([first], pictures), first.shape, Fraction(fps).limit_denominator(1001))
+            encode(container, chain([first], pictures), first.shape, Fraction(float(fps)).limit_denominator(1001))
 
 
 def _is_gif(path: str | Path) -> bool:

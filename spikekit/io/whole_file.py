@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 import secrets
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from itertools import chain, count
 from pathlib import Path
 from typing import IO, Any
 
+from spikekit.arguments import home_path
 from spikekit.standard_output import FULL
 
 try:
@@ -32,8 +34,9 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
         next writing of the same name removes it. Two processes that write the same name do not disturb each other: the
         last one wins.
 
-        The file keeps the mode of the one that it replaces. A link keeps pointing where it does. What is no regular
-        file, such as ``/dev/stdout``, is written directly.
+        The file keeps the mode of the one that it replaces. A link of that name is replaced, and what it points at
+        stays as it is: a folder from a stranger may have links in it. A device, such as ``/dev/stdout``, is written
+        directly, and so is a pipe that somebody reads.
 
     Args:
         path: the file; its folder is made when it is missing.
@@ -58,11 +61,12 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
     """
     if mode not in ("w", "wb"):
         raise ValueError(f"mode: expected 'w' or 'wb', got {mode!r}")
-    target = Path(os.path.realpath(path))
-    if target.exists() and not target.is_file():  # a folder says so
-        with open(target, mode, **how) as file:
+    path = home_path(path)
+    if path.exists() and not path.is_file():
+        with open(path, mode, opener=_without_waiting, **how) as file:  # a folder says so
             yield file
         return
+    target = Path(os.path.realpath(path.parent), path.name)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
     except FileExistsError as error:
@@ -73,7 +77,7 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
         file.flush()
         os.fsync(file.fileno())
         with suppress(OSError):  # not every file system has modes
-            if target.exists():
+            if target.is_file() and not target.is_symlink():
                 os.chmod(part, target.stat().st_mode & 0o7777)
         if fcntl is None:
             file.close()
@@ -90,17 +94,32 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
     flush_folder(target.parent)
 
 
+def _without_waiting(path: str, flags: int) -> int:
+    """Open a device or a pipe; one that nobody reads is an error, rather than waited for."""
+    handle = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+    if os.name == "posix":
+        os.set_blocking(handle, True)
+    return handle
+
+
+def hidden_name(name: str) -> str:
+    """Return the beginning of a hidden file's name, which leaves room for an ending within the 255 bytes of a name."""
+    raw = os.fsencode(name)
+    return f".{name}" if len(raw) < 230 else f".{hashlib.sha256(raw).hexdigest()}"
+
+
 def _open_part(target: Path, mode: str, **how: Any) -> tuple[Path, IO[Any]]:
     """Open a file beside the target, and lock it; remove what killed processes have left of others.
 
     Names are counted, so that leftovers are found without a look at the whole folder.
     """
-    parts = [target.with_name(f".{target.name}.{n}.part") for n in range(_SIDE_BY_SIDE)]
+    hidden = hidden_name(target.name)
+    parts = [target.with_name(f"{hidden}.{n}.part") for n in range(_SIDE_BY_SIDE)]
     for leftover in parts:
         with suppress(OSError), open(leftover, "rb") as file:
             if _lock(file):
                 leftover.unlink()
-    more = (target.with_name(f".{target.name}.{secrets.token_hex(4)}.part") for _ in count())
+    more = (target.with_name(f"{hidden}.{secrets.token_hex(4)}.part") for _ in count())
     for part in chain(parts, more):
         try:
             file = open(part, mode.replace("w", "x"), **how)  # noqa: SIM115 - closed when it is complete

@@ -215,7 +215,7 @@ def simulate(source: Source, settings: Settings, output: Path, replayed: Sidecar
     Args:
         source: the frames.
         settings: all else.
-        output: the stream, a ``.dat`` or an ``.npz``; the truth and the side-car get its name with other endings.
+        output: the stream, see :func:`spikekit.write_spikes`; truth and side-car get its name with other endings.
         replayed: a side-car that the source and the stream must agree with.
 
     Returns:

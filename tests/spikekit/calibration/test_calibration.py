@@ -191,10 +191,10 @@ def test_corrected_pictures_are_nearly_those_of_an_ideal_sensor(truth):
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"gain": torch.zeros(2, 3)}, "gain: expected finite numbers above 0, got 0"),
+        ({"gain": torch.zeros(2, 3)}, "gain: expected 0.0001 to 10000, got 0"),
         ({"gain": torch.ones(2, 3, dtype=torch.float64)}, "gain: expected .H, W. of torch.float32"),
-        ({"dark": torch.full((2, 3), -1.0)}, "dark: expected finite numbers, 0 or more, got -1"),
-        ({"dark": torch.full((2, 3), float("nan"))}, "dark: expected finite numbers, 0 or more, got nan"),
+        ({"dark": torch.full((2, 3), -1.0)}, "dark: expected 0 to 1, got -1"),
+        ({"dark": torch.full((2, 3), float("nan"))}, "dark: expected 0 to 1, got nan"),
         ({"dark": torch.zeros(3, 2)}, "dark: expected .H, W."),
         ({"defects": torch.full((2, 3), 3, dtype=torch.uint8)}, "defects: expected 0, 1 or 2, got 3"),
     ],

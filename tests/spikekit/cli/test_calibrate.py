@@ -160,7 +160,7 @@ KIND = {"kind": "spikekit calibration 1"}
         (planes((768,)), KIND, "expected (H, W) of at most"),
         (planes(dark=torch.zeros(3)), KIND, "expected gain, dark and defects of one size"),
         (planes(more=torch.zeros(3)), KIND, "expected gain, dark and defects of one size"),
-        (planes(gain=torch.full(SIZE, float("inf"))), KIND, "gain: expected finite numbers above 0, got inf"),
+        (planes(gain=torch.full(SIZE, float("inf"))), KIND, "gain: expected 0.0001 to 10000, got inf"),
         (planes(defects=torch.full(SIZE, 9, dtype=torch.uint8)), KIND, "defects: expected 0, 1 or 2, got 9"),
     ],
 )

@@ -281,10 +281,10 @@ def test_decode_many_until_the_disk_is_full(clip, tmp_path, monkeypatch, fails):
     """The pictures already made stay, and the one that failed leaves nothing."""
     write, out = decode.write_picture, tmp_path / "out"
 
-    def full(path, picture):
+    def full(path, picture, **how):
         if path.name == "12.png":
             raise OSError(28, "No space left on device")
-        write(path, picture)
+        write(path, picture, **how)
 
     monkeypatch.setattr(decode, "write_picture", full)
     words = ("--method", "tfp", "--frame", "10:20", "-o", out / "{frame}.png")
@@ -377,7 +377,7 @@ def test_decode_darkness(tmp_path, capsys):
         (["info", "a.dat", "--hight", 3], "unrecognized arguments: --hight 3 (see spikekit info --help)"),
         (["info", "a.dat", "--height", "0"], "--height: expected a whole number, 1 or more, got 0"),
         (["info", "a.dat", "--width", "wide"], "--width: expected a whole number, 1 or more, got wide"),
-        (["decode", "a.dat"], "required: --method, -o/--output (see spikekit decode --help)"),
+        (["decode", "a.dat"], "required: -o/--output (see spikekit decode --help)"),
         (["decode", "a.dat", "-o", "a.png", "--method", "mean"], "--method: invalid choice: 'mean'"),
         (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--pattern", "RGB"], "--pattern: invalid choice: 'RGB'"),
         (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--alpha", "0"], "--alpha: expected a number above 0"),
@@ -396,7 +396,7 @@ def test_decode_darkness(tmp_path, capsys):
         ),
         (
             ["decode", "a.dat", "-o", "a.dat", "--method", "tfi"],
-            "ends in .png, .jpg, .jpeg, .bmp, .tif, .tiff, got a.dat",
+            "ends in .png, .jpg, .jpeg, .bmp, .tif, .tiff, .pgm, .ppm, .pnm, got a.dat",
         ),
     ],
 )
@@ -440,7 +440,7 @@ def test_wrong_files(clip, tmp_path, fails):
         (sized(tmp_path / "none.dat"), "none.dat: no such file"),
         ((tmp_path / "none.dat",), "none.dat: no such file"),
         ((tmp_path,), "got a folder"),
-        ((tmp_path / "clip.raw",), "clip.raw: expected a recording that ends in .dat or .npz, got .raw"),
+        ((tmp_path / "clip.raw",), "clip.raw: expected a recording that ends in .dat, .npy, .npz, got .raw"),
         (sized(clip, 7, 7), "1800 bytes at 7 bytes a frame make 257 whole frames and 1 bytes left over"),
         (sized(tmp_path / "a.npz", 20, 12), "holds frames of 12 x 20, got height 20 and width 12"),
     ]:
@@ -469,7 +469,7 @@ def test_stopped(clip, monkeypatch, capsys, error, status):
 
     monkeypatch.setattr(recording, "iter_spikes", stop)
     assert main(["info", *map(str, sized(clip))]) == status
-    assert capsys.readouterr() == ("", "spikekit: no room\n" if status == 1 else "")
+    assert capsys.readouterr() == ("", "spikekit: no room\n" if status == 1 else "spikekit: interrupted\n")
 
 
 # --- as a process -----------------------------------------------------------------------------------------------------

@@ -155,7 +155,9 @@ _PICTURES = {
 def test_pictures(fuzz, kind, monkeypatch):
     good = _PICTURES[kind]()
     monkeypatch.setattr("spikekit.io.images.MOST_PIXELS", 1 << 20)  # so that it is what bounds the memory
-    fuzz(read_picture, lambda rng: fuzz.damage(good, rng), f"bad.{kind}", PictureError, 400)
+    fuzz(
+        read_picture, lambda rng: fuzz.damage(good, rng), f"bad.{kind}", PictureError, 400, silent="tif" not in kind
+    )  # libtiff prints
 
 
 @pytest.mark.parametrize(

@@ -1,15 +1,15 @@
 """Pictures to files and back, panels, flow as colour."""
 
-import struct
-import zlib
-
 import numpy as np
 import pytest
+import tifffile
 import torch
 from PIL import Image
 from skimage import io
 
 from spikekit import flow_to_rgb, panel, read_picture, write_picture
+from spikekit.io.image_bytes import png_bytes, png_notes
+from spikekit.io.images import picture_size
 
 
 def test_round_trip(tmp_path):
@@ -34,64 +34,115 @@ def test_written_values(tmp_path):
         assert io.imread(tmp_path / "grey.png").tolist() == [[0, 0, 0, 1, 255, 255, 0]]
 
 
-@pytest.mark.parametrize(
-    ("pixels", "expected"),
-    [
-        (np.full((4, 5), 51, np.uint8), [0.2, 0.2, 0.2]),
-        (np.full((4, 5), 13107, np.uint16), [0.2, 0.2, 0.2]),
-        (np.full((4, 5), 1, np.uint16), [1 / 65535] * 3),
-        (np.full((4, 5, 3), [0, 51, 255], np.uint8), [0, 0.2, 1]),
-        (np.full((4, 5, 4), [0, 51, 255, 255], np.uint8), [0, 0.2, 1]),
-        (np.full((4, 5, 4), [0, 51, 255, 0], np.uint8), [1, 1, 1]),
-    ],
-)
-def test_read(tmp_path, pixels, expected):
-    io.imsave(tmp_path / "a.png", pixels, check_contrast=False)
-    rgb = read_picture(tmp_path / "a.png")
-    assert rgb.shape == (3, 4, 5)
+def over_white(pixels):
+    """The picture (3, H, W) that numbers (H, W, C) from 0 to 1 mean."""
+    colors = pixels.shape[-1] - 1 + pixels.shape[-1] % 2
+    alpha = pixels[..., colors:] if colors < pixels.shape[-1] else 1
+    return np.broadcast_to(alpha * pixels[..., :colors] + 1 - alpha, (*pixels.shape[:2], 3)).transpose(2, 0, 1)
+
+
+def numbers(bits, channels, size=(6, 9)):
+    drawn = np.random.default_rng(bits).integers(0, 1 << bits, (*size, channels))
+    return drawn.astype(f"uint{max(bits, 8)}")
+
+
+TURNED = {  # what orientation of EXIF stores a picture in which way, and what it looks like
+    1: lambda seen: seen,
+    2: lambda seen: seen[:, ::-1],
+    3: lambda seen: seen[::-1, ::-1],
+    4: lambda seen: seen[::-1],
+    5: lambda seen: seen.swapaxes(0, 1),
+    6: lambda seen: np.rot90(seen, -1),
+    7: lambda seen: np.rot90(seen, -1)[::-1],
+    8: lambda seen: np.rot90(seen),
+}
+
+
+def reads(path, expected, atol):
+    rgb = read_picture(path)
     assert rgb.dtype == torch.float32
     assert rgb.is_contiguous()
-    assert torch.allclose(rgb, torch.tensor(expected, dtype=torch.float32).reshape(3, 1, 1).expand(3, 4, 5), atol=1e-7)
+    np.testing.assert_allclose(rgb.numpy(), expected, rtol=0, atol=atol)
+    assert picture_size(path) in (tuple(expected.shape[1:]), None)  # without reading it; Pillow does not know some
 
 
-def write_png16(path, pixels):
-    """A PNG of 16 bits a channel, (H, W, C), which neither Pillow nor scikit-image writes in colour."""
-    height, width, channels = pixels.shape
-    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in pixels)
-    header = struct.pack(">IIBBBBB", width, height, 16, {3: 2, 4: 6}[channels], 0, 0, 0)
-    with open(path, "wb") as file:
-        file.write(b"\x89PNG\r\n\x1a\n")
-        for kind, data in ((b"IHDR", header), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")):
-            file.write(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)))
+@pytest.mark.parametrize("bits", [8, 16, 32])
+@pytest.mark.parametrize("pack", [{}, {"compression": "zlib", "predictor": True}, {"tile": (16, 16)}])
+def test_tiffs_of_every_depth_and_photometric_kind(tmp_path, bits, pack):
+    path, grey, rgb, rgba = tmp_path / "a.tif", *(numbers(bits, channels) for channels in (1, 3, 4))
+    most, close = 2**bits - 1, {8: 1e-7, 16: 1e-7, 32: 1e-6}[bits]
+    tifffile.imwrite(path, grey[..., 0], photometric="minisblack", **pack)
+    reads(path, over_white(grey / most), close)
+    tifffile.imwrite(path, grey[..., 0], photometric="miniswhite", **pack)
+    reads(path, over_white(1 - grey / most), close)
+    for turned, look in TURNED.items():
+        tags = [(274, "H", 1, turned, True)]
+        tifffile.imwrite(path, rgb, photometric="rgb", extratags=tags, **pack)
+        reads(path, over_white(look(rgb / most)), close)
+    tifffile.imwrite(path, np.moveaxis(rgb, -1, 0), photometric="rgb", planarconfig="separate", **pack)
+    reads(path, over_white(rgb / most), close)
+    tifffile.imwrite(path, rgba, photometric="rgb", extrasamples=["unassalpha"], **pack)
+    reads(path, over_white(rgba / most), close)
+    tifffile.imwrite(path, rgba, photometric="rgb", extrasamples=["unspecified"], **pack)
+    reads(path, over_white(rgba[..., :3] / most), close)
+    rgba[..., :3] = rgba[..., :3] / most * rgba[..., 3:]
+    tifffile.imwrite(path, rgba, photometric="rgb", extrasamples=["assocalpha"], **pack)
+    reads(path, (rgba[..., :3] / most + 1 - rgba[..., 3:] / most).transpose(2, 0, 1), max(close, 2 / most))
 
 
-@pytest.mark.parametrize("channels", [3, 4])
-def test_16_bits_in_colour(tmp_path, channels):
-    pixels = np.random.default_rng(0).integers(0, 65536, (4, 5, channels)).astype(np.uint16)
-    write_png16(tmp_path / "a.png", pixels)
-    expected = pixels[..., :3] / 65535
-    if channels == 4:
-        alpha = pixels[..., 3:] / 65535
-        expected = alpha * expected + (1 - alpha)
-    rgb = read_picture(tmp_path / "a.png").permute(1, 2, 0).numpy()
-    assert np.abs(rgb - expected).max() < 1e-6  # one part in 65535 is 1.5e-5
+@pytest.mark.parametrize("compression", ["raw", "tiff_lzw", "tiff_deflate", "packbits", "jpeg"])
+def test_tiffs_as_pillow_packs_them(tmp_path, compression):
+    rgb = Image.fromarray(numbers(8, 3))
+    kinds = [rgb, rgb.convert("L"), rgb.convert("CMYK"), Image.fromarray(numbers(8, 4))]
+    if compression != "jpeg":
+        kinds += [rgb.quantize(16), rgb.convert("1"), Image.fromarray(numbers(16, 1)[..., 0])]
+    for picture in kinds:
+        picture.save(tmp_path / "a.tif", compression=compression)
+        with Image.open(tmp_path / "a.tif") as seen:
+            deep = seen.mode == "I;16"
+            pixels = np.asarray(seen if deep or seen.mode == "RGBA" else seen.convert("RGB")) / (65535 if deep else 255)
+        reads(tmp_path / "a.tif", over_white(pixels.reshape(*pixels.shape[:2], -1)), 1e-6)
+
+
+@pytest.mark.parametrize("kind", ["P2", "P3", "P5", "P6"])
+@pytest.mark.parametrize("most", [1, 15, 255, 256, 1023, 65535])
+def test_portable_maps_of_any_depth(tmp_path, kind, most):
+    pixels = np.random.default_rng(most).integers(0, most + 1, (6, 9, 3 if kind in ("P3", "P6") else 1))
+    head = f"{kind}\n# a comment\n9 6\n{most}\n".encode()
+    plain = " ".join(map(str, pixels.ravel())).encode() + b"\n"
+    packed = pixels.astype(">u2" if most > 255 else "u1").tobytes()
+    (tmp_path / "a.ppm").write_bytes(head + (plain if kind in ("P2", "P3") else packed))
+    reads(tmp_path / "a.ppm", over_white(pixels / most), 1e-5 if most >= 255 else 1 / 255)
+
+
+@pytest.mark.parametrize("ending", ["png", "jpg", "webp"])
+@pytest.mark.parametrize("turned", TURNED)
+def test_pictures_stand_as_their_exif_says(tmp_path, ending, turned):
+    exif = Image.Exif()
+    exif[274] = turned
+    Image.fromarray(np.kron(numbers(8, 3), np.ones((16, 16, 1), np.uint8))).save(tmp_path / f"a.{ending}", exif=exif)
+    with Image.open(tmp_path / f"a.{ending}") as picture:
+        seen = TURNED[turned](np.asarray(picture.convert("RGB")) / 255)
+    reads(tmp_path / f"a.{ending}", over_white(seen), 1e-6)
 
 
 @pytest.mark.parametrize(
     ("mode", "color", "expected"),
     [
         ("1", 1, [1, 1, 1]),
+        ("L", 51, [0.2, 0.2, 0.2]),
+        ("I;16", 13107, [0.2, 0.2, 0.2]),
+        ("RGB", (0, 51, 255), [0, 0.2, 1]),
+        ("RGBA", (0, 51, 255, 255), [0, 0.2, 1]),
+        ("RGBA", (0, 51, 255, 0), [1, 1, 1]),
         ("LA", (51, 255), [0.2, 0.2, 0.2]),
         ("LA", (51, 0), [1, 1, 1]),
         ("P", (255, 0, 51), [1, 0, 0.2]),
-        ("CMYK", (0, 255, 255, 0), [1, 0, 0]),  # of four channels, none of which is alpha
     ],
 )
-def test_read_modes(tmp_path, mode, color, expected):
-    path = tmp_path / ("a.tif" if mode == "CMYK" else "a.png")
-    Image.new("RGB" if mode == "P" else mode, (5, 4), color).convert(mode).save(path)
-    rgb = read_picture(path)
-    assert torch.allclose(rgb, torch.tensor(expected, dtype=torch.float32).reshape(3, 1, 1).expand(3, 4, 5), atol=1e-6)
+def test_pngs_of_every_mode(tmp_path, mode, color, expected):
+    Image.new("RGB" if mode == "P" else mode, (5, 4), color).convert(mode).save(tmp_path / "a.png")
+    reads(tmp_path / "a.png", np.broadcast_to(np.reshape(expected, (3, 1, 1)), (3, 4, 5)), 1e-7)
 
 
 def test_palette_with_a_transparent_colour(tmp_path):
@@ -101,6 +152,32 @@ def test_palette_with_a_transparent_colour(tmp_path):
     picture.save(tmp_path / "clear.png", transparency=1)
     assert read_picture(tmp_path / "red.png")[:, 0, 0].tolist() == [1, 0, 0]
     assert read_picture(tmp_path / "clear.png")[:, 0, 0].tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize("ending", ["png", "tif", "tiff"])
+@pytest.mark.parametrize("shape", [(3, 6, 9), (6, 9)])
+def test_16_bits_are_written_and_read(tmp_path, ending, shape):
+    image = torch.randint(0, 65536, shape, generator=torch.Generator().manual_seed(0)) / 65535
+    write_picture(tmp_path / f"a.{ending}", image, bits=16)
+    reads(tmp_path / f"a.{ending}", image.expand(3, 6, 9).numpy(), 1e-6)
+    with Image.open(tmp_path / f"a.{ending}") as picture:  # whose parts of 16 bits another library takes, too
+        picture.load()
+
+
+def test_16_bits_carry_notes_and_quality_makes_jpegs_larger(tmp_path):
+    (tmp_path / "a.png").write_bytes(png_bytes(torch.rand(3, 4, 6), {"frame": "7"}, bits=16))
+    assert png_notes(tmp_path / "a.png") == {"frame": "7"}
+    for quality in (20, 95):
+        write_picture(tmp_path / f"{quality}.jpg", torch.rand(3, 40, 60), quality=quality)
+    assert (tmp_path / "95.jpg").stat().st_size > 2 * (tmp_path / "20.jpg").stat().st_size
+    for name, how in (
+        ("a.jpg", {"bits": 16}),
+        ("a.png", {"bits": 12}),
+        ("a.png", {"quality": 90}),
+        ("a.jpg", {"quality": 101}),
+    ):
+        with pytest.raises(ValueError, match=r"(bits|quality): expected"):
+            write_picture(tmp_path / name, torch.rand(3, 4, 6), **how)
 
 
 def test_files_that_are_no_pictures(tmp_path):

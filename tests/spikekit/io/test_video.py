@@ -3,16 +3,18 @@
 import os
 import pickle
 import re
+import struct
 import subprocess
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from spikekit import write_picture
+from spikekit import write_picture, write_video
 from spikekit.io import video as video_module
 from spikekit.io.video import VideoError, VideoFrames, read_video
 
@@ -288,6 +290,42 @@ def test_a_fork_leaves_its_parent_where_it_was(tmp_path):
     film = write_film(tmp_path / "a.mkv", codec="ffv1")
     done = subprocess.run([sys.executable, "-c", FORK, film], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_threads_share_a_film(tmp_path):
+    """Each gets the frames that it asks for, whatever others ask for."""
+    write_video(tmp_path / "a.mp4", [frame(40 * n, *SIZE) for n in range(6)])
+    film = read_video(tmp_path / "a.mp4")
+    expected = [film[n] for n in range(6)]
+
+    def look(seed):
+        order = np.random.default_rng(seed).integers(0, 6, 30)
+        return all(film[n].equal(expected[n]) for n in order)
+
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        with ThreadPoolExecutor(8) as threads:
+            assert all(threads.map(look, range(8)))
+    finally:
+        sys.setswitchinterval(before)
+
+
+@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+def test_a_film_of_a_phone_is_upright(tmp_path, turns):
+    """As the matrix in its header says: by so many quarter turns clockwise."""
+    seen = torch.linspace(0.2, 0.8, SIZE[0] * SIZE[1]).reshape(1, *SIZE).expand(3, -1, -1)
+    write_video(tmp_path / "a.mp4", [seen] * 3)
+    data = (tmp_path / "a.mp4").read_bytes()
+    upright = struct.pack(">9i", 1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)
+    cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[turns]
+    matrix = struct.pack(">9i", cos << 16, sin << 16, 0, -sin << 16, cos << 16, 0, 0, 0, 1 << 30)
+    place = data.index(upright, data.index(b"tkhd"))
+    (tmp_path / "a.mp4").write_bytes(data[:place] + matrix + data[place + len(matrix) :])
+    film = read_video(tmp_path / "a.mp4")
+    expected = torch.rot90(seen, -turns, (1, 2))
+    assert (film.height, film.width) == tuple(expected.shape[1:])
+    assert (pickle.loads(pickle.dumps(film))[2] - expected).abs().max() < 0.02
 
 
 def test_ten_bits_keep_their_depth(tmp_path):

@@ -2,7 +2,9 @@
 
 import sys
 import weakref
+from fractions import Fraction
 
+import numpy as np
 import pytest
 import torch
 
@@ -86,3 +88,9 @@ def test_what_cannot_be_a_film_is_one_line_and_leaves_nothing(tmp_path, monkeypa
     with pytest.raises(VideoError, match=r"a.mp4: writing a film needs PyAV, pip install '.\[video\]'"):
         write_video(tmp_path / "a.mp4", good)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("fps", [np.float32(25), np.int64(25), Fraction(25), torch.tensor(25.0)])
+def test_frames_a_second_are_any_kind_of_number(tmp_path, fps):
+    write_video(tmp_path / "a.mp4", [torch.zeros(3, 16, 16)] * 2, fps=fps)
+    assert read_video(tmp_path / "a.mp4").fps == 25

@@ -141,17 +141,22 @@ def test_modes_links_and_devices(tmp_path):
         file.write(b"1")
     assert (tmp_path / "new").stat().st_mode == (tmp_path / "any").stat().st_mode
     (tmp_path / "new").chmod(0o600)
+    with whole_file(tmp_path / "new") as file:
+        file.write(b"2")
+    assert (tmp_path / "new").stat().st_mode & 0o777 == 0o600
     (tmp_path / "link").symlink_to("new")
     with whole_file(tmp_path / "link") as file:
-        file.write(b"2")
-    assert (tmp_path / "link").is_symlink()
-    assert (tmp_path / "new").read_bytes() == b"2"
-    assert (tmp_path / "new").stat().st_mode & 0o777 == 0o600
+        file.write(b"3")
+    assert not (tmp_path / "link").is_symlink()
+    assert [(tmp_path / name).read_bytes() for name in ("new", "link")] == [b"2", b"3"]
     os.mkfifo(tmp_path / "pipe")
-    reader = subprocess.Popen(["cat", tmp_path / "pipe"], stdout=subprocess.PIPE)
+    with pytest.raises(OSError, match="pipe"), whole_file(tmp_path / "pipe"):  # nobody reads it
+        pass
+    reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
     with whole_file(tmp_path / "pipe") as file:
         file.write(b"through")
-    assert reader.communicate()[0] == b"through"
+    assert os.read(reader, 99) == b"through"
+    os.close(reader)
     assert (tmp_path / "pipe").is_fifo()
 
 
@@ -164,3 +169,10 @@ def test_what_cannot_be_written(tmp_path):
     with pytest.raises(ValueError, match="expected 'w' or 'wb', got 'a'"), whole_file(tmp_path / "a", "a"):
         pass
     assert files(tmp_path) == {"file": b""}
+
+
+def test_a_name_as_long_as_names_can_be(tmp_path):
+    for name in ("a" * 255, "ä" * 127):
+        with whole_file(tmp_path / name) as file:
+            file.write(b"1")
+    assert [len(os.fsencode(name)) for name in sorted(files(tmp_path))] == [255, 254]
