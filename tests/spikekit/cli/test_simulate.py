@@ -580,7 +580,7 @@ def test_mistakes(film, fails, words, status, said):
 
 
 def test_another_ending(film, fails):
-    assert "expected a stream that ends in .dat or .npz, got a.png" in fails(2, film, "-o", "a.png", "--scale", 2)
+    assert "expected a stream that ends in .dat, .npy, .npz, got a.png" in fails(2, film, "-o", "a.png", "--scale", 2)
 
 
 def calibrated(path, width=18, gain=0.5):

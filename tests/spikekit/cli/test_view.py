@@ -276,7 +276,7 @@ def test_a_camera_is_known(own_camera, capsys, header):
     assert (known - (1.5 * inner).sqrt()).abs().max() < 0.01
     view(*words, "-o", "v.png")
     assert read_picture("v.png").shape[0] == 3
-    known = recording.camera("own.json")
+    known = recording.load_camera("own.json")
     shown = recording.Recording(Path("a.dat"), 400, (6, 10 if header else 8), known.flip, camera=known)
     for n, plane in enumerate(shown.packed(7, 3), 7):
         assert (shown.unpack(plane) == known.prepare(spikes[n]).numpy()).all()
