@@ -51,8 +51,9 @@ def demosaic(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
     if count_colors(pattern) == 1:
         return raw.unsqueeze(-3).clone()
     height, width = raw.shape[-2:]
-    padded = F.pad(F.pad(known[:, None], (2, 2, 2, 2), "reflect"), (0, width % 2, 0, height % 2))
-    phases = F.pixel_unshuffle(padded, 2)
+    mirrored = F.pad(known.unsqueeze(1), (2, 2, 2, 2), "reflect").squeeze(1)
+    padded = F.pad(mirrored, (0, width % 2, 0, height % 2))
+    phases = padded.unflatten(2, (-1, 2)).unflatten(1, (-1, 2)).permute(0, 2, 4, 1, 3).flatten(1, 2).contiguous()
     cells = [[phases] * 4 for _ in range(3)]
     (_, red_row, _), *_ = bayer_sites(pattern)
     for colour, row, column in bayer_sites(pattern):
@@ -61,7 +62,8 @@ def demosaic(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
         found = (red, own, blue) if colour == 1 else (own, row_colour, opposite)[:: 1 - colour]
         for cell, value in zip(cells, found, strict=True):
             cell[2 * row + column] = value
-    rgb = F.pixel_shuffle(torch.stack([torch.stack(cell, dim=1) for cell in cells], dim=1).flatten(1, 2), 2)
+    rgb = torch.stack([torch.stack(cell, dim=1) for cell in cells], dim=1).unflatten(2, (2, 2))
+    rgb = rgb.permute(0, 1, 4, 2, 5, 3).flatten(4, 5).flatten(2, 3)
     return rgb[..., :height, :width].to(raw.dtype).reshape(*raw.shape[:-2], 3, height, width)
 
 
