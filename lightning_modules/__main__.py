@@ -9,6 +9,7 @@ from importlib import import_module
 
 from lightning_modules.cli import errors
 from lightning_modules.cli.short_help import VERBS, overview, usage
+from lightning_modules.configurations import with_found_configs
 from spikekit.completion import OPTION
 
 #: where the verbs that are not Lightning's are
@@ -60,7 +61,7 @@ def _run(verb: str, rest: Sequence[str], args: Sequence[str] | None) -> None:
         print_completion("".join(rest), _OURS)
     elif verb in _OURS:
         with errors.stopped_by_sigterm():
-            getattr(import_module(f"lightning_modules.{_OURS[verb]}"), verb)(rest)
+            getattr(import_module(f"lightning_modules.{_OURS[verb]}"), verb)(with_found_configs(rest))
     else:
         from lightning_modules.cli.command import Command, run
 

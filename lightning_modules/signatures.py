@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from dataclasses import is_dataclass
 from typing import TypeVar, get_type_hints
 
 T = TypeVar("T", bound=Callable[..., None])
@@ -26,7 +27,8 @@ def takes(other: type, *without: str) -> Callable[[T], T]:
         own = {one.name: one for one in own if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD)}
         passed = [one for one in inspect.signature(other).parameters.values() if one.name not in {*own, *without}]
         passed = passed if in_place else [one.replace(kind=one.KEYWORD_ONLY) for one in passed]
-        hints = {**get_type_hints(other.__init__), **get_type_hints(init)}
+        passed_hints = get_type_hints(other if is_dataclass(other) else other.__init__)  # of each base in its module
+        hints = {**passed_hints, **get_type_hints(init)}
         parameters = [one.replace(annotation=hints[one.name]) for one in (*passed, *own.values())]
         init.__signature__ = inspect.Signature([first, *sorted(parameters, key=lambda one: one.kind)])
         init.__doc__ = other.__doc__

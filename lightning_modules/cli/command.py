@@ -30,6 +30,7 @@ from lightning_modules.cli.configured import run_checkpoint
 from lightning_modules.cli.errors import Ended, InputError, UsageError
 from lightning_modules.cli.folder_lock import FolderError, check_folder, locked_folder
 from lightning_modules.cli.reasons import reason, suggestion, unknown
+from lightning_modules.configurations import with_found_configs
 from lightning_modules.data import FilmScenes, StillScenes
 from lightning_modules.data.loading import end_when_orphaned
 from lightning_modules.motion import Spike2Flow
@@ -118,7 +119,7 @@ class Command(LightningCLI):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         typed = kwargs.get("args")
         typed = sys.argv[1:] if typed is None else typed
-        self.typed = ["--help" if word == "--help=all" else word for word in typed]
+        self.typed = with_found_configs("--help" if word == "--help=all" else word for word in typed)
         super().__init__(*args, **kwargs)
 
     def subcommands(self) -> dict[str, set[str]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict
 from functools import lru_cache
 from typing import Any, ClassVar
 
@@ -120,7 +119,7 @@ class CSCSR(Network):
         if steps < 0 or steps % 2:
             raise ValueError(f"steps: expected an even number, or 0 for the exact search, got {steps}")
         times = config.times
-        super().__init__(asdict(config), (times[0], config.frames // 2, times[-1]), motion)
+        super().__init__(config.settings, (times[0], config.frames // 2, times[-1]), motion)
         self.config = config
         self.takes_flow = config.search
         self.times = times

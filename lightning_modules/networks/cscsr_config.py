@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
 
 from lightning_modules.networks.configuration import check_fields
+from lightning_modules.networks.sizes import SIZES, default_stride
 from spikekit.color.cfa import GREY
 
 
@@ -13,23 +14,26 @@ from spikekit.color.cfa import GREY
 class CSCSRConfig:
     """Configuration of a :class:`lightning_modules.networks.CSCSR`: a YAML file fills it, and weights carry it.
 
-    Widths and depths are not in the paper; the defaults are size paper_base of this project, see ``configs/size``. The
-    fields from ``representation`` to ``reconstruction`` are the ablations of the paper's Table 3, see
-    ``configs/ablation``; the defaults are the full network (J).
+    The paper leaves widths and depths open: a ``size`` of this project gives those that are not given. The fields from
+    ``representation`` to ``reconstruction`` are the ablations of the paper's Table 3, see ``configs/ablation``; the
+    defaults are the full network (J).
 
     Args:
         scale: super-resolution factor s.
         frames: spike frames N of a clip, odd.
         window: spike frames that a time point sees, odd.
-        stride: spike frames between two time points; must divide frames - window.
+        stride: spike frames between two time points; must divide frames - window. When not given, that of the size, or
+            what gives eleven time points: 3 for 41 frames, 9 for 101.
         pattern: Bayer phase of the streams; ``"grey"`` where all pixels see the same: there is one colour then.
+        size: a name of :data:`lightning_modules.networks.sizes.SIZES`, for what is not given of ``stride``, the widths
+            and depths up to ``end_width``, and ``resolution``. Weights carry the values, not the name.
         width: channels of refinement and reconstruction.
         representation_width: channels of the spike representation, at sensor resolution.
         features: channels of every time point that are warped.
         stages: fusions of the colours.
         blocks: residual blocks of every colour before every fusion.
         end_blocks: residual blocks after the last fusion.
-        end_width: channels after the last fusion; when not given, ``width``.
+        end_width: channels after the last fusion; when neither the size gives them, ``width``.
         skip: learn what to add to a smooth, enlarged TFP picture instead of the picture itself. The paper has no
             such skip; with it training starts where the classical decoder ends. The picture of a grey sensor, which
             has nothing to demosaic, is the widest mean of third order that the clip has room for, and not smooth.
@@ -67,14 +71,15 @@ class CSCSRConfig:
     scale: int = 4
     frames: int = 41
     window: int = 11
-    stride: int = 3
+    stride: int | None = None
     pattern: str = "RGGB"
-    width: int = 32
-    representation_width: int = 32
-    features: int = 4
-    stages: int = 3
-    blocks: int = 1
-    end_blocks: int = 3
+    size: str = "full_base"
+    width: int | None = None
+    representation_width: int | None = None
+    features: int | None = None
+    stages: int | None = None
+    blocks: int | None = None
+    end_blocks: int | None = None
     end_width: int | None = None
     skip: bool = False
     alpha: float = 0.4
@@ -86,10 +91,17 @@ class CSCSRConfig:
     search: bool = True
     refinement: bool = True
     reconstruction: Literal["correlated", "separate", "early"] = "correlated"
-    resolution: Literal["output", "sensor"] = "output"
+    resolution: Literal["output", "sensor"] | None = None
 
     def __post_init__(self) -> None:
+        if self.size not in SIZES:
+            raise ValueError(f"size: expected one of {', '.join(SIZES)}, got {self.size!r}")
+        for name, value in SIZES[self.size].items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, value)  # frozen
         check_fields(self)
+        if self.stride is None:
+            object.__setattr__(self, "stride", default_stride(self.frames, self.window))
         frames, window, stride = self.frames, self.window, self.stride
         if frames % 2 == 0 or window % 2 == 0 or window >= frames or (frames - window) % stride:
             raise ValueError(
@@ -114,6 +126,11 @@ class CSCSRConfig:
             )
         if self.end_width is not None and self.reconstruction == "separate":
             raise ValueError(f"end_width: separate colours are never fused, expected none, got {self.end_width}")
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Return the values of all fields but the name of the size, from which the same network is built again."""
+        return {name: value for name, value in asdict(self).items() if name != "size"}
 
     @property
     def times(self) -> tuple[int, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -39,7 +39,7 @@ class RecurrentCSCSRConfig(CSCSRConfig):
     fusion_width: int = 64
     fusion_blocks: int = 3
     memory: int = 32
-    resolution: Literal["output", "sensor"] = "sensor"
+    size: str = "small"
 
     def __post_init__(self) -> None:
         super().__post_init__()

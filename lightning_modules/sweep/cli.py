@@ -10,6 +10,7 @@ from pathlib import Path
 from lightning_modules.cli.command import check_folder
 from lightning_modules.cli.errors import Ended, InputError, UsageError, VerbParser
 from lightning_modules.cli.folder_lock import locked_folder
+from lightning_modules.configurations import find_configs
 from lightning_modules.sweep.budget import seconds
 from lightning_modules.sweep.cost import measure_variants
 from lightning_modules.sweep.engines import run_locally, run_on_ray
@@ -56,9 +57,9 @@ multiplications of a frame are measured for all of them, in turns. Every trial l
   lightning test -c runs/sweep/c-s-seed1/trial.yaml --ckpt_path last
 
 examples:
-  lightning sweep configs/x4.yaml -c configs/quick.yaml --over configs/ablation/*.yaml --seeds 0 1 --steps 300
-  lightning sweep configs/x4.yaml --over configs/baseline/*.yaml configs/size/{small,paper_large}.yaml --flops 1e16
-  lightning sweep configs/x4.yaml --over configs/ablation/*.yaml --over configs/size/*.yaml --time 12:00:00 --engine ray
+  lightning sweep x4 -c quick --over 'ablation/*' --seeds 0 1 --steps 300
+  lightning sweep x4 --over 'baseline/*' --flops 1e16
+  lightning sweep x4 --over 'ablation/*' --set model.network.size=small,full_large --time 12:00:00 --engine ray
   lightning sweep configs/x4.yaml --set model.network.width=16,32,64 --set data.root=DIR --flops 1e15
 """,
     )
@@ -137,13 +138,14 @@ def sweep(args: Sequence[str]) -> None:
         InputError: what was asked for cannot be; or trials failed.
     """
     asked = parser().parse_args(args)
-    configs = asked.configs + asked.config
+    configs = [find_configs(name)[0] for name in asked.configs] + asked.config
+    over = [[file for name in group for file in find_configs(name)] for group in asked.over]
     if not configs:
         raise UsageError("sweep: expected a configuration, such as configs/x4.yaml")
     check_folder(asked.output)
     budget = {"steps": asked.steps, "seconds": asked.time, "flops": asked.flops}
     budget = {name: value for name, value in budget.items() if value is not None}
-    trials = make_trials(configs, asked.over, asked.set, asked.seeds, budget, asked.output)
+    trials = make_trials(configs, over, asked.set, asked.seeds, budget, asked.output)
     if asked.engine == "ray" and find_spec("ray") is None:
         raise InputError("sweep: --engine ray: Ray is not installed; pip install '.[ray]' in a clone brings it")
     with locked_folder(asked.output, "sweep"):

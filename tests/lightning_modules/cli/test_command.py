@@ -23,7 +23,6 @@ from lightning_modules.cli.command import run as run_command
 from lightning_modules.cli.errors import InputError
 from lightning_modules.cli.rehearsal import Rehearsal
 from lightning_modules.cli.short_help import options_of
-from lightning_modules.networks import CSCSR
 from lightning_modules.storage.checkpoint import read_checkpoint
 from spikekit import read_picture, write_spikes
 
@@ -428,23 +427,10 @@ def test_the_paper_is_the_default(configs, capsys):
     config = yaml.safe_load(capsys.readouterr().out)
     model, data = config["model"]["init_args"], config["data"]["init_args"]
     network = model["network"]["init_args"]
-    assert [network[name] for name in ("scale", "frames", "window", "stride", "pattern")] == [4, 41, 11, 3, "RGGB"]
+    assert [network[name] for name in ("scale", "frames", "window", "pattern")] == [4, 41, 11, "RGGB"]
     assert network["alpha"] == 0.4
     assert [data[name] for name in ("patch", "batch_size", "pattern")] == [96, 4, "RGGB"]
     assert model["optimizer"]["class_path"] == "torch.optim.Adam"
     assert model["optimizer"]["init_args"]["lr"] == 1e-4
     assert model["lr_scheduler"]["init_args"]["step_size"] == 7500
     assert model["lr_scheduler"]["init_args"]["gamma"] == 0.8
-
-
-@pytest.mark.parametrize(
-    "overlay",
-    ["quick", *(f"size/{size}" for size in ("tiny", "small", "base", "large", "huge", "paper_small", "paper_large"))],
-)
-@pytest.mark.parametrize("scale", [2, 3, 4])
-def test_overlays_build(overlay, scale, configs):
-    base, over = (
-        yaml.safe_load((configs / f"{name}.yaml").read_text())["model"]["network"]["init_args"]
-        for name in (f"x{scale}", overlay)
-    )
-    assert CSCSR(**{**base, **over}).scale == scale

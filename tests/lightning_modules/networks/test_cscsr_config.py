@@ -8,6 +8,7 @@ import torch
 from jsonargparse import ArgumentParser
 
 from lightning_modules.networks import CSCSR, CSCSRConfig
+from lightning_modules.networks.sizes import SIZES
 
 NAMES = [field.name for field in fields(CSCSRConfig)]
 TINY = {"width": 4, "representation_width": 4, "features": 1, "stages": 1, "end_blocks": 1}
@@ -16,10 +17,11 @@ TINY = {"width": 4, "representation_width": 4, "features": 1, "stages": 1, "end_
 def test_the_constructor_takes_the_fields_and_what_weights_serve_with_any_of():
     parameters = signature(CSCSR).parameters
     assert list(parameters) == [*NAMES, "steps", "motion"]
-    assert {name: parameters[name].default for name in NAMES} == asdict(CSCSRConfig())
+    assert {name: parameters[name].default for name in NAMES} == {one.name: one.default for one in fields(CSCSRConfig)}
     network = CSCSR(2, 23, **TINY)
     assert network.config == CSCSRConfig(scale=2, frames=23, **TINY)
-    assert network.settings == asdict(network.config)
+    assert network.settings == network.config.settings
+    assert CSCSR(**network.settings).config.settings == network.settings  # a file without the size builds the same
     with pytest.raises(TypeError, match="widht"):
         CSCSR(widht=4)
     with pytest.raises(FrozenInstanceError):
@@ -59,6 +61,27 @@ def test_the_command_line_takes_the_fields_and_says_what_they_are():
 def test_every_field_is_checked_by_its_type(changed, message):
     with pytest.raises(ValueError, match=f"^{message}"):
         CSCSRConfig(**changed)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_size_fills_what_is_not_given(size):
+    config, other = CSCSRConfig(size=size), CSCSRConfig(size=size, width=8, stride=15)
+    assert SIZES[size].items() <= config.settings.items()
+    assert (other.width, other.stride, other.end_blocks) == (8, 15, config.end_blocks)
+    assert None not in {value for name, value in config.settings.items() if name != "end_width"}
+    assert CSCSRConfig(**config.settings).settings == config.settings
+
+
+def test_an_unknown_size_is_refused_with_those_that_there_are():
+    with pytest.raises(ValueError, match="size: expected one of tiny, small, "):
+        CSCSRConfig(size="gigantic")
+
+
+@pytest.mark.parametrize(("frames", "points"), [(41, 11), (101, 11), (53, 15), (23, 13), (13, 3)])
+def test_the_stride_follows_the_frames_and_always_divides(frames, points):
+    times = CSCSRConfig(frames=frames).times
+    assert len(times) == points
+    assert times[0] + times[-1] == frames - 1
 
 
 def test_settings_are_plain_values_whatever_came():

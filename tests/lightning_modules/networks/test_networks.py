@@ -1,6 +1,5 @@
 import pytest
 import torch
-import yaml
 from torch.utils.flop_counter import FlopCounterMode
 
 from lightning_modules.inference.tiles import forward_in_tiles
@@ -30,26 +29,23 @@ def test_a_trace_keeps_no_motion_of_its_example():
     torch.testing.assert_close(torch.jit.trace(at_rest, (spikes,))(other), at_rest(other))
 
 
-# The figures of README.md and configs/size.
+# The figures of sizes.py.
 @pytest.mark.parametrize(
     ("size", "parameters", "mmac"),
     [
-        ("paper_small", 165_801, 1.86),
-        ("paper_base", 726_447, 9.06),
-        ("paper_large", 2_832_251, 42.7),
+        ("full_small", 165_801, 1.86),
+        ("full_base", 726_447, 9.06),
+        ("full_large", 2_832_251, 42.7),
         ("base", 1_320_742, 1.72),
         ("small", 1_080_294, 1.48),
         ("tiny", 300_963, 0.356),
         ("large", 2_257_222, 2.66),
         ("huge", 3_783_526, 4.18),
-        ("large_long", 2_283_142, 2.68),
-        ("huge_long", 3_809_446, 4.21),
     ],
 )
-def test_parameters_and_work_of_the_sizes(size, parameters, mmac, configs):
-    settings = yaml.safe_load((configs / f"size/{size}.yaml").read_text())["model"]["network"]["init_args"]
-    for scale in (2, 3, 4) if size.startswith("paper") else (4,):  # the others see scale x scale pixels as channels
-        network = CSCSR(scale, **settings)
+def test_parameters_and_work_of_the_sizes(size, parameters, mmac):
+    for scale in (2, 3, 4) if size.startswith("full") else (4,):  # the others see scale x scale pixels as channels
+        network = CSCSR(scale, size=size)
         assert sum(p.numel() for p in network.parameters()) == parameters
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
         network(torch.zeros(1, network.frames, 8, 8), torch.zeros(1, 2, 2, 8, 8))

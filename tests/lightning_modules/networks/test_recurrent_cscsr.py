@@ -1,6 +1,5 @@
 import pytest
 import torch
-import yaml
 from torch.utils.flop_counter import FlopCounterMode
 
 from lightning_modules.inference.film import FilmMaker, film
@@ -127,21 +126,18 @@ def test_what_is_too_far_away_is_not_asked(network, clips):
 
 
 @pytest.mark.parametrize(
-    ("size", "parameters", "future", "mmac"),
+    ("settings", "parameters", "future", "mmac"),
     [
-        ("large_film", 2_635_654, None, 2.66),
-        ("large_film", 2_635_654, 0, 2.99),
-        ("large_film", 2_635_654, 4, 3.41),
-        ("large_long_film", 2_661_574, 0, 3.02),
-        ("huge_film", 4_180_390, 0, 4.54),
-        ("huge_long_film", 4_206_310, 0, 4.56),
-        ("huge_deep_film", 4_549_670, 4, 5.65),
-        ("huge_long_deep_film", 4_575_590, 0, 4.89),
+        ({"size": "large"}, 2_635_654, None, 2.66),
+        ({"size": "large"}, 2_635_654, 0, 2.99),
+        ({"size": "large"}, 2_635_654, 4, 3.41),
+        ({"size": "large", "frames": 101}, 2_661_574, 0, 3.02),
+        ({"size": "huge", "frames": 101}, 4_206_310, 0, 4.56),
+        ({"size": "huge", "fusion_blocks": 8}, 4_549_670, 4, 5.65),
     ],
 )
-def test_parameters_and_work_of_sizes_for_films(configs, size, parameters, future, mmac):
-    model = yaml.safe_load((configs / f"size/{size}.yaml").read_text())["model"]
-    network = RecurrentCSCSR(4, **model["network"]["init_args"])
+def test_parameters_and_work_of_sizes_for_films(settings, parameters, future, mmac):
+    network = RecurrentCSCSR(4, **settings)
     assert sum(weight.numel() for weight in network.parameters()) == parameters
     frames = network.frames
     with torch.no_grad(), FlopCounterMode(display=False) as counter:

@@ -242,8 +242,8 @@ def test_predict_needs_nothing_but_weights(file, how, tmp_path, monkeypatch, cap
     ("named", "expected"),
     [
         ([], Spike2Flow),
-        (["-c", "{configs}/motion/zero.yaml"], ZeroFlow),
-        (["-c{configs}/motion/zero.yaml"], ZeroFlow),
+        (["-c", "{still}"], ZeroFlow),
+        (["-c{still}"], ZeroFlow),
         (["--model.network.motion", "ZeroFlow"], ZeroFlow),
         (["--model.network.motion", "ZeroFlow", "-c", "{configs}/x2.yaml"], ZeroFlow),
         (["--model.network.motion.iterations", "1"], Spike2Flow),
@@ -252,7 +252,8 @@ def test_predict_needs_nothing_but_weights(file, how, tmp_path, monkeypatch, cap
 def test_motion_is_that_of_the_weights_unless_another_is_named(named, expected, tmp_path, configs, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["lightning"])
     trained = checkpoint(tmp_path / "moving.ckpt", SuperResolution(network(motion=Spike2Flow(**FLOW_TINY))))
-    words = [word.format(configs=configs) for word in named]
+    (tmp_path / "still.yaml").write_text("model: {network: {init_args: {motion: {class_path: ZeroFlow}}}}")
+    words = [word.format(configs=configs, still=tmp_path / "still.yaml") for word in named]
     built = run(["test", "-c", str(configs / "x2.yaml"), *words, "--model.weights", str(trained)], Rehearsal)
     motion = built.model.network.motion
     assert type(motion) is expected

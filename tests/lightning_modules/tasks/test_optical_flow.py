@@ -242,16 +242,6 @@ def test_errors_are_one_line(configs, tmp_path):
         assert "\n" not in str(exit.value)
 
 
-@pytest.mark.parametrize("name", ["spike2flow", "classical", "zero"])
-def test_overlays_name_their_estimators(name, configs, capsys):
-    args = ["fit", "-c", configs / "x4.yaml", "-c", configs / f"motion/{name}.yaml", "--print_config"]
-    with pytest.raises(SystemExit):
-        main([*map(str, args)])
-    config = yaml.safe_load(capsys.readouterr().out)
-    kind = config["model"]["init_args"]["network"]["init_args"]["motion"]["class_path"].split(".")[-1]
-    assert kind == {"spike2flow": "Spike2Flow", "classical": "ClassicalFlow", "zero": "ZeroFlow"}[name]
-
-
 def test_flows_are_shown_on_the_scale_of_the_longest_true_one():
     truth = torch.zeros(2, 4, 4)
     truth[:, 1, 2], truth[0, 3, 2] = torch.tensor([3.0, 4.0]), 4.5

@@ -18,18 +18,18 @@ def clip(batch=1, height=12, width=16):
 
 
 @pytest.mark.parametrize(
-    ("overlay", "parameters"),
+    ("changed", "parameters"),
     [
-        ("swinir_light", {2: 910_152, 3: 918_267, 4: 929_628}),
-        ("swinir", {2: 11_752_487, 3: 11_937_127, 4: 11_900_199}),
+        ({"width": 60, "groups": 4, "upsampler": "direct"}, {2: 910_152, 3: 918_267, 4: 929_628}),
+        ({}, {2: 11_752_487, 3: 11_937_127, 4: 11_900_199}),
     ],
 )
-def test_parameters_are_those_of_the_publication(overlay, parameters, configs):
-    network = yaml.safe_load((configs / f"baseline/{overlay}.yaml").read_text())["model"]["network"]
+def test_parameters_are_those_of_the_publication(changed, parameters, configs):
+    network = yaml.safe_load((configs / "baseline/swinir.yaml").read_text())["model"]["network"]
     assert network["class_path"] == "SwinIR"
     for scale, expected in parameters.items():
         with torch.device("meta"):
-            built = SwinIR(scale, **network["init_args"])
+            built = SwinIR(scale, **network["init_args"] | changed)
         assert sum(p.numel() for p in built.parameters()) == expected
 
 

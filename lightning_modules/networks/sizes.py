@@ -1,0 +1,69 @@
+"""Sizes of CSCSR by name: widths and depths, which the paper leaves open."""
+
+from __future__ import annotations
+
+from typing import Any
+
+#: as the paper lays the network out: refinement and reconstruction work at the resolution of the picture
+_FULL = {"resolution": "output"}
+#: at the resolution of the sensor, with the temporal pixels of a site as channels: a fraction of the work
+_SENSOR = {"resolution": "sensor", "width": 32, "representation_width": 16, "features": 2, "stages": 3, "blocks": 1}
+
+#: fields of :class:`lightning_modules.networks.CSCSRConfig` by the name of a size. Parameters and million
+#: multiplications by sensor pixel at x4: tiny 0.30 M and 0.36, small 1.08 M and 1.48, base 1.32 M and 1.72, large
+#: 2.26 M and 2.66, huge 3.78 M and 4.18, full_small 0.17 M and 1.86, full_base 0.73 M and 9.06, full_large 2.83 M
+#: and 42.7
+SIZES: dict[str, dict[str, Any]] = {
+    "tiny": {
+        "resolution": "sensor",
+        "stride": 6,
+        "width": 24,
+        "representation_width": 8,
+        "features": 1,
+        "stages": 2,
+        "blocks": 1,
+        "end_blocks": 1,
+    },
+    "small": {**_SENSOR, "end_blocks": 3},
+    "base": {**_SENSOR, "end_blocks": 16},
+    "large": {**_SENSOR, "end_blocks": 16, "end_width": 64},
+    "huge": {**_SENSOR, "end_blocks": 16, "end_width": 96},
+    "full_small": {
+        **_FULL,
+        "width": 16,
+        "representation_width": 16,
+        "features": 2,
+        "stages": 2,
+        "blocks": 1,
+        "end_blocks": 2,
+    },
+    "full_base": {
+        **_FULL,
+        "width": 32,
+        "representation_width": 32,
+        "features": 4,
+        "stages": 3,
+        "blocks": 1,
+        "end_blocks": 3,
+    },
+    "full_large": {
+        **_FULL,
+        "width": 64,
+        "representation_width": 32,
+        "features": 8,
+        "stages": 3,
+        "blocks": 2,
+        "end_blocks": 4,
+    },
+}
+
+
+def default_stride(frames: int, window: int) -> int:
+    """Return the stride between time points that gives eleven of them, or the next larger number that fits.
+
+    Example:
+        >>> default_stride(41, 11), default_stride(101, 11), default_stride(23, 11)
+        (3, 9, 1)
+    """
+    between = frames - window
+    return max((stride for stride in range(1, between // 10 + 1) if between % stride == 0), default=1)

@@ -1,0 +1,61 @@
+"""Configurations by name, from anywhere, and that each of them builds."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from lightning_modules.__main__ import main
+from lightning_modules.configurations import find_configs, with_found_configs
+from lightning_modules.networks import CSCSR
+
+NAMES = ["x1", "x2", "x3", "x4", "quick", "flow", "ablation/a", "baseline/vidarsr", "data/films", "motion/spike2flow"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("typed", ["{}", "{}.yaml", "configs/{}", "configs/{}.yaml"])
+def test_a_configuration_is_found_from_anywhere(name, typed, tmp_path, monkeypatch, configs):
+    monkeypatch.chdir(tmp_path)
+    (found,) = find_configs(typed.format(name))
+    assert Path(found).samefile(configs / f"{name}.yaml")
+
+
+def test_a_file_in_the_folder_comes_first(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("x4", "configs/x4.yaml"):
+        Path(name).parent.mkdir(exist_ok=True)
+        Path(name).write_text("output: mine")
+        assert find_configs(name) == [name]
+
+
+@pytest.mark.parametrize("name", ["nowhere", "../x4", "/x4", "{model: {flow: scene}}", "", "a\nb", "x" * 5000])
+def test_what_is_no_name_stays_as_it_is(name):
+    assert find_configs(name) == [name]
+
+
+def test_every_way_to_type_it(configs):
+    x4 = str(configs / "x4.yaml")
+    typed = ["fit", "-c", "x4", "--config", "x4", "--config=x4", "-cx4", "--ckpt_path", "x4"]
+    expected = ["fit", "-c", x4, "--config", x4, f"--config={x4}", f"-c{x4}", "--ckpt_path", "x4"]
+    assert with_found_configs(typed) == expected
+
+
+def test_the_command_finds_them_from_an_empty_folder(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["lightning"])
+    with pytest.raises(SystemExit):
+        main(["fit", "-c", "x4", "-c", "configs/quick.yaml", "-c", "ablation/b", "--print_config"])
+    network = yaml.safe_load(capsys.readouterr().out)["model"]["init_args"]["network"]["init_args"]
+    assert (network["scale"], network["size"], network["global_perception"]) == (4, "small", False)
+
+
+@pytest.mark.parametrize("scale", [1, 2, 3, 4])
+@pytest.mark.parametrize("size", [None, "tiny", "small", "base", "large", "huge", "full_small", "full_base"])
+def test_every_scale_takes_every_size(scale, size, configs):
+    said = yaml.safe_load((configs / f"x{scale}.yaml").read_text())["model"]["network"]["init_args"]
+    quick = yaml.safe_load((configs / "quick.yaml").read_text())["model"]["network"]["init_args"]
+    assert CSCSR(**{**said, **quick, **({"size": size} if size else {})}).scale == scale
+
+
+def test_there_are_few(configs):
+    assert len([*configs.rglob("*.yaml")]) <= 26
