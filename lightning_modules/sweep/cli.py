@@ -58,7 +58,7 @@ multiplications of a frame are measured for all of them, in turns. Every trial l
 
 examples:
   lightning sweep x4 -c quick --over 'ablation/*' --seeds 0 1 --steps 300
-  lightning sweep x4 --over 'baseline/*' --flops 1e16
+  lightning sweep x4 --set model.network=CSCSR,BasicVSR,VidarSR --flops 1e16
   lightning sweep x4 --over 'ablation/*' --set model.network.size=small,full_large --time 12:00:00 --engine ray
   lightning sweep configs/x4.yaml --set model.network.width=16,32,64 --set data.root=DIR --flops 1e15
 """,

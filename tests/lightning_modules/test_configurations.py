@@ -9,7 +9,7 @@ from lightning_modules.__main__ import main
 from lightning_modules.configurations import find_configs, with_found_configs
 from lightning_modules.networks import CSCSR
 
-NAMES = ["x1", "x2", "x3", "x4", "quick", "flow", "ablation/a", "baseline/vidarsr", "data/films", "motion/spike2flow"]
+NAMES = ["x1", "x2", "x3", "x4", "quick", "flow", "ablation/a", "grey", "data/films", "motion/spike2flow"]
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -1,4 +1,4 @@
-"""The overlays of the baselines, as their users type them: trained, tested, exported, read again, and run."""
+"""Baselines by name, as their users type them: trained, tested, exported, read again, and run."""
 
 import csv
 from inspect import signature
@@ -17,7 +17,7 @@ from lightning_modules.sweep.paper import TABLE_2, method_of
 from spikekit import read_picture, write_spikes
 
 CONFIGS = Path(__file__).parents[4] / "configs"
-OVERLAYS = sorted((CONFIGS / "baseline").glob("*.yaml"))
+BASELINES = ["BasicVSR", "RealRawVSR", "SpikeSRNetLike", "SwinIR", "TSCNN", "VidarSR"]
 
 TINY = {
     "BasicVSR": {"width": 4, "blocks": 1, "neighbors": 1},
@@ -29,62 +29,51 @@ TINY = {
 }
 
 
-def network(overlay):
-    return yaml.safe_load(overlay.read_text())["model"]["network"]
+@pytest.mark.parametrize("name", BASELINES)
+def test_a_baseline_takes_scale_frames_pattern_and_skip_of_a_configuration_of_cscsr(name):
+    """It is named over one, whose settings of the same name stay."""
+    kind = getattr(networks, name)
+    for below in ("x2", "x3", "x4", "quick"):
+        said = yaml.safe_load((CONFIGS / f"{below}.yaml").read_text())["model"]["network"]["init_args"]
+        assert said.keys() & signature(kind).parameters.keys() <= {"scale", "frames", "pattern", "skip"}
 
 
-@pytest.mark.parametrize("overlay", OVERLAYS, ids=lambda path: path.stem)
-def test_an_overlay_shares_scale_frames_pattern_and_alpha_with_cscsr_alone(overlay):
-    """It is laid over a configuration of CSCSR, whose settings of the same name would stay."""
-    said = network(overlay)
-    kind = getattr(networks, said["class_path"])
-    for scale in (2, 3, 4):
-        below = yaml.safe_load((CONFIGS / f"x{scale}.yaml").read_text())["model"]["network"]["init_args"]
-        with torch.device("meta"):
-            made = kind(scale=scale, **said["init_args"])
-        stays = below.keys() & made.settings.keys() - said["init_args"].keys()
-        assert stays <= {"scale", "frames", "pattern", "alpha"}
-
-
-# what the comments of the overlays say
+# for comparisons at equal work; their docstrings say so
 NARROWED = [
-    ("basicvsr", {"width": 24}, 1.5),
-    ("real_rawvsr", {"width": 24}, 1.7),
-    ("spikesrnet", {"width": 32, "maps": 12}, 1.5),
-    ("spikesrnet", {"width": 24, "maps": 8, "per_channel": True}, 1.6),
-    ("vidarsr", {"width": 16, "features": 8}, 1.1),
-    ("vidarsr", {"width": 10, "features": 4, "per_channel": True}, 0.9),
+    ("BasicVSR", {"width": 24}, 1.5),
+    ("RealRawVSR", {"width": 24}, 1.7),
+    ("SpikeSRNetLike", {"width": 32, "maps": 12}, 1.5),
+    ("SpikeSRNetLike", {"width": 24, "maps": 8, "per_channel": True}, 1.6),
+    ("VidarSR", {"width": 16, "features": 8}, 1.1),
+    ("VidarSR", {"width": 10, "features": 4, "per_channel": True}, 0.9),
 ]
 
 
-@pytest.mark.parametrize(("overlay", "changed", "expected"), NARROWED)
-def test_narrowed_to_the_work_of_size_small(overlay, changed, expected):
-    said = network(CONFIGS / f"baseline/{overlay}.yaml")
-    made = getattr(networks, said["class_path"])(scale=4, **said["init_args"] | changed)
+@pytest.mark.parametrize(("name", "changed", "expected"), NARROWED)
+def test_narrowed_to_the_work_of_size_small(name, changed, expected):
+    made = getattr(networks, name)(scale=4, **changed)
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
         made(torch.zeros(1, 41, 16, 16), static=True)
     assert counter.get_total_flops() / 2 / 16**2 / 1e6 == pytest.approx(expected, abs=0.05)
 
 
-def test_every_method_of_the_paper_is_an_overlay_or_an_argument_more():
-    said = [network(overlay) for overlay in OVERLAYS]
+def test_every_method_of_the_paper_is_a_baseline_or_an_argument_more():
     found = set()
-    for one in said:
-        kind = getattr(networks, one["class_path"])
+    for name in BASELINES:
+        kind = getattr(networks, name)
         for more in ({}, {"decoder": "tfp"}, {"per_channel": True}):
             if more.keys() <= signature(kind).parameters.keys():
                 with torch.device("meta"):
-                    settings = kind(scale=4, **one["init_args"] | more).settings
+                    settings = kind(scale=4, **more).settings
                 found.add(method_of({"class": kind.__name__, **settings}))
     assert found == TABLE_2[4].keys() - {"CSCSR"}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("overlay", OVERLAYS, ids=lambda path: path.stem)
-def test_from_training_to_a_picture(overlay, tmp_path):
-    kind = network(overlay)["class_path"]
-    scale = 2 + OVERLAYS.index(overlay) % 3
-    configs = ["-c", str(CONFIGS / f"x{scale}.yaml"), "-c", str(overlay)]
+@pytest.mark.parametrize("kind", BASELINES)
+def test_from_training_to_a_picture(kind, tmp_path):
+    scale = 2 + BASELINES.index(kind) % 3
+    configs = ["-c", f"x{scale}", "--model.network", kind]
     tiny = [f"--model.network.{name}={value}" for name, value in TINY[kind].items()]
     small = ["patch=16", "val_patch=16", "train_clips=2", "val_clips=1", "batch_size=2", "workers=0"]
     args = [*configs, *tiny, *(f"--data.{setting}" for setting in small), "-o", str(tmp_path)]
@@ -113,9 +102,9 @@ def test_from_training_to_a_picture(overlay, tmp_path):
 @pytest.mark.parametrize(
     ("config", "settings", "expected"),
     [
-        ("baseline/vidarsr.yaml", ["network.frames=61"], "'frames': 61,.*'flow_times': (7, 53)"),
-        ("baseline/swinir.yaml", ["network.frames=21"], "'frames': 21,.*'flow_times': (2, 18)"),
-        ("baseline/spikesrnet.yaml", ["network.frames=27"], "'frames': 27,.*'flow_times': (3, 23)"),
+        ("x2.yaml", ["network=VidarSR", "network.frames=61"], "'frames': 61,.*'flow_times': (7, 53)"),
+        ("x2.yaml", ["network=SwinIR", "network.frames=21"], "'frames': 21,.*'flow_times': (2, 18)"),
+        ("x2.yaml", ["network=SpikeSRNetLike", "network.frames=27"], "'frames': 27,.*'flow_times': (3, 23)"),
         (
             "quick.yaml",
             ["network.size=tiny", "network.stride=6", "network.frames=23"],
