@@ -10,7 +10,7 @@ from typing import TypeVar, get_type_hints
 T = TypeVar("T", bound=Callable[..., None])
 
 
-def takes(other: type, *without: str) -> Callable[[T], T]:
+def inherit_signature(other: type, *without: str) -> Callable[[T], T]:
     """Decorate a constructor that passes ``**settings``, and perhaps ``*args``, on to another class.
 
     It gets the signature and the documentation of both, for ``help``, editors and the command line; its own arguments

@@ -22,7 +22,7 @@ from spikekit.timing import Timer, peak_memory, timer_of
 
 
 @dataclass
-class Row:
+class Measurement:
     """A setting, and its measurements so far.
 
     Args:
@@ -78,7 +78,7 @@ class Timed:
     every: int | None = None
 
 
-def measure(rows: Sequence[Row], scenes: DataLoader, rounds: int) -> Timed:
+def measure(rows: Sequence[Measurement], scenes: DataLoader, rounds: int) -> Timed:
     """Measure the settings that can run; if one fails, its row gets the reason, and the others continue.
 
     All settings see a clip before the next one is made. That also warms them up. Then they are timed, see
@@ -101,7 +101,7 @@ def measure(rows: Sequence[Row], scenes: DataLoader, rounds: int) -> Timed:
     return measure_costs(rows, kept, rounds)
 
 
-def measure_costs(rows: Sequence[Row], clips: Sequence[Tensor], rounds: int) -> Timed:
+def measure_costs(rows: Sequence[Measurement], clips: Sequence[Tensor], rounds: int) -> Timed:
     """Measure the cost of settings that can run; one that fails on the way gets a reason, and the others go on.
 
     Args:
@@ -117,12 +117,12 @@ def measure_costs(rows: Sequence[Row], clips: Sequence[Tensor], rounds: int) -> 
     return Timed(len(clips), tuple(clips[0].shape[-2:]), rounds, ", ".join(units))
 
 
-def running(rows: Sequence[Row]) -> list[Row]:
+def running(rows: Sequence[Measurement]) -> list[Measurement]:
     """Return the rows that can run, as far as is known."""
     return [row for row in rows if row.reason is None]
 
 
-def time_in_turns(rows: Sequence[Row], clips: Sequence[Tensor], rounds: int) -> None:
+def time_in_turns(rows: Sequence[Measurement], clips: Sequence[Tensor], rounds: int) -> None:
     """Time all rows once in every round, on the round's clip, each round beginning with the next row.
 
     Other work on the machine and the demands of a clip then affect all rows alike, and no row is always the first of
@@ -140,12 +140,12 @@ def time_in_turns(rows: Sequence[Row], clips: Sequence[Tensor], rounds: int) -> 
         row.seconds.append(timer(lambda row=row, spikes=spikes: row.runner(spikes), 1))
 
 
-def _from(rows: Sequence[Row], turn: int) -> list[Row]:
+def _from(rows: Sequence[Measurement], turn: int) -> list[Measurement]:
     first = turn % max(1, len(rows))
     return [*rows[first:], *rows[:first]]
 
 
-def _timer(row: Row) -> tuple[Timer, str]:
+def _timer(row: Measurement) -> tuple[Timer, str]:
     return timer_of(row.runner.device, torch.get_num_threads())
 
 
@@ -156,7 +156,7 @@ def _clips(scenes: DataLoader) -> Iterator[dict[str, Tensor]]:
             yield {name: value[n : n + 1] for name, value in batch.items()}
 
 
-def attempt(row: Row, work: Callable[[], None]) -> None:
+def attempt(row: Measurement, work: Callable[[], None]) -> None:
     """Do some work for a row; if it fails, the row gets the reason."""
     try:
         work()
@@ -165,14 +165,14 @@ def attempt(row: Row, work: Callable[[], None]) -> None:
         row.runner = None  # its memory
 
 
-def _score(row: Row, clip: dict[str, Tensor]) -> None:
+def _score(row: Measurement, clip: dict[str, Tensor]) -> None:
     rgb = row.runner(clip["spikes"].to(row.runner.device))
     truth = clip["rgb"].to(rgb.device)
     for measure in measures():
         getattr(row, measure.name).extend(measure.of(rgb, truth).tolist())
 
 
-def _weigh(row: Row, spikes: Tensor) -> None:
+def _weigh(row: Measurement, spikes: Tensor) -> None:
     """Memory, work and energy of one clip."""
     device = row.runner.device
     spikes = spikes.to(device)

@@ -23,7 +23,7 @@ from lightning_modules.data.layouts import EXPECTED, Collection, SequenceFiles, 
 from lightning_modules.data.loading import ClipScenes, cut_key_frames
 from lightning_modules.data.margin import flow_margin, trim
 from lightning_modules.data.pictures import split_pictures
-from lightning_modules.signatures import takes
+from lightning_modules.signatures import inherit_signature
 from spikekit import bin_to_sensor
 from spikekit.check import check_positive, check_whole
 from spikekit.color.cfa import GREY, cfa_pattern
@@ -347,7 +347,7 @@ class FilmScenes(ClipScenes):
         seed: random seed. The same seed gives the same clips, whatever the number of workers.
     """
 
-    @takes(ClipRecipe)
+    @inherit_signature(ClipRecipe)
     def __init__(
         self,
         root: str,

@@ -20,7 +20,7 @@ from lightning_modules.data.margin import flow_margin, trim
 from lightning_modules.data.pictures import embedded_pictures, folder_pictures, split_pictures
 from lightning_modules.data.rendering import Gallery, Pictures, draw_cut, render_scene, see
 from lightning_modules.data.textures import outline
-from lightning_modules.signatures import takes
+from lightning_modules.signatures import inherit_signature
 from spikekit.check import check_positive, check_whole
 from spikekit.color.cfa import cfa_pattern
 from spikekit.scenes import analytic
@@ -366,7 +366,7 @@ class StillScenes(ClipScenes):
         seed: random seed. The same seed gives the same clips, whatever the number of workers.
     """
 
-    @takes(StillClips, "pictures", "augment", "textures", "length")
+    @inherit_signature(StillClips, "pictures", "augment", "textures", "length")
     def __init__(
         self,
         root: str | None = None,

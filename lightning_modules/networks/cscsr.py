@@ -20,7 +20,7 @@ from lightning_modules.networks.network import Network
 from lightning_modules.networks.reconstruction import ColorCorrelation, EarlyFusion, SeparateColors
 from lightning_modules.networks.refinement import FeatureRefinement, TimeFusion
 from lightning_modules.networks.representation import IntervalRepresentation, SpikeRepresentation, WindowMeans
-from lightning_modules.signatures import takes
+from lightning_modules.signatures import inherit_signature
 from spikekit import bayer_mask, demosaic, flow_warp_idw, linear_motion, split_colors, tfp_at
 from spikekit.color.cfa import count_colors
 from spikekit.warp.bayer_warp import bayer_warp_idw
@@ -113,7 +113,7 @@ class CSCSR(Network):
     flow_groups = ((), (3,))
     configuration: ClassVar[type[CSCSRConfig]] = CSCSRConfig  #: of the fields that ``settings`` are
 
-    @takes(CSCSRConfig)
+    @inherit_signature(CSCSRConfig)
     def __init__(self, *args: Any, steps: int = 16, motion: MotionEstimator | None = None, **settings: Any) -> None:
         config = self.configuration(*args, **settings)
         if steps < 0 or steps % 2:

@@ -14,7 +14,7 @@ from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks.cscsr import CSCSR
 from lightning_modules.networks.cscsr_config import CSCSRConfig
 from lightning_modules.networks.layers import conv, res_blocks, start_pixel_by_pixel
-from lightning_modules.signatures import takes
+from lightning_modules.signatures import inherit_signature
 from spikekit import flow_warp, upsample_flow
 from spikekit.check import check_whole
 
@@ -129,7 +129,7 @@ class RecurrentCSCSR(CSCSR):
     configuration = RecurrentCSCSRConfig
     warm_up = 8
 
-    @takes(RecurrentCSCSRConfig)
+    @inherit_signature(RecurrentCSCSRConfig)
     def __init__(self, *args: Any, steps: int = 16, motion: MotionEstimator | None = None, **settings: Any) -> None:
         super().__init__(*args, steps=steps, motion=motion, **settings)
         config = self.config

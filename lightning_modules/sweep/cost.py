@@ -7,19 +7,18 @@ from pathlib import Path
 from typing import Any
 
 from lightning_modules.cli.errors import InputError
-from lightning_modules.cost.measure import Row as Measured
-from lightning_modules.cost.measure import measure_costs, quartiles, running
+from lightning_modules.cost.measure import Measurement, measure_costs, quartiles, running
 from lightning_modules.cost.runner import CannotRunError, Runner
 from lightning_modules.cost.setting import Setting
 from lightning_modules.sweep.state import read_json, write_json
-from lightning_modules.sweep.table import Row
+from lightning_modules.sweep.table import VariantResults
 from spikekit.progress import progress
 from spikekit.timing import cpu_name
 
 _ROUNDS = 5
 
 
-def measure_variants(rows: Sequence[Row], path: Path) -> dict[str, Any]:
+def measure_variants(rows: Sequence[VariantResults], path: Path) -> dict[str, Any]:
     """Measure the cost of ``lightning predict`` on a clip for every trained variant, or read earlier results.
 
     All variants are measured in this process, with the weights of their first seed, and timed in turns: every variant
@@ -60,9 +59,9 @@ def measure_variants(rows: Sequence[Row], path: Path) -> dict[str, Any]:
     return found
 
 
-def _ready(variant: str, folder: Path) -> Measured | None:
+def _ready(variant: str, folder: Path) -> Measurement | None:
     args = ["-c", str(folder / "trial.yaml"), "--ckpt_path", str(folder / "checkpoints" / "last.ckpt")]
     try:
-        return Measured(Setting(variant, args), Runner(args))
+        return Measurement(Setting(variant, args), Runner(args))
     except (CannotRunError, InputError):
         return None

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lightning_modules.cost.charts import BLUE, ORANGE, chart
-from lightning_modules.sweep.table import Row, differences, reference, score_names
+from lightning_modules.sweep.table import VariantResults, differences, reference, score_names
 
 
-def plot(rows: Sequence[Row], path: Path) -> None:
+def plot(rows: Sequence[VariantResults], path: Path) -> None:
     """Draw a row a variant: a dot a seed, a bar at their mean, and a diamond for the paper; nothing without results.
 
     Where J is among them, or CSCSR among other methods, PSNR is drawn as the difference from it, since the paper's
@@ -51,6 +51,6 @@ def plot(rows: Sequence[Row], path: Path) -> None:
         axes.figure.legend(loc="outside lower left", ncols=2)
 
 
-def _paper_gap(row: Row, rows: Sequence[Row]) -> float | None:
+def _paper_gap(row: VariantResults, rows: Sequence[VariantResults]) -> float | None:
     full = reference(row, rows)
     return None if row.paper is None or full.paper_gap != 0 else row.paper_gap

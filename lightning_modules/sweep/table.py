@@ -27,7 +27,7 @@ _OURS = "CSCSR"
 
 
 @dataclass
-class Row:
+class VariantResults:
     """A variant and the results of its trials.
 
     Args:
@@ -99,16 +99,16 @@ def own_scores(result: dict[str, Any]) -> dict[str, float]:
     return scores
 
 
-def score_names(rows: Sequence[Row]) -> list[str]:
+def score_names(rows: Sequence[VariantResults]) -> list[str]:
     """Return what was measured, the first of it what variants are compared by."""
     return list(dict.fromkeys(name for row in rows for result in row.results.values() for name in own_scores(result)))
 
 
-def collect(trials: Sequence[Trial], failed: dict[Path, str]) -> list[Row]:
+def collect(trials: Sequence[Trial], failed: dict[Path, str]) -> list[VariantResults]:
     """Collect the results so far, in the order of the trials."""
-    rows: dict[str, Row] = {}
+    rows: dict[str, VariantResults] = {}
     for trial in trials:
-        row = rows.setdefault(trial.variant, Row([]))
+        row = rows.setdefault(trial.variant, VariantResults([]))
         row.trials.append(trial)
         result = read_json(trial.folder / RESULT)
         if result:
@@ -121,7 +121,7 @@ def collect(trials: Sequence[Trial], failed: dict[Path, str]) -> list[Row]:
     return list(rows.values())
 
 
-def reference(row: Row, rows: Sequence[Row]) -> Row:
+def reference(row: VariantResults, rows: Sequence[VariantResults]) -> VariantResults:
     """Return the row that another is compared with: J or else, among other methods, CSCSR, with all else the same.
 
     Where there is none, it is the first.
@@ -136,7 +136,7 @@ def reference(row: Row, rows: Sequence[Row]) -> Row:
     return rows[0]
 
 
-def differences(row: Row, other: Row, name: str) -> list[float]:
+def differences(row: VariantResults, other: VariantResults, name: str) -> list[float]:
     """Return how much better a row scores than another, seed by seed; of the means, where they share no seed."""
     ours, theirs = row.scores(name), other.scores(name)
     shared = [seed for seed in ours if seed in theirs]
@@ -145,7 +145,7 @@ def differences(row: Row, other: Row, name: str) -> list[float]:
     return [ours[seed] - theirs[seed] for seed in shared]
 
 
-def markdown(rows: Sequence[Row], costs: dict[str, Any] | None = None) -> str:
+def markdown(rows: Sequence[VariantResults], costs: dict[str, Any] | None = None) -> str:
     """Return the table as Markdown.
 
     Args:
@@ -204,7 +204,7 @@ def markdown(rows: Sequence[Row], costs: dict[str, Any] | None = None) -> str:
     return "\n".join(text) + "\n"
 
 
-def write_csv(rows: Sequence[Row], path: Path, costs: dict[str, Any] | None = None) -> None:
+def write_csv(rows: Sequence[VariantResults], path: Path, costs: dict[str, Any] | None = None) -> None:
     """Write every trial, and the mean, the spread and the costs of every variant.
 
     Args:
@@ -247,17 +247,17 @@ def _settings(result: dict[str, Any]) -> dict[str, Any]:
     return {**network, **result["optimizer"]}
 
 
-def _results(rows: Sequence[Row]) -> list[dict[str, Any]]:
+def _results(rows: Sequence[VariantResults]) -> list[dict[str, Any]]:
     return [result for row in rows for result in row.results.values()]
 
 
-def _differing(rows: Sequence[Row]) -> list[str]:
+def _differing(rows: Sequence[VariantResults]) -> list[str]:
     found = [_settings(result) for result in _results(rows)]
     names = dict.fromkeys(name for settings in found for name in settings)
     return [name for name in names if any(settings.get(name) != found[0].get(name) for settings in found)]
 
 
-def _others(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+def _others(rows: Sequence[VariantResults]) -> dict[str, dict[str, float]]:
     """Return the methods that were tested beside the networks and that scored the same in all trials."""
     found = _results(rows)
     if not found:
@@ -271,7 +271,7 @@ def _others(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     }
 
 
-def _values(row: Row, of: Any) -> str:
+def _values(row: VariantResults, of: Any) -> str:
     return ", ".join(dict.fromkeys(str(of(result)) for result in row.results.values()))
 
 

@@ -101,35 +101,46 @@ class MuonWithAdam(torch.optim.Optimizer):
                 loss = closure()
         for group in self.param_groups:
             alike: dict[Any, list[Tensor]] = {}
+            others: list[Tensor] = []
             for parameter in group["params"]:
                 if parameter.grad is None:
                     continue
-                if parameter.ndim > 1 and min(parameter.flatten(1).shape) > 3:
-                    alike.setdefault((parameter.shape, parameter.dtype, parameter.device), []).append(parameter)
+                matrix = parameter.flatten(1).shape if parameter.ndim > 1 else ()
+                if matrix and min(matrix) > 3:
+                    alike.setdefault((matrix, parameter.dtype, parameter.device), []).append(parameter)
                 else:
-                    parameter.add_(self._adam(parameter, group), alpha=-group["lr"])
-            for parameters in alike.values():  # a GPU takes longer to start an operation than to do it for all of them
-                for parameter, change in zip(parameters, self._muon(parameters, group), strict=True):
-                    parameter.add_(change, alpha=-group["lr"])
+                    others.append(parameter)
+            # a GPU takes longer to start an operation than to do it for all of them
+            for parameters in alike.values():
+                torch._foreach_add_(parameters, self._muon(parameters, group), alpha=-group["lr"])
+            if others:
+                torch._foreach_add_(others, self._adam(others, group), alpha=-group["lr"])
         return loss
 
-    def _muon(self, parameters: list[Tensor], group: dict[str, Any]) -> Tensor:
-        """Changes of weights of one shape."""
+    def _muon(self, parameters: list[Tensor], group: dict[str, Any]) -> list[Tensor]:
+        """Changes of weights whose matrices are of one size."""
         for parameter in parameters:
             if not self.state[parameter]:
                 self.state[parameter]["momentum"] = torch.zeros_like(parameter)
-            self.state[parameter]["momentum"].lerp_(parameter.grad, 1 - group["momentum"])
         momenta = [self.state[parameter]["momentum"] for parameter in parameters]
         gradients = [parameter.grad for parameter in parameters]
-        ahead = torch.stack(gradients).lerp(torch.stack(momenta), group["momentum"])  # Nesterov's
-        matrices = ahead.flatten(2)
-        return (0.2 * math.sqrt(max(matrices.shape[1:])) * orthogonalized(matrices)).reshape(ahead.shape)
+        torch._foreach_lerp_(momenta, gradients, 1 - group["momentum"])
+        ahead = torch._foreach_lerp(gradients, momenta, group["momentum"])  # Nesterov's
+        matrices = torch.stack([one.flatten(1) for one in ahead])
+        changes = 0.2 * math.sqrt(max(matrices.shape[1:])) * orthogonalized(matrices)
+        return [change.reshape(parameter.shape) for change, parameter in zip(changes, parameters, strict=True)]
 
-    def _adam(self, parameter: Tensor, group: dict[str, Any]) -> Tensor:
-        state, (first, second) = self.state[parameter], group["betas"]
-        if not state:
-            state |= {"steps": 0, "mean": torch.zeros_like(parameter), "square": torch.zeros_like(parameter)}
-        state["steps"] += 1
-        mean = state["mean"].lerp_(parameter.grad, 1 - first) / (1 - first ** state["steps"])
-        square = state["square"].lerp_(parameter.grad.square(), 1 - second) / (1 - second ** state["steps"])
-        return mean / (square.sqrt() + group["eps"])
+    def _adam(self, parameters: list[Tensor], group: dict[str, Any]) -> list[Tensor]:
+        first, second = group["betas"]
+        states = [self.state[parameter] for parameter in parameters]
+        for state, parameter in zip(states, parameters, strict=True):
+            if not state:
+                state |= {"steps": 0, "mean": torch.zeros_like(parameter), "square": torch.zeros_like(parameter)}
+            state["steps"] += 1
+        gradients = [parameter.grad for parameter in parameters]
+        means, squares = ([state[name] for state in states] for name in ("mean", "square"))
+        torch._foreach_lerp_(means, gradients, 1 - first)
+        torch._foreach_lerp_(squares, torch._foreach_mul(gradients, gradients), 1 - second)
+        mean = torch._foreach_div(means, [1 - first ** state["steps"] for state in states])
+        root = torch._foreach_sqrt(torch._foreach_div(squares, [1 - second ** state["steps"] for state in states]))
+        return torch._foreach_div(mean, torch._foreach_add(root, group["eps"]))

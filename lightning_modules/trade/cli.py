@@ -10,7 +10,7 @@ from pathlib import Path
 
 from lightning_modules.cli.errors import InputError, UsageError, VerbParser
 from lightning_modules.cli.folder_lock import locked_folder
-from lightning_modules.cost.measure import Row, measure, running
+from lightning_modules.cost.measure import Measurement, measure, running
 from lightning_modules.cost.runner import CannotRunError, Runner, make_runner
 from lightning_modules.trade.films import PICTURES, measure_films
 from lightning_modules.trade.plot import plot
@@ -111,7 +111,7 @@ def trade(args: Sequence[str]) -> None:
         _measured(rows, base, asked, [_command(setting, shared, asked) for setting in settings])
 
 
-def _measured(rows: Sequence[Row], base: Runner, asked: argparse.Namespace, commands: Sequence[str]) -> None:
+def _measured(rows: Sequence[Measurement], base: Runner, asked: argparse.Namespace, commands: Sequence[str]) -> None:
     """Measure the rows, and write them in three ways."""
     for row in rows:
         if row.reason is not None:
@@ -144,16 +144,16 @@ def _own_weights(base: Runner) -> list[str]:
     return [option for option, value in given.items() if value is not None]
 
 
-def _row(setting: Setting, shared: Sequence[str], base: Runner) -> Row:
+def _row(setting: Setting, shared: Sequence[str], base: Runner) -> Measurement:
     try:
-        return Row(setting, make_runner(shared, setting.args, base))
+        return Measurement(setting, make_runner(shared, setting.args, base))
     except InputError as error:
         raise type(error)(f"{setting.name}: {error}") from error
     except CannotRunError as error:
-        return Row(setting, reason=str(error))
+        return Measurement(setting, reason=str(error))
 
 
-def _check_any(rows: Sequence[Row]) -> None:
+def _check_any(rows: Sequence[Measurement]) -> None:
     if not running(rows):
         raise InputError(f"trade: nothing can run; {rows[0].setting.name}: {rows[0].reason}")
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lightning_modules.cli.errors import UsageError
-from lightning_modules.cost.measure import Row, Timed, attempt, measure_costs, running
+from lightning_modules.cost.measure import Measurement, Timed, attempt, measure_costs, running
 from lightning_modules.cost.runner import Runner
 from lightning_modules.data import FilmScenes, StillScenes
 from lightning_modules.data.sequences import SequenceClips
@@ -133,7 +133,9 @@ def _film_scene(spikes: Tensor, view: Scene | SequenceClip, every: int, scale: i
     return FilmScene(spikes[None], rgb, flow)
 
 
-def measure_films(rows: Sequence[Row], data: LightningDataModule, frames: int, every: int, rounds: int) -> Timed:
+def measure_films(
+    rows: Sequence[Measurement], data: LightningDataModule, frames: int, every: int, rounds: int
+) -> Timed:
     """Measure settings as :func:`lightning_modules.cost.measure.measure` does, on films.
 
     Args:
@@ -163,7 +165,7 @@ def measure_films(rows: Sequence[Row], data: LightningDataModule, frames: int, e
     return replace(timed, every=every)
 
 
-def _score(row: Row, scene: FilmScene) -> None:
+def _score(row: Measurement, scene: FilmScene) -> None:
     rgb = row.runner(scene.spikes.to(row.runner.device))[_COUNTED]
     truth = scene.rgb.to(rgb)
     for measure in measures():

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lightning_modules.cost.charts import BLUE, GREY, chart
-from lightning_modules.cost.measure import Row
+from lightning_modules.cost.measure import Measurement
 from lightning_modules.trade.table import figures, front
 
 
-def plot(rows: Sequence[Row], path: Path) -> None:
+def plot(rows: Sequence[Measurement], path: Path) -> None:
     """Draw a numbered dot a setting, those of the front in blue and joined by its steps, and the names beside it."""
     points = {n: (values["ms"], values["psnr"]) for n, values in enumerate(figures(rows)) if values}
     best = front(rows)

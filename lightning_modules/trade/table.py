@@ -10,7 +10,7 @@ from statistics import mean
 
 import torch
 
-from lightning_modules.cost.measure import Row, Timed, quartiles, running
+from lightning_modules.cost.measure import Measurement, Timed, quartiles, running
 from lightning_modules.inference.presets import Preset
 from lightning_modules.metrics.image import why_no_lpips
 from lightning_modules.trade.films import PICTURES
@@ -46,7 +46,7 @@ _OF_FILMS = "flicker", "latency"
 _PERHAPS = ("LPIPS", "J a frame", *_OF_FILMS)
 
 
-def figures(rows: Sequence[Row]) -> list[dict[str, float | None]]:
+def figures(rows: Sequence[Measurement]) -> list[dict[str, float | None]]:
     """Return what was measured, a dictionary a row; an empty one where a setting could not run."""
     measured = running(rows)
     found = []
@@ -68,7 +68,7 @@ def figures(rows: Sequence[Row]) -> list[dict[str, float | None]]:
     return found
 
 
-def front(rows: Sequence[Row]) -> list[int]:
+def front(rows: Sequence[Measurement]) -> list[int]:
     """Return which rows are on the Pareto front of time and PSNR, to 0.01 dB, fastest first."""
     shown = figures(rows)
     there = [n for n, values in enumerate(shown) if values]
@@ -76,7 +76,7 @@ def front(rows: Sequence[Row]) -> list[int]:
     return [there[n] for n in found]
 
 
-def machine(rows: Sequence[Row], timed: Timed) -> str:
+def machine(rows: Sequence[Measurement], timed: Timed) -> str:
     """Return, line by line, on what and how it was measured."""
     devices = dict.fromkeys(row.runner.device for row in running(rows))
     gpus = [torch.cuda.get_device_name(device) for device in devices if device.type == "cuda"]
@@ -95,7 +95,7 @@ def machine(rows: Sequence[Row], timed: Timed) -> str:
     )
 
 
-def markdown(rows: Sequence[Row], commands: Sequence[str], timed: Timed) -> str:
+def markdown(rows: Sequence[Measurement], commands: Sequence[str], timed: Timed) -> str:
     """Return the table as Markdown.
 
     Args:
@@ -134,7 +134,7 @@ def _cells(values: dict[str, float | None], best: bool) -> dict[str, str]:
     }
 
 
-def write_csv(rows: Sequence[Row], commands: Sequence[str], timed: Timed, path: Path) -> None:
+def write_csv(rows: Sequence[Measurement], commands: Sequence[str], timed: Timed, path: Path) -> None:
     """Write a row a setting: the preset that it is, its figures, and the command that measures it alone.
 
     ``reference`` is the setting that the ratios refer to. The columns of a preset are empty where a setting says what

@@ -12,8 +12,7 @@ import yaml
 from lightning_modules.__main__ import main
 from lightning_modules.cli.command import Configuration
 from lightning_modules.cost.charts import chart
-from lightning_modules.cost.measure import Row as Measured
-from lightning_modules.cost.measure import Timed
+from lightning_modules.cost.measure import Measurement, Timed
 from lightning_modules.data.cache import ClipCache
 from lightning_modules.inference import export
 from lightning_modules.networks import ClassicalDecoder
@@ -58,7 +57,7 @@ def sweep_md(path):
 def trade_csv(path):
     runner = SimpleNamespace(network=torch.nn.Linear(2, 3))
     settings = [read_setting(f"{n}: --model.tile 8") for n in range(50)]
-    rows = [Measured(setting, runner, psnr=[20.0], ssim=[0.5], seconds=[1.0], macs=1.0) for setting in settings]
+    rows = [Measurement(setting, runner, psnr=[20.0], ssim=[0.5], seconds=[1.0], macs=1.0) for setting in settings]
     trade_table.write_csv(rows, ["command"] * 50, Timed(1, (8, 8), 2, "wall time"), path)
 
 

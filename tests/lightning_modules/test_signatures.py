@@ -6,7 +6,7 @@ import pytest
 
 from lightning_modules.data import FilmScenes, StillClips, StillScenes
 from lightning_modules.data.sequences import ClipRecipe
-from lightning_modules.signatures import takes
+from lightning_modules.signatures import inherit_signature
 
 
 class Inner:
@@ -22,7 +22,7 @@ class Inner:
 
 def test_its_own_first_then_by_name_what_is_passed_on():
     class Outer:
-        @takes(Inner, "hidden")
+        @inherit_signature(Inner, "hidden")
         def __init__(self, root: "str", *, colour: int = 3, **settings: object) -> None:
             pass
 
@@ -35,7 +35,7 @@ def test_its_own_first_then_by_name_what_is_passed_on():
 
 def test_what_is_passed_on_in_place_keeps_its_place():
     class Outer:
-        @takes(Inner)
+        @inherit_signature(Inner)
         def __init__(self, *args: object, more: int = 1, **settings: object) -> None:
             pass
 

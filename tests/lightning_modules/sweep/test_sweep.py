@@ -25,7 +25,7 @@ from lightning_modules.sweep import cli, engines, worker
 from lightning_modules.sweep.budget import seconds
 from lightning_modules.sweep.paper import TABLE_3
 from lightning_modules.sweep.plot import plot
-from lightning_modules.sweep.table import Row
+from lightning_modules.sweep.table import VariantResults
 from lightning_modules.sweep.trials import Trial, make_trials
 from lightning_modules.sweep.view import View
 from spikekit import read_picture
@@ -141,7 +141,7 @@ def test_size_e_is_not_the_variant_e(overlays, tmp_path):
     for over, letter in ([sizes], ""), ([variants], "E"), ([sizes, [CONFIGS / "ablation/a.yaml"]], "A"):
         [trial] = make_trials([CONFIGS / "x4.yaml"], over, [], [], {"steps": 5}, tmp_path)
         assert trial.letter == letter
-        row = Row([trial], {None: {"network": {"scale": 4}}})
+        row = VariantResults([trial], {None: {"network": {"scale": 4}}})
         assert row.paper == {"E": 26.66, "A": 28.57}.get(letter)
 
 
@@ -585,7 +585,7 @@ def row(label, *scores, measure="psnr"):
     trials = [Trial((label,), seed, Path(), {}, {}, label.upper()) for seed in range(2)]
     found = {"method": "CSCSR", "network": {"scale": 4}}
     results = {seed: {**found, "metrics": {"CSCSR": {measure: value}}} for seed, value in enumerate(scores)}
-    return Row(trials, results, {} if scores else {0: "killed"})
+    return VariantResults(trials, results, {} if scores else {0: "killed"})
 
 
 def test_the_plot_has_what_is_there(tmp_path):

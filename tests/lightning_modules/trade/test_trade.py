@@ -21,7 +21,7 @@ from lightning_modules.cli.arguments import arguments_preset
 from lightning_modules.cli.errors import InputError, UsageError
 from lightning_modules.cost import charts, energy, measure
 from lightning_modules.cost.energy import energy_meter, energy_per_call
-from lightning_modules.cost.measure import Row, Timed, running, time_in_turns
+from lightning_modules.cost.measure import Measurement, Timed, running, time_in_turns
 from lightning_modules.cost.runner import Runner, make_runner
 from lightning_modules.data import FilmScenes
 from lightning_modules.inference import presets
@@ -456,7 +456,7 @@ def some_rows(count, seconds=()):
             calls.append((self.name, int(spikes.sum())))
 
     names = [chr(ord("a") + n) for n in range(count)]
-    rows = [Row(Setting(name, []), Remember(name), psnr=[20.0], ssim=[0.5], macs=100.0) for name in names]
+    rows = [Measurement(Setting(name, []), Remember(name), psnr=[20.0], ssim=[0.5], macs=100.0) for name in names]
     for row, times in zip(rows, seconds, strict=False):
         row.seconds = list(times)
     return rows, calls
@@ -477,7 +477,7 @@ def test_order_rotates_and_everyone_is_timed_equally_often_on_the_same_clip(thre
 
 def test_ratios_are_of_the_same_round():
     rows, _ = some_rows(2, [(1.0, 10.0, 2.0), (2.0, 20.0, 4.0)])
-    lost = Row(Setting("lost", []), reason="no such thing")
+    lost = Measurement(Setting("lost", []), reason="no such thing")
     first, second, third = figures([rows[0], rows[1], lost])
     assert (first["ratio"], second["ratio"], second["ratio_q3"]) == (1, 2, 2)
     rows[1].seconds = [2.0, 30.0, 1.0]
