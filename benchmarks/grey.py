@@ -1,7 +1,7 @@
 """Judge reconstructions of grey recordings whose truth is known, as the field does on its REDS clips.
 
 ``python benchmarks/grey.py FOLDER [WEIGHTS ...]`` prints PSNR and SSIM up to exposure of TFI, TFP, TFP of third order
-and networks, and the seconds that each picture took, and writes them to ``results/grey.csv``. Weights are names or
+and networks, and the seconds of a processor that each picture took, and writes them to ``results/grey.csv``. Weights are names or
 files; those for Bayer sensors read the grey stream as if it were one, and a picture larger than the sensor is averaged
 down. FOLDER is searched with all folders in it for recordings with a truth beside them:
 
@@ -130,12 +130,12 @@ def main() -> None:
             spikes, truth = one.read(args.height, args.width, not args.upright)
             if not scores:
                 method(spikes, one.frame)  # what is compiled the first time is not timed
-            begin = time.perf_counter()
+            begin = time.process_time()
             picture = method(spikes, one.frame)
-            scores.append([*judge(picture, truth), time.perf_counter() - begin])
+            scores.append([*judge(picture, truth), time.process_time() - begin])
             rows.append([name, one.name, *_written(scores[-1])])
         rows.append([name, "mean", *_written(torch.tensor(scores, dtype=torch.float64).mean(0).tolist())])
-    head = ["method", "recording", "PSNR (dB)", "SSIM", "seconds"]
+    head = ["method", "recording", "PSNR (dB)", "SSIM", "CPU seconds"]
     print(table(head, rows))
     args.output.parent.mkdir(parents=True, exist_ok=True)
     with args.output.open("w", newline="") as file:
