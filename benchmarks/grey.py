@@ -1,9 +1,9 @@
 """Judge reconstructions of grey recordings whose truth is known, as the field does on its REDS clips.
 
 ``python benchmarks/grey.py FOLDER [WEIGHTS ...]`` prints PSNR and SSIM up to exposure of TFI, TFP, TFP of third order
-and networks, and the seconds of a processor that each picture took, and writes them to ``results/grey.csv``. Weights are names or
-files; those for Bayer sensors read the grey stream as if it were one, and a picture larger than the sensor is averaged
-down. FOLDER is searched with all folders in it for recordings with a truth beside them:
+and networks, and the seconds of a processor that each picture took, and writes them to ``results/grey.csv``. Weights
+are names or files; those for Bayer sensors read the grey stream as if it were one, and a picture larger than the sensor
+is averaged down. FOLDER is searched with all folders in it for recordings with a truth beside them:
 
 - ``spike/NAME_key_idK.dat`` and ``gt/NAME_key_idK.png``, the K-th frame: Spike-Zoo's BASE set as its repository has it;
 - ``NAME.dat``, or with a size as ``NAME_250x400.dat``, and ``NAME_truth_N.png``, frame N counted from 0.

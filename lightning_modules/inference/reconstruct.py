@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from itertools import islice, pairwise
@@ -20,7 +20,7 @@ from lightning_modules.inference.film import FilmFrame, FilmMaker
 from lightning_modules.inference.output import file_identity
 from lightning_modules.inference.presets import SPEEDS, Choice, Preset, choose
 from lightning_modules.networks import ClassicalDecoder, Network
-from lightning_modules.registry import find_model
+from lightning_modules.registry import Model, find_model, list_models
 from spikekit import __version__
 from spikekit.color.cfa import GREY, PATTERNS
 from spikekit.io.image_bytes import to_bytes
@@ -296,6 +296,25 @@ def _digest(values: Any) -> str:
     return total.hexdigest()
 
 
+def grey_model(models: Sequence[Model], speed: str, film: bool) -> Model | None:
+    """Return the weights that a speed stands for: the largest for ``best``, the smallest for ``fastest``.
+
+    Args:
+        models: those for grey cameras at one scale.
+        speed: one of ``SPEEDS``.
+        film: whether pictures are near enough to know each other; weights that make use of it are picked, if any.
+
+    Raises:
+        ValueError: another speed.
+    """
+    if speed not in SPEEDS:
+        raise ValueError(f"speed: expected one of {', '.join(SPEEDS)}, got {speed!r}")
+    able = [model for model in models if model.film == film] or [model for model in models if not model.film]
+    able.sort(key=lambda model: model.macs)
+    place = list(SPEEDS).index(speed) / (len(SPEEDS) - 1)
+    return able[round(place * (len(able) - 1))] if able else None
+
+
 def _chosen(
     recording: Recording,
     speed: str | None,
@@ -309,6 +328,9 @@ def _chosen(
     clips = RecordingClips(recording, frame=frame)
     every = min((later - clock for clock, later in pairwise(clips.chosen)), default=clips.frames + 1)
     film = every <= clips.frames  # one picture knows the other
+    grey = grey_model(list_models(scale, GREY), speed or "balanced", film) if recording.pattern == GREY else None
+    if grey is not None:
+        return Preset(grey.name), [f"{grey.name}, for grey cameras"]
     around = 2 * min(clips.chosen[0], recording.frames - 1 - clips.chosen[-1]) + 1
     room = max(FRAMES, recording.frames // _MANY if frame is None else around)
     asked = {"scale": scale, "size": clips.size, "film": film, "white": white, "noisy": noisy}

@@ -7,7 +7,10 @@ import torch
 
 from lightning_modules import reconstruct
 from lightning_modules.inference.predict import predict
+from lightning_modules.inference.presets import SPEEDS
+from lightning_modules.inference.reconstruct import grey_model
 from lightning_modules.networks import CSCSR, RecurrentCSCSR
+from lightning_modules.registry import Model
 from spikekit import write_spikes
 
 TINY = {"width": 8, "representation_width": 8, "features": 2, "stages": 1, "end_blocks": 1, "skip": True}
@@ -59,3 +62,18 @@ def test_weights_for_another_sensor_are_told(recording):
     (note,) = reconstruct(**recording, network=_network(), pattern="BGGR").notes
     assert "BGGR" in note
     assert not reconstruct(**recording, network=_network()).notes  # nobody says what the camera is
+
+
+def test_speeds_stand_for_sizes_of_grey_weights():
+    def model(name, macs, film=False):
+        known = {"file": "", "scale": 1, "pattern": "grey", "size": None, "frames": 41, "margin": 16, "noise": True}
+        return Model(name, macs=macs, film=film, kodak=None, vid4=None, **known)
+
+    models = [model("large", 2000), model("small", 700), model("large_film", 2100, film=True)]
+    chosen = {speed: grey_model(models, speed, film=False).name for speed in SPEEDS}
+    assert chosen == {"fastest": "small", "fast": "small", "balanced": "large", "best": "large"}
+    assert grey_model(models, "fastest", film=True).name == "large_film"
+    assert grey_model(models[:2], "best", film=True).name == "large"
+    assert grey_model([], "best", film=False) is None
+    with pytest.raises(ValueError, match="speed"):
+        grey_model(models, "soon", film=False)
