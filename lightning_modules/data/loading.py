@@ -38,7 +38,7 @@ class FreshClips(DistributedSampler[int]):
     def __init__(self, data: LightningDataModule, batch_size: int, length: int) -> None:
         super().__init__(range(length), 1, 0, shuffle=False)  # Lightning would cut any other kind into parts itself
         self.data, self.batch_size = data, batch_size
-        _, processes = _process(data)
+        _, processes = process(data)
         a_batch = batch_size * processes
         if length < a_batch:
             raise ValueError(f"batch_size: {batch_size} x {processes} processes need {a_batch} clips, got {length}")
@@ -48,7 +48,7 @@ class FreshClips(DistributedSampler[int]):
         return self.length
 
     def __iter__(self) -> Iterator[int]:
-        rank, processes = _process(self.data)
+        rank, processes = process(self.data)
         trainer = self.data.trainer
         steps = 0 if trainer is None else trainer.global_step * trainer.accumulate_grad_batches
         for batch in range(self.length // self.batch_size):
@@ -69,7 +69,7 @@ class OwnPart(DistributedSampler[int]):
 
     def __init__(self, data: LightningDataModule, length: int) -> None:
         super().__init__(range(length), 1, 0, shuffle=False)
-        rank, processes = _process(data)
+        rank, processes = process(data)
         if length < processes:
             raise ValueError(f"devices: expected at most {length}, a clip for every process, got {processes}")
         self.part = range(length * rank // processes, length * (rank + 1) // processes)
@@ -81,7 +81,7 @@ class OwnPart(DistributedSampler[int]):
         return iter(self.part)
 
 
-def _process(data: LightningDataModule) -> tuple[int, int]:
+def process(data: LightningDataModule) -> tuple[int, int]:
     """Return which process this is, and of how many."""
     trainer = data.trainer
     return (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
@@ -143,7 +143,7 @@ def load_clips(clips: Dataset, batch_size: int, workers: int, **options: object)
         batch_size=batch_size,
         num_workers=workers,
         persistent_workers=workers > 0,
-        worker_init_fn=_start_worker,
+        worker_init_fn=start_worker,
         collate_fn=_to_arrays,
         **options,
     )
@@ -175,7 +175,8 @@ def _to_arrays(clips: list[dict[str, Tensor]]) -> dict[str, np.ndarray]:
     return {name: np.stack([clip[name].numpy() for clip in clips]) for name in clips[0]}
 
 
-def _start_worker(_: int) -> None:
+def start_worker(_: int) -> None:
+    """Begin a process that makes clips."""
     torch.set_num_threads(1)
     # schedulers send it to all processes of a run: training ends its step and saves, for which it needs its workers
     signal.signal(signal.SIGTERM, lambda *_: threading.Timer(_GRACE, os._exit, (0,)).start())

@@ -159,14 +159,18 @@ class StillClips(Dataset):
             gallery: the pictures, on the device that renders.
         """
         scene = self._scene(drawn, gallery)
-        light, noise = scene.light(self.pattern, scale=self.scale), self.noise or SensorNoise(photons=self.photons)
+        light = scene.light(self.pattern, scale=self.scale)
         middles = [self.frames // 2 + n * self.every for n in range(self.key_frames)]
         rgb = torch.stack([trim(scene.rgb(middle), self.scale * self.margin) for middle in middles], dim=1)
-        clips = {"spikes": see(light, drawn, noise), "rgb": rgb if self.key_frames > 1 else rgb[:, 0]}
+        clips = {"spikes": see(light, drawn, self._noise), "rgb": rgb if self.key_frames > 1 else rgb[:, 0]}
         if self.key_frames == 1:
             flow = torch.stack([scene.flow(clock, scale=self.scale) for clock in self.flow_times], dim=1)
             clips["flow"] = trim(flow, self.margin)
         return clips | {name: torch.from_numpy(drawn[name]).to(rgb.device) for name in self._told}
+
+    @property
+    def _noise(self) -> SensorNoise:
+        return self.noise or SensorNoise(photons=self.photons)
 
     @property
     def _told(self) -> list[str]:
@@ -179,6 +183,11 @@ class StillClips(Dataset):
 
     def _cut(self, clip: dict[str, Tensor]) -> dict[str, Tensor]:
         return cut_key_frames(clip, self.key_frames, self.frames, self.every)
+
+    def spikes(self, index: int, scene: Scene) -> Tensor:
+        """Return what the sensor of a clip makes of a scene, uint8 (clocks, H, W)."""
+        drawn = {name: np.asarray(part)[None] for name, part in self._sensor(index).items()}
+        return see(scene.light(self.pattern, scale=self.scale)[None], drawn, self._noise)[0]
 
     def scene(self, index: int) -> Scene:
         """Return the scene of a clip, to look at other clocks or sizes than the clip has."""
@@ -361,6 +370,11 @@ class StillScenes(ClipScenes):
         train_clips: training clips in an epoch. They are new in every epoch.
         val_clips: validation clips, the same every time; also those of ``test``.
         batch_size: clips in a batch.
+        pool: make so many training clips at once, on the device that trains, where workers only draw their numbers; 0
+            has workers make them. With a GPU some 1000 are worth it.
+        reuse: how often a clip of a pool is trained on, turned in between.
+        kinds: kinds of scenes in a pool, such as ``[{share: 0.4}, {share: 0.6, key_frames: 5, every: 8}]``: their share
+            of the batches, and what they have other than the rest says. Null for one kind.
         workers: processes that make clips. Null takes one less than there are cores, sixteen at most: one core is left
             to training.
         seed: random seed. The same seed gives the same clips, whatever the number of workers.
@@ -379,6 +393,9 @@ class StillScenes(ClipScenes):
         train_clips: int = 1200,
         val_clips: int = 16,
         batch_size: int = 4,
+        pool: int = 0,
+        reuse: int = 4,
+        kinds: list[dict[str, Any]] | None = None,
         workers: int | None = None,
         seed: int = 0,
         **options: Any,
@@ -387,6 +404,7 @@ class StillScenes(ClipScenes):
         self.root, self.val_root = root, val_root
         self.patch, self.val_patch, self.flow_patch, self.cache = patch, val_patch, flow_patch, cache
         self.train_clips, self.val_clips, self.seed = train_clips, val_clips, seed
+        self.pool, self.reuse, self.kinds = pool, reuse, kinds
         self.options = {**options, "seed": seed}
 
     def setup(self, stage: str | None = None) -> None:
@@ -399,12 +417,42 @@ class StillScenes(ClipScenes):
         """
         if self.batch_size < 1 or self.train_clips < self.batch_size:
             raise ValueError(f"train_clips: expected at least batch_size = {self.batch_size}, got {self.train_clips}")
+        for name, good, expected in (
+            ("pool", self.pool >= 0, "0 or more clips"),
+            ("reuse", self.reuse >= 1, "at least 1"),
+            ("kinds", self.pool or not self.kinds, "a pool of more than 0 clips with them"),
+            ("cache", not (self.pool and self.cache), "none with a pool"),
+        ):
+            if not good:
+                raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)}")
         train, val = self._pictures()
         train_only = {"textures": self.root is None, "flow_patch": self.flow_patch}
         train_only["cache"] = ClipCache(self.cache) if self.cache else None
-        self.train_set = StillClips(train, **self.options, patch=self.patch, length=self.train_clips, **train_only)
+        train_only |= {"patch": self.patch, "length": self.train_clips}
+        self.train_set = StillClips(train, **self.options, **train_only)
+        self._shares, self._kinds = [1.0], [self.train_set]
+        if self.kinds:
+            self._shares = [kind.get("share", 1.0) for kind in self.kinds]
+            own = [{name: value for name, value in kind.items() if name != "share"} for kind in self.kinds]
+            try:
+                self._kinds = [StillClips(train, **{**self.options, **train_only, **options}) for options in own]
+            except TypeError as error:
+                raise ValueError(f"kinds: expected arguments of StillClips and share, got {self.kinds}") from error
         self.val_set = StillClips(val, **self.options, patch=self.val_patch, length=self.val_clips, augment=False)
         self.test_set = self.val_set
+
+    def train_dataloader(self) -> Any:  # noqa: D102
+        if not self.pool:
+            return super().train_dataloader()
+        from lightning_modules.data.pool import ScenePool
+
+        how = {"size": self.pool, "reuse": self.reuse, "batch_size": self.batch_size, "workers": self.workers}
+        return ScenePool(self, self._kinds, self._shares, length=self.train_clips // self.batch_size, **how)
+
+    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:  # noqa: D102
+        if self.pool and self.trainer.training:
+            return batch  # made there
+        return super().transfer_batch_to_device(batch, device, dataloader_idx)
 
     def _pictures(self) -> tuple[list[Path], list[Path]]:
         if self.root is None:

@@ -108,7 +108,7 @@ class SuperResolution(BaseTask):
 
     def _with_motion(self, batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor | None]:
         """Clips of patches, and the motion in them: what is around them serves its estimate alone."""
-        spikes, flow = batch["spikes"], batch.get("flow") if self.flow == "scene" else None
+        spikes, flow = batch["spikes"], batch.get("flow" if self.flow == "scene" else "motion")
         margin = (spikes.shape[-1] - batch["rgb"].shape[-1] // self.network.scale) // 2
         if not margin:
             return batch, flow
