@@ -19,9 +19,6 @@ import torch
 from torch import nn
 
 import spikekit as sk
-from lightning_modules.networks import RecurrentCSCSR
-from lightning_modules.storage.pretrained import Weights, read_weights, settings_of, write_weights
-from spikekit import write_picture
 from spikekit.cli.command import main
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -221,53 +218,6 @@ def built(tmp_path_factory):
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return folder / "pages"
-
-
-@pytest.fixture
-def old(tmp_path):
-    """Weights of a small network for films, in a folder of their own."""
-    network = RecurrentCSCSR(scale=2, width=8, representation_width=8, features=1, stages=1, end_blocks=1, skip=True)
-    write_weights(Weights(tmp_path, settings_of(network), {}, network.state_dict()), tmp_path / "old.safetensors")
-    return network
-
-
-def test_the_script_for_a_gpu_begins_with_the_same_pictures(old, tmp_path):
-    script = runpy.run_path(str(DOCS / "howto" / "train_on_a_gpu.py"))
-    torch.nn.init.normal_(old.fusion.share.weight, std=0.1)
-    write_weights(Weights(tmp_path, settings_of(old), {}, old.state_dict()), tmp_path / "old.safetensors")
-    new = script["widened"](str(tmp_path / "old.safetensors"), 0.8, end_width=10, fusion_blocks=5)
-    assert (new.config.end_width, new.config.fusion_blocks, new.steps) == (10, 5, 0)
-    old.steps = 0
-    spikes, flow = (torch.rand(1, 3, 41, 12, 10) < 0.3).to(torch.uint8), torch.randn(1, 3, 2, 2, 12, 10)
-    torch.testing.assert_close(new(spikes, flow) * 2, old(spikes, flow), rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("films", ["mixing", "all"])
-def test_the_script_for_a_gpu_trains(films, old, tmp_path):
-    for n in range(2):
-        write_picture(tmp_path / "pictures" / f"{n}.png", torch.rand(3, 80, 90))
-    small = {"steps": 3, "film-steps": 2, "batch": 5, "patch": 12, "workers": 1, "kept": 4, "width": 10, "lr": 1e-2}
-    if films == "all":
-        small |= {"steps": 0, "film-steps": 3, "minutes": 5}
-    script = [sys.executable, DOCS / "howto" / "train_on_a_gpu.py", "old.safetensors", "pictures"]
-    script += [part for name, value in small.items() for part in (f"--{name}", str(value))] + ["--all"] * (
-        films == "all"
-    )
-    done = subprocess.run(script, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stderr
-    steps, film_steps = small["steps"], small["film-steps"]
-    said = rf"clips: {steps} steps, .*films: {film_steps} of {film_steps} steps, "
-    assert re.search(said, done.stdout, flags=re.DOTALL)
-    before, new = old.state_dict(), read_weights(tmp_path / "new.safetensors")
-    assert new.settings["end_width"] == 10
-    assert new.settings["alpha"] == 0.6
-    for name, value in new.tensors.items():
-        assert value.isfinite().all(), name
-        first = before[name].half() if "rgb" not in name else before[name] * 0.4 / 0.6
-        assert not torch.equal(value[tuple(slice(side) for side in first.shape)], first.half()), (
-            f"{name} has learned nothing"
-        )
 
 
 @pytest.mark.slow

@@ -159,7 +159,7 @@ class StillClips(Dataset):
             gallery: the pictures, on the device that renders.
         """
         scene = self._scene(drawn, gallery)
-        light = scene.light(self.pattern, scale=self.scale)
+        light = scene.light(self.pattern, scale=self.scale, alpha=1.0)
         middles = [self.frames // 2 + n * self.every for n in range(self.key_frames)]
         rgb = torch.stack([trim(scene.rgb(middle), self.scale * self.margin) for middle in middles], dim=1)
         clips = {"spikes": see(light, drawn, self._noise), "rgb": rgb if self.key_frames > 1 else rgb[:, 0]}
@@ -187,7 +187,7 @@ class StillClips(Dataset):
     def spikes(self, index: int, scene: Scene) -> Tensor:
         """Return what the sensor of a clip makes of a scene, uint8 (clocks, H, W)."""
         drawn = {name: np.asarray(part)[None] for name, part in self._sensor(index).items()}
-        return see(scene.light(self.pattern, scale=self.scale)[None], drawn, self._noise)[0]
+        return see(scene.light(self.pattern, scale=self.scale, alpha=1.0)[None], drawn, self._noise)[0]
 
     def scene(self, index: int) -> Scene:
         """Return the scene of a clip, to look at other clocks or sizes than the clip has."""

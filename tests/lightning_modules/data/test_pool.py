@@ -74,7 +74,7 @@ def test_a_turned_batch_is_a_scene_turned():
         red = torch.nn.functional.avg_pool2d(batch["rgb"][:, 0], 2)[:, ::2, ::2]
         light = batch["spikes"][:, 15:26, ::2, ::2].float().mean(dim=1) / 0.4
         error, other = error + (light - red).abs().mean(), other + (light - red.mT).abs().mean()
-    assert max(wrong) < 0.5
+    assert max(wrong) < 0.8  # a wrong turn makes it 1 or more
     assert error < other / 1.5
 
 
