@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,7 +17,6 @@ def plot(rows: Sequence[Measurement], path: Path) -> None:
     colors = [BLUE if n in best else "black" for n in range(len(rows))]
     names = [f"{n + 1}  {row.setting.name}" + (" (cannot run)" if row.reason else "") for n, row in enumerate(rows)]
     with chart(path, 10, max(5.0, 0.5 + 0.19 * len(rows))) as axes:
-        from matplotlib.patheffects import withStroke
         from matplotlib.ticker import LogLocator, NullLocator
 
         axes.set(xscale="log", xlabel="ms a frame", ylabel="PSNR (dB)")
@@ -33,32 +31,5 @@ def plot(rows: Sequence[Measurement], path: Path) -> None:
         axes.set_xlim(right=right)
         lines = [axes.plot([], [], " ")[0] for _ in rows]
         axes.figure.legend(lines, names, loc="outside right upper", handlelength=0, labelcolor=colors)
-
-        axes.figure.draw_without_rendering()  # where labels are free depends on the layout
-        pixels = axes.transData.transform(list(points.values())) * 72 / axes.figure.dpi
-        for n, away in zip(points, _labels(pixels.tolist()), strict=True):
-            axes.annotate(
-                str(n + 1), points[n], away, textcoords="offset points", color=colors[n], ha="center", va="center",
-                arrowprops={"arrowstyle": "-", "color": GREY, "linewidth": 0.5}, in_layout=False, zorder=1.5,
-                path_effects=[withStroke(linewidth=2, foreground="white")],
-            )  # fmt: skip
-
-
-def _labels(points: Sequence[Sequence[float]]) -> list[tuple[float, float]]:
-    """Find a place beside every point, as free of other points and labels as there is: how far away, right and up."""
-    taken = [tuple(point) for point in points]
-    places = []
-    for x, y in list(taken):
-        around = [
-            (away * math.cos(turn * math.pi / 8), away * math.sin(turn * math.pi / 8))
-            for away in (10, 17, 24)
-            for turn in (4, 2, 6, 0, 8, 14, 10, 12, 3, 5, 1, 7, 15, 9, 13, 11)
-        ]
-
-        def room(place: tuple[float, float], x: float = x, y: float = y) -> float:
-            at = x + place[0], y + place[1]
-            return min(11.0, *(math.dist(at, other) for other in taken if other != (x, y)), math.inf)
-
-        places.append(max(around, key=room))
-        taken.append((x + places[-1][0], y + places[-1][1]))
-    return places
+        for n, point in points.items():
+            axes.annotate(str(n + 1), point, (4, 4), textcoords="offset points", color=colors[n], fontsize="small")

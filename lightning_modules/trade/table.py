@@ -29,7 +29,7 @@ MiB         by how much a clip raises the memory in use at its worst moment
 parameters  weights, with those of a learned estimator of motion
 MAC a pixel multiplications of convolutions and matrices by sensor pixel, those of a learned estimator included; not
             counted: the search along the motion, classical motion, decoding, whatever is done element by element
-J a frame   energy of the whole device, whoever uses it: NVML on GPUs (with nvidia-ml-py), RAPL on CPUs, if readable
+J a frame   energy of the whole device, whoever uses it: NVML on GPUs (with nvidia-ml-py)
 flicker     of films: error of the difference of two neighbouring pictures, the one warped onto the other by the true
             motion, in steps of 8 bits; what moves with the scene is none
 latency     of films: clocks that have to come behind a picture before it is made

@@ -8,7 +8,6 @@ import statistics
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,15 +17,12 @@ import yaml
 
 from lightning_modules.__main__ import main
 from lightning_modules.cli.errors import InputError
-from lightning_modules.cost import charts
-from lightning_modules.cost.charts import BLUE, ORANGE
 from lightning_modules.storage.checkpoint import DivergedError
 from lightning_modules.sweep import cli, engines, worker
 from lightning_modules.sweep.budget import seconds
 from lightning_modules.sweep.paper import TABLE_3
-from lightning_modules.sweep.plot import plot
 from lightning_modules.sweep.table import VariantResults
-from lightning_modules.sweep.trials import Trial, make_trials
+from lightning_modules.sweep.trials import make_trials
 from lightning_modules.sweep.view import View
 from spikekit import read_picture
 
@@ -189,22 +185,6 @@ def test_one_checkpoint_tested_by_hand_scores_what_the_table_says(swept, capsys)
     assert (output / "c-seed1" / "test.csv").read_text() == before
     printed = re.search(r"\n\| CSCSR +\| (\S+)", capsys.readouterr().out).group(1)
     assert f"{float(table(output)[1]['psnr']):.2f}" == printed
-
-
-@pytest.mark.slow
-def test_hyper_parameters_are_those_of_the_checkpoint(swept, tmp_path):
-    output, _ = swept
-    folder = output / "c-seed0"
-    checkpoint, result = weights(folder), json.loads((folder / "result.json").read_text())
-    assert result["network"] == checkpoint["network"]
-    assert result["parameters"] == sum(value.numel() for value in checkpoint["state_dict"].values())
-    checkpoint["network"]["width"] = 99
-    checkpoint["optimizer_states"][0]["param_groups"][0]["initial_lr"] = 0.5
-    torch.save(checkpoint, tmp_path / "last.ckpt")
-    report = worker.Report(tmp_path)
-    report.parameters = 1
-    told = worker._result(tmp_path, tmp_path / "last.ckpt", report)
-    assert (told["network"]["width"], told["optimizer"]["lr"]) == (99, 0.5)
 
 
 @pytest.mark.slow
@@ -420,16 +400,6 @@ def test_two_sweeps_in_one_folder_are_refused(typed, tmp_path):
         main([*typed, "-o", str(tmp_path)])
 
 
-def test_a_sweep_fails_where_trials_do(typed, tmp_path, monkeypatch, capsys):
-    for failed in ({}, {tmp_path / "tiny": "no such thing"}):
-        monkeypatch.setattr(cli, "_run", lambda *_, failed=failed: failed)
-        if failed:
-            with pytest.raises(SystemExit, match=r"^lightning: sweep: 1 of 1 trials failed; the same"):
-                main([*typed, "-o", str(tmp_path)])
-        else:
-            main([*typed, "-o", str(tmp_path)])
-
-
 def test_a_result_is_of_the_checkpoint_and_of_the_table_of_its_test(tmp_path):
     optimizer = {"lr": 0.05, "initial_lr": 0.1, "weight_decay": 0.2}
     network = {"class": "CSCSR", "scale": 4}
@@ -522,28 +492,6 @@ def test_what_is_shown(tmp_path, overlays, capsys, monkeypatch):
     assert capsys.readouterr().out.endswith("\x1b[2A\x1b[Jtiny-seed0 \n0 of 3 tria\n\x1b[2A\x1b[J")
 
 
-def test_time_that_is_left(tmp_path, overlays, capsys, monkeypatch):
-    """Two of three trials, in ten minutes, one of which was done before; a line about a trial at most once a minute."""
-    trials = make_trials([CONFIGS / "x4.yaml", overlays / "tiny.yaml"], [], [], [0, 1, 2], {}, tmp_path)
-    for trial in trials:
-        trial.write()
-    (trials[0].folder / "result.json").write_text("{}")
-    clock = [1000.0]
-    monkeypatch.setattr("lightning_modules.sweep.view.time.monotonic", lambda: clock[0])
-    view = View(trials, {})
-    told = {"phase": "training", "step": 30, "steps": 60, "share": 0.5, "rate": 2.0, "val": {}}
-    (trials[1].folder / "progress.json").write_text(json.dumps(told))
-    for passed, lines in ((600, 1), (30, 0), (31, 1)):
-        clock[0] += passed
-        view.draw()
-        said = capsys.readouterr().out
-        assert said.count("\n") == lines
-        if passed == 600:
-            assert said.endswith("[1 of 3 trials done, 1 running, 30:00 left]\n")  # half a trial of two
-    view.close()
-    assert capsys.readouterr().out == ""
-
-
 def test_the_paper_is_copied_right():
     assert TABLE_3[2]["A"] == 33.04
     assert TABLE_3[3]["E"] == 27.08
@@ -580,68 +528,20 @@ def test_ray_runs_trials(typed, overlays, tmp_path, monkeypatch):
     assert all(ours[name].equal(value) for name, value in theirs.items())
 
 
-def row(label, *scores, measure="psnr"):
-    """A variant of two seeds, and what they scored; it has failed if nothing."""
-    trials = [Trial((label,), seed, Path(), {}, {}, label.upper()) for seed in range(2)]
-    found = {"method": "CSCSR", "network": {"scale": 4}}
-    results = {seed: {**found, "metrics": {"CSCSR": {measure: value}}} for seed, value in enumerate(scores)}
-    return VariantResults(trials, results, {} if scores else {0: "killed"})
+def test_a_trial_that_ends_without_a_result_has_failed(typed, tmp_path, monkeypatch):
+    """As one whose process SIGTERM ended."""
+    monkeypatch.setitem(cli._ENGINES, "local", lambda folders, *_: [dict.fromkeys(folders)])
+    with pytest.raises(SystemExit, match="1 of 1 trials failed; the same command"):
+        main([*typed, "-o", str(tmp_path)])
+    assert "ended without a result" in (tmp_path / "sweep.md").read_text()
 
 
-def test_the_plot_has_what_is_there(tmp_path):
-    def marks(*rows):
-        plot(rows, tmp_path / "plot.png")
-        pixels = (read_picture(tmp_path / "plot.png") * 255).round().int().permute(1, 2, 0)[:-70]  # without the legend
-        colours = [torch.tensor([int(colour[n : n + 2], 16) for n in (1, 3, 5)]) for colour in (BLUE, ORANGE)]
-        blue, orange = ((pixels == colour).all(-1).sum().item() for colour in colours)
-        return blue > 0, orange > 0
+def test_ctrl_c_ends_a_sweep_with_130(typed, tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+        yield
 
-    plot([row("c")], tmp_path / "plot.png")
-    assert not (tmp_path / "plot.png").exists()
-    assert marks(row("c", 20.0, 21.0), row("j", 22.0)) == (True, True)
-    assert marks(row("c", 20.0, 21.0), row("h", 22.0)) == (True, False)  # no J to compare with
-    assert marks(row("width=4", 20.0), row("width=8")) == (True, True)  # the word "failed"
-    assert marks(row("$x^{$", 20.0)) == (True, False)  # no formula
-
-
-def test_the_plot_shows_seeds_means_and_the_paper(tmp_path, monkeypatch):
-    seen = []
-
-    @contextmanager
-    def watched(*args):
-        with charts.chart(*args) as axes:
-            yield axes
-            seen.append(axes)
-
-    monkeypatch.setattr("lightning_modules.sweep.plot.chart", watched)
-
-    def drawn(*rows):
-        """Title, points by their marks, (x, y), bars, (x, from, to), and the legend of a plot."""
-        plot(rows, tmp_path / "plot.png")
-        axes = seen[-1]
-        marks = {}
-        for line in axes.lines:
-            marks.setdefault(line.get_marker(), []).extend(zip(*map(list, line.get_data()), strict=True))
-        bars = [(start[0], start[1], end[1]) for part in axes.collections for start, end in part.get_segments()]
-        texts = [text.get_text() for text in axes.figure.legends[0].get_texts()]
-        assert [label.get_text() for label in axes.get_yticklabels()] == [row.variant for row in rows]
-        bottom, top = axes.get_ylim()
-        assert top < 0 <= len(rows) - 1 < bottom  # the first row at the top
-        return axes.get_title(loc="left"), marks, bars, texts
-
-    title, marks, bars, texts = drawn(row("c", 20.0, 21.0), row("j", 22.0, 22.5))
-    assert title == "PSNR (dB) above or below J, the same seed"
-    assert marks["o"] == [(-2.0, 0), (-1.5, 0), (0.0, 1), (0.0, 1)]
-    assert marks["D"] == [(pytest.approx(28.06 - 28.77), 0), (0.0, 1)]
-    assert [seen[-1].lines[0].get_xdata()] == [[0, 0]]  # where J is
-    assert bars == [(-1.75, -0.3, 0.3), (0.0, 0.7, 1.3)]
-    assert texts == ["a seed; bar: the mean", "the paper, Table 3 (REDS)"]
-
-    title, marks, bars, texts = drawn(row("width=4", 20.0, 21.0), row("width=8"), row("width=12", 22.0))
-    assert title == "PSNR (dB)"
-    assert marks == {"o": [(20.0, 0), (21.0, 0), (22.0, 2)]}
-    assert bars == [(20.5, -0.3, 0.3), (22.0, 1.7, 2.3)]
-    assert texts == ["a seed; bar: the mean"]
-    [failed] = seen[-1].texts
-    assert (failed.get_text(), failed.get_position()[1]) == ("failed", 1)
-    assert drawn(row("width=4", 1.5, measure="epe"))[0] == "epe"
+    monkeypatch.setitem(cli._ENGINES, "local", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        main([*typed, "-o", str(tmp_path)])
+    assert ended.value.code == 130

@@ -1,14 +1,11 @@
 """``lightning trade``, as its users type it, and the parts of it that have laws of their own."""
 
 import csv
-import math
 import random
 import re
 import shlex
 import sys
-from contextlib import contextmanager
 from dataclasses import replace
-from itertools import combinations
 from pathlib import Path
 
 import pytest
@@ -19,9 +16,8 @@ from pytorch_lightning import LightningDataModule
 from lightning_modules.__main__ import main
 from lightning_modules.cli.arguments import arguments_preset
 from lightning_modules.cli.errors import InputError, UsageError
-from lightning_modules.cost import charts, energy, measure
-from lightning_modules.cost.energy import energy_meter, energy_per_call
-from lightning_modules.cost.measure import Measurement, Timed, running, time_in_turns
+from lightning_modules.cost import energy, measure
+from lightning_modules.cost.measure import Measurement, Timed, time_in_turns
 from lightning_modules.cost.runner import Runner, make_runner
 from lightning_modules.data import FilmScenes
 from lightning_modules.inference import presets
@@ -34,7 +30,7 @@ from lightning_modules.storage.pretrained import settings_of
 from lightning_modules.trade import cli
 from lightning_modules.trade.films import film_scenes
 from lightning_modules.trade.pareto import pareto_front
-from lightning_modules.trade.plot import _labels, plot
+from lightning_modules.trade.plot import plot
 from lightning_modules.trade.settings import Setting, read_setting, usual_settings
 from lightning_modules.trade.table import figures, front, markdown, write_csv
 from spikekit import flow_warp, psnr, read_picture
@@ -510,72 +506,8 @@ def test_the_front_leaves_out_what_cannot_run(tmp_path):
     text = markdown(rows, ["command"] * 4, Timed(1, (8, 8), 1, "wall time"))
     marked = [line.rstrip("| ").endswith("x") for line in text.splitlines() if line.startswith("|")][2:]
     assert marked == [False, True, True, False]
-    for shown, beaten in ((rows, True), (rows[:3], False)):
-        plot(shown, tmp_path / "trade.png")
-        pixels = (read_picture(tmp_path / "trade.png") * 255).round().permute(1, 2, 0)
-        blue, grey = ((pixels == torch.tensor(colour)).all(-1).sum() for colour in ((38, 92, 160), (150, 150, 150)))
-        assert blue > 500  # two dots and the line, at least
-        assert (grey > 100) == beaten  # a dot; rounded letters have some grey, too
-
-
-def test_the_front_is_joined_by_its_steps_and_named_in_blue(tmp_path, monkeypatch):
-    rows, _ = some_rows(3, [(2.0,), (3.0,), (1.0,)])
-    rows[1].psnr = [15.0]  # slower and worse than both
-    rows[0].psnr, rows[2].psnr = [22.0], [20.0]
-    seen = []
-    from matplotlib.colors import to_hex
-
-    @contextmanager
-    def watched(*args):
-        with charts.chart(*args) as axes:
-            yield axes
-            seen.append(axes)
-
-    monkeypatch.setattr("lightning_modules.trade.plot.chart", watched)
     plot(rows, tmp_path / "trade.png")
-    (axes,) = seen
-    (steps,) = (line for line in axes.lines if line.get_drawstyle() == "steps-post")
-    times, scores = steps.get_data()
-    assert [*scores] == [20.0, 22.0, 22.0]
-    assert [*times[:2]] == [figures(rows)[2]["ms"], figures(rows)[0]["ms"]]
-    assert times[2] == axes.get_xlim()[1]
-    assert (axes.get_xscale(), axes.get_xlabel(), axes.get_ylabel()) == ("log", "ms a frame", "PSNR (dB)")
-    colours = [text.get_color() for text in axes.figure.legends[0].get_texts()]
-    assert [to_hex(colour) == charts.BLUE for colour in colours] == [True, False, True]
-
-
-def test_labels_keep_away_from_points_and_from_each_other():
-    points = [(0.0, 0.0), (12.0, 0.0), (0.0, 12.0), (200.0, 0.0), (212.0, 3.0), (206.0, 12.0)]
-    labels = [(x + right, y + up) for (x, y), (right, up) in zip(points, _labels(points), strict=True)]
-    for n, label in enumerate(labels):
-        others = [*points[:n], *points[n + 1 :], *labels[:n], *labels[n + 1 :]]
-        assert min(math.dist(label, other) for other in others) > 8
-        assert 9.9 < math.dist(label, points[n]) < 24.1
-    # so many on a spot that each takes the place of another
-    points = [(4.0 * (n % 3), 4.0 * (n // 3)) for n in range(9)]
-    labels = [(x + right, y + up) for (x, y), (right, up) in zip(points, _labels(points), strict=True)]
-    assert min(math.dist(*pair) for pair in combinations(labels, 2)) > 8
-    assert _labels([(5.0, 5.0)]) == [pytest.approx((0, 10))]  # above, where all is free
-
-
-def test_energy_is_counted_where_the_machine_counts_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(energy, "POWERCAP", tmp_path)
-    assert energy_meter(torch.device("cpu")) is None
-    for name, value in (("intel-rapl:0", 999_990), ("intel-rapl:1", 0), ("intel-rapl:0:0", 0), ("dtpm", 0)):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "energy_uj").write_text(f"{value}\n")
-        (tmp_path / name / "max_energy_range_uj").write_text("999999\n")
-    meter = energy_meter(torch.device("cpu"))
-
-    def run():
-        for name in ("intel-rapl:0", "intel-rapl:1", "intel-rapl:0:0"):
-            path = tmp_path / name / "energy_uj"
-            path.write_text(f"{(int(path.read_text()) + 300) % 1_000_000}\n")
-
-    assert energy_per_call(run, meter, seconds=0) == pytest.approx(600e-6)  # two packages, one begins anew
-    assert energy_per_call(run, meter, seconds=1e-3) == pytest.approx(600e-6)
-    (tmp_path / "intel-rapl:1" / "energy_uj").unlink()
-    assert energy_meter(torch.device("cpu")) is None
+    assert read_picture(tmp_path / "trade.png").std() > 0
 
 
 def test_energy_has_a_column_only_where_there_is_some(monkeypatch):
@@ -587,11 +519,6 @@ def test_energy_has_a_column_only_where_there_is_some(monkeypatch):
     measure._weigh(rows[1], torch.zeros(1, 1, 2, 2))
     assert "| J a frame " in markdown(rows, ["", ""], timed)
     assert rows[1].joules == len(calls) ** 2 + 0.25
-
-
-def test_running_leaves_out_what_has_a_reason():
-    rows, _ = some_rows(2)
-    assert running([rows[0], replace(rows[1], reason="no")]) == [rows[0]]
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
