@@ -12,11 +12,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lightning_modules.data.pictures import cached_picture
-from lightning_modules.inference.scene_activity import CELL, Activity, Look, expected_errors, look, required
-from lightning_modules.inference.scene_activity import scene_activity as measure_activity
+from lightning_modules.inference.scene_activity import CELL, Activity, expected_errors, moving_cells, scene_activity
 from lightning_modules.networks import Network
 from lightning_modules.storage.error_model import ErrorModel
+from spikekit import read_picture
 from spikekit.scenes.analytic import Layer, Motion, Scene
 from spikekit.sensor.simulate import simulate_spikes
 
@@ -56,14 +55,12 @@ class Errors:
     Args:
         clip: name of its picture and scene.
         seen: statistics of the clip.
-        smooth: squared errors of the smooth picture, summed over sensor pixels, (h, w), float64.
-        still: likewise, of the network that is told that nothing moves.
+        still: squared errors of the network that is told that nothing moves, by sensor pixel, (h, w), float64.
         own: likewise, of the network with its own estimate of motion.
     """
 
     clip: str
     seen: Activity
-    smooth: Tensor
     still: Tensor
     own: Tensor
 
@@ -87,11 +84,11 @@ def make_clips(
         place = n % len(pictures)
         name = list(SCENES)[(n + n // len(pictures)) % len(SCENES)]
         speed, moving = SCENES[name]
-        ground = _middle(cached_picture(pictures[place]), height, width)
+        ground = _middle(read_picture(pictures[place]), height, width)
         layers = [Layer(ground, Motion(velocity=(speed * scale, speed * scale / 2)))]
         if moving:
             side = scale * _OBJECT
-            thing = _middle(cached_picture(pictures[(place + 1) % len(pictures)]), side, side)
+            thing = _middle(read_picture(pictures[(place + 1) % len(pictures)]), side, side)
             y, x = (torch.linspace(-1, 1, length) for length in thing.shape[1:])
             disc = (y[:, None].square() + x.square() <= 1).to(thing)
             layers.append(Layer(thing, Motion(velocity=(0.2 * scale, 0.1 * scale)), (width // 3, height // 3), disc))
@@ -116,11 +113,10 @@ def measure_errors(network: Network, clip: Clip, flow: Tensor | None = None) -> 
         flow: its estimate of motion, where it is known already.
     """
     alpha = network.settings["alpha"]
-    smooth = look(clip.spikes, network.scale, network.pattern, alpha).picture
     still, own = network(clip.spikes, static=True), network(clip.spikes, flow)
-    errors = (_cells((rgb[0].clamp(0, 1) - clip.truth).square(), network.scale) for rgb in (smooth, still, own))
+    errors = (_cells((rgb[0].clamp(0, 1) - clip.truth).square(), network.scale) for rgb in (still, own))
     name = f"{clip.picture}, {clip.scene}"
-    return Errors(name, measure_activity(clip.spikes, network.pattern, alpha), *errors)
+    return Errors(name, scene_activity(clip.spikes, network.pattern, alpha), *errors)
 
 
 def _cells(error: Tensor, scale: int) -> Tensor:
@@ -128,7 +124,7 @@ def _cells(error: Tensor, scale: int) -> Tensor:
     return F.avg_pool2d(of_sensor, CELL, ceil_mode=True, divisor_override=1)[0, 0]
 
 
-def loss(errors: Errors, model: ErrorModel, tolerance: float) -> tuple[float, float, float]:
+def loss(errors: Errors, model: ErrorModel, tolerance: float) -> tuple[float, float]:
     """Return the loss of a clip by a tolerance where every cell gets just what it is said to need.
 
     Tiles give a cell as much or more.
@@ -139,12 +135,11 @@ def loss(errors: Errors, model: ErrorModel, tolerance: float) -> tuple[float, fl
         tolerance: in dB.
 
     Returns:
-        The fall of the PSNR in dB, and the shares of the cells that get the network, and motion.
+        The fall of the PSNR in dB, and the share of the cells that get motion.
     """
-    flat, still, error = expected_errors(errors.seen, model)
-    network, motion = required(Look(errors.seen.smooth, flat, still, error.sum(dim=(1, 2))), tolerance)
-    left = torch.where(network, torch.where(motion, errors.own, errors.still), errors.smooth).sum()
-    return 10 * log10(left / errors.own.sum()), network.double().mean().item(), motion.double().mean().item()
+    motion = moving_cells(*expected_errors(errors.seen, model), tolerance)
+    left = torch.where(motion, errors.own, errors.still).sum()
+    return 10 * log10(left / errors.own.sum()), motion.double().mean().item()
 
 
 def fit_error_model(clips: Sequence[Errors]) -> ErrorModel:
@@ -161,26 +156,25 @@ def fit_error_model(clips: Sequence[Errors]) -> ErrorModel:
     Raises:
         ValueError: no constants hold the tolerances on these clips.
     """
-    texture, grain, change, area = (
-        _stack([part[0] for part in parts]) for parts in zip(*(clip.seen[1:] for clip in clips), strict=True)
+    texture, change, area = (
+        _stack([part[0] for part in parts]) for parts in zip(*(clip.seen for clip in clips), strict=True)
     )
-    smooth, still, own = (_stack([getattr(clip, name) for clip in clips]) for name in ("smooth", "still", "own"))
+    still, own = (_stack([getattr(clip, name) for clip in clips]) for name in ("still", "own"))
     relative = 1 / (own + 1e-5 * area)
     left = _envelope([texture, change, area], own, relative, 1 - _SHARE)
-    added = _envelope([texture, grain, change], smooth - own, relative, _SHARE)
     stilled = _envelope([change], still - own, relative, _SHARE)
-    model = ErrorModel(*map(float, (*added, *stilled, *left)))
+    model = ErrorModel(*map(float, (*stilled, *left)))
     for factor in _STEP ** np.arange(50.0):
         careful = _scaled(model, factor)
         if all(loss(clip, careful, value)[0] <= _MARGIN * value for clip in clips for value in TOLERANCES):
             return careful
-    raise ValueError("clips: expected some on which less work costs what texture, grain and change let expect")
+    raise ValueError("clips: expected some on which less work costs what texture and change let expect")
 
 
 def _scaled(model: ErrorModel, factor: float) -> ErrorModel:
     """Constants of three digits, what is added times a factor."""
-    added = {name: getattr(model, name) * factor for name in ("flat", "grainy", "blurred", "still")}
-    return ErrorModel(**{name: float(f"{value:.3g}") for name, value in asdict(replace(model, **added)).items()})
+    scaled = replace(model, still=model.still * factor)
+    return ErrorModel(**{name: float(f"{value:.3g}") for name, value in asdict(scaled).items()})
 
 
 def _stack(parts: Sequence[Tensor]) -> np.ndarray:

@@ -2,9 +2,8 @@
 Where the network works: scene activity
 =======================================
 
-With ``--model.psnr_tolerance`` a clip is analysed before the network runs. Cells without texture get the smooth mean of
-all frames, tiles at rest get no optical flow, until the PSNR is expected to have fallen by so many dB. Here is what
-it decides.
+With ``--tolerance`` a clip is analysed before the network runs: tiles at rest get no optical flow, until the PSNR is
+expected to have fallen by so many dB. Here is what it decides.
 """
 
 import matplotlib.pyplot as plt
@@ -12,7 +11,7 @@ import torch
 from skimage import data
 
 import spikekit as sk
-from lightning_modules.inference.scene_activity import CELL, look, required
+from lightning_modules.inference.scene_activity import CELL, expected_errors, moving_cells, scene_activity
 from lightning_modules.networks import CSCSR
 
 scale, alpha, height, width = 4, 0.4, 128, 192
@@ -27,27 +26,26 @@ light = scene.light("RGGB", scale=scale, alpha=alpha)
 spikes = sk.simulate_spikes(light, generator=torch.Generator().manual_seed(0))[None]
 
 # %%
-# ``look`` estimates what every cell would lose by less work, with an error model that was fitted for these weights;
-# ``required`` spends the tolerance on the cheapest cells first.
+# ``scene_activity`` measures texture and change of every cell. With an error model that was fitted for these weights,
+# ``expected_errors`` says what a cell loses without motion, and ``moving_cells`` spends the tolerance on the cheapest.
 
 model = CSCSR.from_pretrained("cscsr_small_x4").error_model
-seen = look(spikes, scale, "RGGB", alpha, model)
+errors = expected_errors(scene_activity(spikes, "RGGB", alpha), model)
 picture = sk.demosaic(sk.tfp(spikes[0], 13, order=3)[20] / alpha, "RGGB").clamp(0, 1)
 
 figure, axes = plt.subplots(1, 3, figsize=(11, 2.9), layout="constrained")
 for ax, tolerance in zip(axes, (0.02, 0.1, 0.5), strict=True):
-    network, motion = required(seen, tolerance)
+    motion = moving_cells(*errors, tolerance)
     ax.imshow(picture.movedim(0, -1))
-    overlay = torch.zeros(*network.shape, 4)
-    overlay[~network] = torch.tensor([0.2, 0.4, 1.0, 0.45])  # blue: smooth mean only
-    overlay[motion] = torch.tensor([0.3, 1.0, 0.2, 0.45])  # green: network with optical flow
+    overlay = torch.zeros(*motion.shape, 4)
+    overlay[motion] = torch.tensor([0.3, 1.0, 0.2, 0.45])  # green: with optical flow
     ax.imshow(overlay, extent=(-0.5, width - 0.5, height - 0.5, -0.5), interpolation="nearest")
-    shares = f"{network.float().mean():.0%} network, {motion.float().mean():.0%} with flow"
+    shares = f"{motion.float().mean():.0%} with flow"
     ax.set_title(f"tolerance {tolerance} dB\n{shares}", fontsize=9)
     ax.set_xticks(range(0, width, CELL), [])
     ax.set_yticks(range(0, height, CELL), [])
 
 # %%
-# Blue cells get the smooth mean, plain ones the network for a scene at rest, green ones the network with optical
-# flow. A larger tolerance never needs more work. ``lightning predict`` then works tile by tile: a tile gets what its
-# most demanding cell requires.
+# Plain cells get the network for a scene at rest, green ones the network with optical flow. A larger tolerance never
+# needs more work. ``lightning predict`` works tile by tile: motion is estimated around the green cells, and a tile
+# without any is reconstructed as at rest.
