@@ -7,11 +7,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
 
-from lightning_modules.cli.errors import InputError, VerbParser
+from lightning_modules.cli.configured import configured_network
+from lightning_modules.cli.errors import InputError, UsageError, VerbParser
 from lightning_modules.inference.export import FORMATS, WITHOUT_WEIGHTS, export_network, load_network
 from lightning_modules.motion import ESTIMATORS
 from lightning_modules.networks import NETWORKS
-from lightning_modules.storage.pretrained import check_weights, read_weights, write_weights
+from lightning_modules.storage.pretrained import (
+    Weights,
+    check_weights,
+    motion_of,
+    read_weights,
+    settings_of,
+    write_weights,
+)
 from spikekit.io.failures import writing
 from spikekit.timing import duration
 
@@ -21,7 +29,7 @@ def parser() -> argparse.ArgumentParser:
     made = VerbParser(
         prog="lightning export",
         description="Write a network for other programs. safetensors are weights that know what network they are of, "
-        "for lightning predict --model.weights FILE and CSCSR.from_pretrained(FILE). torch is a program of "
+        "for lightning predict --weights FILE and CSCSR.from_pretrained(FILE). torch is a program of "
         "torch.export, which needs torch alone; onnx is for onnxruntime and others (the extra export writes it). "
         "Both take a clip of any even height and width, and the motion as a second input where the network follows "
         "motion: an estimate of motion cannot be exported. They are compared with the network on three sizes.",
@@ -29,6 +37,9 @@ def parser() -> argparse.ArgumentParser:
     names = " or ".join(WITHOUT_WEIGHTS)
     made.add_argument(
         "weights", help=f"a name that lightning models lists, a .safetensors, a checkpoint; or {names}, which have none"
+    )
+    made.add_argument(
+        "-c", "--config", action="append", default=[], metavar="FILE", help="says what network, where it is your own"
     )
     made.add_argument("--format", choices=("safetensors", *FORMATS), default="safetensors", help="safetensors")
     made.add_argument("--still", action="store_true", help="nothing moves: no motion as an input, for torch and onnx")
@@ -52,18 +63,25 @@ def export(args: Sequence[str]) -> None:
         raise InputError(f"-o: expected a name that ends in {ending} for {asked.format}, got {asked.output}")
     said = ""
     try:
-        if asked.format in FORMATS:
-            network = load_network(asked.weights)
-            with writing(asked.output):
+        with writing(asked.output):
+            if asked.format in FORMATS:
+                own = bool(asked.config)
+                network = configured_network(asked.config, asked.weights) if own else load_network(asked.weights)
                 said = f", {export_network(network, asked.output, asked.format, still=asked.still)}"
-        elif asked.weights in WITHOUT_WEIGHTS:
-            raise ValueError(f"{asked.weights}: expected --format torch or onnx, as it has no weights of its own")
-        else:
-            weights = read_weights(asked.weights)
-            check_weights(weights, {**NETWORKS, **ESTIMATORS})
-            with writing(asked.output):
-                write_weights(weights, asked.output)
+            else:
+                write_weights(_weights(asked), asked.output)
     except (OSError, ValueError, ImportError) as error:
-        raise InputError(str(error)) from error
+        raise (UsageError if isinstance(error, UsageError) else InputError)(str(error)) from error
     size = Path(asked.output).stat().st_size / 2**20
     print(f"{asked.output}: {size:.1f} MiB{said}, in {duration(perf_counter() - begin)}")
+
+
+def _weights(asked: argparse.Namespace) -> Weights:
+    if asked.weights in WITHOUT_WEIGHTS:
+        raise ValueError(f"{asked.weights}: expected --format torch or onnx, as it has no weights of its own")
+    if asked.config:
+        network = configured_network(asked.config, asked.weights)
+        return Weights(Path(asked.weights), settings_of(network), motion_of(network), network.state_dict())
+    weights = read_weights(asked.weights)
+    check_weights(weights, {**NETWORKS, **ESTIMATORS})
+    return weights

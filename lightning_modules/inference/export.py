@@ -84,10 +84,11 @@ def load_network(source: str) -> Network:
     """
     if source in WITHOUT_WEIGHTS:
         return WITHOUT_WEIGHTS[source]()
-    kind = NETWORKS.get(read_weights(source).settings.get("class"))
-    if kind is None:
-        raise ValueError(f"{source}: expected weights of a network, got those of an estimator of motion")
-    return kind.from_pretrained(source)
+    named = read_weights(source).settings.get("class")
+    if named not in NETWORKS:
+        expected = "expected weights of a network of this package; -c describes another"
+        raise ValueError(f"{source}: {expected}, got those of {named}")
+    return NETWORKS[named].from_pretrained(source)
 
 
 def export_network(network: Network, path: str | Path, kind: str, *, still: bool = False) -> str:
