@@ -10,7 +10,6 @@ import threading
 import warnings
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from inspect import signature
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NoReturn
@@ -29,7 +28,7 @@ from lightning_modules.cli.arguments import classes_first, flatten, whole_counts
 from lightning_modules.cli.configured import run_checkpoint
 from lightning_modules.cli.errors import Ended, InputError, UsageError
 from lightning_modules.cli.folder_lock import FolderError, check_folder, locked_folder
-from lightning_modules.cli.reasons import reason, suggestion, unknown
+from lightning_modules.cli.reasons import reason
 from lightning_modules.configurations import with_found_configs
 from lightning_modules.data import FilmScenes, StillScenes
 from lightning_modules.data.loading import end_when_orphaned
@@ -154,9 +153,7 @@ class Command(LightningCLI):
         except SystemExit as error:
             if not isinstance(error.code, str):
                 raise
-            names = [name.removeprefix("--") for name in option_names(*self._subcommand_parsers.values())]
-            meant = suggestion(unknown(self.typed, names), names)
-            raise UsageError(error.code + (meant or f" (see lightning {self.typed[0]} --help)")) from error
+            raise UsageError(f"{error.code} (see lightning {self.typed[0]} --help)") from error
         self.counts = whole_counts(args)
 
     def _parse_ckpt_path(self) -> None:
@@ -308,13 +305,6 @@ def _locked(verb: str, config: Any) -> AbstractContextManager[None]:
     return locked_folder(config.output, f"lightning {verb}", f".{verb}.lock")
 
 
-def option_names(*parsers: ArgumentParser) -> list[str]:
-    """Return the options of parsers, and those of the classes that a configuration may name."""
-    own = [option for parser in parsers for option in parser._option_string_actions]
-    classes = [f"--{option}.{name}" for option, choice in CHOICES for name in signature(choice).parameters]
-    return sorted({*own, *classes})
-
-
 def _is_of_file(error: BaseException | None, said: str) -> bool:
     """Return whether a file is to blame, and not what was typed."""
     if Path(said.partition(": ")[0]).exists():
@@ -348,7 +338,7 @@ def _check_verb(verb: str, model: BaseTask, data: LightningDataModule) -> None:
 
 def _check_continuation(path: str, model: BaseTask, trainer: Trainer | None) -> None:
     """Refuse to go on with another network, optimizer or schedule: the checkpoint's would win without a word."""
-    checkpoint = read_checkpoint(path) if trainer is None else check_resume(path, model, trainer)
+    checkpoint = read_checkpoint(path)
     check_settings(model.network, checkpoint["network"], path)
     here = dict(flatten(model.recipe))
     there = dict(flatten(checkpoint["recipe"] or model.recipe))  # older checkpoints do not say
@@ -357,6 +347,8 @@ def _check_continuation(path: str, model: BaseTask, trainer: Trainer | None) -> 
             name, expected = key.replace(".init_args", ""), f"{there.get(key)}, as {path} was trained with"
             anew = "--model.weights starts anew with other settings"
             raise UsageError(f"model.{name}: expected {expected}, got {here.get(key)}; {anew}")
+    if trainer is not None:  # a rehearsal has none
+        check_resume(path, model, trainer)
 
 
 def _check_agreement(model: BaseTask, data: LightningDataModule) -> None:

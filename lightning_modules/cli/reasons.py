@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from difflib import get_close_matches
 
 # what jsonargparse writes around a cause
 _AROUND = re.compile(
@@ -40,35 +38,3 @@ def reason(message: str) -> str:
         cause = f"expected {kind[1]}" + (f", got {got[:80]!r}" if got else "")
     cause = re.sub("Expected a dot import path string: (.*)", r"expected the name of a class, got \1", cause)
     return ".".join(where) + (": " if where else "") + cause[:_MOST]
-
-
-def suggestion(unknown: Sequence[str], names: Sequence[str]) -> str:
-    """Return which argument may have been meant, or nothing.
-
-    Args:
-        unknown: arguments as they were typed, without dashes.
-        names: those that there are.
-
-    Example:
-        >>> suggestion(["data.patern"], ["data.path", "data.pattern"])
-        '; data.patern: did you mean data.pattern?'
-    """
-    for key in unknown:
-        ends = {name.rpartition(".")[2] for name in names}
-        close = get_close_matches(key.rpartition(".")[2], ends, 1, 0.75)
-        meant = [name for name in names if close and name.rpartition(".")[2] == close[0]]
-        meant = [name for name in meant if name.partition(".")[0] == key.partition(".")[0]] or meant
-        if meant:
-            return f"; {key}: did you mean {' or '.join(meant)}?"
-    return ""
-
-
-def unknown(words: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Return the options among words, without dashes, that are not names.
-
-    Example:
-        >>> unknown(["--data.path", "a.dat", "--data.patern=RGGB"], ["data.path"])
-        ['data.patern']
-    """
-    typed = [word[2:].partition("=")[0] for word in words if word.startswith("--")]
-    return [key for key in typed if names and key not in names]

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from lightning_modules.cli.command import run
 from lightning_modules.cli.errors import InputError, UsageError, VerbParser
-from lightning_modules.cli.rehearsal import Rehearsal, argument_names, mistake, resolved
+from lightning_modules.cli.reasons import reason
+from lightning_modules.cli.rehearsal import Rehearsal, resolved
 from lightning_modules.inference.film import FilmFrame, FilmMaker, film
 from lightning_modules.storage.pretrained import load_weights, read_weights
 from lightning_modules.tasks.super_resolution import SuperResolution
@@ -42,7 +43,6 @@ class Runner:
     Args:
         args: of ``lightning test``, in the order in which they are typed; and how pictures are made, as of ``predict``:
             ``--tile``, ``--psnr_tolerance``, ``--self_ensemble``, ``--interpolated`` and ``--future``.
-        names: arguments that there are, to guess which one was meant.
 
     Attributes:
         network: with its weights.
@@ -55,13 +55,13 @@ class Runner:
         CannotRunError: a file is missing, or the machine lacks what is asked for.
     """
 
-    def __init__(self, args: Sequence[str], names: Sequence[str] = ()) -> None:
+    def __init__(self, args: Sequence[str]) -> None:
         how, args = _how().parse_known_args(args)
         if how.tile is not None and how.tile % 2:
             raise UsageError(f"tile: expected an even number of sensor pixels, or 0 for no tiles, got {how.tile}")
         logging.disable(logging.INFO)  # Lightning would say for every setting anew what machine this is
         try:
-            command = _built(args, names)
+            command = _built(args)
         finally:
             logging.disable(logging.NOTSET)
         trainer, module = command.trainer, command.model
@@ -133,7 +133,7 @@ def make_runner(shared: Sequence[str], args: Sequence[str], base: Runner) -> Run
         InputError: arguments that make no sense, or that ask for other scenes.
         CannotRunError: a file is missing, or the machine lacks what is asked for.
     """
-    runner = Runner([*shared, *args], argument_names(base.config))
+    runner = Runner([*shared, *args])
     if runner.scenes != base.scenes:
         key = next(key for key in base.scenes if runner.scenes.get(key) != base.scenes[key])
         got = f"got {runner.scenes.get(key)}; what goes for all stands outside of --setting"
@@ -144,14 +144,14 @@ def make_runner(shared: Sequence[str], args: Sequence[str], base: Runner) -> Run
     return runner
 
 
-def _built(args: Sequence[str], names: Sequence[str]) -> _Test:
+def _built(args: Sequence[str]) -> _Test:
     try:
         command = run(["test", *args], _Test)
         path = command.config[command.verb].ckpt_path
         if path:
             load_weights(command.model.network, read_weights(path))
     except ArgumentError as error:
-        raise UsageError(mistake(error, args, names)) from error
+        raise UsageError(reason(str(error))) from error
     except MisconfigurationException as error:
         raise CannotRunError(one_line(error)) from error
     except ValueError as error:

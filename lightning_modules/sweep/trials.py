@@ -16,7 +16,8 @@ import yaml
 from lightning_modules.cli.arguments import flatten
 from lightning_modules.cli.command import run
 from lightning_modules.cli.errors import InputError, UsageError
-from lightning_modules.cli.rehearsal import Rehearsal, argument_names, mistake, resolved
+from lightning_modules.cli.reasons import reason
+from lightning_modules.cli.rehearsal import Rehearsal, resolved
 from lightning_modules.sweep.budget import with_budget
 from lightning_modules.sweep.state import read_json, read_yaml, write_json
 from spikekit.io.whole_file import whole_file
@@ -99,14 +100,13 @@ def make_trials(
             short = key.rpartition(".")[2]
             groups.append([(f"{short}={value}", choice) for value, choice in zip(values, choices, strict=True)])
     base = _resolve(common, "")
-    names = argument_names(base)
     trials = []
     for combination in progress(list(itertools.product(*groups)), "combinations built"):
         labels = tuple(label for label, _ in combination) or (Path(configs[-1]).stem,)
         args = [*common, *(word for _, words in combination for word in words)]
         overlays = [Path(words[-1]) for _, words in combination]
         letter = next((path.stem.upper() for path in overlays if path.parent.name == "ablation"), "")
-        config = _resolve(args, f"{'-'.join(labels)}: ", names) if combination else base
+        config = _resolve(args, f"{'-'.join(labels)}: ") if combination else base
         for seed in seeds or [None]:
             name = "-".join(labels) + ("" if seed is None else f"-seed{seed}")
             folder = output / re.sub(r"[^\w.=+-]+", "_", name)
@@ -160,12 +160,12 @@ class _Resolver(Rehearsal):
         """None: the machine that trains may be another one."""
 
 
-def _resolve(args: Sequence[str], trial: str, names: Sequence[str] = ()) -> dict[str, Any]:
+def _resolve(args: Sequence[str], trial: str) -> dict[str, Any]:
     try:
         command = run(["fit", *args], _Resolver)
     except (ArgumentError, InputError) as error:
         kind = InputError if isinstance(error, InputError) and not isinstance(error, UsageError) else UsageError
-        raise kind(trial + mistake(error, args, names)) from error
+        raise kind(trial + reason(str(error))) from error
     config = resolved(command)
     if config["trainer"]["devices"] not in ("auto", 1, "1"):
         raise UsageError(f"{trial}trainer.devices: expected 1, the one of a trial, got {config['trainer']['devices']}")

@@ -173,6 +173,7 @@ def test_a_folder_that_cannot_be_locked(tmp_path, monkeypatch):
         locked_folder(tmp_path, "run"),
     ):
         pass
+    (tmp_path / "lock").rmdir()
     with monkeypatch.context() as patch:
 
         def refuse(*_):

