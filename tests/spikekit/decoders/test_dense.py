@@ -282,15 +282,6 @@ def test_tfp_gradcheck(frames, window):
     assert gradcheck(lambda s: tfp(s, window, 2.0, order=3), spikes)
 
 
-def test_memory_layouts():
-    spikes = (torch.rand(2, 9, 5, 4) < 0.3).float()
-    view = spikes.permute(3, 2, 1, 0).contiguous().permute(3, 2, 1, 0)
-    frame = spikes[0, :1].expand(9, 5, 4)
-    for op in (spike_interval, tfi, lambda s: tfp(s, 5)):
-        assert torch.equal(op(view), op(spikes))
-        assert torch.equal(op(frame), op(frame.contiguous()))
-
-
 @pytest.mark.parametrize("op", [spike_interval, tfi, lambda s: tfp(s, 3)])
 @pytest.mark.parametrize(
     ("error", "spikes"),

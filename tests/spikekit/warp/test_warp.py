@@ -5,7 +5,6 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch._dynamo.testing import CompileCounterWithBackend
 from torch.autograd import gradcheck, gradgradcheck
 
 from spikekit import FlowWarpIdw, bayer_mask, flow_warp, flow_warp_idw
@@ -87,33 +86,11 @@ def test_idw_of_every_small_mask(bits, neighbors):
             check_idw(mask, neighbors)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
-def test_idw_of_narrow_dtypes(dtype):
-    """What comes in is what counts: the same flow in float64 gives the same pixels."""
-    for mask in [*bayer_mask(3, 4, scale=3), torch.rand(9, 12) < 0.4]:
-        features = torch.randn(5, 2, 9, 12).to(dtype)
-        flow = flows(9, 12).to(dtype)[:5]
-        flow = (flow.double() * UNIT).round().div(UNIT).to(dtype)
-        warped = flow_warp_idw(features, flow, mask.to(dtype))
-        assert warped.dtype == dtype
-        eps = max(torch.finfo(dtype).eps, 1e-6)
-        torch.testing.assert_close(warped.double(), idw_brute(features, flow, mask, 4), rtol=eps, atol=eps)
-
-
 def test_idw_takes_features_and_flow_of_two_dtypes():
     features, flow, mask = torch.randn(5, 2, 6, 8).half(), flows(6, 8, torch.float32)[:5], bayer_mask(6, 8)[1]
     warped = flow_warp_idw(features, flow, mask)
     assert warped.dtype == torch.float16
     torch.testing.assert_close(warped.double(), idw_brute(features, flow, mask, 4), rtol=1e-3, atol=1e-3)
-
-
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16, torch.float16])
-def test_idw_by_zero_flow_keeps_known_pixels(dtype):
-    features, flow = torch.randn(2, 3, 9, 12).to(dtype), torch.zeros(2, 2, 9, 12, dtype=dtype)
-    for mask in [*bayer_mask(3, 4, scale=3, dtype=torch.bool), torch.rand(9, 12) < 0.4]:
-        warped = flow_warp_idw(features, flow, mask)
-        assert torch.equal(warped[..., mask], features[..., mask])
-    assert torch.equal(flow_warp_idw(features, flow, torch.ones(9, 12)), features)
 
 
 def test_idw_shifts_by_whole_pixels():
@@ -222,23 +199,6 @@ def test_idw_second_gradient_is_finite(channels):
         assert grad.isfinite().all()
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16, torch.float16])
-@pytest.mark.parametrize("op", [flow_warp, lambda f, w: flow_warp_idw(f, w, bayer_mask(4, 6)[0])])
-def test_flow_that_is_not_finite(op, dtype):
-    """NaN counts as 0, infinity as very far, and there is no gradient there."""
-    features = torch.randn(1, 2, 4, 6).to(dtype)
-    flow = torch.randn(1, 2, 4, 6).to(dtype)
-    bad = torch.rand(1, 2, 4, 6) < 0.5
-    cases = {float("nan"): 0.0, float("inf"): 60000.0, float("-inf"): -60000.0}
-    for value, same in cases.items():
-        leaf = flow.masked_fill(bad, value).requires_grad_()
-        warped = op(features, leaf)
-        torch.testing.assert_close(warped, op(features, flow.masked_fill(bad, same)), rtol=1e-3, atol=1e-3)
-        (grad,) = torch.autograd.grad(warped.sum(), leaf)
-        assert grad.isfinite().all()
-        assert (grad[bad] == 0).all()
-
-
 @pytest.mark.parametrize("known", [[(2, 3)], [(0, 0), (4, 5)], [(1, 0), (1, 4), (3, 0)]])
 def test_idw_reads_known_pixels_only_where_they_are_few(known):
     mask = torch.zeros(5, 6, dtype=torch.bool)
@@ -265,50 +225,6 @@ def test_idw_keeps_the_memory_format(channels):
     torch.testing.assert_close(warped, expected)
     (grad,) = torch.autograd.grad(warped, last, torch.ones_like(warped))
     assert grad.is_contiguous(memory_format=torch.channels_last)
-
-
-def test_idw_by_torch_func():
-    features, flow = torch.randn(3, 2, 9, 4, 6), torch.randn(3, 2, 2, 4, 6)
-    mask = bayer_mask(4, 6)[2]
-    expected = flow_warp_idw(features, flow, mask)
-    torch.testing.assert_close(torch.func.vmap(flow_warp_idw, (0, 0, None))(features, flow, mask), expected)
-    torch.testing.assert_close(torch.func.vmap(flow_warp_idw, (1, 1, None), 1)(features, flow, mask), expected)
-    one_flow = torch.func.vmap(flow_warp_idw, (0, None, None))(features, flow[0], mask)
-    torch.testing.assert_close(one_flow[2], flow_warp_idw(features[2], flow[0], mask))
-
-    def energy(flow, features):
-        return flow_warp_idw(features, flow, mask).square().sum()
-
-    leaf = flow.clone().requires_grad_()
-    (grad,) = torch.autograd.grad(energy(leaf, features), leaf)
-    torch.testing.assert_close(torch.func.vmap(torch.func.grad(energy))(flow, features), grad)
-
-
-def test_idw_compiles_once_for_all_sizes():
-    torch.compiler.reset()
-    counter = CompileCounterWithBackend("aot_eager")
-    compiled = torch.compile(lambda *a: flow_warp_idw(*a), fullgraph=True, dynamic=True, backend=counter)
-    for batch, height, width in [(4, 5, 7), (5, 8, 6), (6, 10, 12)]:
-        features = torch.randn(batch, 9, height, width, requires_grad=True)
-        flow = torch.randn(batch, 2, height, width, requires_grad=True)
-        results = []
-        for op in (compiled, flow_warp_idw):
-            warped = op(features, flow, bayer_mask(height, width)[1])
-            results.append([warped, *torch.autograd.grad(warped.square().sum(), (features, flow))])
-        for got, expected in zip(*results, strict=True):
-            torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-5)
-    assert counter.frame_count == 1
-
-
-def test_idw_exports_with_any_size():
-    batch, height, width = (torch.export.Dim(name) for name in ("batch", "height", "width"))
-    planes = {0: batch, 2: height, 3: width}
-    args = torch.randn(3, 9, 5, 7), torch.randn(3, 2, 5, 7), bayer_mask(5, 7)[1]
-    shapes = planes, planes, {0: height, 1: width}
-    exported = torch.export.export(FlowWarpIdw(steps=4), args, dynamic_shapes=shapes, strict=False).module()
-    for size in [(5, 7), (8, 6)]:
-        args = torch.randn(2, 9, *size), torch.randn(2, 2, *size), bayer_mask(*size)[1]
-        torch.testing.assert_close(exported(*args), flow_warp_idw(*args, steps=4))
 
 
 def test_idw_with_steps():
@@ -342,20 +258,6 @@ def test_idw_gradient_next_to_a_known_pixel():
             grads.append(torch.autograd.grad(flow_warp_idw(features.to(dtype), leaf, mask).sum(), leaf)[0].double())
         torch.testing.assert_close(*(grad[..., mask] for grad in grads), rtol=1e-5, atol=1e-5)
         assert grads[0][..., mask].abs().max() > 0.1
-
-
-@pytest.mark.parametrize("lead", [(), (2,), (2, 3), (0,), (2, 0)])
-def test_leading_dimensions(lead):
-    features, flow, mask = torch.randn(*lead, 3, 4, 6), torch.randn(*lead, 2, 4, 6), bayer_mask(4, 6)[0]
-    for op in (flow_warp, lambda f, w: flow_warp_idw(f, w, mask)):
-        warped = op(features, flow)
-        assert warped.shape == features.shape
-        flat = op(features.reshape(-1, 3, 4, 6), flow.reshape(-1, 2, 4, 6))
-        torch.testing.assert_close(warped.reshape(-1, 3, 4, 6), flat, rtol=0, atol=0)
-        if 0 in lead:
-            continue
-        one = op(features.reshape(-1, 3, 4, 6)[:1], flow.reshape(-1, 2, 4, 6)[:1])
-        torch.testing.assert_close(one[0], flat[0], rtol=0, atol=0)
 
 
 def test_idw_remembers_masks_but_not_too_well():
@@ -424,20 +326,6 @@ def test_flow_warp(size):
     torch.testing.assert_close(
         flow_warp(image.float(), flow.float())[:6], bilinear_loop(image, flow).float()[:6], rtol=1e-4, atol=1e-4
     )
-
-
-@pytest.mark.parametrize(("dtype", "atol"), [(torch.float64, 1e-12), (torch.float32, 1e-5), (torch.bfloat16, 1e-2)])
-def test_flow_warp_by_zero_flow(dtype, atol):
-    image = torch.rand(2, 3, 11, 13).to(dtype)
-    warped = flow_warp(image, torch.zeros(2, 2, 11, 13, dtype=dtype))
-    assert warped.dtype == dtype
-    torch.testing.assert_close(warped, image, rtol=0, atol=atol)
-
-
-def test_flow_warp_gradcheck():
-    image = torch.randn(1, 2, 4, 5, dtype=torch.float64, requires_grad=True)
-    flow = (torch.rand(1, 2, 4, 5, dtype=torch.float64) * 3 - 1.5).requires_grad_()
-    assert gradcheck(flow_warp, (image, flow))
 
 
 IMAGE, FLOW, MASK = torch.rand(2, 3, 4, 6), torch.rand(2, 2, 4, 6), torch.ones(4, 6)
