@@ -91,7 +91,9 @@ def _is_grey(picture: Tensor) -> bool:
     return all(bool((part[1:] == part[:1]).all()) for part in (picture[:, ::16, ::16], picture))
 
 
-def draw_cut(side: int, size: tuple[int, int], rng: np.random.Generator, mirror: float) -> np.ndarray:
+def draw_cut(
+    side: int, size: tuple[int, int], rng: np.random.Generator, mirror: float, least: float = 0.5
+) -> np.ndarray:
     """Draw a square at a random place and size of a picture; where the picture ends, it is mirrored.
 
     Args:
@@ -100,6 +102,7 @@ def draw_cut(side: int, size: tuple[int, int], rng: np.random.Generator, mirror:
         rng: where chance comes from.
         mirror: the square is at most so many times as long as the picture, as far as that is to be had without
             enlarging.
+        least: how far the picture is shrunk at most.
 
     Returns:
         Of rows and of columns, (2, 4): first line of the picture and how many are taken, to how many they are
@@ -107,7 +110,7 @@ def draw_cut(side: int, size: tuple[int, int], rng: np.random.Generator, mirror:
     """
     # Shrinking makes grain small and edges sharp. Enlarging blurs: only a picture below half the square's side is.
     shortest = min(size)
-    smallest = max(0.5, min(1.0, side / (mirror * shortest)), side / (2 * shortest))
+    smallest = max(least, min(1.0, side / (mirror * shortest)), side / (2 * shortest))
     factor = math.exp(rng.uniform(math.log(smallest), math.log(max(smallest, 1.0))))
     axes = []
     for lines in size:

@@ -249,10 +249,12 @@ class StillClips(Dataset):
         else:
             which = int(rng.integers(count)) if self.augment or turn is None else turn % count
         push = _in_disc(rng) * 2 * self.bend * self.scale / half**2
+        # at the sensor's own resolution nothing is averaged later, which would make edges sharp
+        least = 0.25 if self.scale == 1 else 0.5
         return {
             "picture": which,
             "side": side,
-            "cut": draw_cut(side, self.sources.size(which), rng, mirror=1.25 if self.augment else 1.0),
+            "cut": draw_cut(side, self.sources.size(which), rng, mirror=1.25 if self.augment else 1.0, least=least),
             **(_recolour(rng) if self.augment else _AS_IT_IS),
             "position": np.array(corner, "float64"),
             "velocity": velocity,

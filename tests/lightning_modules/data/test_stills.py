@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import pytorch_lightning as pl
 import torch
+import torch.nn.functional as F
 from skimage import io
 
 from lightning_modules.data.pictures import (
@@ -466,3 +467,15 @@ def test_linked_folders_of_pictures_are_seen_and_links_that_lead_back_are_not_fo
     (tmp_path / "in" / "there").symlink_to(tmp_path / "out")
     (tmp_path / "out" / "back").symlink_to(tmp_path / "in")
     assert [path.name for path in folder_pictures(tmp_path / "in")] == ["a.png", "b.png"]
+
+
+def test_at_scale_1_pictures_are_shrunk_until_their_edges_are_sharp():
+    """How much of a clip's truth changes from pixel to pixel: as much as after the mean of 2 x 2 at scale 2."""
+
+    def detail(scale):
+        clips = StillClips(embedded_pictures(), scale=scale, patch=32, pattern="grey", objects=0, seed=1)
+        pictures = torch.stack([F.avg_pool2d(clips[n]["rgb"], scale) for n in range(30)])
+        spread = pictures.std(dim=(-2, -1)).clamp(min=0.01)
+        return (pictures.diff(dim=-1).square().mean(dim=(-2, -1)).sqrt() / spread).median()
+
+    assert detail(1) > 0.8 * detail(2)
