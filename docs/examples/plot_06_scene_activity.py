@@ -1,9 +1,9 @@
 """
-Where the network works: scene activity
-=======================================
+Where motion is computed: scene activity
+========================================
 
-With ``--tolerance`` a clip is analysed before the network runs: tiles at rest get no optical flow, until the PSNR is
-expected to have fallen by so many dB. Here is what it decides.
+With ``lightning predict --tolerance`` a clip is analysed before the network runs. Parts at rest get no optical flow,
+until the PSNR is expected to have fallen by so many dB. Here is what it decides.
 """
 
 import matplotlib.pyplot as plt
@@ -26,26 +26,24 @@ light = scene.light("RGGB", scale=scale, alpha=alpha)
 spikes = sk.simulate_spikes(light, generator=torch.Generator().manual_seed(0))[None]
 
 # %%
-# ``scene_activity`` measures texture and change of every cell. With an error model that was fitted for these weights,
-# ``expected_errors`` says what a cell loses without motion, and ``moving_cells`` spends the tolerance on the cheapest.
+# ``scene_activity`` measures every cell, ``expected_errors`` says what it would lose without motion, by an error model
+# that was fitted for these weights, and ``moving_cells`` spends the tolerance on the cheapest cells first.
 
 model = CSCSR.from_pretrained("cscsr_small_x4").error_model
-errors = expected_errors(scene_activity(spikes, "RGGB", alpha), model)
+still, error = expected_errors(scene_activity(spikes, "RGGB", alpha), model)
 picture = sk.demosaic(sk.tfp(spikes[0], 13, order=3)[20] / alpha, "RGGB").clamp(0, 1)
 
 figure, axes = plt.subplots(1, 3, figsize=(11, 2.9), layout="constrained")
 for ax, tolerance in zip(axes, (0.02, 0.1, 0.5), strict=True):
-    motion = moving_cells(*errors, tolerance)
+    motion = moving_cells(still, error, tolerance)
     ax.imshow(picture.movedim(0, -1))
     overlay = torch.zeros(*motion.shape, 4)
     overlay[motion] = torch.tensor([0.3, 1.0, 0.2, 0.45])  # green: with optical flow
     ax.imshow(overlay, extent=(-0.5, width - 0.5, height - 0.5, -0.5), interpolation="nearest")
-    shares = f"{motion.float().mean():.0%} with flow"
-    ax.set_title(f"tolerance {tolerance} dB\n{shares}", fontsize=9)
+    ax.set_title(f"tolerance {tolerance} dB\n{motion.float().mean():.0%} with flow", fontsize=9)
     ax.set_xticks(range(0, width, CELL), [])
     ax.set_yticks(range(0, height, CELL), [])
 
 # %%
-# Plain cells get the network for a scene at rest, green ones the network with optical flow. A larger tolerance never
-# needs more work. ``lightning predict`` works tile by tile: motion is estimated around the green cells, and a tile
-# without any is reconstructed as at rest.
+# Green cells get optical flow; for the others the network takes the scene to be at rest. ``lightning predict`` then
+# works tile by tile: a tile gets what its most demanding cell requires.
