@@ -16,7 +16,6 @@ LEARN = {
     "tabulate",
     "tensorboard",
     "tifffile",
-    "torchmetrics",
     "tqdm",
     "yaml",
 }
