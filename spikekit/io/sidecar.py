@@ -255,9 +255,18 @@ def published(output: Path) -> Iterator[Path]:
 
 def _publish(part: Path, target: Path, last: str) -> None:
     sidecar = target / last
+    files = sorted((path for path in part.rglob("*") if path.is_file()), key=lambda path: path == part / last)
+    known = read_sidecar(sidecar).truth if sidecar.is_file() else {}
+    for path in files:  # pictures of others are not replaced; what a killed process has left is the same
+        name = path.relative_to(part)
+        final = target / name
+        if name.parent.name and final.parent.is_symlink():  # whoever made the folder chose where it leads
+            raise ValueError(f"{final.parent}: expected a folder of its own, got a link; choose another name")
+        taken = name.suffix == ".png" and name.as_posix() not in known and final.exists()
+        if taken and not (final.is_file() and final.read_bytes() == path.read_bytes()):
+            raise ValueError(f"{final}: would be lost, and is no ground truth of {last}; choose another name")
     if sidecar.is_file() and sidecar.read_bytes() != (part / last).read_bytes():
         sidecar.unlink()
-    files = sorted((path for path in part.rglob("*") if path.is_file()), key=lambda path: path == part / last)
     folders = {target}
     for path in files:
         final = target / path.relative_to(part)

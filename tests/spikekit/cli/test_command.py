@@ -4,9 +4,10 @@ import contextlib
 import errno
 import io
 import os
-import re
+import signal
 import subprocess
 import sys
+import time
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -15,13 +16,11 @@ import pytest
 import torch
 
 from spikekit import (
-    __version__,
     bin_to_sensor,
     iter_spikes,
     psnr,
     read_picture,
     read_spikes,
-    recording,
     spike_integrate_fire,
     tfi,
     tfp,
@@ -80,11 +79,6 @@ def sized(path, height=12, width=20):
 # --- info -------------------------------------------------------------------------------------------------------------
 
 
-def test_version(capsys):
-    assert main(["--version"]) == 0
-    assert capsys.readouterr().out == f"spikekit {__version__}\n"
-
-
 def test_info(clip, capsys):
     assert main(["info", *map(str, sized(clip))]) == 0
     out, err = capsys.readouterr()
@@ -101,20 +95,6 @@ def test_info(clip, capsys):
     assert lines["never_fire"] == "1 of 240 pixels, 0.42%"
     assert lines["always_fire"] == "0 of 240 pixels, 0.00%"
     assert lines["bits_set"].startswith(f"{read_spikes(clip, 12, 20).sum()} of 14400, ")
-
-
-@pytest.mark.parametrize("frames", [255, 256, 700])
-def test_info_of_many_frames(tmp_path, capsys, monkeypatch, frames):
-    """Sums of bytes do not run over, whatever is counted at a time."""
-    spikes = torch.ones(frames, 2, 4)
-    spikes[1, 0, 0] = 0
-    write_spikes(tmp_path / "a.npz", spikes)
-    for block in (1, 800, 1 << 24):
-        monkeypatch.setattr(recording, "_BLOCK", block)
-        assert main(["info", str(tmp_path / "a.npz")]) == 0
-        out = capsys.readouterr().out
-        assert f"bits set     {8 * frames - 1} of {8 * frames}," in out
-        assert "always fire  7 of 8 pixels" in out
 
 
 def test_info_of_an_array(tmp_path, capsys):
@@ -231,16 +211,6 @@ def test_decode_reads_only_what_it_needs(tmp_path, monkeypatch, words, expected)
     assert [tuple(part) for part in read] == expected
 
 
-def test_decode_reads_an_array_once(tmp_path, monkeypatch):
-    """Every way into an .npz begins at its start."""
-    calls = []
-    monkeypatch.setattr(decode, "iter_spikes", lambda *_, **__: calls.append(__) or iter_spikes(*_, **__))
-    write_spikes(tmp_path / "a.npz", torch.ones(90, 2, 4))
-    words = ["--method", "tfp", "--window", "3", "--frame", "10:90:20", "--alpha", "1"]
-    assert main(["decode", str(tmp_path / "a.npz"), *words, "-o", str(tmp_path / "{frame}.png")]) == 0
-    assert [call["start"] for call in calls] == [9]
-
-
 @pytest.mark.parametrize("name", ["a.dat", "a.npz"])
 @pytest.mark.parametrize("method", ["tfi", "tfp"])
 @pytest.mark.parametrize("frames", ["0:500:83", "240:260:7", ":3", "498:", "17:18"])
@@ -291,19 +261,6 @@ def test_decode_many_until_the_disk_is_full(clip, tmp_path, monkeypatch, fails):
     assert f"{out / '12.png'}: cannot be written (No space left on device)" in fails(1, "decode", *sized(clip), *words)
     assert sorted(path.name for path in out.iterdir()) == ["10.png", "11.png"]
     assert read_picture(out / "11.png").shape == (3, 12, 20)
-
-
-def test_progress_on_a_terminal(clip, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    monkeypatch.setattr("spikekit.progress.AFTER", 0)
-    line = ["decode", *map(str, sized(clip)), "--method", "tfp", "-o", str(tmp_path / "{frame}.png"), "--frame"]
-    assert main([*line, "5:8"]) == 0
-    shown = capsys.readouterr().err.split("\r")
-    assert any(re.match(r"pictures: .* 0/3 ", line) for line in shown)
-    assert not shown[-2].strip()  # the bar is taken away
-    monkeypatch.setattr("spikekit.progress.AFTER", 600)  # what takes less shows nothing
-    assert main([*line, "5:8"]) == 0
-    assert capsys.readouterr().err == ""
 
 
 BOUNDED = """
@@ -376,20 +333,11 @@ def test_decode_darkness(tmp_path, capsys):
         (["info"], "required: FILE (see spikekit info --help)"),
         (["info", "a.dat", "--hight", 3], "unrecognized arguments: --hight 3 (see spikekit info --help)"),
         (["info", "a.dat", "--height", "0"], "--height: expected a whole number, 1 or more, got 0"),
-        (["info", "a.dat", "--width", "wide"], "--width: expected a whole number, 1 or more, got wide"),
         (["decode", "a.dat"], "required: -o/--output (see spikekit decode --help)"),
-        (["decode", "a.dat", "-o", "a.png", "--method", "mean"], "--method: invalid choice: 'mean'"),
-        (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--pattern", "RGB"], "--pattern: invalid choice: 'RGB'"),
-        (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--alpha", "0"], "--alpha: expected a number above 0"),
-        (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--alpha", "nan"], "--alpha: expected a number above 0"),
-        (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--frame", "-1"], "--frame: expected a whole number, 0"),
-        (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--frame", "1:2:0"], "or A:B or A:B:STEP, got 1:2:0"),
-        (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--frame", "1:-2"], "or A:B or A:B:STEP, got 1:-2"),
-        (
-            ["decode", "a.dat", "-o", "a.png", "--method", "tfp", "--window", "4"],
-            "odd number, with --method tfp, got 4",
-        ),
-        (["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--window", "5"], "with --method tfp, got 5 with tfi"),
+        (["decode", "a.dat", "-o", "a.png", "--pattern", "RGB"], "--pattern: invalid choice: 'RGB'"),
+        (["decode", "a.dat", "-o", "a.png", "--alpha", "nan"], "--alpha: expected a number above 0"),
+        (["decode", "a.dat", "-o", "a.png", "--frame", "1:-2"], "or A:B or A:B:STEP, got 1:-2"),
+        (["decode", "a.dat", "-o", "a.png", "--window", "4"], "odd number, with --method tfp, got 4"),
         (
             ["decode", "a.dat", "-o", "a.png", "--method", "tfi", "--order", "3"],
             "expected --method tfp, got 3 with tfi",
@@ -414,13 +362,6 @@ def test_frames_that_are_not_there(clip, tmp_path, fails, frames):
 def test_many_pictures_under_one_name(clip, tmp_path, fails):
     words = ("--method", "tfi", "-o", tmp_path / "a.png", "--frame", "0:3")
     message = f"--output: expected {{frame}} in the name of 3 pictures, got {tmp_path / 'a.png'}"
-    assert message in fails(2, "decode", *sized(clip), *words)
-
-
-@pytest.mark.parametrize("order", [61, 10**20])
-def test_an_order_beyond_the_recording(clip, tmp_path, fails, order):
-    words = ("--method", "tfp", "-o", tmp_path / "a.png", "--order", order)
-    message = f"--order: expected 1 .. 60, as {clip} has 60 frames, got {order}\n"
     assert message in fails(2, "decode", *sized(clip), *words)
 
 
@@ -462,14 +403,87 @@ def test_where_nothing_can_be_written(clip, tmp_path, fails):
         assert message in err
 
 
-@pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt(), 130), (MemoryError("no room"), 1)])
-def test_stopped(clip, monkeypatch, capsys, error, status):
-    def stop(*_, **__):
-        raise error
+# --- what is assumed, and said ----------------------------------------------------------------------------------------
 
-    monkeypatch.setattr(recording, "iter_spikes", stop)
-    assert main(["info", *map(str, sized(clip))]) == status
-    assert capsys.readouterr() == ("", "spikekit: no room\n" if status == 1 else "spikekit: interrupted\n")
+
+def test_the_decoder_follows_what_is_asked_for(clip, tmp_path, capsys):
+    for words, method in (((), "tfi"), (("--window", "5"), "tfp"), (("--order", "3"), "tfp")):
+        assert main(["decode", *map(str, sized(clip)), *words, "-o", str(tmp_path / "a.png")]) == 0
+        assert f" by {method} from" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("size", "words", "noted"),
+    [
+        ((250, 400), [], "vidar"),
+        ((250, 400), ["--flip"], None),
+        ((1000, 1000), [], "m1k40"),
+        ((250, 250), [], None),  # UHSR's are upright
+        ((12, 20), [], None),
+    ],
+)
+def test_frames_that_are_likely_upside_down_are_noted(tmp_path, capsys, size, words, noted):
+    write_spikes(tmp_path / "a.dat", torch.ones(3, *size))
+    assert main(["decode", *map(str, sized(tmp_path / "a.dat", *size)), *words, "-o", str(tmp_path / "a.png")]) == 0
+    said = capsys.readouterr().err
+    assert said.count("\n") == (noted is not None)
+    assert noted is None or (noted in said and "--flip" in said)
+
+
+@pytest.mark.parametrize("ending", ["npy", "npz"])
+def test_time_that_is_not_first_is_said(tmp_path, capsys, ending):
+    save = np.save if ending == "npy" else np.savez
+    for shape, words, status in (
+        ((250, 400, 90), [], 1),  # the size of a camera
+        ((12, 20, 90), ["--height", "12", "--width", "20"], 1),
+        ((30, 40, 200), [], 0),
+    ):
+        save(tmp_path / f"a.{ending}", np.zeros(shape, bool))
+        assert main(["info", str(tmp_path / f"a.{ending}"), *words]) == status
+        assert "(H, W, T)" in capsys.readouterr().err
+
+
+def test_pictures_of_16_bits_and_of_some_quality(clip, tmp_path, fails, capsys):
+    for name, words in (("a.png", ["--bits", "16"]), ("a.tif", ["--bits", "16"]), ("a.jpg", ["--quality", "90"])):
+        assert main(["decode", *map(str, sized(clip)), *words, "-o", str(tmp_path / name)]) == 0
+    shown = read_picture(tmp_path / "a.png")
+    assert shown.equal(read_picture(tmp_path / "a.tif"))
+    assert (shown * 255 - (shown * 255).round()).abs().max() > 0.1
+    capsys.readouterr()
+    assert "bits" in fails(1, "decode", *sized(clip), "--bits", "16", "-o", tmp_path / "b.jpg")
+
+
+def test_home_is_known_where_no_shell_says_it(clip, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert main(["decode", *map(str, sized(Path("~") / clip.name)), "-o", "~/a.png"]) == 0
+    assert (tmp_path / "a.png").exists()
+
+
+def test_names_do_nothing_to_a_terminal_and_need_no_encoding(clip, tmp_path):
+    name = tmp_path / "r\x1b[31med ä.dat"
+    name.write_bytes(clip.read_bytes())
+    done = run("info", *sized(name), cwd=tmp_path, env=os.environ | {"PYTHONIOENCODING": "ascii"})
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "\x1b" not in done.stdout
+    assert done.stdout.isascii()
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_what_is_whole_stays_when_it_is_stopped(tmp_path, number, status):
+    with open(tmp_path / "a.dat", "wb") as file:
+        file.truncate(1000 * 1008 // 8 * 20_000)  # minutes of work, and no room on the disk
+    words = ["decode", *map(str, sized(tmp_path / "a.dat", 1000, 1008)), "--frame", ":", "--alpha", "1"]
+    started = [*COMMAND, *words, "--window", "1", "-o", str(tmp_path / "out" / "{frame}.png")]
+    with subprocess.Popen(started, stderr=subprocess.PIPE, text=True) as process:
+        while not (tmp_path / "out" / "00002.png").exists():
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.send_signal(number)
+        said = process.communicate(timeout=60)[1]
+    assert (process.returncode, said.count("\n")) == (status, 1)
+    for picture in (tmp_path / "out").iterdir():
+        assert picture.suffix == ".png"
+        assert read_picture(picture).shape == (3, 1000, 1008)
 
 
 # --- as a process -----------------------------------------------------------------------------------------------------

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import os
-import re
 import subprocess
 import sys
 import time
@@ -19,7 +18,7 @@ from spikekit.cli.command import main
 from spikekit.io.sidecar import find_sidecar, published, read_sidecar
 from spikekit.scenes.adaptive_sampling import Plan
 from spikekit.scenes.frame_sequence import FrameSequence
-from spikekit.scenes.simulation import Settings, Source, build
+from spikekit.scenes.simulation import Settings, Source
 from spikekit.sensor.noise import DEAD, HOT
 
 # Forks processes of the command, so many at once, and kills them where seconds are given. What is started anew takes
@@ -268,15 +267,6 @@ def test_what_is_no_interpolation_is_refused(film, fails):
         next(iter(FrameSequence(frames(2), scale=2, interpolation=0, plan=Plan(3)).spikes(0, 20)))
 
 
-def test_the_defaults_are_those_of_the_film():
-    film = FrameSequence(frames(1), scale=2)
-    settings = Settings(scale=2)
-    for name in ("pattern", "alpha", "clocks", "step"):
-        assert getattr(settings, name) == getattr(film, name)
-    assert settings.tolerance == film.spike_tolerance
-    assert isinstance(build(settings.interpolation), type(film.interpolation))
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -504,14 +494,6 @@ def test_a_full_disk(film, fails, capsys, full_disk, room, words, name):
     assert not list(Path().glob(".*"))
 
 
-def test_no_permission(film, fails, monkeypatch):
-    def refuse(*_):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr("spikekit.io.sidecar.tempfile.mkdtemp", refuse)
-    assert fails(1, film, "-o", "a.dat", *QUICK) == "spikekit: a.dat: cannot be written (Permission denied)\n"
-
-
 def test_nothing_of_others_is_replaced(film, fails, capsys):
     assert "its ground truth, film/f0.png, would replace the source" in fails(
         1, film, "-o", "film.dat", "--all", *QUICK
@@ -524,6 +506,11 @@ def test_nothing_of_others_is_replaced(film, fails, capsys):
     assert "a.npz: its side-car, a.json, would replace that of a.dat" in fails(1, film, "-o", "a.npz", *QUICK)
     Path("c.dat").mkdir()
     assert "c.dat: expected a stream to write, got a folder" in fails(1, film, "-o", "c.dat", *QUICK)
+    write_picture("d.png", torch.zeros(3, 4, 4))
+    assert "d.png: would be lost" in fails(1, film, "-o", "d.dat", *QUICK)
+    Path("elsewhere").mkdir()
+    Path("e").symlink_to("elsewhere")
+    assert "e: expected a folder of its own" in fails(1, film, "-o", "e.dat", "--all", *QUICK)
 
 
 # --- awkward input ----------------------------------------------------------------------------------------------------
@@ -579,10 +566,6 @@ def test_mistakes(film, fails, words, status, said):
     assert said in fails(status, *words, "-o", "a.dat")
 
 
-def test_another_ending(film, fails):
-    assert "expected a stream that ends in .dat, .npy, .npz, got a.png" in fails(2, film, "-o", "a.png", "--scale", 2)
-
-
 def calibrated(path, width=18, gain=0.5):
     """A sensor whose left half sees half of the light, with a dead pixel and a hot one."""
     gains, defects = torch.ones(16, width), torch.zeros(16, width, dtype=torch.uint8)
@@ -617,17 +600,6 @@ def test_the_pixels_of_a_sensor_that_was_measured(film, capsys, fails):
     calibrated("cameras/one.safetensors", width=20)
     said = "one.safetensors: expected 16 x 18 pixels as the film gives them, got 16 x 20"
     assert said in fails(1, *words, *sensor, "-o", "a.dat")
-
-
-def test_progress_on_a_terminal(film, monkeypatch, capsys):
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    monkeypatch.setattr("spikekit.progress.AFTER", 0)
-    simulate(film, "-o", "a.dat", "--all", *QUICK)
-    err = capsys.readouterr().err
-    assert re.search(r"frames read: .* 0/5 ", err)
-    assert re.search(r"frames of a.dat: .* 0/81 ", err)
-    assert err.endswith("\r")
-    assert not err.split("\r")[-2].strip()  # the bar is taken away
 
 
 @pytest.mark.parametrize(("frames", "clocks"), [(41, 20), (40, 19), (1, 3), (2, 1), (39, 19), (40, 40)])

@@ -336,21 +336,3 @@ def test_a_stream_that_lost_its_end(still, capsys):
     Path("a.dat").write_bytes(Path("a.dat").read_bytes()[:-192])
     assert main(["view", "a.dat", "-o", "out.png"]) == 1
     assert "a.dat: expected 41 frames as its side-car says, got 40" in capsys.readouterr().err
-
-
-def test_another_ending(still, capsys):
-    assert main(["view", "a.dat", "-o", "a.dat"]) == 2
-    assert "expected a file that ends in .png, .gif or .html, got a.dat" in capsys.readouterr().err
-
-
-def test_no_room(still, capsys, monkeypatch):
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    Path("a.html").write_text("before")
-    capsys.readouterr()
-    monkeypatch.setattr("os.fsync", full)
-    assert main(["view", "a.dat", "-o", "a.html"]) == 1
-    assert capsys.readouterr().err == "spikekit: a.html: cannot be written (No space left on device)\n"
-    assert Path("a.html").read_text() == "before"
-    assert not list(Path().glob(".*"))

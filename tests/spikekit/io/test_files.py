@@ -1,6 +1,5 @@
 """Recordings: bits, rows, flips, parts of files, and every way in which a file can be wrong."""
 
-import sys
 import tracemalloc
 import zipfile
 from pathlib import Path
@@ -11,7 +10,6 @@ import torch
 
 from spikekit import SpikeFileError, iter_spikes, read_spikes, spikes_shape, write_spikes
 from spikekit.decoders.packing import pack_spikes
-from spikekit.io import files
 
 SPIKES = Path(__file__).parents[3].parent / "shared" / "data" / "spikes"
 REDS = SPIKES / "reds_sim_mono_203_250x400.dat"
@@ -109,7 +107,7 @@ def test_written_with_the_sign_still_to_be_turned(tmp_path):
 # --- parts of recordings ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["a.dat", "a.npz"])
+@pytest.mark.parametrize("name", ["a.dat", "a.npy", "a.npz"])
 @pytest.mark.parametrize("flip", [False, True])
 def test_parts_equal_the_whole(tmp_path, name, flip):
     spikes = random_spikes(11, 3, 5)
@@ -139,7 +137,7 @@ def test_reads_only_what_is_asked_for(tmp_path):
     assert peak < 8 * 100_000
 
 
-@pytest.mark.parametrize("name", ["a.dat", "a.npz"])
+@pytest.mark.parametrize("name", ["a.dat", "a.npy", "a.npz"])
 def test_frame_by_frame_in_bounded_memory(tmp_path, name):
     write_spikes(tmp_path / name, torch.ones(200, 100, 400, dtype=torch.uint8))
     tracemalloc.start()
@@ -150,7 +148,7 @@ def test_frame_by_frame_in_bounded_memory(tmp_path, name):
     assert peak < 25 * 40_000
 
 
-@pytest.mark.parametrize("name", ["a.dat", "a.npz"])
+@pytest.mark.parametrize("name", ["a.dat", "a.npy", "a.npz"])
 @pytest.mark.parametrize("width", [5, 8, 16])
 @pytest.mark.parametrize("flip", [False, True])
 @pytest.mark.parametrize("packed", [False, True])
@@ -173,7 +171,7 @@ def test_chunks_equal_the_whole(tmp_path, name, width, flip, packed):
         tensor.zero_()  # its own memory, and writable
 
 
-@pytest.mark.parametrize("name", ["a.dat", "a.npz"])
+@pytest.mark.parametrize("name", ["a.dat", "a.npy", "a.npz"])
 @pytest.mark.parametrize("cuts", [[11], [1] * 11, [4, 4, 3], [10, 1]])
 @pytest.mark.parametrize("flip", [False, True])
 def test_written_in_chunks(tmp_path, name, cuts, flip):
@@ -201,18 +199,7 @@ def test_from_one_format_to_the_other(tmp_path):
         assert np.array_equal(arrays["spk"], spikes.numpy())
 
 
-@pytest.mark.parametrize("name", ["a.dat", "a.npz"])
-def test_large_tensors_are_written_block_by_block(tmp_path, name, monkeypatch):
-    monkeypatch.setattr(files, "_BLOCK", 100)
-    spikes = random_spikes(40, 5, 7).float()
-    write_spikes(tmp_path / name, spikes)
-    assert read_spikes(tmp_path / name, 5, 7).equal(spikes.byte())
-    spikes[33, 2, 2] = 3
-    with pytest.raises(ValueError, match=r"values from 0\.0 to 3\.0 in frame 33"):
-        write_spikes(tmp_path / name, spikes)
-
-
-@pytest.mark.parametrize("name", ["a.dat", "a.npz"])
+@pytest.mark.parametrize("name", ["a.dat", "a.npy", "a.npz"])
 def test_chunks_in_bounded_memory(tmp_path, name):
     """8 MB go through in chunks of 400 kB, written and read."""
     tracemalloc.start()
@@ -287,6 +274,26 @@ def test_damaged_npz(tmp_path):
         assert "\n" not in str(caught.value)
 
 
+def test_a_header_of_blanks_takes_no_memory(tmp_path):
+    """A million bytes that could claim billions."""
+    bomb = b"\x93NUMPY\x02\x00" + (1 << 28).to_bytes(4, "little")
+    with (
+        zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("spk.npy", "w") as file,
+    ):
+        file.write(bomb)
+        for _ in range(1 << 8):
+            file.write(b" " * (1 << 20))
+    (tmp_path / "a.npy").write_bytes(bomb + b" " * 100_000)
+    tracemalloc.start()
+    for name in ("a.npz", "a.npy"):
+        with pytest.raises(SpikeFileError, match="header"):
+            spikes_shape(tmp_path / name)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1 << 20
+
+
 def test_npz_shorter_than_its_header_says(tmp_path):
     path = tmp_path / "a.npz"
     np.savez(path, spk=np.zeros((50, 20, 30), np.uint8))
@@ -299,10 +306,6 @@ def test_npz_shorter_than_its_header_says(tmp_path):
 
 
 # --- files that cannot be used ----------------------------------------------------------------------------------------
-
-
-def test_one_exception_for_all():
-    assert issubclass(SpikeFileError, ValueError)
 
 
 @pytest.mark.parametrize("read", [read_spikes, iter_spikes, spikes_shape])
@@ -410,7 +413,7 @@ def test_frames_that_are_not_there(clip, read, part, message):
 # --- writing that fails -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["a.dat", "a.npz"])
+@pytest.mark.parametrize("name", ["a.dat", "a.npy", "a.npz"])
 @pytest.mark.parametrize(
     ("spikes", "error", "message"),
     [
@@ -432,7 +435,7 @@ def test_what_cannot_be_written(tmp_path, name, spikes, error, message):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["a.dat", "a.npz"])
+@pytest.mark.parametrize("name", ["a.dat", "a.npy", "a.npz"])
 def test_failed_write_keeps_the_old_file(tmp_path, name):
     spikes = random_spikes(3, 4, 5)
     write_spikes(tmp_path / name, spikes)
@@ -442,7 +445,7 @@ def test_failed_write_keeps_the_old_file(tmp_path, name):
     assert read_spikes(tmp_path / name, 4, 5).equal(spikes)
 
 
-@pytest.mark.parametrize("name", ["a.dat", "a.npz"])
+@pytest.mark.parametrize("name", ["a.dat", "a.npy", "a.npz"])
 @pytest.mark.parametrize(
     ("chunks", "error", "message"),
     [
@@ -461,7 +464,7 @@ def test_chunks_that_cannot_be_written(tmp_path, name, chunks, error, message):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["a.dat", "a.npz"])
+@pytest.mark.parametrize("name", ["a.dat", "a.npy", "a.npz"])
 def test_chunks_that_fail_leave_the_old_file(tmp_path, name):
     """What the chunks raise comes out as it is."""
     spikes = random_spikes(3, 4, 5)
@@ -475,16 +478,6 @@ def test_chunks_that_fail_leave_the_old_file(tmp_path, name):
         write_spikes(tmp_path / name, chunks())
     assert [file.name for file in tmp_path.iterdir()] == [name]
     assert read_spikes(tmp_path / name, 4, 5).equal(spikes)
-
-
-@pytest.mark.parametrize("name", ["a.dat", "a.npz"])
-@pytest.mark.skipif(sys.platform == "win32", reason="no limits on file sizes")
-def test_full_disk(tmp_path, name, full_disk):
-    """A file that may not grow, like a full disk, is one line, and nothing is left behind."""
-    with full_disk(50_000), pytest.raises(SpikeFileError) as error:
-        write_spikes(tmp_path / name, (torch.rand(10, 100, 100) < 0.5 for _ in range(20)))
-    assert str(error.value) == f"{tmp_path / name}: cannot be written (File too large)"
-    assert not list(tmp_path.iterdir())
 
 
 def test_where_nothing_can_be_written(tmp_path):

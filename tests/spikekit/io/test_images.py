@@ -20,13 +20,6 @@ def test_round_trip(tmp_path):
     assert np.array_equal(io.imread(path), (rgb * 255).round().byte().permute(1, 2, 0).numpy())
 
 
-def test_png_is_compressed_fast(tmp_path):
-    write_picture(tmp_path / "a.png", torch.rand(3, 40, 50))
-    data = (tmp_path / "a.png").read_bytes()
-    stream = data[data.index(b"IDAT") + 4 :]
-    assert stream[1] >> 6 == 1  # what zlib says of its levels 2 to 5; the usual 6 is 2
-
-
 def test_written_values(tmp_path):
     values = torch.tensor([[-1.0, 0.0, 0.4 / 255, 0.6 / 255, 1.0, 2.0, float("nan")]])
     for dtype in (torch.float64, torch.float32, torch.bfloat16):
