@@ -1,0 +1,29 @@
+#!/bin/sh
+# What a GPU should train next, in order: sh benchmarks/train_queue.sh PICTURES OUTPUT [MINUTES [ARGUMENT ...]]
+# MINUTES for each of the large ones, half as long for the small. A run that was cut short goes on where it stopped when
+# the same is typed again (its time, too); what is ready is OUTPUT/NAME/weights.safetensors.
+set -e
+pictures=$1 output=$2 minutes=${3:-4}
+[ -d "$pictures" ] && [ -n "$output" ] || { sed -n 2,4p "$0"; exit 2; }
+shift $(( $# < 3 ? $# : 3 ))
+
+# NAME SECONDS CONFIGURATION ...
+train() {
+    name=$1 seconds=$2
+    shift 2
+    last=$output/$name/checkpoints/last.ckpt
+    [ ! -f "$last" ] || set -- "$@" --ckpt_path "$last"
+    lightning fit "$@" -o "$output/$name" --data.root "$pictures" \
+        --trainer.max_time "00:$(( seconds / 3600 )):$(( seconds / 60 % 60 )):$(( seconds % 60 ))"
+}
+
+seconds=$(( minutes * 60 ))
+configs=$(dirname "$0")/../configs
+train grey_large_x1 $seconds -c "$configs/x1.yaml" -c "$configs/size/large_film.yaml" -c "$configs/grey.yaml" \
+    -c "$configs/cameras.yaml" -c "$configs/gpu.yaml" "$@"
+train grey_small_x1 $(( seconds / 2 )) -c "$configs/x1.yaml" -c "$configs/size/small.yaml" -c "$configs/grey.yaml" \
+    -c "$configs/cameras.yaml" -c "$configs/gpu.yaml" "$@"
+train large_x4 $seconds -c "$configs/x4.yaml" -c "$configs/size/huge_film.yaml" -c "$configs/cameras.yaml" \
+    -c "$configs/gpu.yaml" "$@"
+train small_x4 $(( seconds / 2 )) -c "$configs/x4.yaml" -c "$configs/size/small.yaml" -c "$configs/cameras.yaml" \
+    -c "$configs/gpu.yaml" "$@"
