@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from lightning_modules.inference.tiles import call
 from lightning_modules.networks import NETWORKS, ClassicalDecoder, Network, RecurrentCSCSR
 from lightning_modules.storage.pretrained import read_weights
 from spikekit.io.whole_file import whole_file
@@ -38,7 +39,7 @@ class _Still(nn.Module):
         self.network = network
 
     def forward(self, spikes: Tensor) -> Tensor:
-        return self.network(spikes, static=True)
+        return call(self.network, spikes, static=True)
 
 
 class _Moving(_Still):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
+from inspect import signature
 from typing import Any, NamedTuple
 
 import torch
@@ -55,7 +56,7 @@ def forward_in_tiles(
         rgb :math:`(B, 3, s H, s W)`.
     """
     if network.halo is None:
-        return network(spikes, flow, static)
+        return call(network, spikes, flow, static)
     whole = Box(0, 0, *spikes.shape[-2:])
     if tolerance and flow is None and not static and network.takes_flow and not network.motion.static:
         flow = _flow_where_it_moves(network, spikes, tolerance, whole)
@@ -67,9 +68,22 @@ def forward_in_tiles(
         if tolerance and part is not None and not part.any():
             part = None
         seen = outer.of(spikes)
-        return network(seen, static=True) if part is None else run_replayed(network.__call__, seen, part)
+        return call(network, seen, static=True) if part is None else run_replayed(network.__call__, seen, part)
 
     return tiled(run, whole, tile, lambda box: reach(flow, box, whole, network.halo), network.scale, done)
+
+
+def call(network: Network, spikes: Tensor, flow: Tensor | None = None, static: bool = False) -> Tensor:
+    """Run a network; one of users' own may take spikes and a flow alone, or spikes alone."""
+    takes = signature(network.forward).parameters
+    if "static" in takes:
+        return network(spikes, flow, static)
+    if "flow" not in takes:
+        return network(spikes)
+    resolved = network.resolve_flow(spikes, flow, static)
+    if resolved is None:
+        resolved = spikes.new_zeros(len(spikes), 2, 2, *spikes.shape[-2:], dtype=torch.float32)
+    return network(spikes, resolved)
 
 
 def tiled(

@@ -102,7 +102,7 @@ def test_a_picture_for_several_frames_is_refused(words, tmp_path, capsys):
 def test_a_picture_of_nan_is_no_picture(words, tmp_path, monkeypatch):
     """Weights may be finite and too large; a black picture would say nothing of it."""
     nan = torch.full((1, 3, 24, 32), float("nan"))
-    monkeypatch.setattr(ClassicalDecoder, "forward", lambda *_: nan)
+    monkeypatch.setattr(ClassicalDecoder, "forward", lambda *_, static=False: nan)
     assert "frame_000020.png: expected a picture, the network makes NaN" in refused([*words, str(tmp_path / "out")])
     assert not pictures(tmp_path / "out")
 
@@ -304,7 +304,7 @@ class Mean(Network):
         super().__init__(settings, (0, frames // 2, frames - 1), motion)
         self.weight = torch.nn.Parameter(torch.ones(()))
 
-    def forward(self, spikes, flow=None, static=False):
+    def forward(self, spikes, flow):
         seen = self.weight * spikes.float().mean(dim=1, keepdim=True).expand(-1, 3, -1, -1)
         return seen.repeat_interleave(self.scale, -1).repeat_interleave(self.scale, -2)
 
@@ -329,6 +329,11 @@ def test_a_network_and_an_estimator_of_the_present_folder_make_pictures(words, t
     write_weights(Weights(tmp_path, settings_of(my_network.Mean()), {}, {"weight": torch.tensor(0.5)}), "w.safetensors")
     main([*words, "--weights", "w.safetensors"])
     assert len(pictures(tmp_path / "out")) == 1
+    main(["export", "w.safetensors", "-c", "own.yaml", "-o", "copy.safetensors"])
+    main(["export", "w.safetensors", "-c", "own.yaml", "--format", "torch", "-o", "copy.pt2"])
+    main([*words[:-1], "again", "--weights", "copy.safetensors"])
+    assert pictures(tmp_path / "again") == pictures(tmp_path / "out")
+    refused(["export", "w.safetensors", "--format", "torch", "-o", "alone.pt2"])
 
 
 def test_a_network_that_carries_on_is_resumed_where_it_was_stopped(words, tmp_path):
