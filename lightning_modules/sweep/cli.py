@@ -19,7 +19,7 @@ from lightning_modules.sweep.state import COSTS, PROGRESS, RESULT
 from lightning_modules.sweep.table import collect, markdown, write_csv
 from lightning_modules.sweep.trials import Trial, make_trials
 from lightning_modules.sweep.view import View
-from spikekit.arguments import positive, whole
+from spikekit.arguments import one_line, positive, whole
 from spikekit.io.whole_file import whole_file
 
 _ENGINES = {"local": run_locally, "ray": run_on_ray}
@@ -170,7 +170,7 @@ def _run(trials: Sequence[Trial], asked: argparse.Namespace) -> dict[Path, str]:
                 if reason is None and not (folder / RESULT).is_file():
                     reason = "it ended without a result"
                 if reason is not None:
-                    failed[folder] = reason
+                    failed[folder] = one_line(ValueError(reason))  # the last line of a log
                 view.ended(by_folder[folder])
                 _write_tables(trials, failed, asked)
             view.draw()

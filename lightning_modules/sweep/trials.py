@@ -8,6 +8,7 @@ import re
 from argparse import ArgumentError
 from collections.abc import Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ from lightning_modules.sweep.budget import with_budget
 from lightning_modules.sweep.state import read_json, read_yaml, write_json
 from spikekit.io.whole_file import whole_file
 from spikekit.progress import progress
+
+_LONGEST = 180  # bytes of a folder's name
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,7 @@ def make_trials(
         config = _resolve(args, f"{'-'.join(labels)}: ") if combination else base
         for seed in seeds or [None]:
             name = "-".join(labels) + ("" if seed is None else f"-seed{seed}")
-            folder = output / re.sub(r"[^\w.=+-]+", "_", name)
+            folder = output / _folder_name(name)
             own = {} if seed is None else {"seed_everything": seed}
             resolved = with_budget({**config, **own, "output": str(folder)}, budget)
             trials.append(Trial(labels, seed, folder, resolved, budget, letter))
@@ -119,6 +122,14 @@ def make_trials(
         raise UsageError(f"two trials are called {twice.name}: give overlays and values names that differ")
     _check_differences(trials)
     return trials
+
+
+def _folder_name(name: str) -> str:
+    """A name that a file system takes, which has room for 255 bytes."""
+    name = re.sub(r"[^\w.=+-]+", "_", name)
+    if len(name.encode()) > _LONGEST:
+        name = f"{name.encode()[:_LONGEST].decode(errors='ignore')}-{sha256(name.encode()).hexdigest()[:12]}"
+    return name
 
 
 def _check_differences(trials: Sequence[Trial]) -> None:

@@ -5,18 +5,14 @@ import importlib
 import shutil
 import types
 import warnings
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from skimage import io
 
-from lightning_modules.data import sequences
 from lightning_modules.data.layouts import find_sequences
-from lightning_modules.data.loading import load_clips
 from lightning_modules.data.sequences import ClipRecipe, FilmScenes
-from lightning_modules.data.stills import StillScenes
 from spikekit import bin_to_sensor, read_picture
 from spikekit.flow.interpolate import FlowInterpolation
 from spikekit.sensor.noise import SensorNoise
@@ -211,23 +207,6 @@ def test_same_clips_whatever_the_workers(tmp_path, reds):
     assert len(list((tmp_path / "cache").glob("*/*.clip"))) == 6
 
 
-def test_spawned_workers_make_the_same_clips(tmp_path, write_film):
-    """Of films, and of still pictures in motion: a worker that is started anew takes seconds to import torch."""
-    write_film(tmp_path / "film", 4)
-    still = {"patch": 8, "val_patch": 8, "train_clips": 2, "val_clips": 1, "batch_size": 2, "workers": 0}
-
-    def clips():
-        stills = StillScenes(**still)
-        stills.setup("fit")
-        return torch.utils.data.ConcatDataset([scenes(tmp_path).test_set, stills.train_set])
-
-    loader = load_clips(clips(), 1, 1, multiprocessing_context="spawn")
-    assert loader.num_workers == 1
-    found, expected = list(loader), list(load_clips(clips(), 1, 0))
-    assert len(found) > 2
-    assert all(equal(*pair) for pair in zip(found, expected, strict=True))
-
-
 def test_training_goes_on_where_it_stands(tmp_path, reds):
     reds(tmp_path)
     data = scenes(tmp_path, "fit", clips=2)
@@ -300,23 +279,6 @@ def test_another_setting_is_another_clip(film, tmp_path, simulated, changed):
     assert simulated.clips == 2
     scenes(film, cache=cache, clips=1).test_set[0]
     assert simulated.clips == 2
-
-
-def test_a_recipe_takes_a_scale_of_numpy():
-    scale = ClipRecipe(scale=np.uint8(2)).scale
-    assert scale == 2
-    assert type(scale) is int
-
-
-def test_keys_tell_versions_and_kinds_of_films_apart(film, tmp_path, monkeypatch):
-    (one,) = find_sequences(film, lambda found: (found, found)).test
-    recipe = ClipRecipe()
-    keys = {recipe.key(kind, 2) for kind in (one, replace(one, shrink=4), replace(one, truth=one.folder))}
-    keys.add(ClipRecipe(interpolation=First()).key(one, 2))
-    assert recipe.key(replace(one, name="other"), 2) in keys
-    monkeypatch.setattr(sequences, "SIMULATOR_VERSION", sequences.SIMULATOR_VERSION + 1)
-    keys.add(recipe.key(one, 2))
-    assert len(keys) == 5
 
 
 def test_an_interpolation_of_ones_own_that_changes_makes_another_clip(film, tmp_path, monkeypatch):

@@ -29,10 +29,6 @@ def test_singular_values_become_about_one_and_directions_stay(shape, size):
     assert 0.6 < inside.diag().min() <= inside.diag().max() < 1.3
 
 
-def test_nothing_stays_nothing():
-    assert orthogonalized(torch.zeros(4, 6)).eq(0).all()
-
-
 def test_on_matrices_it_is_the_muon_of_torch():
     torch.manual_seed(0)
     start, gradients = torch.randn(8, 20), torch.randn(4, 8, 20)
@@ -80,13 +76,6 @@ def test_biases_and_layers_of_three_channels_are_left_to_adam(shape):
     reference = torch.optim.Adam([theirs], lr=1e-2, betas=(0.9, 0.99))
     expected = _steps(reference, theirs, gradients)
     assert torch.allclose(_steps(MuonWithAdam([ours], lr=1e-2), ours, gradients), expected, atol=1e-6)
-
-
-def test_a_step_is_as_large_as_one_of_adam():
-    torch.manual_seed(0)
-    weight = nn.Parameter(torch.zeros(64, 32, 3, 3))
-    change = _steps(MuonWithAdam([weight], lr=1.0), weight, torch.randn(1, 64, 32, 3, 3))
-    assert 0.1 < change.square().mean().sqrt() < 0.3  # match_rms_adamw: 0.2
 
 
 def test_it_goes_on_where_it_stopped():

@@ -11,11 +11,9 @@ from lightning_modules.__main__ import main
 from lightning_modules.metrics.flow import end_point_error, outliers
 from lightning_modules.motion import MotionEstimator, Spike2Flow, ZeroFlow
 from lightning_modules.networks import CSCSR
-from lightning_modules.tasks.flow_callbacks import flow_row
 from lightning_modules.tasks.optical_flow import FlowTraining
 from lightning_modules.tasks.super_resolution import SuperResolution
 from spikekit import read_picture, split_bayer
-from spikekit.io import flow_to_rgb
 
 TINY = """
 model:
@@ -240,12 +238,3 @@ def test_errors_are_one_line(configs, tmp_path):
             main(["fit", "-c", str(configs / "flow.yaml"), *args, "-o", str(tmp_path / "run")])
         assert message in str(exit.value)
         assert "\n" not in str(exit.value)
-
-
-def test_flows_are_shown_on_the_scale_of_the_longest_true_one():
-    truth = torch.zeros(2, 4, 4)
-    truth[:, 1, 2], truth[0, 3, 2] = torch.tensor([3.0, 4.0]), 4.5
-    shown = flow_row([truth / 2, 2 * truth], truth)
-    for picture, flow in zip(shown, (truth / 2, 2 * truth, truth), strict=True):
-        assert picture.equal(flow_to_rgb(flow, 5.0))
-    assert flow_row([], truth / 50)[0].equal(flow_to_rgb(truth / 50, 1.0))  # what rests is pale
