@@ -131,9 +131,9 @@ def test_every_combination_has_a_name_and_a_configuration(overlays, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_size_e_is_not_the_variant_e(overlays, tmp_path):
-    """Both are called e."""
-    sizes, variants = ([CONFIGS / folder / "e.yaml"] for folder in ("size", "ablation"))
+def test_an_overlay_called_e_is_not_the_variant_e(tmp_path):
+    (tmp_path / "e.yaml").write_text("model: {network: {init_args: {width: 6}}}")
+    sizes, variants = [tmp_path / "e.yaml"], [CONFIGS / "ablation" / "e.yaml"]
     for over, letter in ([sizes], ""), ([variants], "E"), ([sizes, [CONFIGS / "ablation/a.yaml"]], "A"):
         [trial] = make_trials([CONFIGS / "x4.yaml"], over, [], [], {"steps": 5}, tmp_path)
         assert trial.letter == letter
