@@ -1,4 +1,4 @@
-"""Standard output that nobody reads, or that finds no room."""
+"""Standard output that is closed, or on a full disk."""
 
 from __future__ import annotations
 

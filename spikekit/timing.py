@@ -1,4 +1,4 @@
-"""Timing: several functions in turn in one process, with their memory, and what it all ran on."""
+"""Timing: several functions in turn in one process, with their memory, and the machine and software."""
 
 from __future__ import annotations
 

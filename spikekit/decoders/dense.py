@@ -289,7 +289,7 @@ def tfp(
         that exist, so a window longer than the clip is legal. Linear in the spikes, and differentiable as such; sums
         run in float32 or wider.
 
-        An integrate-and-fire pixel is a delta-sigma modulator of first order: what it rounds away now it adds later.
+        An integrate-and-fire pixel is a delta-sigma modulator of first order: a rounding error now is added later.
         A plain mean makes no use of that. Means of means do: three of 13 frames see 37 and leave far less noise than
         one of 41, and less motion blur, since the frames far from n count for little.
 

@@ -89,7 +89,7 @@ class _Blend(Between):
 
 
 class Still:
-    """The nearer of the two frames, the second at half way: what a film shows.
+    """The nearer of the two frames, the second at half way, as a projector shows them.
 
     Example:
         >>> between = Still()(torch.zeros(3, 4, 4), torch.ones(3, 4, 4))
@@ -132,7 +132,7 @@ class FlowInterpolation:
         Flow is estimated once a pair, on luma, by two estimators of scikit-image whose weaknesses differ (TV-L1 and
         iterative Lucas-Kanade); of both, each pixel keeps the one under which its surroundings match better. For every
         time, each frame's flow is splatted to where its pixels are then; among pixels that meet, those that match
-        across the frames prevail, so that what is in front covers what is behind. The three candidates that a pixel
+        across the frames prevail, so that the foreground covers the background. The three candidates that a pixel
         gets, from both frames and from either one, are told apart by how well the frames match around it. What comes
         from outside of one frame is taken from the other alone. Frames are compared at the same mean brightness and
         sampled bicubically, and the result is kept in the range of the two frames.

@@ -50,8 +50,8 @@ class Plan:
         latent: frames that are synthesised in the interval, evenly spaced; with none, its two ends are blended.
         region: the part of the sensor they are synthesised for, the ends being blended in the rest; first row and
             column even; ``None`` for all of it.
-        noise: what the sensor adds, ``None`` for nothing.
-        because: what the decisions rest on, one line each, for whoever prints the plan.
+        noise: noise of the sensor, ``None`` for none.
+        because: reasons of the decisions, one line each, to be printed.
 
     Raises:
         ValueError: a negative number of frames, a region that begins at an odd pixel or has none.
@@ -232,8 +232,8 @@ def profile_interval(
         The estimate: light I that moves by a step of :math:`\delta` pixels bends by :math:`\delta^2 I''` on the way,
         and a straight line between the ends is off by :math:`\delta^2 |I''| / 12` on average. Over the T clocks of an
         interval this adds up in the charge, as long as the sign of :math:`I''` stays: for about one pixel of way. A
-        charge that is off by E moves a spike with probability E, and a spike that moves changes two bits. Four times
-        as much stands for what the sensor's pixels do not show of the detail.
+        charge that is off by E moves a spike with probability E, and a spike that moves changes two bits. The estimate
+        is multiplied by four for detail that is finer than the sensor's pixels.
 
     Args:
         first: ``rgb`` (3, H, W), H and W multiples of ``2 * scale``.

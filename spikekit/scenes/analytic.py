@@ -177,7 +177,7 @@ class Scene:
         see :func:`spikekit.bin_to_sensor`; the
         sensor pixel (x, y) is centred at (s x + (s - 1) / 2, s y + (s - 1) / 2) of the view.
 
-        Layers of a batch make a batch of scenes, all of one size: what comes out has a leading dimension more. It is
+        Layers of a batch make a batch of scenes, all of one size: results have a leading dimension more. It is
         computed where the pictures are, and on a GPU waits for nothing.
 
     Args:

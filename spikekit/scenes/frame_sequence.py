@@ -52,7 +52,7 @@ class FrameSequence:
         alpha: light of a white pixel per clock, in thresholds.
         clocks: clocks from one frame to the next.
         interpolation: what makes latent frames; :class:`spikekit.FlowInterpolation` by default.
-        plan: what is modelled, in every interval; ``Plan.everything(clocks)`` for all there is.
+        plan: what is modelled, the same in every interval; ``Plan.everything(clocks)`` for the most.
         spike_tolerance: share of the spikes that may change by not modelling more, see :meth:`SceneProfile.plan`.
         step: displacement between latent frames in sensor pixels, likewise.
         motion: what finds motion for the profile, see ``spikekit.scenes.adaptive_sampling.profile_interval``.
@@ -184,7 +184,7 @@ class FrameSequence:
         Args:
             first: the first clock.
             count: how many, a multiple of ``readout``; up to the film's end when not given.
-            noise: what the sensor adds, see :class:`spikekit.SensorNoise`.
+            noise: noise of the sensor, see :class:`spikekit.SensorNoise`.
             readout: clocks for every frame of spikes, see :class:`spikekit.SpikeSensor`.
             seed: random seed: the first charge and all noise.
             chunk: clocks of light that are held.

@@ -86,11 +86,11 @@ class SensorNoise:
         hot: share of pixels that always fire.
         dead: share of pixels that never fire.
         calibration: gain, dark current and defects of a sensor that was measured, a :class:`spikekit.Calibration`,
-            instead of chance; then the spreads and shares above are 0.
+            instead of random ones; then the spreads and shares above are 0.
 
     Raises:
         ValueError: a number out of its range, shares of hot and dead pixels that together exceed 1, a spread of a dark
-            current of 0, a calibration with what it would replace.
+            current of 0, a calibration beside one of the options that it replaces.
 
     Example:
         The constants of Hu et al. for a camera of 250 x 400 pixels at 20 kHz, which are bare numbers, read as fF, V and
@@ -135,7 +135,7 @@ class SensorNoise:
             raise ValueError(f"{drawn[0]}: expected 0, as the calibration has it, got {getattr(self, drawn[0])}")
 
     def scaled(self, share: float) -> SensorNoise:
-        """Return the noise of a better sensor: a share of all that is left to chance.
+        """Return the noise of a better sensor: a share of every random source.
 
         Args:
             share: in (0, 1]; so many times the variance that photons make, the dark current of every pixel, the spread
@@ -256,7 +256,7 @@ def random_numbers(seed: int, purpose: str, clock: int = 0) -> np.random.Generat
 
 
 class NoisyPixels:
-    """The pixels of one sensor: what noise gives them for good, and what it does to them at every clock.
+    """The pixels of one sensor: their fixed pattern, and the noise of every clock.
 
     Args:
         noise: its sources.
@@ -273,7 +273,7 @@ class NoisyPixels:
         self.noise, self.size, self.seed = noise, size, seed
 
     def charge(self, light: Tensor, threshold: float, clock: int) -> Tensor:
-        """Return what the pixels integrate of light (*, T, H, W), whose first frame is that of ``clock``."""
+        """Return the charge that pixels integrate from light (*, T, H, W), whose first frame is that of ``clock``."""
         noise = self.noise
         known = noise.calibration
         if noise.photons is None and known is None and not noise.dark_current and not noise.gain_spread:

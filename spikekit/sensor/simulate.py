@@ -22,14 +22,14 @@ class SpikeSensor:
         The read-out takes the bits every ``readout`` frames of the light. A pixel that reaches its threshold is reset
         at once and keeps a flag, which is read at the end of the period and cleared: one spike at most, however often
         it fired. As the reset subtracts the threshold and light is never negative, that is the same as summing the
-        light of a period and then integrating it, which is what is done. A clock is a read-out: noise is that of a
+        light of a period and then integrating it, and is computed so. A clock is a read-out: noise is that of a
         read-out, not of a frame of light.
 
         The same seed gives the same spikes on every device, as far as the light is the same. With leading dimensions,
         every (H, W) of them is a sensor of its own.
 
     Args:
-        noise: what the sensor adds to the light; nothing when not given.
+        noise: noise of the sensor; none when not given.
         threshold: charge of one spike.
         readout: frames of light for every frame of spikes.
         seed: random seed, 0 or more.
@@ -130,7 +130,7 @@ def simulate_spikes(
     Args:
         light: charge per frame, :math:`(*, T, H, W)`, floating, on the generator's device.
         threshold: :math:`\theta`, charge of one spike.
-        noise: what the sensor adds to the light; nothing when not given.
+        noise: noise of the sensor; none when not given.
         readout: frames of light for every frame of spikes; it divides T.
         charge: charge at the start, broadcastable to :math:`(*, H, W)`, below the threshold; random when not given.
         generator: of random numbers; torch's default one when not given.

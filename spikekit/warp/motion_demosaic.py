@@ -39,9 +39,9 @@ def demosaic_along_motion(
         The picture is that of the middle time j, the mosaic T // 2; times are counted in mosaics. Flow in sensor
         pixels, order (x, y), backward sampling: the pixel x of the picture is found at x + o_t(x) in the mosaic t, as
         :func:`spikekit.linear_motion` gives it. The samples k are those of the colour among the 3 x 3 pixels around
-        that place; what is outside the sensor is not used. E is moved to the time t by the opposite flow, which is
-        right where motion is smooth; what it gets wrong, sigma_range keeps out, as it does occlusions. NaN flow
-        counts as 0. Unlike in :func:`spikekit.demosaic_residual` known values change: other times have their say.
+        that place; pixels outside the sensor are not used. E is moved to the time t by the opposite flow, which is
+        right where motion is smooth; its errors, like occlusions, are kept out by sigma_range. NaN flow counts as 0.
+        Unlike in :func:`spikekit.demosaic_residual` known values change, as other times contribute.
         Differentiable almost everywhere, in mosaics and flow. Computed in float32 or wider.
 
     Args:
