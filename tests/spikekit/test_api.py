@@ -88,10 +88,11 @@ def test_sensor_module_takes_a_charge():
 
 @EVERY
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_dtype_is_kept(op, options, tensors, dtype):
-    narrow = [tensor.to(dtype) for tensor in tensors]
+def test_dtype_and_device_are_kept(op, options, tensors, dtype, device):
+    narrow = [tensor.to(device, dtype) for tensor in tensors]
     result = outputs(op(*narrow, **options))
     assert result[0].dtype == dtype
+    assert result[0].device.type == device.type
     # the right answer for the numbers that came in, rounded once or so
     expected = outputs(op(*[tensor.double() for tensor in narrow], **options))[0]
     eps = max(torch.finfo(dtype).eps, 1e-6)

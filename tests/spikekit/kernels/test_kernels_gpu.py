@@ -435,7 +435,7 @@ def test_nearest_known(which, neighbors, dtype):
 
 @computes
 @pytest.mark.parametrize(("which", "steps"), [("red", 16), ("green", 8), ("green", 6), ("any", 2)])
-def test_rounded_positions_are_those_of_the_table(which, steps):
+def test_rounded_positions_are_those_of_plain_torch(which, steps):
     mask = known_pixels()[which]
     flow = torch.randn(3, 2, *mask.shape) * torch.tensor([0.3, 3.0, 300.0]).reshape(3, 1, 1, 1)
     flow[0, :, 0] = 0.5 / steps  # half to even
