@@ -9,6 +9,7 @@ import runpy
 import shutil
 import subprocess
 import sys
+import textwrap
 import typing
 from pathlib import Path
 
@@ -195,6 +196,35 @@ def test_quickstart_runs():
     failed, tried = doctest.testfile(str(DOCS / "quickstart.rst"), module_relative=False, optionflags=flags)
     assert tried > 10
     assert failed == 0
+
+
+def shown(page, name):
+    """The file that a page shows, and the commands under it."""
+    text = PAGES[DOCS / "howto" / f"{page}.rst"]
+    code, commands = re.search(rf"   # {name}\n((?:   .*\n|\n)+?)\.\. code-block:: sh\n\n((?:   .*\n)+)", text).groups()
+    return textwrap.dedent(code), [line.strip() for line in commands.splitlines()]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("page", "name"), [("training", "mynet.py"), ("motion", "myflow.py")])
+def test_networks_and_estimators_of_ones_own_go_through_the_verbs_as_shown(page, name, tmp_path):
+    code, commands = shown(page, name)
+    (tmp_path / name).write_text(code)
+    sk.write_spikes(tmp_path / "FILE.dat", torch.rand(61, 24, 32) < 0.3)
+    few = "--trainer.max_steps 4 --data.train_clips 8 --data.val_clips 2 --data.workers 0 --data.batch_size 2"
+    for command in commands:
+        arguments = command.split()[1:]
+        if arguments[0] == "predict":
+            arguments = command.replace("250", "24").replace("400", "32").split()[1:]
+        else:
+            arguments += few.split()
+        program = [sys.executable, "-c", "from lightning_modules.__main__ import main; main()", *arguments]
+        environment = {**os.environ, "PYTHONPATH": str(DOCS.parent)}
+        done = subprocess.run(program, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, (command, done.stderr[-2000:])
+    if page == "training":
+        assert (tmp_path / "runs" / "quick" / "test.csv").is_file()
+        assert len(list((tmp_path / "out").glob("*.png"))) == 2
 
 
 #: what the copied conf.py ends with: figures are small
