@@ -267,8 +267,12 @@ def main(arguments: list[str] | None = None) -> None:
             for row in measure(case, asked.rounds, timer):
                 rows.append(row)
                 print(" | ".join(row), flush=True)
+    before = []
+    if asked.operators and asked.output.exists():  # the others' rows stay
+        with asked.output.open(newline="") as file:
+            before = [row for row in list(csv.reader(file))[1:] if row[0] not in asked.operators]
     with asked.output.open("w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([HEADING, *rows])
+        csv.writer(file, lineterminator="\n").writerows([HEADING, *before, *rows])
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -23,6 +23,8 @@ from spikekit.warp.warp import flow_warp
 #: Version of the simulation from frames to spikes. Whoever changes light, spikes or flow, in whatever module,
 #: counts it up: clips that were kept are simulated again, and a test that knows every version's output passes again.
 SIMULATOR_VERSION = 1
+
+T = TypeVar("T")
 
 _KEPT = 2  # frames and intervals that stay in memory: a clip and its flow look at two intervals
 
@@ -303,13 +305,15 @@ class FrameSequence:
     def _view(self, frame: int) -> Tensor:
         if not 0 <= frame < len(self.frames):
             raise ValueError(f"frame: expected 0 to {len(self.frames) - 1}, got {frame}")
-        if frame not in self._views:
+
+        def read() -> Tensor:
             rgb = self._read(frame)
             if tuple(rgb.shape[1:]) != self._size:
                 expected, got = (f"{height} x {width}" for height, width in (self._size, rgb.shape[1:]))
                 raise ValueError(f"frames[{frame}]: expected {expected} as the first, got {got}")
-            _keep(self._views, frame, rgb[:, : self.height, : self.width].contiguous())
-        return self._views[frame]
+            return rgb[:, : self.height, : self.width].contiguous()
+
+        return _kept(self._views, frame, read)
 
     def _seen(self, rgb: Tensor) -> Tensor:
         return self.alpha * bin_to_sensor(rgb, self.pattern, scale=self.scale)
@@ -321,16 +325,17 @@ class FrameSequence:
     def _interval(self, index: int) -> Interval:
         if not 0 <= index < len(self.frames) - 1:
             raise ValueError(f"interval: expected 0 to {len(self.frames) - 2}, got {index}")
-        if index not in self._intervals:
-            _keep(self._intervals, index, Interval(self, self._view(index), self._view(index + 1)))
-        return self._intervals[index]
+        return _kept(self._intervals, index, lambda: Interval(self, self._view(index), self._view(index + 1)))
 
 
-def _keep(kept: dict[int, Any], index: int, value: Any) -> None:
-    """Add the newest and forget the oldest."""
-    kept[index] = value
-    if len(kept) > _KEPT:
-        del kept[next(iter(kept))]
+def _kept(kept: dict[int, T], index: int, make: Callable[[], T]) -> T:
+    """Return what is kept, or made and kept; the oldest is forgotten. Other threads may do the same meanwhile."""
+    value = kept.get(index)
+    if value is None:
+        value = kept[index] = make()
+        for oldest in list(kept)[:-_KEPT]:
+            kept.pop(oldest, None)
+    return value
 
 
 @dataclass(frozen=True)

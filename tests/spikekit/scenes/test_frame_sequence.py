@@ -1,6 +1,8 @@
 """Films: light against a plain loop over interpolated frames, the frames' own pixels, and what plans cost and save."""
 
 import pickle
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import pytest
@@ -409,3 +411,18 @@ def test_errors(make, message):
 def test_frames_are_tensors_of_floats():
     with pytest.raises(TypeError, match=r"frames\[0\]: expected a floating-point tensor, got torch.uint8"):
         FrameSequence([torch.zeros(3, 8, 8, dtype=torch.uint8)], scale=2)
+
+
+def test_several_threads_share_a_sequence():
+    frames = [torch.rand(3, 8, 12, generator=torch.Generator().manual_seed(n)) for n in range(20)]
+    sequence = FrameSequence(frames, scale=2, clocks=3, interpolation=Blend())
+    firsts = [7 * n % 50 for n in range(64)]
+    expected = [FrameSequence(frames, scale=2, clocks=3, interpolation=Blend()).light(first, 6) for first in firsts]
+    before = sys.getswitchinterval()
+    try:
+        sys.setswitchinterval(1e-6)
+        with ThreadPoolExecutor(8) as pool:
+            found = list(pool.map(lambda first: sequence.light(first, 6), firsts))
+    finally:
+        sys.setswitchinterval(before)
+    assert all(one.equal(other) for one, other in zip(found, expected, strict=True))
