@@ -71,6 +71,13 @@ def _shares(times: tuple[int, ...], flow_times: tuple[int, int, int], device: to
         return torch.tensor(shares, device=device)
 
 
+@lru_cache(maxsize=6)  # at rest, a picture and its sides have three sizes
+def _masks(height: int, width: int, pattern: str, scale: int, device: torch.device) -> tuple[Tensor, ...]:
+    """Masks of the colours, the same tensors every time, so that the tables of the search are found again."""
+    with torch.inference_mode(False):  # what is made in inference mode cannot be kept for a gradient
+        return bayer_mask(height, width, pattern, scale=scale, device=device, dtype=torch.bool).unbind(0)
+
+
 class CSCSR(Network):
     r"""Super-resolution of a colour picture from a Bayer-pattern spike stream, or of a grey one from a grey stream.
 
@@ -141,7 +148,6 @@ class CSCSR(Network):
         )
         if not self.reconstruction.rgb.weight.is_meta:
             self._initialize()
-        self._masks: dict[Any, Tensor] = {}
 
     def _initialize(self) -> None:
         for part in (self.representation, self.refinement, self.reconstruction):
@@ -196,7 +202,9 @@ class CSCSR(Network):
             pixels = map(self._search_in_graph, features, self._offsets(flow, spikes), colors)
         else:
             offsets = self._offsets(flow, spikes)
-            pixels = map(self._search, features, offsets, self._mask(height, width, spikes.device))
+            pixels = map(
+                self._search, features, offsets, _masks(height, width, self.pattern, self.scale, spikes.device)
+            )
         pixels = (fold(part.flatten(1, 2), self.fold) for part in pixels)
         return [refine(part) for refine, part in zip(self.refinement, pixels, strict=True)]
 
@@ -308,12 +316,3 @@ class CSCSR(Network):
         if self.scale == 1:
             return smooth
         return F.interpolate(smooth, scale_factor=self.scale, mode="bicubic", align_corners=False)
-
-    def _mask(self, height: int, width: int, device: torch.device) -> tuple[Tensor, ...]:
-        key = height, width, device
-        if key not in self._masks:
-            with torch.inference_mode(False):  # what is made in inference mode cannot be kept for a gradient
-                mask = bayer_mask(height, width, self.pattern, scale=self.scale, device=device, dtype=torch.bool)
-                # the same tensors every time: their tables are kept; at rest, a picture and its sides have three sizes
-                self._masks = dict([*self._masks.items()][-2:]) | {key: mask.unbind(0)}
-        return self._masks[key]

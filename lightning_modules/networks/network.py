@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from inspect import signature
 from pathlib import Path
 from typing import Any, Self
 
@@ -16,14 +18,23 @@ from lightning_modules.storage.pretrained import check_weights, load_weights, re
 from lightning_modules.storage.settings import own_class
 from spikekit.check import check_planes
 
+#: settings of all networks
+_ALL_HAVE = "scale", "frames", "pattern", "alpha"
+
 
 class Network(nn.Module):
     r"""Base of the networks that map a clip of spikes to the colour picture of its middle frame.
 
+    A network of your own calls ``super().__init__()`` and keeps its arguments as attributes of the same names; its
+    ``forward`` takes spikes and flow, which is None where nobody gives it: :meth:`estimate_flow` is there to ask. It is
+    then trained, tested and read again by its class, whole pictures at a time.
+
     Args:
         settings: what the constructor was given, as plain values, with at least ``scale``, ``frames``, ``pattern``
-            and ``alpha``; a checkpoint remembers them, because they are not all to be seen in its weights.
-        flow_times: spike frames that the flows run between: the first, the middle and the last time point.
+            and ``alpha``; a checkpoint remembers them, because they are not all to be seen in its weights. When not
+            given, the attributes that are called as the constructor's arguments, and those four.
+        flow_times: spike frames that the flows run between: the first, the middle and the last time point. When not
+            given, those of windows of 11 frames.
         motion: estimator that is asked where no flow is given; :class:`lightning_modules.motion.ClassicalFlow` when
             not given.
 
@@ -43,22 +54,40 @@ class Network(nn.Module):
         - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
     """
 
+    scale: int = 4
+    frames: int = 41
+    pattern: str = "RGGB"
+    alpha: float = 0.4
     halo: int | None = None
     takes_flow: bool = True
     warm_up: int = 0
     flow_groups: tuple[tuple[int, ...], ...] = ((),)
 
     def __init__(
-        self, settings: dict[str, Any], flow_times: tuple[int, int, int], motion: MotionEstimator | None = None
+        self,
+        settings: dict[str, Any] | None = None,
+        flow_times: tuple[int, int, int] | None = None,
+        motion: MotionEstimator | None = None,
     ) -> None:
         super().__init__()
-        self.settings = settings
-        self.scale: int = settings["scale"]
-        self.frames: int = settings["frames"]
-        self.pattern: str = settings["pattern"]
-        self.flow_times = flow_times
+        self._settings, self._flow_times = settings, flow_times
+        for name in _ALL_HAVE if settings else ():
+            setattr(self, name, settings[name])
         self.error_model = ErrorModel()
         self.motion = ClassicalFlow() if motion is None else motion
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the network was built with, by name, as plain values."""
+        if self._settings is not None:
+            return self._settings
+        names = dict.fromkeys((*_ALL_HAVE, *signature(type(self)).parameters))
+        return {name: getattr(self, name) for name in names if hasattr(self, name) and name != "motion"}
+
+    @property
+    def flow_times(self) -> tuple[int, int, int]:
+        """Spike frames that the flows run between: the first, the middle and the last time point."""
+        return self._flow_times or (5, self.frames // 2, self.frames - 6)
 
     @classmethod
     def from_pretrained(cls, weights: str | Path, motion: MotionEstimator | None = None, **arguments: Any) -> Self:
@@ -83,20 +112,25 @@ class Network(nn.Module):
         kind = next((kind for kind in _family(cls) if kind.__name__ == named), None)
         if kind is None:
             raise ValueError(f"{weights}: expected weights of {cls.__name__}, got those of {named}")
+        takes = signature(kind).parameters
+        if not _ours(kind):  # what all networks have, whether or not its constructor takes it
+            known = {name: value for name, value in found.settings.items() if name in takes or name not in _ALL_HAVE}
+            found = replace(found, settings=known)
         check_weights(found, {named: kind, **ESTIMATORS})
         settings = {name: value for name, value in found.settings.items() if name != "class"}
         own = motion is not None
+        same = own and type(motion).__name__ == found.motion.get("class") and found.motion["class"] not in ESTIMATORS
         if own and not kind.takes_flow:
             raise ValueError(f"motion: {named} takes no flow, expected none, got {type(motion).__name__}")
         try:
             if found.motion and not own:
                 estimator, built_with = own_class(found.motion, weights, ESTIMATORS)
                 motion = estimator(**built_with)
-            flow = {"motion": motion} if kind.takes_flow else {}
+            flow = {"motion": motion} if kind.takes_flow and "motion" in takes else {}
             network = kind(**{**settings, **arguments}, **flow)
         except TypeError as error:
             raise ValueError(f"{weights}: written by another version of this package ({error})") from error
-        load_weights(network, found, keep_motion=own)
+        load_weights(network, found, keep_motion=own and not same)
         return network.eval()
 
     def scale_picture(self, factor: float) -> None:
@@ -158,5 +192,28 @@ def _family(kind: type[Network]) -> Iterator[type[Network]]:
     """A class and what derives from it in this package: a file builds no other class by its name."""
     yield kind
     for child in kind.__subclasses__():
-        if child.__module__.startswith(f"{__package__}."):
+        if _ours(child):
             yield from _family(child)
+
+
+def _ours(kind: type[Network]) -> bool:
+    return kind.__module__.startswith(f"{__package__}.")
+
+
+def read_network(weights: str | Path) -> nn.Module:
+    """Build the network or the estimator of motion that weights belong to, ready to be trained.
+
+    Args:
+        weights: as :meth:`Network.from_pretrained` takes them.
+
+    Raises:
+        FileNotFoundError: neither a file nor the name of one.
+        ValueError: a file that is damaged, or of no class of this package.
+    """
+    found = read_weights(weights)
+    if found.settings.get("class") not in ESTIMATORS:
+        return Network.from_pretrained(weights).train()
+    kind, arguments = own_class(found.settings, found.source, ESTIMATORS)
+    estimator = kind(**arguments)
+    load_weights(estimator, found)
+    return estimator

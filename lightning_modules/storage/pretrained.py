@@ -21,6 +21,7 @@ from lightning_modules.storage.settings import check_plain, check_shapes
 from spikekit.io.whole_file import whole_file
 
 _MOTION = "motion."
+_COMPILED = "_orig_mod."  # how the names of a network begin that torch.compile returned
 _ADAPTED = "alpha", "motion_fusion"  # settings that weights serve any value of
 
 
@@ -115,7 +116,9 @@ def _read_safetensors(path: Path) -> Weights:
 
 def _read_checkpoint(path: Path) -> Weights:
     checkpoint = read_checkpoint(path)
-    tensors = {name.removeprefix("network."): value for name, value in checkpoint["state_dict"].items()}
+    tensors = {
+        name.removeprefix("network.").removeprefix(_COMPILED): value for name, value in checkpoint["state_dict"].items()
+    }
     try:
         return Weights(path, _named(checkpoint["network"]), _named(checkpoint["motion"]), tensors)
     except ValueError as error:
@@ -141,7 +144,10 @@ def write_weights(weights: Weights, path: str | Path) -> None:
     if path.suffix != ".safetensors":
         raise ValueError(f"{path}: expected a name that ends in .safetensors")
     # copies, as tensors that share memory cannot be saved
-    tensors = {name: value.clone(memory_format=torch.contiguous_format) for name, value in weights.tensors.items()}
+    tensors = {
+        name.removeprefix(_COMPILED): value.clone(memory_format=torch.contiguous_format)
+        for name, value in weights.tensors.items()
+    }
     said = {"network": json.dumps(weights.settings), "motion": json.dumps(weights.motion)}
     with whole_file(path) as file:
         file.write(_same_every_time(save(tensors, said)))
@@ -157,8 +163,9 @@ def _same_every_time(data: bytes) -> bytes:
 
 
 def settings_of(network: nn.Module) -> dict[str, Any]:
-    """Return the class of a network and its arguments."""
-    return {"class": type(network).__name__, **network.settings}
+    """Return the class of a network, which may be compiled, and its arguments; none of one that does not say."""
+    network = getattr(network, "_orig_mod", network)
+    return {"class": type(network).__name__, **getattr(network, "settings", {})}
 
 
 def motion_of(network: nn.Module) -> dict[str, Any]:
@@ -228,6 +235,7 @@ def load_weights(network: nn.Module, weights: Weights, keep_motion: bool = False
         CheckpointMismatchError: they are of another network.
         ValueError: the file says that they fit, and they do not.
     """
+    network = getattr(network, "_orig_mod", network)
     exchanged = {name: network.settings[name] for name in _ADAPTED if name in network.settings}
     ratio = weights.settings.get("alpha", exchanged["alpha"]) / exchanged["alpha"] if "alpha" in exchanged else 1
     check_settings(network, weights.settings and {**weights.settings, **exchanged}, weights.source)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import types
 from collections.abc import Mapping, Sequence
-from inspect import signature
+from inspect import Parameter, signature
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -138,6 +138,8 @@ def check_plain(name: str, value: Any, depth: int = 0) -> None:
 def _fits(value: Any, hint: Any, most: int) -> bool:
     """Say whether a value is of the type of an argument, and no larger than it may be."""
     origin, inner = get_origin(hint), get_args(hint)
+    if hint is Parameter.empty:  # of a user's own class; what a file says is plain
+        return True
     if origin in (Union, types.UnionType):
         return any(_fits(value, choice, most) for choice in inner)
     if origin is Literal:

@@ -11,6 +11,7 @@ from pytorch_lightning import Callback, LightningModule
 from pytorch_lightning.cli import LRSchedulerCallable, OptimizerCallable
 from torch import Tensor, nn
 
+from lightning_modules.networks.network import read_network
 from lightning_modules.storage.checkpoint import read_checkpoint
 from lightning_modules.storage.pretrained import check_settings, motion_of, settings_of
 
@@ -60,17 +61,20 @@ class BaseTask(LightningModule):
 
     @classmethod
     def load_from_checkpoint(cls, checkpoint_path: str | Path, **arguments: Any) -> Self:
-        """Build a module from arguments and give it the weights of a checkpoint; nothing else is taken out of that.
+        """Build a module from arguments and give it the weights of a checkpoint, and its network, if none is given.
 
         Args:
             checkpoint_path: a checkpoint of ``lightning fit``.
             arguments: those of the constructor; Lightning would take them out of the file, and build what it names.
+                Without a ``network`` it is that of the checkpoint, which is then one of this package.
 
         Raises:
             FileNotFoundError: no such file.
             ValueError: the file is damaged or of something else.
         """
         checkpoint = read_checkpoint(checkpoint_path)
+        if "network" not in arguments:
+            arguments["network"] = read_network(checkpoint_path)
         module = cls(**arguments)
         module.on_load_checkpoint(checkpoint)
         module.load_state_dict(checkpoint["state_dict"])

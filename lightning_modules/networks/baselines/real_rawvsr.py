@@ -36,7 +36,8 @@ class RealRawVSR(Baseline):
 
     Ours: the five mosaics are what TFI or TFP makes of the frames 10, 15, 20, 25 and 30 of 41. Attention over time
     is scaled by the root of the number of values, as attention is. The colour correction by the ground truth is left
-    out. Sides are mirrored to multiples of 8, on which the levels meet. A ``width`` of 24 does the work of CSCSR's size small.
+    out. Sides are mirrored to multiples of 8, on which the levels meet. A ``width`` of 24 does the work of CSCSR's size
+    small.
 
     Attention and the selective kernel look at the whole picture: not run tile by tile.
 

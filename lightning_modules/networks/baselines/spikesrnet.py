@@ -26,8 +26,8 @@ class SpikeSRNetLike(Baseline):
     window, predicted for every pixel, 16 of them; alignment to the middle one by a deformable convolution whose offsets
     come from both; a picture's features that are corrected four times by the enlarged difference of the mean of the
     aligned representations and the shrunk features. The 16 filtered maps are split into the three colours, zeros
-    elsewhere: a convolution over a bare mosaic could not know which colour is where. No flow is asked for. A ``width`` of
-    32 with 12 ``maps`` does the work of CSCSR's size small, or 24 and 8 ``per_channel``.
+    elsewhere: a convolution over a bare mosaic could not know which colour is where. No flow is asked for. A ``width``
+    of 32 with 12 ``maps`` does the work of CSCSR's size small, or 24 and 8 ``per_channel``.
 
     Offsets may reach anywhere, so it is not run tile by tile.
 
