@@ -113,11 +113,14 @@ class Network(nn.Module):
         if kind is None:
             raise ValueError(f"{weights}: expected weights of {cls.__name__}, got those of {named}")
         takes = signature(kind).parameters
-        if not _ours(kind):  # what all networks have, whether or not its constructor takes it
-            known = {name: value for name, value in found.settings.items() if name in takes or name not in _ALL_HAVE}
-            found = replace(found, settings=known)
-        check_weights(found, {named: kind, **ESTIMATORS})
-        settings = {name: value for name, value in found.settings.items() if name != "class"}
+        # a user's own constructor need not take all that every network has
+        settings = {
+            name: value
+            for name, value in found.settings.items()
+            if _ours(kind) or name in takes or name not in _ALL_HAVE
+        }
+        check_weights(replace(found, settings=settings), {named: kind, **ESTIMATORS})
+        settings.pop("class")
         own = motion is not None
         same = own and type(motion).__name__ == found.motion.get("class") and found.motion["class"] not in ESTIMATORS
         if own and not kind.takes_flow:

@@ -17,7 +17,7 @@ def test_all_weights_of_the_package_have_their_own():
     assert len(set(models)) == len(models)
     careful = ErrorModel()  # the defaults spend no less than any of them
     for model in models:
-        assert all(getattr(model, name) <= getattr(careful, name) for name in ("flat", "grainy", "blurred", "still"))
+        assert model.still <= careful.still
         assert all(getattr(model, name) >= getattr(careful, name) for name in ("textured", "moved", "faint"))
 
 
@@ -25,7 +25,7 @@ def test_a_network_has_the_constants_of_its_weights(tmp_path):
     file = tmp_path / "mine.safetensors"
     shutil.copy(list_models(4)[0].path, file)
     assert CSCSR.from_pretrained(file).error_model == ErrorModel()
-    model = ErrorModel(flat=1.0, faint=0.0)
+    model = ErrorModel(still=1.0, faint=0.0)
     assert write_error_model(file, model) == tmp_path / FILE
     write_error_model(tmp_path / "other.safetensors", ErrorModel(still=9.0))
     assert CSCSR.from_pretrained(file).error_model == model
@@ -41,8 +41,8 @@ def test_constants_of_a_checkpoint_are_not_written(tmp_path):
 @pytest.mark.parametrize(
     "text",
     [
-        *("", "[]", '{"a": 1}', '{"a": {"flat": -1}}', '{"a": {"flat": NaN}}', '{"a": {"flat": true}}'),
-        *('{"a": {"x": 1}}', f'{{"a": {{"flat": 1{"0" * 400}}}}}'),
+        *("", "[]", '{"a": 1}', '{"a": {"still": -1}}', '{"a": {"still": NaN}}', '{"a": {"still": true}}'),
+        *('{"a": {"x": 1}}', f'{{"a": {{"still": 1{"0" * 400}}}}}'),
     ],
 )
 def test_a_damaged_file_of_constants_is_named_in_one_line(text, tmp_path):
