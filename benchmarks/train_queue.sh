@@ -14,16 +14,16 @@ train() {
     last=$output/$name/checkpoints/last.ckpt
     [ ! -f "$last" ] || set -- "$@" --ckpt_path "$last"
     lightning fit "$@" -o "$output/$name" --data.root "$pictures" \
-        --trainer.max_time "00:$(( seconds / 3600 )):$(( seconds / 60 % 60 )):$(( seconds % 60 ))"
+        --trainer.max_time "$(printf 00:%02d:%02d:%02d $(( seconds / 3600 )) $(( seconds / 60 % 60 )) $(( seconds % 60 )))"
 }
 
 seconds=$(( minutes * 60 ))
 configs=$(dirname "$0")/../configs
-train grey_large_x1 $seconds -c "$configs/x1.yaml" -c "$configs/size/large_film.yaml" -c "$configs/grey.yaml" \
+train grey_large_x1 $seconds -c "$configs/x1.yaml" -c "$configs/size/large_x1.yaml" -c "$configs/grey.yaml" \
     -c "$configs/cameras.yaml" -c "$configs/gpu.yaml" "$@"
-train grey_small_x1 $(( seconds / 2 )) -c "$configs/x1.yaml" -c "$configs/size/small.yaml" -c "$configs/grey.yaml" \
+train grey_small_x1 $(( seconds / 2 )) -c "$configs/x1.yaml" -c "$configs/size/small_x1.yaml" -c "$configs/grey.yaml" \
     -c "$configs/cameras.yaml" -c "$configs/gpu.yaml" "$@"
-train large_x4 $seconds -c "$configs/x4.yaml" -c "$configs/size/huge_film.yaml" -c "$configs/cameras.yaml" \
-    -c "$configs/gpu.yaml" "$@"
-train small_x4 $(( seconds / 2 )) -c "$configs/x4.yaml" -c "$configs/size/small.yaml" -c "$configs/cameras.yaml" \
-    -c "$configs/gpu.yaml" "$@"
+train large_x4 $seconds -c "$configs/x4.yaml" -c "$configs/cameras.yaml" -c "$configs/gpu.yaml" \
+    --model.network.size huge "$@"
+train small_x4 $(( seconds / 2 )) -c "$configs/x4.yaml" -c "$configs/cameras.yaml" \
+    -c "$configs/gpu.yaml" --model.network.size small "$@"
