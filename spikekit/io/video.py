@@ -59,8 +59,8 @@ class VideoFrames(Sequence[Tensor]):
         is cheap, a few frames back too; further back the file is decoded from its start again, so that frame n is
         always the same one.
 
-        A slice is again a lazy sequence. The object can be pickled and used in other processes; each opens the files
-        for itself.
+        A slice is again a lazy sequence. Threads can share the object, which decodes for one after the other. It can be
+        pickled and used in other processes; each opens the files for itself.
 
     Args:
         path: a folder, a picture or a video file.

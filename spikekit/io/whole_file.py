@@ -62,7 +62,8 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
     if mode not in ("w", "wb"):
         raise ValueError(f"mode: expected 'w' or 'wb', got {mode!r}")
     path = home_path(path)
-    if path.exists() and not path.is_file():
+    chosen = path.is_dir() or not path.is_symlink() or path.parent == Path("/dev")  # no stranger's way to a device
+    if chosen and path.exists() and not path.is_file():
         with open(path, mode, opener=_without_waiting, **how) as file:  # a folder says so
             yield file
         return
@@ -96,7 +97,12 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
 
 def _without_waiting(path: str, flags: int) -> int:
     """Open a device or a pipe; one that nobody reads is an error, rather than waited for."""
-    handle = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+    try:
+        handle = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+    except OSError as error:
+        if error.errno == errno.ENXIO:
+            raise OSError(errno.ENXIO, "a pipe that nobody reads, expected a file", path) from error
+        raise
     if os.name == "posix":
         os.set_blocking(handle, True)
     return handle

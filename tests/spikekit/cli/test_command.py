@@ -1,14 +1,10 @@
 """The ``spikekit`` command as a user types it."""
 
-import contextlib
-import errno
-import io
 import os
 import signal
 import subprocess
 import sys
 import time
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import numpy as np
@@ -365,15 +361,6 @@ def test_many_pictures_under_one_name(clip, tmp_path, fails):
     assert message in fails(2, "decode", *sized(clip), *words)
 
 
-@pytest.mark.parametrize("window", [2 * 60 - 1, 10**20 + 1])
-def test_a_window_beyond_the_recording(clip, tmp_path, window):
-    """The mean of all frames."""
-    words = ["--method", "tfp", "--alpha", "1", "-o", str(tmp_path / "a.png"), "--window", str(window)]
-    assert main(["decode", *map(str, sized(clip)), *words]) == 0
-    expected = read_spikes(clip, 12, 20).float().mean(0)
-    assert (read_picture(tmp_path / "a.png")[0] - expected).abs().max() < 1 / 255
-
-
 def test_wrong_files(clip, tmp_path, fails):
     (tmp_path / "clip.raw").write_bytes(b"raw")
     np.savez(tmp_path / "a.npz", spk=np.zeros((3, 12, 20)))
@@ -388,12 +375,6 @@ def test_wrong_files(clip, tmp_path, fails):
         assert message in fails(1, "info", *path)
         assert message in fails(1, "decode", *path, "--method", "tfi", "-o", tmp_path / "a.png")
     assert not (tmp_path / "a.png").exists()
-
-
-def test_too_small_for_colour(tmp_path, fails):
-    write_spikes(tmp_path / "a.npz", torch.ones(3, 2, 2))
-    words = ("--method", "tfp", "-o", tmp_path / "a.png", "--pattern", "RGGB")
-    assert "at least 3 x 3, got (2, 2)" in fails(1, "decode", tmp_path / "a.npz", *words)
 
 
 def test_where_nothing_can_be_written(clip, tmp_path, fails):
@@ -489,11 +470,6 @@ def test_what_is_whole_stays_when_it_is_stopped(tmp_path, number, status):
 # --- as a process -----------------------------------------------------------------------------------------------------
 
 
-def test_installed_command():
-    (script,) = entry_points(group="console_scripts", name="spikekit")
-    assert script.load() is main
-
-
 def test_cameras(capsys):
     assert main(["cameras"]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -535,30 +511,6 @@ def test_full_disk(clip):
             [*COMMAND, "info", *map(str, sized(clip))], stdout=full, stderr=subprocess.PIPE, text=True
         )
     assert (done.returncode, done.stderr) == (1, "spikekit: standard output: No space left on device\n")
-
-
-class Full(io.StringIO):
-    """Standard output in memory that finds no room."""
-
-    def __init__(self, error):
-        super().__init__()
-        self.error = error
-
-    def write(self, text):
-        raise self.error
-
-
-@pytest.mark.parametrize(
-    ("error", "status", "said"),
-    [
-        (OSError(errno.ENOSPC, "No room"), 1, "spikekit: standard output: No room\n"),
-        (BrokenPipeError(errno.EPIPE, "Broken pipe"), 141, ""),
-    ],
-)
-def test_called_where_standard_output_is_no_file(clip, capsys, error, status, said):
-    with contextlib.redirect_stdout(Full(error)):
-        assert main(["info", *map(str, sized(clip))]) == status
-    assert capsys.readouterr() == ("", said)
 
 
 # --- the field's own --------------------------------------------------------------------------------------------------

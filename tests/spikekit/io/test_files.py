@@ -95,15 +95,6 @@ def test_written_views_and_gradients(tmp_path):
     assert read_spikes(str(tmp_path / "a.dat"), 5, 4).equal(spikes.detach().byte())
 
 
-def test_written_with_the_sign_still_to_be_turned(tmp_path):
-    """What torch calls a negative view, which NumPy does not know."""
-    spikes = random_spikes(3, 4, 5)
-    negative = torch.complex(torch.zeros(3, 4, 5), -spikes.float()).conj().imag
-    assert negative.is_neg()
-    write_spikes(tmp_path / "a.dat", negative)
-    assert read_spikes(tmp_path / "a.dat", 4, 5).equal(spikes)
-
-
 # --- parts of recordings ----------------------------------------------------------------------------------------------
 
 
@@ -187,16 +178,6 @@ def test_written_in_chunks(tmp_path, name, cuts, flip):
         assert [file.name for file in (tmp_path / folder).iterdir()] == [name]
     if name == "a.dat":
         assert len({(tmp_path / folder / name).read_bytes() for folder in ("whole", "chunks", "frames")}) == 1
-
-
-def test_from_one_format_to_the_other(tmp_path):
-    spikes = random_spikes(30, 4, 9)
-    write_spikes(tmp_path / "a.dat", spikes)
-    write_spikes(tmp_path / "a.npz", iter_spikes(tmp_path / "a.dat", 4, 9, chunk=7))
-    write_spikes(tmp_path / "b.dat", iter_spikes(tmp_path / "a.npz"))
-    assert (tmp_path / "b.dat").read_bytes() == (tmp_path / "a.dat").read_bytes()
-    with np.load(tmp_path / "a.npz") as arrays:
-        assert np.array_equal(arrays["spk"], spikes.numpy())
 
 
 @pytest.mark.parametrize("name", ["a.dat", "a.npy", "a.npz"])
@@ -380,13 +361,6 @@ def test_truncated_while_it_is_read(clip):
         next(frames)
 
 
-def test_truncated_within_a_chunk(clip):
-    chunks = iter_spikes(clip, 3, 5, chunk=4)
-    clip.write_bytes(clip.read_bytes()[:5])
-    with pytest.raises(SpikeFileError, match=r"clip\.dat: truncated while it was read, at frame 2"):
-        next(chunks)
-
-
 @pytest.mark.parametrize("size", [(3, 6), (4, 5), (0, 5), (4, None), (None, 6)])
 def test_npz_of_another_size(tmp_path, size):
     write_spikes(tmp_path / "a.npz", random_spikes(2, 3, 5))
@@ -433,16 +407,6 @@ def test_what_cannot_be_written(tmp_path, name, spikes, error, message):
     with pytest.raises(error, match=message):
         write_spikes(tmp_path / name, spikes)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("name", ["a.dat", "a.npy", "a.npz"])
-def test_failed_write_keeps_the_old_file(tmp_path, name):
-    spikes = random_spikes(3, 4, 5)
-    write_spikes(tmp_path / name, spikes)
-    with pytest.raises(ValueError, match="in frame 2"):
-        write_spikes(tmp_path / name, torch.tensor([0, 1, 2]).expand(4, 5, 3).permute(2, 0, 1))
-    assert [file.name for file in tmp_path.iterdir()] == [name]
-    assert read_spikes(tmp_path / name, 4, 5).equal(spikes)
 
 
 @pytest.mark.parametrize("name", ["a.dat", "a.npy", "a.npz"])

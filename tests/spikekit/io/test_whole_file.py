@@ -149,6 +149,10 @@ def test_modes_links_and_devices(tmp_path):
         file.write(b"3")
     assert not (tmp_path / "link").is_symlink()
     assert [(tmp_path / name).read_bytes() for name in ("new", "link")] == [b"2", b"3"]
+    (tmp_path / "device").symlink_to("/dev/null")
+    with whole_file(tmp_path / "device") as file:
+        file.write(b"4")
+    assert not (tmp_path / "device").is_symlink()
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(OSError, match="pipe"), whole_file(tmp_path / "pipe"):  # nobody reads it
         pass
