@@ -34,7 +34,6 @@ _PRESET = {
     "motion": "--model.network.motion",
     "motion_weights": "--model.network.motion.weights",
     "motion_iterations": "--model.network.motion.iterations",
-    "steps": "--model.network.steps",
     "tile": "--tile",
     "psnr_tolerance": "--psnr_tolerance",
     "self_ensemble": "--self_ensemble",

@@ -64,7 +64,6 @@ class Preset:
         motion: class of the estimator, such as ``"ZeroFlow"``, in place of the one that the weights were trained with.
         motion_weights: of that estimator.
         motion_iterations: of that estimator.
-        steps: of the network's search, see :class:`lightning_modules.networks.CSCSR`.
         tile: see :func:`lightning_modules.inference.predict.predict`.
         psnr_tolerance: in dB, see there.
         self_ensemble: number of views, see there.
@@ -94,7 +93,6 @@ class Preset:
     motion: str | None = None
     motion_weights: str | None = None
     motion_iterations: int | None = None
-    steps: int | None = None
     tile: int | None = None
     psnr_tolerance: float | None = None
     self_ensemble: int | None = None
@@ -168,7 +166,7 @@ class Preset:
             return ClassicalDecoder(**self.given("method", "window", "order", "scale", "frames")).eval()
         if self.weights is None:
             raise ValueError(f"preset: expected weights or the name of a network, got {self}")
-        return CSCSR.from_pretrained(self.weights, self._estimator(), **self.given("steps"))
+        return CSCSR.from_pretrained(self.weights, self._estimator())
 
     def _estimator(self) -> estimators.MotionEstimator | None:
         if self.motion is None:

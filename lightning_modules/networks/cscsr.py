@@ -26,6 +26,9 @@ from spikekit.color.cfa import count_colors
 from spikekit.warp.bayer_warp import bayer_warp_idw
 from spikekit.warp.site_search import SMALLEST, search_sites, site_table
 
+# positions per pixel of the picture, along each axis, that the search rounds motion to on a CPU, where that saves time,
+# and in exported programs; elsewhere it is exact
+_STEPS = 16
 _SEARCHED = 1 << 19  # positions that are searched in one go on a CPU, whose cache is small
 _SEARCHED_ELSEWHERE = 1 << 25  # where a launch costs more
 
@@ -86,8 +89,6 @@ class CSCSR(Network):
 
     Args:
         *args: fields of :class:`CSCSRConfig`, in its order; ``CSCSR(4)`` is ``CSCSR(scale=4)``.
-        steps: positions per pixel of the picture, along each axis, that the search rounds motion to, an even number,
-            which makes it faster on a CPU; 0 for the exact search. Weights serve with any.
         motion: estimator that is asked where no flow is given; when not given,
             :class:`lightning_modules.motion.ClassicalFlow`.
         **settings: fields of :class:`CSCSRConfig`, by name.
@@ -104,7 +105,7 @@ class CSCSR(Network):
         - Output: rgb :math:`(B, 3, s H, s W)`, or :math:`(B, 1, s H, s W)` where the pattern is grey, not clamped
 
     Raises:
-        ValueError: a field that :class:`CSCSRConfig` refuses, or an odd number of steps; a ``noise`` that the network
+        ValueError: a field that :class:`CSCSRConfig` refuses; a ``noise`` that the network
             was not trained to be told.
 
     Example:
@@ -121,16 +122,13 @@ class CSCSR(Network):
     configuration: ClassVar[type[CSCSRConfig]] = CSCSRConfig  #: of the fields that ``settings`` are
 
     @inherit_signature(CSCSRConfig)
-    def __init__(self, *args: Any, steps: int = 16, motion: MotionEstimator | None = None, **settings: Any) -> None:
+    def __init__(self, *args: Any, motion: MotionEstimator | None = None, **settings: Any) -> None:
         config = self.configuration(*args, **settings)
-        if steps < 0 or steps % 2:
-            raise ValueError(f"steps: expected an even number, or 0 for the exact search, got {steps}")
         times = config.times
         super().__init__(config.settings, (times[0], config.frames // 2, times[-1]), motion)
         self.config = config
         self.takes_flow = config.search
         self.times = times
-        self.steps = steps
         sensor = config.resolution == "sensor"
         self.fold = config.scale if sensor else 1
         self.colors = count_colors(config.pattern)
@@ -269,12 +267,13 @@ class CSCSR(Network):
 
         Offsets of a single time point are those of all.
         """
-        how = {"neighbors": self.config.neighbors, "steps": self.steps or None}
+        on_cpu = features.device.type == "cpu"
+        how = {"neighbors": self.config.neighbors, "steps": _STEPS if on_cpu else None}
         if offsets.shape[1] == 1:
             pixels = self._enlarge(features, mask)
             return flow_warp_idw(pixels.flatten(1, 2), offsets[:, 0], mask, **how).reshape(pixels.shape)
         # a few time points after the others: what the search needs on the way is many times its result
-        searched = _SEARCHED if features.device.type == "cpu" else _SEARCHED_ELSEWHERE
+        searched = _SEARCHED if on_cpu else _SEARCHED_ELSEWHERE
         few = max(1, searched // (offsets.shape[-2] * offsets.shape[-1]))
         pixels = [
             flow_warp_idw(self._enlarge(part, mask), offset, mask, **how)
@@ -292,14 +291,13 @@ class CSCSR(Network):
 
     def _search_in_graph(self, features: Tensor, offsets: Tensor, color: int) -> Tensor:
         """The same in operations that other programs know, for any even height and width."""
-        if not self.steps or self.config.neighbors > 4:
-            got = f"steps={self.steps}, neighbors={self.config.neighbors}"
-            raise ValueError(f"steps, neighbors: expected rounded positions and 4 neighbours at most, got {got}")
+        if self.config.neighbors > 4:
+            raise ValueError(f"neighbors: expected 4 at most to export, got {self.config.neighbors}")
         offsets = offsets.expand(-1, features.shape[1], -1, -1, -1)
         height, width = features.shape[-2:]
         mask = bayer_mask(height, width, self.pattern, scale=self.scale, device=features.device, dtype=torch.bool)
         pixels = self._enlarge(features.flatten(0, 1), mask[color])
-        how = self.scale, self.steps, self.config.neighbors
+        how = self.scale, _STEPS, self.config.neighbors
         found = bayer_warp_idw(pixels, offsets.flatten(0, 1), self.pattern, color, *how)
         return found.unflatten(0, features.shape[:2])
 

@@ -98,7 +98,7 @@ class Network(nn.Module):
                 safetensors; or a checkpoint of ``lightning fit``.
             motion: estimator that is asked where no flow is given; when not given, the one inside the weights, or
                 :class:`lightning_modules.motion.ClassicalFlow` where none is.
-            arguments: of the constructor, such as ``steps`` or ``alpha``, that weights serve with any of.
+            arguments: of the constructor, such as ``alpha``, that weights serve with any of.
 
         Returns:
             The network, in evaluation mode, on the CPU.

@@ -107,7 +107,6 @@ class RecurrentCSCSR(CSCSR):
 
     Args:
         *args: fields of :class:`RecurrentCSCSRConfig`, in its order.
-        steps: as of :class:`CSCSR`.
         motion: as of :class:`CSCSR`.
         **settings: fields of :class:`RecurrentCSCSRConfig`, by name.
 
@@ -130,8 +129,8 @@ class RecurrentCSCSR(CSCSR):
     warm_up = 8
 
     @inherit_signature(RecurrentCSCSRConfig)
-    def __init__(self, *args: Any, steps: int = 16, motion: MotionEstimator | None = None, **settings: Any) -> None:
-        super().__init__(*args, steps=steps, motion=motion, **settings)
+    def __init__(self, *args: Any, motion: MotionEstimator | None = None, **settings: Any) -> None:
+        super().__init__(*args, motion=motion, **settings)
         config = self.config
         self.fusion = StateFusion(
             config.end_width or config.width,

@@ -49,8 +49,6 @@ _MOST = [(f"self-ensemble of {views}", {"self_ensemble": views}) for views in (4
 
 #: what is tried on the reference, besides
 _VARIANTS = [
-    ("exact search", {"steps": 0}),
-    ("search steps 4", {"steps": 4}),
     ("bf16-true", {"precision": "bf16-true"}),
     ("bf16-mixed", {"precision": "bf16-mixed"}),
     ("no tiles", {"tile": 0}),
@@ -90,7 +88,7 @@ def usual_settings(
         networks, largest = {"own weights": Preset()}, "own weights"
     lacking: set[str] = set()
     if network is not None:
-        lacking = {"motion", "steps"} - signature(type(network)).parameters.keys()
+        lacking = {"motion"} - signature(type(network)).parameters.keys()
         if network.halo is None:  # it is never cut into tiles
             lacking |= {"tile", "psnr_tolerance"}
     presets = dict(networks)

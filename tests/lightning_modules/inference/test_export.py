@@ -183,8 +183,8 @@ def test_an_export_that_is_killed_leaves_what_was_there(tmp_path, monkeypatch, f
 
 
 def test_what_cannot_be_exported_is_said_in_one_line(tmp_path):
-    with pytest.raises(ValueError, match=r"CSCSR: cannot be exported \(steps, neighbors: expected rounded positions"):
-        export_network(CSCSR(scale=2, steps=0, motion=ZeroFlow(), **TINY), tmp_path / "a.pt2", "torch")
+    with pytest.raises(ValueError, match=r"CSCSR: cannot be exported \(neighbors: expected 4 at most"):
+        export_network(CSCSR(scale=2, neighbors=5, motion=ZeroFlow(), **TINY), tmp_path / "a.pt2", "torch")
     assert not list(tmp_path.iterdir())
 
 

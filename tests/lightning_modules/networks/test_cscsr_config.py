@@ -16,7 +16,7 @@ TINY = {"width": 4, "representation_width": 4, "features": 1, "stages": 1, "end_
 
 def test_the_constructor_takes_the_fields_and_what_weights_serve_with_any_of():
     parameters = signature(CSCSR).parameters
-    assert list(parameters) == [*NAMES, "steps", "motion"]
+    assert list(parameters) == [*NAMES, "motion"]
     assert {name: parameters[name].default for name in NAMES} == {one.name: one.default for one in fields(CSCSRConfig)}
     network = CSCSR(2, 23, **TINY)
     assert network.config == CSCSRConfig(scale=2, frames=23, **TINY)

@@ -294,7 +294,6 @@ def test_classical_decoder_shows_the_middle_of_the_clip(method, settings):
         ({"width": 2.5}, "width: expected a whole number >= 1, got 2.5"),
         ({"stride": 0}, "stride: expected a whole number >= 1, got 0"),
         ({"alpha": float("nan")}, "alpha: expected a finite number above 0, got nan"),
-        ({"steps": 5}, "steps: expected an even number, or 0 for the exact search, got 5"),
     ],
 )
 def test_wrong_arguments(arguments, message):
