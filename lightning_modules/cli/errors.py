@@ -50,13 +50,12 @@ class VerbParser(argparse.ArgumentParser):
 
 def _of_users() -> tuple[type[BaseException], ...]:
     """Return what is raised where a user made a mistake; importing it takes torch."""
-    from lightning_modules.cli.folder_lock import FolderError
     from lightning_modules.storage.checkpoint import DivergedError
     from lightning_modules.storage.pretrained import CheckpointMismatchError
     from spikekit import SpikeFileError, VideoError
     from spikekit.io import PictureError
 
-    known = [InputError, SpikeFileError, PictureError, VideoError, CheckpointMismatchError, FolderError, DivergedError]
+    known = [InputError, SpikeFileError, PictureError, VideoError, CheckpointMismatchError, DivergedError]
     if "pytorch_lightning" in sys.modules:  # a verb that needs no Trainer does not import it
         from pytorch_lightning.utilities.exceptions import MisconfigurationException
 

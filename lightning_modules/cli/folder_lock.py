@@ -10,14 +10,14 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from lightning_modules.cli.errors import UsageError
+from lightning_modules.cli.errors import InputError, UsageError
 from spikekit.io.video import PICTURE_ENDINGS, VIDEO_ENDINGS
 
 # of what users may take the output for
 _FILE_ENDINGS = (*PICTURE_ENDINGS, *VIDEO_ENDINGS, ".gif", ".html", ".npz", ".dat", ".ckpt", ".safetensors")
 
 
-class FolderError(ValueError):
+class FolderError(InputError):
     """A folder that a run cannot write to."""
 
 
