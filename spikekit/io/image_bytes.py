@@ -38,7 +38,7 @@ def png_bytes(image: Tensor, notes: Mapping[str, str] | None = None, *, bits: in
 
     Args:
         image: (3, H, W) or (H, W), floating, [0, 1], or uint8.
-        notes: texts that stand in front of the pixels, by name, both ASCII; :func:`png_notes` reads them.
+        notes: texts that stand in front of the pixels, by name, both ASCII.
         bits: 8 or 16.
 
     Returns:
@@ -73,17 +73,6 @@ def _png16(pixels: np.ndarray, notes: Mapping[str, str]) -> bytes:
     texts = b"".join(chunk(b"tEXt", f"{name}\0{text}".encode("latin-1")) for name, text in notes.items())
     body = chunk(b"IHDR", header) + texts + chunk(b"IDAT", zlib.compress(rows.tobytes(), 2)) + chunk(b"IEND", b"")
     return b"\x89PNG\r\n\x1a\n" + body
-
-
-def png_notes(path: str | Path) -> dict[str, str]:
-    """Return the texts in front of the pixels of a PNG file, none where it cannot be read; the pixels are not read."""
-    from PIL import Image
-
-    try:
-        with quiet(), Image.open(path, formats=["PNG"]) as picture:
-            return {name: text for name, text in picture.info.items() if isinstance(text, str)}
-    except Exception:
-        return {}
 
 
 def png_pixels(path: str | Path) -> Tensor:
