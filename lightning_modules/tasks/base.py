@@ -106,14 +106,14 @@ class BaseTask(LightningModule):
         # Lightning divides the number of clips by that of processes, and rounds down
         self.log(name, values.mean(), batch_size=len(values) * processes, sync_dist=True, **how)
 
+    def on_train_batch_start(self, batch: Any, batch_index: int) -> None:
+        """Let loggers have the step that training stands at; resumed, Lightning's own count may be one off."""
+        self.trainer.fit_loop.epoch_loop._batches_that_stepped = self.trainer.global_step
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:  # noqa: D102
         checkpoint["network"] = settings_of(self.network)
         checkpoint["motion"] = motion_of(self.network)
         checkpoint["recipe"] = self.recipe
-        if "loops" in checkpoint and not (self._trainer and self._trainer.validating):
-            # Lightning counts a step for its loggers after it has saved: resumed, it would log all steps one too early
-            progress = checkpoint["loops"]["fit_loop"]["epoch_loop.state_dict"]
-            progress["_batches_that_stepped"] = checkpoint["global_step"]
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:  # noqa: D102
         check_settings(self.network, checkpoint.get("network", {}), "the checkpoint")

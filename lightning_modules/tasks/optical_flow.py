@@ -94,14 +94,16 @@ class FlowTraining(BaseTask):
                 torch.cuda.synchronize(flow.device)
             milliseconds = 1000 * (time.perf_counter() - start) / len(flow)
             flows[name] = flow
-            scores[name] = {**_scores(flow, batch["flow"]), "milliseconds": flow.new_full((len(flow),), milliseconds)}
+            found = _scores(flow, batch["flow"])
+            found |= {measure: 100 * found[measure] for measure in ("over_1px", "outliers")}  # per cent
+            scores[name] = {**found, "milliseconds": flow.new_full((len(flow),), milliseconds)}
         for measure, values in scores[type(self.network).__name__].items():
             self.log_mean(f"test/{measure}", values)
         return {"pictures": flows, "scores": scores}
 
 
 def _scores(flow: Tensor, truth: Tensor) -> dict[str, Tensor]:
-    """End-point error, and shares of wrong pixels in per cent, of every clip."""
+    """End-point error, and shares of wrong pixels, of every clip."""
     error = end_point_error(flow, truth)
-    measures = {"epe": error, "over_1px": 100 * (error > 1).float(), "outliers": 100 * outliers(error, truth).float()}
+    measures = {"epe": error, "over_1px": (error > 1).float(), "outliers": outliers(error, truth).float()}
     return {name: values.flatten(1).mean(dim=1) for name, values in measures.items()}

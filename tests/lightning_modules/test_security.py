@@ -77,8 +77,9 @@ def test_hyper_parameters_of_a_checkpoint_build_nothing(verb, kinds, content, tr
             "-o",
             str(tmp_path / "o"),
         ]
+        wrong = [str(tmp_path / "nowhere.dat")] if verb == "predict" else ["--data.root", str(tmp_path / "nowhere")]
         with pytest.raises(SystemExit):
-            main([verb, *words, "--data", "Recording", "--data.path", str(tmp_path / "nowhere.dat")])
+            main([verb, *words, *wrong])
         assert not trap.exists()
         assert "hyper_parameters" not in Checkpoints().load_checkpoint(tmp_path / f"{name}.ckpt")
 
@@ -155,7 +156,7 @@ ESTIMATOR = {"class": "Spike2Flow", "window": 5}
 def test_settings_reach_only_what_is_known(settings, motion, suffix, trap, configs, tmp_path):
     path = write(tmp_path / f"odd{suffix}", settings, motion, CSCSR(**TINY).state_dict())
     with pytest.raises(SystemExit) as stopped:
-        main(["predict", "--model.weights", str(path), "--data", "Recording", "--data.path", "nowhere.dat"])
+        main(["test", "-c", str(configs / "x2.yaml"), "--model.weights", str(path), "-o", str(tmp_path / "o")])
     said = str(stopped.value)
     assert said.startswith(f"lightning: {path}: ")
     assert "\n" not in said

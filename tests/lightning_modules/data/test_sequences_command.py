@@ -108,7 +108,6 @@ def test_fit_on_vimeo_and_on_films_without_flow(tmp_path, command, capsys, write
         ("fit", "films", ["--data.root", "."], "expected one of\n  REDS 120 fps   train/train_orig/000/"),
         ("test", "films", ["--data.root", "vid4", "--data.pattern", "BGGR"], "data.pattern: expected RGGB"),
         ("fit", "films", ["--data.root", "vid4"], "Vid4 without sequences for fit"),
-        ("predict", "films", ["--data.root", "vid4"], "--data Recording --data.path FILE"),
     ],
 )
 def test_errors_come_before_anything_is_written(tmp_path, command, verb, overlay, args, message, write_film):

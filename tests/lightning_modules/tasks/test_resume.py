@@ -113,7 +113,7 @@ def test_a_plateau_is_looked_for_in_what_chooses_the_best(fit, schedule):
     words += ["--model.lr_scheduler.threshold", "1000"] + ["--model.lr_scheduler.monitor", "val/psnr"] * (
         schedule[0] == "p"
     )
-    checkpoint = fit("run", "--trainer.check_val_every_n_epoch=1", "--trainer.max_steps=8", *words)
+    checkpoint = fit("run", "--trainer.check_val_every_n_epoch=1", "--trainer.max_steps=12", *words)
     assert checkpoint["optimizer_states"][0]["param_groups"][0]["lr"] == pytest.approx(
         1e-5
     )  # after the second of two validations
