@@ -479,3 +479,17 @@ def test_at_scale_1_pictures_are_shrunk_until_their_edges_are_sharp():
         return (pictures.diff(dim=-1).square().mean(dim=(-2, -1)).sqrt() / spread).median()
 
     assert detail(1) > 0.8 * detail(2)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+@pytest.mark.parametrize("options", [{}, {"pattern": "grey", "key_frames": 3, "every": 8}])
+def test_a_gpu_renders_the_same_scenes(options):
+    clips = StillClips(
+        embedded_pictures(), **{"scale": 4, "patch": 24, "noise": SensorNoise(gain_spread=0.05)} | options
+    )
+    drawn = [clips.draw(index) for index in range(16)]
+    drawn = {name: np.stack([one[name] for one in drawn]) for name in drawn[0]}
+    here, there = (clips.render(drawn, clips.sources.gallery(device)) for device in ("cpu", "cuda"))
+    assert (here.pop("spikes") != there.pop("spikes").cpu()).double().mean() < 5e-3
+    for name in here:
+        torch.testing.assert_close(there[name].cpu(), here[name], atol=1e-4, rtol=0)
