@@ -106,7 +106,7 @@ def _argv(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["lightning"])
 
 
-@pytest.mark.parametrize("letter", VARIANTS)
+@pytest.mark.parametrize("letter", "cdj")  # an argument of the network, one of the task as well, and none
 def test_the_command_builds_the_variant(letter, configs, capsys):
     model = parsed(configs, capsys, "x4", "quick", f"ablation/{letter}")["model"]["init_args"]
     assert model["flow"] == ("estimated" if letter in "de" else "scene")
@@ -118,9 +118,8 @@ def test_the_command_builds_the_variant(letter, configs, capsys):
     assert all((asked[name] == defaults[name]) == (letter == "j") for name in overlay)
 
 
-@pytest.mark.parametrize("scale", [2, 3, 4])
-def test_j_is_the_configuration_of_the_scale_itself(scale, configs, capsys):
-    assert parsed(configs, capsys, f"x{scale}", "ablation/j") == parsed(configs, capsys, f"x{scale}")
+def test_j_is_the_configuration_of_the_scale_itself(configs, capsys):
+    assert parsed(configs, capsys, "x4", "ablation/j") == parsed(configs, capsys, "x4")
 
 
 @pytest.mark.parametrize("letter", VARIANTS)
@@ -128,7 +127,8 @@ def test_variants_differ_in_parameters_and_modules(letter, configs):
     *parameters, modules = VARIANTS[letter]
     for size, expected in zip(("full_base", "full_large"), parameters, strict=True):
         for scale in (2, 3, 4):
-            network = CSCSR(**{**settings(configs, f"x{scale}", f"ablation/{letter}"), "size": size})
+            with torch.device("meta"):
+                network = CSCSR(**{**settings(configs, f"x{scale}", f"ablation/{letter}"), "size": size})
             assert network.scale == scale
             assert sum(p.numel() for p in network.parameters()) == expected
     found = *{type(part) for part in network.representation}, *{type(part) for part in network.refinement}
@@ -151,7 +151,7 @@ def test_no_two_variants_are_alike(configs):
             assert one == other or not torch.allclose(pictures[one], pictures[other], atol=1e-3), (one, other)
 
 
-@pytest.mark.parametrize("scale", [2, 3, 4])
+@pytest.mark.parametrize("scale", [3])
 @pytest.mark.parametrize("letter", VARIANTS)
 def test_any_size_and_every_parameter_learns(letter, scale, configs):
     spikes, flow = clip(2, 9, 7)
@@ -223,7 +223,7 @@ def test_features_without_weights_of_a_flat_scene_are_flat_whatever_moves(letter
     network = variant(letter, configs, scale=scale)
     spikes = torch.ones(1, 41, 12, 16)
     flow = torch.rand(1, 2, 2, 12, 16, generator=torch.Generator().manual_seed(0)) * 6 - 3
-    for color, mask in enumerate(network._mask(12, 16, spikes.device)):
+    for color, mask in enumerate(bayer_mask(12, 16, scale=scale, dtype=torch.bool)):
         features = network.representation[color](spikes * bayer_mask(12, 16)[color])
         for offsets in (network._offsets(flow, spikes)[color], network._offsets(None, spikes)[color]):
             pixels = network._search(features, offsets, mask)
