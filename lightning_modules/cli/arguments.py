@@ -68,7 +68,7 @@ def with_network_of_weights(args: Sequence[str]) -> list[str]:
         elif option in WEIGHTS:
             asked = value
         elif _MOTION.fullmatch(option):
-            named = _with_class(yaml.safe_load(value)) or named
+            named = _with_class(_parsed(value, option)) or named
     if asked in (None, "", "null"):
         return list(args)
     if not isinstance(asked, str):
@@ -189,6 +189,13 @@ def _part_of(config: str, name: str) -> Any:
     except (OSError, ValueError):  # a text that no name can be
         there = False
     return read_config(config).get(name) if there else None
+
+
+def _parsed(text: str, name: str) -> Any:
+    try:
+        return yaml.safe_load(text)
+    except Exception as error:  # what the parser raises depends on the text
+        raise ValueError(f"{name}: not a configuration ({one_line(error)[:300]})") from error
 
 
 def _with_class(choice: Any) -> dict[str, Any] | None:

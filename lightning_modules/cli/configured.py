@@ -47,13 +47,14 @@ def configured_network(
             own = chosen is not None and chosen.network.init_args.get("motion") is not None
             return Network.from_pretrained(source, described.motion if own else None)
         if described is None:
-            kind = "none" if found is None else found.settings.get("class")
-            raise UsageError(f"-c: expected the configuration of a network that is not of this package, {kind}")
+            got = "none" if found is None else f"those of {found.settings.get('class')}"
+            expected = "expected weights of a network of this package, or -c that describes another"
+            raise InputError(f"{source or '--weights'}: {expected}, got {got}")
         if found is not None:
             load_weights(described, found)
         elif any(True for _ in described.parameters()):
             raise UsageError(f"--weights, --ckpt_path: expected one of them for {type(described).__name__}, got none")
-    except UsageError:
+    except InputError:
         raise
     except (ArgumentError, OSError, ValueError) as error:
         raise InputError(reason(str(error))) from error
