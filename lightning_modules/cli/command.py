@@ -138,7 +138,6 @@ class Command(LightningCLI):
         network = "model.init_args.network.init_args"
         for name in ("scale", "frames", "alpha"):
             parser.link_arguments(f"{network}.{name}", f"data.init_args.{name}")
-        parser.link_arguments(f"{network}.pattern", "data.init_args.crop_to")
         parser.link_arguments("model.init_args.flow", "data.init_args.flow_patch", {"scene": 0, "estimated": 48}.get)
         parser.link_arguments("model", "data.init_args.flow_times", _ends, apply_on="instantiate")
 

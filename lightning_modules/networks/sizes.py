@@ -12,7 +12,8 @@ _SENSOR = {"resolution": "sensor", "width": 32, "representation_width": 16, "fea
 #: fields of :class:`lightning_modules.networks.CSCSRConfig` by the name of a size. Parameters and million
 #: multiplications by sensor pixel at x4: tiny 0.30 M and 0.36, small 1.08 M and 1.48, base 1.32 M and 1.72, large
 #: 2.26 M and 2.66, huge 3.78 M and 4.18, full_small 0.17 M and 1.86, full_base 0.73 M and 9.06, full_large 2.83 M
-#: and 42.7
+#: and 42.7. Of those for x1, where a site is one temporal pixel and time points have more features, for a grey sensor:
+#: small_x1 0.53 M and 0.67, large_x1 1.72 M and 2.02
 SIZES: dict[str, dict[str, Any]] = {
     "tiny": {
         "resolution": "sensor",
@@ -28,6 +29,26 @@ SIZES: dict[str, dict[str, Any]] = {
     "base": {**_SENSOR, "end_blocks": 16},
     "large": {**_SENSOR, "end_blocks": 16, "end_width": 64},
     "huge": {**_SENSOR, "end_blocks": 16, "end_width": 96},
+    "small_x1": {
+        "resolution": "sensor",
+        "width": 32,
+        "representation_width": 16,
+        "features": 6,
+        "stages": 1,
+        "blocks": 1,
+        "end_blocks": 10,
+        "end_width": 48,
+    },
+    "large_x1": {
+        "resolution": "sensor",
+        "width": 48,
+        "representation_width": 24,
+        "features": 8,
+        "stages": 1,
+        "blocks": 1,
+        "end_blocks": 20,
+        "end_width": 64,
+    },
     "full_small": {
         **_FULL,
         "width": 16,
