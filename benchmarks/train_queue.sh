@@ -19,10 +19,10 @@ train() {
 
 seconds=$(( minutes * 60 ))
 configs=$(dirname "$0")/../configs
-train grey_large_x1 $seconds -c "$configs/x1.yaml" -c "$configs/size/large_x1.yaml" -c "$configs/grey.yaml" \
-    -c "$configs/cameras.yaml" -c "$configs/gpu.yaml" "$@"
-train grey_small_x1 $(( seconds / 2 )) -c "$configs/x1.yaml" -c "$configs/size/small_x1.yaml" -c "$configs/grey.yaml" \
-    -c "$configs/cameras.yaml" -c "$configs/gpu.yaml" "$@"
+train grey_large_x1 $seconds -c "$configs/x1.yaml" -c "$configs/grey.yaml" -c "$configs/cameras.yaml" \
+    -c "$configs/gpu.yaml" --model.network.size large_x1 "$@"
+train grey_small_x1 $(( seconds / 2 )) -c "$configs/x1.yaml" -c "$configs/grey.yaml" -c "$configs/cameras.yaml" \
+    -c "$configs/gpu.yaml" --model.network.size small_x1 "$@"
 train large_x4 $seconds -c "$configs/x4.yaml" -c "$configs/cameras.yaml" -c "$configs/gpu.yaml" \
     --model.network.size huge "$@"
 train small_x4 $(( seconds / 2 )) -c "$configs/x4.yaml" -c "$configs/cameras.yaml" \
