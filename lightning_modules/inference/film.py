@@ -13,7 +13,6 @@ from torch import Tensor
 
 from lightning_modules.inference.clips import clips_around, film_groups
 from lightning_modules.inference.predict import check_options, predict
-from lightning_modules.inference.replay import run as run_replayed
 from lightning_modules.inference.tiles import TILE, TILE_ON_GPU, Box, reach, tiled
 from lightning_modules.networks import Network, RecurrentCSCSR
 from lightning_modules.networks.recurrent_cscsr import read_forward, read_from_end
@@ -307,7 +306,7 @@ class FilmMaker:
 
     def _features(self, spikes: Tensor, flow: Tensor | None, whole: Box) -> Tensor:
         def run(outer: Box) -> Tensor:
-            features = run_replayed(self.network.features, outer.of(spikes), None if flow is None else outer.of(flow))
+            features = self.network.features(outer.of(spikes), None if flow is None else outer.of(flow))
             return self._halved(features, whole)
 
         return tiled(run, whole, self.tile, lambda box: reach(flow, box, whole, self.network.halo))
@@ -323,7 +322,7 @@ class FilmMaker:
         def run(outer: Box) -> Tensor:
             around = [moved(outer, *neighbor) for neighbor in neighbors]
             seen = outer.of(features).to(self._dtype), outer.of(spikes)
-            state = run_replayed(self.network.advance, *seen, *around)
+            state = self.network.advance(*seen, *around)
             return self._halved(state, whole)
 
         return tiled(run, whole, self.tile, lambda _: self.network.halo)

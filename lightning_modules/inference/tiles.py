@@ -10,14 +10,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from lightning_modules.inference.replay import run as run_replayed
 from lightning_modules.inference.scene_activity import CELL, expected_errors, moving_cells, scene_activity
 from lightning_modules.networks import Network
 
 #: side of a tile, in sensor pixels, where nothing else is asked for
 TILE = 200
 #: on a GPU, which has more memory, and needs larger ones to be busy
-TILE_ON_GPU = 1024
+TILE_ON_GPU = 512
 #: motion that is followed over the edge of a tile, in sensor pixels; what moves further is searched inside
 FAR = 48
 #: sensor pixels around what moves in which motion is estimated, where a tolerance is given
@@ -68,7 +67,7 @@ def forward_in_tiles(
         if tolerance and part is not None and not part.any():
             part = None
         seen = outer.of(spikes)
-        return call(network, seen, static=True) if part is None else run_replayed(network.__call__, seen, part)
+        return call(network, seen, part, part is None)
 
     return tiled(run, whole, tile, lambda box: reach(flow, box, whole, network.halo), network.scale, done)
 

@@ -16,7 +16,6 @@ from spikekit.check import check_planes, check_positive, check_whole
 from spikekit.color.cfa import cfa_pattern, cfa_sites
 from spikekit.flow.tvl1 import tvl1_flow
 from spikekit.kernels import compiler_kept_out
-from spikekit.kernels.graphs import Replayed
 from spikekit.sensor.quantization_noise import flicker
 
 _GREY = 0.25, 0.5, 0.25  # each pixel the mean of the Bayer cells that it is part of
@@ -85,12 +84,11 @@ class ClassicalFlow(MotionEstimator):
             raise ValueError(f"spikes: expected {expected}, got {tuple(spikes.shape)}")
         pattern = cfa_pattern(pattern)
         alike = _clips_by_window(spikes)  # clips that need one window are seen at once
-        run = _replayed if spikes.is_cuda else _of_window
         velocities = []
         for window, clips in alike.items():
             way = _Way(self.attachment, self.warps, middle, window, pattern, by_site)
             noise = noise_by_rate(window, spikes.device)
-            velocities.append(run(way, spikes if len(alike) == 1 else spikes[clips], noise))
+            velocities.append(_of_window(way, spikes if len(alike) == 1 else spikes[clips], noise))
         order = torch.tensor([clip for clips in alike.values() for clip in clips], device=spikes.device).argsort()
         before, after = torch.cat(velocities, dim=-5).index_select(-5, order).unbind(dim=-4)
         return before * (first - middle), after * (last - middle)
@@ -128,10 +126,6 @@ def _of_window(way: _Way, spikes: Tensor, noise: Tensor) -> Tensor:
         attachment = way.attachment / (1 + variance[:, 0] / _NOISE**2)
         velocities = _velocities(pictures, clock, attachment, way.warps)
     return velocities.unflatten(0, (sites, -1)) if way.by_site else velocities
-
-
-#: a GPU waits for the launches of an estimate, not for its work
-_replayed = Replayed(_of_window)
 
 
 def _filtered(planes: Tensor, weights: Sequence[float], border: str) -> Tensor:

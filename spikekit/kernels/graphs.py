@@ -25,7 +25,7 @@ class Replayed:
 
     def __init__(self, function: Callable[..., Tensor], most: int = 8) -> None:
         self.function, self.most = function, most
-        self._graphs: OrderedDict[Hashable, _Graph | None] = OrderedDict()
+        self._graphs: OrderedDict[Hashable, _Graph | bool | None] = OrderedDict()
         self._lock = RLock()
 
     @torch.no_grad()
@@ -41,10 +41,13 @@ class Replayed:
                     self._graphs.popitem(last=False)
                 return self.function(argument, *tensors)
             self._graphs.move_to_end(key)
+            if self._graphs[key] is None:
+                try:
+                    self._graphs[key] = _Graph(self.function, argument, tensors)
+                except RuntimeError:  # something in it waits for the GPU after all, or there is no memory for a graph
+                    self._graphs[key] = False
             graph = self._graphs[key]
-            if graph is None:
-                graph = self._graphs[key] = _Graph(self.function, argument, tensors)
-            return graph.replay(tensors)
+            return graph.replay(tensors) if graph else self.function(argument, *tensors)
 
 
 class _Graph:
