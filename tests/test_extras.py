@@ -46,6 +46,17 @@ def test_every_package_that_is_imported_is_declared_and_the_other_way_round():
     assert declared(extras["learn"]) - {"kornia_rs"} | brought_by == LEARN  # kornia itself needs kornia_rs
 
 
+def test_the_lowest_versions_that_ci_tests_are_those_that_are_allowed():
+    lowest = dict(line.split("==") for line in (ROOT / ".ci" / "lowest.txt").read_text().split("\n")[1:] if line)
+    lowest = {name.replace("_", "-"): version.split(".") for name, version in lowest.items()}
+    of_users = [*PROJECT["dependencies"]]
+    of_users += [text for name in ("learn", "fast", "video") for text in PROJECT["optional-dependencies"][name]]
+    for text in of_users:
+        name, version = re.fullmatch(r"([\w-]+)(?:\[\w+\])?>=([\d.]+)", text).groups()
+        floor = version.split(".")
+        assert lowest[name][: len(floor)] == floor, name
+
+
 WITHOUT = """
 import sys
 
