@@ -116,15 +116,16 @@ def reconstruct(
         path, height=height, width=width, flip=flip, pattern=pattern, camera=camera, calibration=calibration
     )
     notes: list[str] = []
+    noisy = str(calibration) != "none" and may_be_noisy(recording)
     if network is None:
         white = RecordingClips(recording).white if white is None else white
         speed = "balanced" if budget is None and speed is None else speed
-        noisy = str(calibration) != "none" and may_be_noisy(recording)
         preset, notes = _chosen(recording, speed, budget, scale, frame, white, noisy)
         how = {**preset.given("tile", "psnr_tolerance", "self_ensemble", "interpolated"), **how}
         network = preset.build()
     elif not isinstance(network, Network):
         network = Network.from_pretrained(network)
+    network.noise_level = float(noisy)
     clips = RecordingClips(recording, network.frames, frame, network.pattern)
     notes = [line for line in (recording.note, _other_sensor(recording, network.pattern), *notes) if line]
     return Reconstruction(network, clips, white, device, precision, notes, **how)

@@ -175,6 +175,8 @@ class CSCSR(Network):
 
     def _told(self, noise: float | Tensor | None, spikes: Tensor) -> dict[str, Tensor]:
         """The level of the noise as an argument, (B, 1, 1, 1), or none; of clips (B, N, H, W)."""
+        if noise is None and self.config.noise and self.noise_level:
+            noise = self.noise_level
         if noise is None:
             return {}
         if not self.config.noise:

@@ -44,6 +44,8 @@ class Network(nn.Module):
             not run in tiles. Shipped weights bring their own.
         takes_flow: whether a flow changes anything.
         error_model: what less work costs it, for a tolerance; that of the weights, once they are loaded.
+        noise_level: of the sensor, where a call does not say: 0 for an ideal one, 1 for that of training. Networks that
+            were not trained to be told it do not ask.
         warm_up: how many key frames before a picture of a film it depends on, as far as one can see; 0 where every
             clip stands for itself.
         flow_groups: leading dimensions of the flows that the network takes, behind the batch.
@@ -60,6 +62,7 @@ class Network(nn.Module):
     alpha: float = 0.4
     halo: int | None = None
     takes_flow: bool = True
+    noise_level: float = 0.0
     warm_up: int = 0
     flow_groups: tuple[tuple[int, ...], ...] = ((),)
 

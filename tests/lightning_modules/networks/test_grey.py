@@ -82,3 +82,14 @@ def test_a_still_scene_begins_at_the_mean_of_its_spikes():
     picture = CSCSR(1, skip=True, alpha=1.0, **TINY)(spikes, static=True)
     assert (picture[..., :12] - 1 / 2).abs().max() < 0.002
     assert (picture[..., 12:] - 1 / 4).abs().max() < 0.002
+
+
+def test_a_level_of_the_noise_that_the_network_knows_is_that_of_a_call():
+    network = CSCSR(scale=1, pattern="grey", noise=True, width=8, representation_width=8, features=1, stages=1).eval()
+    for part in network.parameters():
+        torch.nn.init.normal_(part, std=0.1)
+    spikes = (torch.rand(1, 41, 12, 13) < 0.3).float()
+    told, ideal = network(spikes, static=True, noise=1.0), network(spikes, static=True)
+    network.noise_level = 1.0
+    torch.testing.assert_close(network(spikes, static=True), told)
+    assert not torch.allclose(told, ideal)
