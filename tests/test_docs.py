@@ -20,7 +20,6 @@ import torch
 from torch import nn
 
 import spikekit as sk
-from spikekit.cli.command import main
 
 DOCS = Path(__file__).parents[1] / "docs"
 MADE = {"_build", "gallery", "generated", "sg_execution_times.rst"}  # by Sphinx
@@ -289,17 +288,12 @@ QUIET = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "page", ["index.html", "operators/tfi.html", "gallery/index.html", "gallery/plot_02_decoders.html", "view.html"]
+    "page", ["index.html", "operators/tfi.html", "gallery/index.html", "gallery/plot_02_decoders.html"]
 )
 def test_pages_open_in_a_browser(built, page, tmp_path):
     browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if browser is None:
         pytest.skip("no Chromium is installed")
-    if page == "view.html":
-        light = 0.4 * torch.rand(1, 24, 32, generator=torch.Generator().manual_seed(0)).expand(60, -1, -1)
-        sk.write_spikes(tmp_path / "a.npz", sk.simulate_spikes(light, generator=torch.Generator().manual_seed(0)))
-        assert main(["view", str(tmp_path / "a.npz"), "-o", str(tmp_path / page)]) == 0
-        built = tmp_path
     picture = tmp_path / "page.png"
     command = [
         browser,

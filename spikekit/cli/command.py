@@ -30,7 +30,7 @@ VERBS = {
         "gain and defects of pixels",
         "calibrate street.dat --height 250 --width 400 --flat wall.dat --dark cap.dat",
     ),
-    "view": ("a recording as a picture or a page", "view walk.dat -o walk.html"),
+    "view": ("a sheet of pictures about a recording", "view walk.dat -o look.png"),
     "cameras": ("the cameras that --camera knows", "cameras"),
 }
 

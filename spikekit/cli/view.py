@@ -1,15 +1,12 @@
-"""``spikekit view``: a recording as a sheet, an animation or an HTML page."""
+"""``spikekit view``: a recording as a sheet of pictures."""
 
 from __future__ import annotations
 
 import argparse
-import base64
+import io
 import math
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from html import escape
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,66 +15,46 @@ from torch import Tensor
 
 from spikekit.arguments import UsageError, ending_in, positive, whole
 from spikekit.cli import recordings
-from spikekit.cli.drawing import fit, histogram, raster, sheet
 from spikekit.color.demosaic import demosaic
 from spikekit.decoders.single_frame import search
 from spikekit.flow.fields import upsample_flow
 from spikekit.io.failures import writing
-from spikekit.io.image_bytes import gif_bytes, picture_bytes, png_bytes
 from spikekit.io.images import flow_to_rgb
 from spikekit.io.sidecar import check_unclaimed
 from spikekit.io.whole_file import whole_file
-from spikekit.progress import progress
 from spikekit.recording import Recording, white_rate
 from spikekit.standard_output import say
 
 #: Frames on each side of the one in the middle that are looked at.
 REACH = 200
 
-#: Pictures of an animation or a page, at most.
-MOST = 60
-
-_SIDE = 480  # pixels of a picture, at most
 _WINDOW = 41
-_QUALITY = 85  # of the JPEGs of a page: a fifth of what PNG takes for pictures that are noisy by nature
 _FEW, _ENOUGH = 4, 8  # spikes of a pixel in a window: below the one there is a hint at a window of the other
 
 
 def run(args: argparse.Namespace) -> None:
-    """Show a recording: decoded pictures, spikes over time, how often pixels fire, and what moves.
+    """Draw a sheet about one moment of a recording.
 
-    A .png is a sheet about one moment, a .gif shows pictures sliding over time, a .html is a page with both
-    and a slider, which works offline. Only the frames that are shown are read.
+    It shows decoded pictures, spikes over time, how often pixels fire, and what moves. Only the frames that are shown
+    are read. For films, see spikekit decode.
 
     Size, Bayer phase and brightness can be omitted if a side-car or --camera gives them.
     """
     shown = recordings.opened(args)
     begin, end = _span(args.frames, shown)
-    window = min(args.window or _WINDOW, end - begin)
-    ending = args.output.suffix.lower()
     if args.output.is_dir():
         raise ValueError(f"{args.output}: expected a file to write, got a folder")
     check_unclaimed([args.output], args.file)
     if args.row is not None and args.row >= shown.size[0]:
         raise UsageError(f"--row: expected 0 .. {shown.size[0] - 1}, got {args.row}")
+    window = min(args.window or _WINDOW, end - begin)
     moment = Moment(shown, begin, end, window, args.alpha or shown.alpha, args.row)
-    hint = "" if args.window else moment.hint
-    if ending == ".png":
-        data = png_bytes(sheet(moment.drawings()))
-    else:
-        if args.window is None:
-            window = min(window, max(1, (end - begin) // 2))  # or nothing slides
-        starts = [int(start) for start in np.linspace(begin, end - window, min(MOST, end - window - begin + 1))]
-        pictures = progress(moment.sliding(starts, window), "pictures", len(starts))
-        if ending == ".gif":
-            data = gif_bytes(pictures, args.seconds / len(starts))
-        else:
-            data = _page(moment, starts, window, pictures, hint).encode()
+    data = moment.sheet()
     with writing(args.output), whole_file(args.output) as file:
         file.write(data)
     say(f"{args.output}: frames {begin} .. {end - 1} of {shown.frames}, {moment.said}")
-    if hint:
-        print(hint)
+    if moment.hint and not args.window:
+        print(moment.hint)
 
 
 @dataclass(frozen=True)
@@ -110,6 +87,12 @@ class Moment:
         """The frames that are drawn: those around the one in the middle."""
         return range(max(self.begin, self.frame - REACH), min(self.end, self.frame + REACH + 1))
 
+    @property
+    def averaged(self) -> range:
+        """The frames that TFP averages."""
+        first = max(self.near.start, self.frame - self.window // 2)
+        return range(first, min(first + self.window, self.near.stop))
+
     @cached_property
     def _planes(self) -> list[np.ndarray]:
         return list(self.recording.packed(self.near.start, len(self.near)))
@@ -117,14 +100,14 @@ class Moment:
     def _plane(self, n: int) -> np.ndarray:
         return self.recording.unpack(self._planes[n - self.near.start])
 
-    def _rate(self, first: int, last: int) -> Tensor:
-        total = sum(map(self._plane, range(first, last)), start=np.float32(0))
-        return torch.from_numpy(total / np.float32(last - first))
+    def _rate(self, frames: range) -> Tensor:
+        total = sum(map(self._plane, frames), start=np.float32(0))
+        return torch.from_numpy(total / np.float32(len(frames)))
 
     @cached_property
     def rates(self) -> Tensor:
         """How often every pixel fires in the frames that are drawn, in spikes a frame."""
-        return self._rate(self.near.start, self.near.stop)
+        return self._rate(self.near)
 
     @property
     def white(self) -> float:
@@ -153,26 +136,20 @@ class Moment:
         """Return raw light as it is shown, (3, H, W) or (H, W)."""
         light, pattern = self.recording.correct(raw) / self.white, self.recording.bayer
         colour = demosaic(light, pattern) if pattern and min(light.shape) >= 3 else light
-        return fit(self.recording.show(colour, known=self.alpha is not None), _SIDE, _SIDE)
+        return self.recording.show(colour, known=self.alpha is not None)
 
     def tfp(self) -> Tensor:
         """The picture of the middle by TFP."""
-        first = max(self.near.start, self.frame - self.window // 2)
-        return self.picture(self._rate(first, min(first + self.window, self.near.stop)))
+        return self.picture(self._rate(self.averaged))
 
     def tfi(self) -> Tensor:
         """The picture of the middle by TFI."""
         return self.picture(torch.from_numpy(search(self._plane, self.frame, self.near)).float().reciprocal())
 
-    def sliding(self, starts: list[int], window: int) -> Iterator[Tensor]:
-        """Pictures by TFP of the windows that begin at these frames."""
-        for start in starts:
-            yield self.picture(self.recording.counts(start, window) / window)
-
     def raster(self) -> Tensor:
-        """The spikes of one row of pixels, time to the right."""
+        """The spikes of one row of pixels, (W, T)."""
         spikes = np.stack([self._plane(n)[self.line].copy() for n in self.near])  # a view would hold its frame
-        return raster(torch.from_numpy(spikes), _SIDE, _SIDE)
+        return torch.from_numpy(spikes).T
 
     @property
     def line(self) -> int:
@@ -191,112 +168,50 @@ class Moment:
         from skimage.registration import optical_flow_ilk
 
         # whole cells of the mosaic, so that colours do not matter, and less noise
+        frame = self.frame
+        rates = (self._rate(range(frame - length, frame)), self._rate(range(frame, frame + length)))
         cells = [
             gaussian(F.avg_pool2d(self.recording.correct(rate)[None, :height, :width], 2)[0].numpy() / self.white, 1.5)
-            for rate in (self._rate(self.frame - length, self.frame), self._rate(self.frame, self.frame + length))
+            for rate in rates
         ]
         y, x = optical_flow_ilk(*cells, radius=9, prefilter=True)
         flow = upsample_flow(torch.from_numpy(np.stack([x, y])).float()[None], 2)[0]
         longest = max(1.0, float(np.quantile(flow.norm(dim=0).numpy(), 0.99)))
-        return fit(flow_to_rgb(flow, longest), _SIDE, _SIDE), longest, length
+        return flow_to_rgb(flow, longest), longest, length
 
-    def drawings(self) -> list[list[tuple[str, Tensor]]]:
-        """Everything about the middle, each with its title, in rows."""
-        near, (height, width) = self.near, self.recording.size
-        first = max(near.start, self.frame - self.window // 2)
+    def sheet(self) -> bytes:
+        """Everything about the middle, as the bytes of a PNG file."""
+        from matplotlib.figure import Figure
+
+        figure = Figure((16, 9), layout="constrained")
+        axes = figure.subplots(2, 3)
+        spikes = torch.from_numpy(self._plane(self.frame)).float()
         pictures = [
-            (f"TFP, frames {first} .. {min(first + self.window, near.stop) - 1}", self.tfp()),
+            (f"TFP, frames {self.averaged.start} .. {self.averaged.stop - 1}", self.tfp()),
             (f"TFI, frame {self.frame}", self.tfi()),
+            (f"spikes of frame {self.frame}", 1 - spikes),
         ]
-        moves = self.motion()
-        if moves:
-            colours, longest, clocks = moves
-            pictures.append((f"motion in {clocks} frames, red to the right, full colour {longest:.1f} pixels", colours))
-        one = torch.from_numpy(self._plane(self.frame)).float()
-        high, wide = pictures[0][1].shape[-2:]
-        silent = (self.rates == 0).float().mean().item()
-        return [
-            pictures,
-            [
-                (f"spikes of row {self.line}, frames {near.start} .. {near.stop - 1} to the right", self.raster()),
-                (f"spikes of frame {self.frame}, {height} x {width}", fit(1 - one, _SIDE, _SIDE)),
-                (
-                    f"spikes a frame: mean {self.rates.mean():.3f}, {silent:.1%} of the pixels silent",
-                    histogram((self.rates * len(near)).round(), len(near), max(240, wide), max(160, high)),
-                ),
-            ],
-        ]
-
-
-_STYLE = (
-    "body{font:15px system-ui,sans-serif;margin:2em auto;padding:0 max(1em,2vw);max-width:1500px;color:#222;"
-    "background:#fff;overflow-wrap:anywhere}"
-    "figure{display:inline-block;margin:0 1.5em 1.5em 0;max-width:100%;vertical-align:top}"
-    "figcaption{margin-bottom:.4em}"
-    "img{image-rendering:pixelated;max-width:100%;height:auto}img:not([hidden]){display:block}"
-    "figure div+div{display:flex;gap:.6em;margin-top:.4em}input{flex:1;min-width:0}"
-)
-
-
-def _page(moment: Moment, starts: list[int], window: int, pictures: Iterable[Tensor], hint: str) -> str:
-    def image(picture: Tensor, more: str = "", **how: Any) -> str:
-        return f'<img {more}src="{_data(picture, **how)}" alt="">'
-
-    name = escape(moment.recording.path.name)
-    frames, (height, width) = moment.recording.frames, moment.recording.size
-    figures = "".join(
-        f"<figure><figcaption>{escape(title)}</figcaption>{image(picture)}</figure>"
-        for row in moment.drawings()
-        for title, picture in row
-    )
-    # encoded one by one, as they come: a page holds no more than one of them as numbers
-    frames_of = "".join(image(picture, "hidden ", ending=".jpg", quality=_QUALITY) for picture in pictures)
-    windows = moment.end - moment.begin - window + 1
-    cut = f", {len(starts)} of {windows} windows" if len(starts) < windows else ""
-    cut += f", shrunk to at most {_SIDE} pixels" if max(height, width) > _SIDE else ""
-    last = len(starts) - 1
-    return f"""<!DOCTYPE html>
-<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
-<title>{name}</title><style>{_STYLE}</style>
-<h1>{name}</h1>
-<p>{frames} frames of {height} x {width}, {escape(moment.said)}{cut}</p>{f"<p>{hint}</p>" if hint else ""}
-<figure><figcaption>TFP, frames <output id="at"></output></figcaption><div id="film">{frames_of}</div>
-<div><button id="play" aria-label="play">&#9654;</button>
-<input id="time" type="range" min="0" max="{last}" value="{last // 2}" aria-label="time"></div></figure>
-{figures}
-<script type="module">
-const starts = {starts}, length = {window}, time = document.getElementById("time");
-const play = document.getElementById("play");
-let timer = 0;
-function show() {{
-  const n = +time.value;
-  [...document.getElementById("film").children].forEach((picture, k) => picture.hidden = k !== n);
-  document.getElementById("at").value = starts[n] + " .. " + (starts[n] + length - 1);
-}}
-function stop() {{
-  clearInterval(timer);
-  timer = 0;
-  play.textContent = "\u25b6";
-}}
-function next() {{
-  time.value = (+time.value + 1) % starts.length;
-  show();
-}}
-play.onclick = () => {{
-  if (timer) return stop();
-  timer = setInterval(next, 100);
-  play.textContent = "\u23f8";
-}};
-time.oninput = () => {{ stop(); show(); }};
-show();
-</script>
-</html>
-"""
-
-
-def _data(picture: Tensor, ending: str = ".png", **how: Any) -> str:
-    kind = {".png": "png", ".jpg": "jpeg"}[ending]
-    return f"data:image/{kind};base64," + base64.b64encode(picture_bytes(picture, ending, **how)).decode()
+        if moves := self.motion():
+            colours, longest, frames = moves
+            pictures.append((f"motion in {frames} frames, red to the right, full colour {longest:.1f} pixels", colours))
+        for place, (title, picture) in zip(axes.flat, pictures, strict=False):
+            place.imshow((picture.movedim(0, -1) if picture.ndim == 3 else picture).numpy(), "gray", vmin=0, vmax=1)
+            place.set_title(title)
+        axes[1, 0].set_visible(bool(moves))
+        begin, end = self.near.start - 0.5, self.near.stop - 0.5
+        sides = begin, end, self.recording.size[1] - 0.5, -0.5
+        axes[1, 1].imshow(1 - self.raster().numpy(), "gray", vmin=0, vmax=1, extent=sides, aspect="auto")
+        axes[1, 1].set(title=f"spikes of row {self.line}", xlabel="frame", ylabel="column")
+        silent = (self.rates == 0).float().mean()
+        axes[1, 2].hist(self.rates.flatten().numpy(), bins=min(len(self.near), 80))
+        axes[1, 2].set(
+            title=f"mean {self.rates.mean():.3f}, {silent:.1%} of the pixels silent",
+            xlabel="spikes a frame",
+            ylabel="pixels",
+        )
+        file = io.BytesIO()
+        figure.savefig(file, format="png")
+        return file.getvalue()
 
 
 def _span(text: str | None, recording: Recording) -> tuple[int, int]:
@@ -315,15 +230,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     recordings.add_arguments(parser)
     add = parser.add_argument
-    output = ending_in(".png", ".gif", ".html", said="a file that ends in .png, .gif or .html")
-    add("-o", "--output", required=True, type=output, metavar="OUT", help="what to write: .png, .gif or .html")
+    output = ending_in(".png", said="a file that ends in .png")
+    add("-o", "--output", required=True, type=output, metavar="OUT.png", help="the sheet to write")
     add(
         "--alpha", type=positive, metavar="A", help="gain of a simulated recording: a white pixel fires A times a frame"
     )
     add("--frames", type=_frames, metavar="A:B", help="which frames to show, from A to B - 1; all if not given")
-    add("--window", type=whole(1), metavar="W", help=f"frames that tfp averages; {_WINDOW}, or half of what is shown")
+    add("--window", type=whole(1), metavar="W", help=f"frames that tfp averages; {_WINDOW} if not given")
     add("--row", type=whole(0), metavar="Y", help="row of pixels whose spikes are drawn; the middle one if not given")
-    add("--seconds", type=positive, default=4.0, metavar="S", help="how long a .gif takes; 4")
 
 
 def _frames(text: str) -> str:

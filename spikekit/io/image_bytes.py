@@ -1,11 +1,11 @@
-"""Image encoding: PNG and animated GIF as bytes."""
+"""Image encoding: a picture as the bytes of its file."""
 
 from __future__ import annotations
 
 import io
 import struct
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -137,27 +137,4 @@ def _pillow_bytes(pixels: Tensor, kind: str, **how: Any) -> bytes:
     file = io.BytesIO()
     # of PNG: a fifth of the time of Pillow's own level 6, for files that are 15 % longer
     Image.fromarray(pixels.numpy()).save(file, kind, compress_level=2, **how)
-    return file.getvalue()
-
-
-def gif_bytes(images: Iterable[Tensor], seconds: float) -> bytes:
-    """Return an animated GIF that begins again at its end.
-
-    Args:
-        images: (3, H, W) or (H, W) each, of one size, floating, [0, 1].
-        seconds: how long each is shown; a GIF counts in hundredths, from 0.02 to 655.35.
-
-    Returns:
-        The bytes of the file.
-
-    Example:
-        >>> gif_bytes([torch.zeros(4, 6), torch.ones(4, 6)], 0.1)[:3]
-        b'GIF'
-    """
-    from PIL import Image
-
-    first, *others = (Image.fromarray(to_bytes(image).numpy()) for image in images)
-    file = io.BytesIO()
-    duration = round(min(max(1000 * seconds, 20), 655_350))
-    first.save(file, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
     return file.getvalue()

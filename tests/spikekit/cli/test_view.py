@@ -1,17 +1,11 @@
 """``spikekit view`` as a user types it, and what the verbs know of a recording by its side-car or its camera."""
 
-import base64
-import io
 import json
-import re
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
-from skimage import io as skio
 
 from spikekit import (
     Layer,
@@ -26,10 +20,8 @@ from spikekit import (
     write_spikes,
 )
 from spikekit.cli.command import main
-from spikekit.cli.drawing import fit, histogram, raster, sheet
 from spikekit.cli.view import Moment
 from spikekit.decoders.dense import spike_interval
-from spikekit.io.image_bytes import gif_bytes
 
 PATTERN = "RGGB"
 
@@ -73,16 +65,14 @@ def test_the_pictures_are_those_of_the_decoders(moving):
     """TFP and TFI of the middle, its motion, and the spikes of a row."""
     here = moment("a.dat", frames=101, size=(40, 48))
     spikes = recording.Recording(Path("a.dat"), 101, (40, 48)).read(0, 101)
-    assert here.tfp()[::10, ::10].equal((tfp(spikes, 41)[50] / 0.5).clamp(0, 1))
-    assert here.tfi()[::10, ::10].equal((1 / spike_interval(spikes)[50].float() / 0.5).clamp(0, 1))
-    assert here.tfi()[::10, ::10].equal((tfi(spikes)[50] / 0.5).clamp(0, 1))
-    drawn = here.raster()
-    assert drawn.shape == (480, 404)
-    assert ((drawn[::10, ::4] < 0.5) == (spikes[:, 20].T == 1)).all()
+    assert here.tfp().equal((tfp(spikes, 41)[50] / 0.5).clamp(0, 1))
+    assert here.tfi().equal((1 / spike_interval(spikes)[50].float() / 0.5).clamp(0, 1))
+    assert here.tfi().equal((tfi(spikes)[50] / 0.5).clamp(0, 1))
+    assert here.raster().equal(spikes[:, 20].T)
     colours, longest, length = here.motion()
     assert length == 20
     assert longest == pytest.approx(2, abs=0.8)  # a tenth of a pixel a frame
-    red, green, blue = colours[:, 150:250, 150:330].flatten(1).median(dim=1).values
+    red, green, blue = colours[:, 15:25, 15:33].flatten(1).median(dim=1).values
     assert red > 0.99  # to the right
     assert max(green, blue) < 0.6
 
@@ -92,72 +82,20 @@ def test_a_sheet_by_its_sidecar(still, capsys):
     capsys.readouterr()
     view("a.dat", "-o", "made/a.png")
     assert capsys.readouterr().out == "made/a.png: frames 0 .. 40 of 41, alpha 0.5 is white\n"
-    shown = read_picture("made/a.png")
-    assert shown[:, 200, 60].tolist() == pytest.approx([1, 0, 0], abs=0.1)
-    assert shown[:, 200, 400].tolist() == pytest.approx([0, 0, 1], abs=0.1)
+    tfp, *_ = read_picture("made/a.png")[:, :450].split(533, dim=-1)
+    red, blue = (tfp[channel] - tfp[1] > 0.9 for channel in (0, 2))
+    assert red.sum() > 10_000
+    assert blue.sum() == pytest.approx(int(red.sum()), rel=0.1)
+    assert red.nonzero()[:, 1].max() < blue.nonzero()[:, 1].min()
 
 
-@pytest.mark.parametrize(("seconds", "shown"), [(1e9, 655_350), (1e-9, 20), (0.5, 500)])
-def test_pictures_of_a_gif_are_shown_as_long_as_it_can_tell(seconds, shown):
-    data = gif_bytes([torch.zeros(4, 6), torch.ones(4, 6)], seconds)
-    with Image.open(io.BytesIO(data)) as film:
-        assert film.n_frames == 2
-        assert film.info["duration"] == shown
-
-
-def test_an_animation_slides(moving):
-    view("a.dat", "--height", 40, "--width", 48, "-o", "a.gif", "--alpha", 0.5, "--seconds", 2)
-    with Image.open("a.gif") as film:
-        assert film.n_frames == 60
-        assert film.size == (480, 400)
-        assert film.info["duration"] == pytest.approx(2000 / 60, abs=10)
-        shades = []
-        for n in (0, 59):
-            film.seek(n)
-            shades.append(np.asarray(film.convert("L"))[::10, ::10].astype(float))
-    spikes = recording.Recording(Path("a.dat"), 101, (40, 48)).read(0, 101).float()
-    for shade, first in zip(shades, (0, 60), strict=True):
-        assert np.abs(shade - (spikes[first : first + 41].mean(0) * 2 * 255).clamp(0, 255).numpy()).mean() < 3
-
-
-def test_a_page_of_its_own(still):
-    """Every picture is inside, one for each place of the slider; nothing is loaded."""
-    view("a.dat", "-o", "a.html")
-    page = Path("a.html").read_text()
-    assert "http" not in page
-    pictures = re.findall(r'<img (hidden )?src="data:image/(?:png|jpeg);base64,([^"]+)"', page)
-    sizes = {Image.open(io.BytesIO(base64.b64decode(data))).size for _, data in pictures}
-    assert (480, 320) in sizes
-    sliding = sum(bool(hidden) for hidden, _ in pictures)
-    starts = json.loads(re.search(r"const starts = (\[[^]]*\])", page)[1])
-    assert len(starts) == sliding == 22
-    assert starts[-1] == 21
-    assert 'max="21"' in page
-    assert "img:not([hidden]){display:block}" in page  # or all would be seen at once
-    assert "length = 20" in page
-    assert "41 frames of 32 x 48, alpha 0.5 is white</p>\n" in page
-    assert "play.onclick" in page
-
-
-def test_a_large_recording_makes_a_page_of_some_megabytes(tmp_path, monkeypatch, capsys):
+def test_a_longer_window_is_proposed_where_pixels_hardly_fire(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    spikes = torch.rand(104, 500, 500, generator=torch.Generator().manual_seed(0)) < 0.03
-    write_spikes("a.dat", spikes)
-    view("a.dat", "--height", 500, "--width", 500, "-o", "a.html")
-    assert Path("a.html").stat().st_size < 11e6  # pure noise, the worst there is; lossless it takes half as much again
-    page = Path("a.html").read_text()
-    assert "60 of 64 windows, shrunk to at most 480 pixels" in page
-    said = "3.0% of the bits are set, 1.2 spikes of a pixel in 41 frames: --window 104 shows less noise"
-    assert said in page
-    assert said in capsys.readouterr().out
-    view("a.dat", "--height", 500, "--width", 500, "-o", "a.png", "--window", 41)
+    write_spikes("a.npz", torch.rand(104, 50, 50, generator=torch.Generator().manual_seed(0)) < 0.03)
+    view("a.npz", "-o", "a.png")
+    assert "--window 104 shows less noise" in capsys.readouterr().out
+    view("a.npz", "-o", "a.png", "--window", 41)
     assert "--window" not in capsys.readouterr().out
-
-
-def test_a_name_cannot_break_the_page(still):
-    Path("a.dat").rename("a<b>.dat")
-    view("a<b>.dat", "--height", 32, "--width", 48, "-o", "a.html")
-    assert "a<b>" not in Path("a.html").read_text()
 
 
 def test_a_part_of_a_long_recording(tmp_path, monkeypatch):
@@ -180,13 +118,9 @@ def test_a_part_of_a_long_recording(tmp_path, monkeypatch):
     size = "--height", 4, "--width", 8
     view("a.dat", *size, "-o", "a.png", "--frames", "1490:1511", "--row", 3)
     assert read == [21]
-    assert (skio.imread("a.png")[:200].min(axis=(0, 1)) < 80).any()
     read.clear()
     view("a.dat", *size, "-o", "a.png")
     assert read == [401]
-    read.clear()
-    view("a.dat", *size, "-o", "a.gif")
-    assert sorted(read) == [41] * 60 + [401]
 
 
 @pytest.mark.parametrize("shape", [(1, 4, 4), (1, 1, 1), (2, 3, 5), (30, 40, 40)])
@@ -195,45 +129,8 @@ def test_little_to_see(tmp_path, monkeypatch, shape, value):
     """A few pixels, one frame, no spike, nothing but spikes: there is always a picture."""
     monkeypatch.chdir(tmp_path)
     write_spikes("a.npz", torch.full(shape, value))
-    for ending in ("png", "gif", "html"):
-        view("a.npz", "-o", f"a.{ending}", "--pattern", "RGGB")
-        assert Path(f"a.{ending}").stat().st_size > 0
-
-
-# --- drawings ---------------------------------------------------------------------------------------------------------
-
-
-def test_fit():
-    assert fit(torch.rand(3, 5, 7), 30, 30).shape == (3, 20, 28)
-    big = torch.rand(40, 60)
-    assert (fit(big, 30, 30) - big.reshape(20, 2, 30, 2).mean((1, 3))).abs().max() < 1e-6
-
-
-def test_raster_of_more_than_fits():
-    spikes = torch.zeros(100, 8)
-    spikes[50:] = 1
-    drawn = raster(spikes, 50, 8)
-    assert drawn.shape == (8, 50)
-    assert (drawn[:, :25] == 1).all()
-    assert (drawn[:, 25:] < 0.2).all()
-
-
-def test_histogram():
-    """Bars as high as there are pixels, at the right place of the axis."""
-    counts = torch.tensor([0] * 50 + [10] * 100)
-    drawn = histogram(counts, 20, 200, 118)
-    ink = (drawn[0, :100] < 0.5).float()
-    left, right = ink[:, 8], ink[:, 190]
-    assert right.sum() == pytest.approx(96, abs=1)
-    assert left.sum() == pytest.approx(48, abs=1)
-    assert ink[:, 40:160].sum() == 0
-
-
-def test_sheet():
-    page = sheet([[("one", torch.zeros(20, 100)), ("two", torch.zeros(3, 20, 100))]])
-    assert page.shape == (3, 20 + 18 + 24, 100 + 12 + 100 + 24)
-    assert (page[:, 30:50, 12:112] == 0).all()
-    assert page[:, 12:30, 12:40].min() < 0.5  # the title
+    view("a.npz", "-o", "a.png", "--pattern", "RGGB")
+    assert read_picture("a.png").shape == (3, 900, 1600)
 
 
 # --- what is known of a recording -------------------------------------------------------------------------------------

@@ -46,8 +46,7 @@ def command(capsys, *words):
     ("name", "words"),
     [
         ("a.png", ("decode", "{clip}", "--method", "tfi")),
-        ("a.html", ("view", "{clip}", "--window", "9")),
-        ("a.gif", ("view", "{clip}", "--window", "9")),
+        ("b.png", ("view", "{clip}", "--window", "9")),
     ],
 )
 def test_a_command_leaves_nothing_half_written(name, words, stays_whole, tmp_path_factory, capsys):
