@@ -26,9 +26,7 @@ from spikekit.color.cfa import count_colors
 from spikekit.warp.bayer_warp import bayer_warp_idw
 from spikekit.warp.site_search import SMALLEST, search_sites, site_table
 
-# positions per pixel of the picture, along each axis, that the search rounds motion to on a CPU, where that saves time,
-# and in exported programs; elsewhere it is exact
-_STEPS = 16
+_STEPS = 16  # positions per pixel of the picture, along each axis, that exported programs round motion to
 _SEARCHED = 1 << 19  # positions that are searched in one go on a CPU, whose cache is small
 _SEARCHED_ELSEWHERE = 1 << 25  # where a launch costs more
 
@@ -270,15 +268,15 @@ class CSCSR(Network):
         Offsets of a single time point are those of all.
         """
         on_cpu = features.device.type == "cpu"
-        how = {"neighbors": self.config.neighbors, "steps": _STEPS if on_cpu else None}
+        neighbors = self.config.neighbors
         if offsets.shape[1] == 1:
             pixels = self._enlarge(features, mask)
-            return flow_warp_idw(pixels.flatten(1, 2), offsets[:, 0], mask, **how).reshape(pixels.shape)
+            return flow_warp_idw(pixels.flatten(1, 2), offsets[:, 0], mask, neighbors=neighbors).reshape(pixels.shape)
         # a few time points after the others: what the search needs on the way is many times its result
         searched = _SEARCHED if on_cpu else _SEARCHED_ELSEWHERE
         few = max(1, searched // (offsets.shape[-2] * offsets.shape[-1]))
         pixels = [
-            flow_warp_idw(self._enlarge(part, mask), offset, mask, **how)
+            flow_warp_idw(self._enlarge(part, mask), offset, mask, neighbors=neighbors)
             for part, offset in zip(features.flatten(0, 1).split(few), offsets.flatten(0, 1).split(few), strict=True)
         ]
         return torch.cat(pixels).unflatten(0, features.shape[:2])

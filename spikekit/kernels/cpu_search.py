@@ -16,7 +16,7 @@ _WORTH_THREADS = 1 << 14  # positions
 
 
 @compiled
-def _search(flow, rows, columns, height, width, steps, begin, end, index, weight):
+def _search(flow, rows, columns, height, width, begin, end, index, weight):
     """Positions ``begin`` to ``end`` of an image: flow (2, H W) to index and weight (K, H W).
 
     ``rows`` (P, 2 H, k) and ``columns`` (P, 2 W, k) name the nearest known rows and columns of every half of a pixel,
@@ -28,9 +28,6 @@ def _search(flow, rows, columns, height, width, steps, begin, end, index, weight
     for n in range(begin, end):
         y, x = n // width, n % width
         moved_x, moved_y = np.float64(flow[0, n]), np.float64(flow[1, n])
-        if steps:
-            moved_x = np.rint((min(max(moved_x + x, -0.5), width - 0.5) - x) * steps) / steps
-            moved_y = np.rint((min(max(moved_y + y, -0.5), height - 0.5) - y) * steps) / steps
         whole_x, whole_y = np.rint(moved_x), np.rint(moved_y)
         part_x, part_y = moved_x - whole_x, moved_y - whole_y
         cell_x, cell_y = np.int64(whole_x) + x, np.int64(whole_y) + y
@@ -89,9 +86,7 @@ def _padded(tables: list[Tensor]) -> np.ndarray:
     return pad_sequence(tables, batch_first=True, padding_value=-1).transpose(1, 2).contiguous().numpy()
 
 
-def nearest_known(
-    flow: Tensor, products: list[tuple[Tensor, Tensor]], neighbors: int, steps: int
-) -> tuple[Tensor, Tensor]:
+def nearest_known(flow: Tensor, products: list[tuple[Tensor, Tensor]], neighbors: int) -> tuple[Tensor, Tensor]:
     """Indices and weights, (N, K, H W), as the operator of the same name; ``products`` as :func:`products_of` gives."""
     count, _, height, width = flow.shape
     plane = height * width
@@ -105,7 +100,7 @@ def nearest_known(
         for n in range(count):
             for begin in range(0, plane, size):
                 end = min(begin + size, plane)
-                yield moved[n], rows, columns, height, width, steps, begin, end, index[n], weight[n]
+                yield moved[n], rows, columns, height, width, begin, end, index[n], weight[n]
 
     in_threads(_search, jobs(), worth=count * plane >= _WORTH_THREADS)
     return torch.from_numpy(index), torch.from_numpy(weight)

@@ -155,25 +155,24 @@ def _weigh(index: Tensor, width: int, cell: Tensor, part: Tensor) -> Tensor:
     return weight / weight.sum(dim=0)
 
 
-def _nearest_known(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
+def _nearest_known(flow: Tensor, mask: Tensor, neighbors: int) -> tuple[Tensor, Tensor]:
     """Flat indices of the ``neighbors`` known pixels nearest to where flow points to, and their weights.
 
     Args:
         flow: (N, 2, H, W), float32 or float64, finite and less than 2^30.
         mask: (H, W).
         neighbors: how many known pixels to weigh, K.
-        steps: positions per pixel and axis that flow is rounded to; 0: no rounding.
 
     Returns:
         Index, int64, and weight, in the dtype of ``flow``: both (N, K, H W), the nearest first. Where fewer pixels
         are known, the nearest is repeated with weight 0.
     """
     count, _, height, width = flow.shape
-    products, wanted = products_of(mask, neighbors), _wanted(flow, steps)
+    products = products_of(mask, neighbors)
     # double, so that what is nearer does not depend on rounding
     double = torch.float32 if flow.device.type == "mps" else torch.float64
     plane = height * width
-    flat = wanted.movedim(1, 0).reshape(2, -1)
+    flat = flow.movedim(1, 0).reshape(2, -1)
     index = flow.new_empty(neighbors, count * plane, dtype=torch.int64)
     weight = flow.new_empty(neighbors, count * plane)
     size = _CHUNK if flow.device.type == "cpu" else 128 * _CHUNK  # elsewhere a launch costs more than the cache saves
@@ -188,7 +187,7 @@ def _nearest_known(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tu
     return index.reshape(shape).movedim(0, 1).contiguous(), weight.reshape(shape).movedim(0, 1).contiguous()
 
 
-def _fake(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
+def _fake(flow: Tensor, mask: Tensor, neighbors: int) -> tuple[Tensor, Tensor]:
     shape = flow.shape[0], neighbors, flow.shape[2] * flow.shape[3]
     return flow.new_empty(shape, dtype=torch.int64), flow.new_empty(shape)
 
@@ -197,38 +196,20 @@ nearest_known = custom_operator("nearest_known", _nearest_known, _fake)
 
 
 @register_kernel(nearest_known, "cpu")
-def _(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
+def _(flow: Tensor, mask: Tensor, neighbors: int) -> tuple[Tensor, Tensor]:
     loops = import_loops("spikekit.kernels.cpu_search")
     if loops is None:
-        return _nearest_known(flow, mask, neighbors, steps)
-    return loops.nearest_known(flow, products_of(mask, neighbors), neighbors, steps)
+        return _nearest_known(flow, mask, neighbors)
+    return loops.nearest_known(flow, products_of(mask, neighbors), neighbors)
 
 
-def _on_gpu(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:
-    index, weight = gpu_kernel("nearest_known")(_wanted(flow, steps), products_of(mask, neighbors), neighbors)
+def _on_gpu(flow: Tensor, mask: Tensor, neighbors: int) -> tuple[Tensor, Tensor]:
+    index, weight = gpu_kernel("nearest_known")(flow, products_of(mask, neighbors), neighbors)
     return index, weight.to(flow.dtype)
 
 
 register_on_gpu(nearest_known, _on_gpu)
 fold_into_batch(nearest_known, 1)
-
-
-def _wanted(flow: Tensor, steps: int) -> Tensor:
-    """Return the flow that neighbours are searched for: rounded, where that is asked for, without loss."""
-    if not steps:
-        return flow
-    return _rounded(flow if flow.device.type == "mps" else flow.double(), steps)[0]
-
-
-def _rounded(flow: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-    """Return the rounded flow, with the gradient of what was rounded, and where it is not cut."""
-    height, width = flow.shape[-2:]
-    y, x = (torch.arange(length, device=flow.device, dtype=flow.dtype) for length in (height, width))
-    pixel = torch.stack([x.expand(height, width), y[:, None].expand(height, width)])
-    position = flow.detach() + pixel
-    moved = position.clamp(min=-0.5).minimum(pixel[:, -1:, -1:] + 0.5)
-    rounded = ((moved - pixel) * steps).round() / steps
-    return flow + (rounded - flow.detach()), moved == position
 
 
 class NearestKnown(torch.autograd.Function):
@@ -237,27 +218,23 @@ class NearestKnown(torch.autograd.Function):
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(flow: Tensor, mask: Tensor, neighbors: int, steps: int) -> tuple[Tensor, Tensor]:  # noqa: D102
-        return nearest_known(flow, mask, neighbors, steps)
+    def forward(flow: Tensor, mask: Tensor, neighbors: int) -> tuple[Tensor, Tensor]:  # noqa: D102
+        return nearest_known(flow, mask, neighbors)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:  # noqa: D102
         index, weight = output
         ctx.mark_non_differentiable(index)
-        ctx.steps = inputs[3]
         ctx.save_for_backward(inputs[0], index, weight)
 
     @staticmethod
-    def backward(ctx: Any, _: Tensor, grad: Tensor) -> tuple[Tensor, None, None, None]:  # noqa: D102
-        return NearestKnown.of_flow(*ctx.saved_tensors, grad, ctx.steps), *[None] * 3
+    def backward(ctx: Any, _: Tensor, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: D102
+        return NearestKnown.of_flow(*ctx.saved_tensors, grad), None, None
 
     @staticmethod
-    def of_flow(flow: Tensor, index: Tensor, weight: Tensor, grad: Tensor, steps: int) -> Tensor:
+    def of_flow(flow: Tensor, index: Tensor, weight: Tensor, grad: Tensor) -> Tensor:
         """Derivative in the flow, from that in the weights."""
         _, _, height, width = flow.shape
-        inside = 1
-        if steps:
-            flow, inside = _rounded(flow, steps)
         whole = flow.detach().round()
         part = (flow - whole).flatten(2)
         pixel = torch.arange(height * width, device=flow.device)
@@ -271,22 +248,20 @@ class NearestKnown(torch.autograd.Function):
         near = first * (others * (grad[:, :1] - grad[:, 1:])).sum(dim=1, keepdim=True)
         far = others * (grad[:, 1:] - (weight * grad).sum(dim=1, keepdim=True))
         factor = torch.cat([near, far], dim=1) / torch.where(square < torch.finfo(flow.dtype).tiny, 1, square)
-        result = torch.stack([(factor * dx).sum(dim=1), (factor * dy).sum(dim=1)], dim=1).reshape(flow.shape)
-        return result * inside
+        return torch.stack([(factor * dx).sum(dim=1), (factor * dy).sum(dim=1)], dim=1).reshape(flow.shape)
 
 
-def idw_neighbors(flow: Tensor, mask: Tensor, neighbors: int = 4, steps: int | None = None) -> tuple[Tensor, Tensor]:
+def idw_neighbors(flow: Tensor, mask: Tensor, neighbors: int = 4) -> tuple[Tensor, Tensor]:
     """Known pixels nearest to where flow points to, and their weights by inverse distance.
 
     Args:
         flow: (N, 2, H, W), floating.
         mask: (H, W); a pixel is known where it is not 0.
         neighbors: how many known pixels to weigh, K.
-        steps: positions per pixel and axis that flow is rounded to, even; None: exact.
 
     Returns:
         Flat indices, int64, and weights, in the dtype of ``flow`` but float32 at least: both (N, K, H W). The weights
         are differentiable in the flow. Where fewer pixels are known, the nearest is repeated with weight 0.
     """
     flow = finite(flow.to(torch.promote_types(flow.dtype, torch.float32)))
-    return NearestKnown.apply(flow, mask, neighbors, steps or 0)
+    return NearestKnown.apply(flow, mask, neighbors)

@@ -101,9 +101,7 @@ class FlowWarp(nn.Module):
         return flow_warp(image, flow)
 
 
-def flow_warp_idw(
-    features: Tensor, flow: Tensor, mask: Tensor, *, neighbors: int = 4, steps: int | None = None
-) -> Tensor:
+def flow_warp_idw(features: Tensor, flow: Tensor, mask: Tensor, *, neighbors: int = 4) -> Tensor:
     r"""Sample features where flow points to, from the nearest known pixels, weighted by inverse distance.
 
     .. math::
@@ -123,10 +121,6 @@ def flow_warp_idw(
         Differentiable in the features and in the flow, twice; the neighbours themselves are constants. On a known
         pixel the gradient with respect to the flow, a cone's tip, is 0, and so it is where the flow is not finite.
 
-        With ``steps`` the flow is rounded to that many positions per pixel and axis, and positions outside the image
-        are moved to its edge, as in a network that was exported. The gradient is that of the rounded flow, 0 where a
-        position was moved.
-
         A CPU searches by Numba where it is installed (``pip install 'spikekit[fast]'``), a GPU by Triton, any other
         device by PyTorch: the same neighbours everywhere.
 
@@ -136,16 +130,13 @@ def flow_warp_idw(
         mask: :math:`(H, W)`; a pixel is known where it is not 0. What is made of a mask is kept between calls; on a GPU
             it is made anew where the mask counts a change, which one through ``mask.data`` does not.
         neighbors: how many known pixels to weigh.
-        steps: positions per pixel and axis that the flow is rounded to, an even number such as 16; None for the exact
-            search.
 
     Returns:
         As ``features``, also in memory: channels-last features give a channels-last result.
 
     Raises:
         TypeError: features or flow are not floating-point tensors.
-        ValueError: sizes that do not fit each other, ``neighbors`` below 1, ``steps`` that are odd or below 1, a mask
-            without a known pixel.
+        ValueError: sizes that do not fit each other, ``neighbors`` below 1, a mask without a known pixel.
 
     Example:
         >>> features = torch.tensor([[[[1.0, 0.0, 5.0, 0.0]]]])
@@ -161,18 +152,12 @@ def flow_warp_idw(
     if not isinstance(mask, Tensor) or mask.shape != features.shape[-2:]:
         got = tuple(mask.shape) if isinstance(mask, Tensor) else type(mask).__name__
         raise ValueError(f"mask: expected {(height, width)} for features {tuple(features.shape)}, got {got}")
-    neighbors, steps = _check_search(neighbors, steps)
+    neighbors = check_whole("neighbors", neighbors)
     dtype = torch.promote_types(features.dtype, flow.dtype)
     flow = flow.reshape(-1, 2, height, width).to(dtype)
     values = features.reshape(-1, features.shape[-3], height * width)
-    index, weight = idw_neighbors(flow, mask, neighbors, steps)
+    index, weight = idw_neighbors(flow, mask, neighbors)
     return Gather.apply(values, index, weight).reshape(features.shape)
-
-
-def _check_search(neighbors: int, steps: int | None) -> tuple[int, int | None]:
-    if steps is not None and check_whole("steps", steps) % 2:
-        raise ValueError(f"steps: expected an even number of positions, or none for the exact search, got {steps}")
-    return check_whole("neighbors", neighbors), steps
 
 
 class FlowWarpIdw(nn.Module):
@@ -187,12 +172,12 @@ class FlowWarpIdw(nn.Module):
         torch.Size([2, 3, 8, 8])
     """
 
-    def __init__(self, *, neighbors: int = 4, steps: int | None = None) -> None:
+    def __init__(self, *, neighbors: int = 4) -> None:
         super().__init__()
-        self.neighbors, self.steps = _check_search(neighbors, steps)
+        self.neighbors = check_whole("neighbors", neighbors)
 
     def forward(self, features: Tensor, flow: Tensor, mask: Tensor) -> Tensor:  # noqa: D102
-        return flow_warp_idw(features, flow, mask, neighbors=self.neighbors, steps=self.steps)
+        return flow_warp_idw(features, flow, mask, neighbors=self.neighbors)
 
     def extra_repr(self) -> str:  # noqa: D102
-        return f"neighbors={self.neighbors}, steps={self.steps}"
+        return f"neighbors={self.neighbors}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import product
 from typing import Any
@@ -227,28 +227,6 @@ for _extreme, _steep, _at_known in (
     ("1e-2 to 1e-15 from a known pixel", _NEAR, True),
 ):
     CASES.add(_OP, f"gradient by the flow: {_extreme}", **_STEEP)(partial(_slopes, _steep, _at_known))
-
-
-def _by_table(take: Callable[[Tensor], Tensor], on: On) -> Iterator[Measured]:
-    """Noise in [0, 1], at positions within the image; an error of 1 is the range of the features."""
-    features, flow = (
-        torch.rand(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).to(on.dtype).to(on.device)
-        for shape in ((4, 1, 32, 32), (4, 2, 32, 32))
-    )
-    leaves = [features.requires_grad_(), (8 * flow.detach() - 4).requires_grad_()]
-    for mask in sk.bayer_mask(16, 16, scale=2, device=on.device):
-        result = sk.flow_warp_idw(*leaves, mask, steps=16)
-        grads = torch.autograd.grad(result.sum(), leaves)
-        error = (result - sk.flow_warp_idw(*leaves, mask))[..., 4:-4, 4:-4].detach().double().abs()
-        yield measured(float(take(error)), (), grads)
-
-
-CASES.add(_OP, "steps=16, worst error", limit=0.75, bound="3/4 of the range: the nearest pixel stays")(
-    partial(_by_table, torch.max)
-)
-CASES.add(_OP, "steps=16, root of the mean square", limit=0.1, bound="1/10 of the range")(
-    partial(_by_table, lambda error: error.square().mean().sqrt())
-)
 
 
 def _bilinear(

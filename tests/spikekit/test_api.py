@@ -171,7 +171,7 @@ def test_compile_of_bits(op, dtype):
         (torch.ops.spikekit.tfp, (SPIKES.clone().requires_grad_(), 3, 1.0, torch.float64)),
         (torch.ops.spikekit.tfp_grad, (SPIKES.clone().requires_grad_(), 3, 1.0, torch.float64)),
         (torch.ops.spikekit.spike_interval, (SPIKES > 0,)),
-        (torch.ops.spikekit.nearest_known, (FLOW, MASK, 4, 0)),
+        (torch.ops.spikekit.nearest_known, (FLOW, MASK, 4)),
         (torch.ops.spikekit.weighted_gather, (RGB.flatten(2), INDEX, WEIGHT)),
         (torch.ops.spikekit.weighted_scatter, (RGB.flatten(2), INDEX, WEIGHT, 24)),
         (torch.ops.spikekit.weighted_dot, (RGB.flatten(2), RGB.flatten(2), INDEX)),

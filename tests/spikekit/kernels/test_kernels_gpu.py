@@ -18,7 +18,6 @@ from spikekit.decoders import dense as decoders
 from spikekit.flow import tvl1
 from spikekit.kernels.layout import is_channels_last
 from spikekit.sensor import integrate_fire as sensor
-from spikekit.warp import neighbors as search
 from spikekit.warp import site_search, warp
 
 triton = pytest.importorskip("triton", reason="triton is not installed")
@@ -431,18 +430,6 @@ def test_nearest_known(which, neighbors, dtype):
     assert index.mT.flatten(0, 1).tolist() == indices
     expected = torch.tensor(shares, dtype=torch.float64)
     check(weight.mT.flatten(0, 1).double(), expected, rtol=4 * torch.finfo(dtype).eps, atol=0)
-
-
-@computes
-@pytest.mark.parametrize(("which", "steps"), [("red", 16), ("green", 8), ("green", 6), ("any", 2)])
-def test_rounded_positions_are_those_of_plain_torch(which, steps):
-    mask = known_pixels()[which]
-    flow = torch.randn(3, 2, *mask.shape) * torch.tensor([0.3, 3.0, 300.0]).reshape(3, 1, 1, 1)
-    flow[0, :, 0] = 0.5 / steps  # half to even
-    index, weight = search._on_gpu(flow.to(DEVICE), mask.to(DEVICE), 4, steps)
-    expected = search._nearest_known(flow, mask, 4, steps)
-    assert torch.equal(index.cpu(), expected[0])
-    check(weight.cpu(), expected[1], rtol=1e-6, atol=0)
 
 
 @computes

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from spikekit import bayer_mask, flow_warp_idw
+from spikekit import bayer_mask
 from spikekit.warp.neighbors import idw_neighbors, nearest_known
 
 UNIT = 64  # flows below are multiples of 1 / UNIT, squared distances are whole numbers in units of 1 / UNIT^2
@@ -29,7 +29,7 @@ def brute(flow, mask, neighbors):
 
 def check(flow, mask, neighbors=4):
     expected, share = brute(flow, mask, neighbors)
-    index, weight = (a.movedim(1, -1).numpy() for a in nearest_known(flow, mask, neighbors, 0))
+    index, weight = (a.movedim(1, -1).numpy() for a in nearest_known(flow, mask, neighbors))
     assert index.shape[-1] == neighbors
     known = expected.shape[-1]
     assert (weight[..., known:] == 0).all()
@@ -105,7 +105,7 @@ def test_float32_is_compared_in_double(path):
     tiny = 2.0**-26
     flow = torch.zeros(2, 2, 9, 9)
     flow[0, 0], flow[1, 0] = tiny, -tiny
-    index, _ = nearest_known(flow, mask, 4, 0)
+    index, _ = nearest_known(flow, mask, 4)
     up, left, centre, right, down = 4, 36, 40, 44, 76
     for nearest, expected in zip(
         index[:, :, centre], ({centre, right, up, down}, {centre, left, up, down}), strict=True
@@ -115,12 +115,11 @@ def test_float32_is_compared_in_double(path):
 
 def test_registration():
     flow = torch.randn(2, 2, 4, 6, dtype=torch.float64)
-    for steps in (0, 4):
-        torch.library.opcheck(
-            nearest_known,
-            (flow, bayer_mask(4, 6)[1], 4, steps),
-            test_utils=("test_schema", "test_faketensor", "test_aot_dispatch_dynamic"),
-        )
+    torch.library.opcheck(
+        nearest_known,
+        (flow, bayer_mask(4, 6)[1], 4),
+        test_utils=("test_schema", "test_faketensor", "test_aot_dispatch_dynamic"),
+    )
 
 
 def test_vmap_is_over_the_flow():
@@ -133,80 +132,21 @@ def test_vmap_is_over_the_flow():
         torch.func.vmap(idw_neighbors, (0, 0))(flow, mask.expand(3, 4, 6))
 
 
-def on_the_grid(mask, steps):
-    """Flows of whole steps that stay within half a pixel of the picture, as (64, 2, H, W)."""
-    height, width = mask.shape
-    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    to_x = torch.randint(-steps // 2, (width - 1) * steps + steps // 2 + 1, (64, height, width))
-    to_y = torch.randint(-steps // 2, (height - 1) * steps + steps // 2 + 1, (64, height, width))
-    return torch.stack([to_x - x * steps, to_y - y * steps], dim=1) / steps
-
-
-@pytest.mark.parametrize(
-    ("scale", "neighbors", "size"), [(1, 4, (14, 18)), (1, 6, (24, 3)), (2, 4, (9, 6)), (3, 2, (5, 4))]
-)
-def test_rounding_is_exact_at_its_positions(scale, neighbors, size, path):
-    """All colours, near the borders and inside: every class of positions has its own neighbours."""
-    for mask in bayer_mask(*size, "GRBG", scale=scale):
-        flow = on_the_grid(mask, 8)
-        exact, rounded = nearest_known(flow, mask, neighbors, 0), nearest_known(flow, mask, neighbors, 8)
-        assert torch.equal(exact[0].sort(1).values, rounded[0].sort(1).values)
-        order = [index.argsort(1) for index, _ in (exact, rounded)]
-        shares = [weight.gather(1, by) for (_, weight), by in zip((exact, rounded), order, strict=True)]
-        torch.testing.assert_close(*shares)
-
-
-@pytest.mark.parametrize("steps", [2, 4, 16])
-def test_rounding_between_its_positions(steps, path):
-    """Weights are those of the rounded position, and no neighbour is farther than the rounding lets it."""
-    mask = bayer_mask(12, 14, scale=2)[1]
-    height, width = mask.shape
-    flow = torch.rand(20, 2, height, width, dtype=torch.float64) * 4 - 2
-    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    position = (flow + torch.stack([x, y])).flatten(2)[:, :, None]
-
-    def distance(index):
-        return (torch.stack([index % width, index // width], dim=1) - position).norm(dim=1)
-
-    index, weight = nearest_known(flow, mask, 4, steps)
-    rounded = nearest_known((flow * steps).round() / steps, mask, 4, 0)[1]
-    inside = ((position > -0.5) & (position < torch.tensor([width, height])[:, None, None] - 0.5)).all(1)[:, 0]
-    farthest = distance(nearest_known(flow, mask, 4, 0)[0]).amax(1)
-    assert (distance(index).amax(1) - farthest)[inside].max() <= 2**0.5 / steps  # twice half a diagonal of a step
-    shares = [part.sort(1).values.movedim(1, -1)[inside] for part in (weight, rounded)]
-    torch.testing.assert_close(*shares)
-
-
-def test_rounded_far_outside_is_at_the_border(path):
-    mask = bayer_mask(12, 14, scale=2)[0]
-    far, border = torch.full((1, 2, *mask.shape), 2.0**30), torch.zeros(1, 2, *mask.shape)
-    border[0, 0], border[0, 1] = 27.5 - torch.arange(28), 23.5 - torch.arange(24)[:, None]
-    assert torch.equal(nearest_known(far, mask, 4, 4)[0], nearest_known(border, mask, 4, 4)[0])
-
-
-def test_rounding_keeps_known_pixels():
-    features, mask = torch.randn(1, 9, 24, 28), bayer_mask(12, 14, scale=2, dtype=torch.bool)[2]
-    for steps in (2, 6, 16):
-        warped = flow_warp_idw(features, torch.zeros(1, 2, 24, 28), mask, steps=steps)
-        assert torch.equal(warped[..., mask], features[..., mask])
-
-
-@pytest.mark.parametrize("steps", [0, 6, 16])
-def test_threads_and_devices_find_the_same(steps, without_kernels):
+def test_threads_and_devices_find_the_same(without_kernels):
     """Without Numba the neighbours are the same, weights within a rounding; more threads change no bit."""
     mask, flow = bayer_mask(70, 61, scale=2)[1], 3 * torch.randn(2, 2, 140, 122)
     flow[1] = (flow[1] * 4).round() / 4
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
-        index, weight = nearest_known(flow, mask, 4, steps)
+        index, weight = nearest_known(flow, mask, 4)
         torch.set_num_threads(3)
-        again = nearest_known(flow, mask, 4, steps)
+        again = nearest_known(flow, mask, 4)
     finally:
         torch.set_num_threads(before)
     assert torch.equal(again[0], index)
     assert torch.equal(again[1], weight)
     with without_kernels(nearest_known):
-        plain = nearest_known(flow, mask, 4, steps)
+        plain = nearest_known(flow, mask, 4)
     assert torch.equal(plain[0], index)
     torch.testing.assert_close(plain[1], weight, rtol=1e-6, atol=1e-7)

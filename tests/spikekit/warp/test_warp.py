@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.autograd import gradcheck, gradgradcheck
 
-from spikekit import FlowWarpIdw, bayer_mask, flow_warp, flow_warp_idw
+from spikekit import bayer_mask, flow_warp, flow_warp_idw
 from spikekit.warp.warp import _bilinear
 
 UNIT = 4096  # the flows below are multiples of 1 / UNIT
@@ -136,32 +136,6 @@ def test_idw_gradients_and_their_gradients(neighbors):
         assert gradgradcheck(warp, (features, flow))
 
 
-@pytest.mark.parametrize("steps", [2, 4, 16])
-def test_idw_gradients_with_steps_are_those_of_the_rounded_flow(steps):
-    features = torch.randn(2, 3, 12, 16, dtype=torch.float64)
-    mask = bayer_mask(6, 8, scale=2)[1]
-    y, x = torch.meshgrid(torch.arange(12), torch.arange(16), indexing="ij")
-    pixel = torch.stack([x, y]).double()
-    flow = torch.rand(2, 2, 12, 16, dtype=torch.float64) * 8 - 4
-    last = torch.tensor([15.5, 11.5]).double()[:, None, None]
-    inside = (flow + pixel >= -0.5) & (flow + pixel <= last)
-    rounded = ((flow + pixel).clamp(min=-0.5).minimum(last) * steps).round() / steps - pixel
-
-    def grads(flow, **how):
-        leaves = [part.clone().requires_grad_() for part in (features, flow)]
-        first = torch.autograd.grad(flow_warp_idw(*leaves, mask, **how).square().sum(), leaves, create_graph=True)
-        second = torch.autograd.grad(sum(part.square().sum() for part in first), leaves)
-        return [*(part.detach() for part in first), *second]
-
-    got, expected = grads(flow, steps=steps), grads(rounded)
-    whole = inside.all(1, keepdim=True).expand_as(inside)
-    torch.testing.assert_close(got[0], expected[0])
-    torch.testing.assert_close(got[1][whole], expected[1][whole])
-    assert (got[1][~inside] == 0).all()
-    assert (got[1][whole] != 0).float().mean() > 0.5
-    torch.testing.assert_close(got[3][whole], expected[3][whole])
-
-
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16, torch.float16])
 def test_idw_is_finite_everywhere(dtype):
     """On hits, on ties, and as near to them as the dtype allows, far outside and at infinity."""
@@ -227,24 +201,10 @@ def test_idw_keeps_the_memory_format(channels):
     assert grad.is_contiguous(memory_format=torch.channels_last)
 
 
-def test_idw_with_steps():
-    features, flow, mask = torch.rand(2, 3, 24, 32), 4 * torch.rand(2, 2, 24, 32) - 2, bayer_mask(12, 16, scale=2)[1]
-    exact, fine = (flow_warp_idw(features, flow, mask, steps=steps) for steps in (None, 16))
-    assert not torch.equal(fine, exact)
-    assert (fine - exact).square().mean().sqrt() < 0.05
-    rounded = flow_warp_idw(features, (flow * 16).round() / 16, mask)
-    torch.testing.assert_close(fine[..., 4:-4, 4:-4], rounded[..., 4:-4, 4:-4])
-    module = FlowWarpIdw(steps=16)
-    assert torch.equal(module(features, flow, mask), fine)
-    assert "steps=16" in repr(module)
-
-
 def test_numbers_of_numpy():
     args = torch.rand(1, 1, 6, 8), torch.rand(1, 2, 6, 8), bayer_mask(6, 8)[0]
     for number in (np.int64(4), np.uint8(4), torch.tensor(4)):
-        assert torch.equal(
-            flow_warp_idw(*args, neighbors=number, steps=number), flow_warp_idw(*args, neighbors=4, steps=4)
-        )
+        assert torch.equal(flow_warp_idw(*args, neighbors=number), flow_warp_idw(*args, neighbors=4))
 
 
 def test_idw_gradient_next_to_a_known_pixel():
@@ -276,18 +236,17 @@ def test_idw_remembers_masks_but_not_too_well():
         torch.testing.assert_close(flow_warp_idw(features, flow, mask), idw_brute(features, flow, mask, 4))
 
 
-@pytest.mark.parametrize("steps", [None, 4])
 @pytest.mark.parametrize("channels", [1, 9])
-def test_idw_sees_a_mask_change_through_other_names(steps, channels):
+def test_idw_sees_a_mask_change_through_other_names(channels):
     """NumPy's view of the same memory and ``mask.data`` do not count their changes."""
     features, flow = torch.rand(1, channels, 6, 8), 3 * torch.rand(1, 2, 6, 8) - 1.5
     for other in (lambda mask: mask.numpy(), lambda mask: mask.data):
         mask = bayer_mask(6, 8)[0].clone()
-        before = flow_warp_idw(features, flow, mask, steps=steps)
+        before = flow_warp_idw(features, flow, mask)
         other(mask)[:] = other(bayer_mask(6, 8)[2])
-        after = flow_warp_idw(features, flow, mask, steps=steps)
+        after = flow_warp_idw(features, flow, mask)
         assert not torch.equal(after, before)
-        assert torch.equal(after, flow_warp_idw(features, flow, bayer_mask(6, 8)[2], steps=steps))
+        assert torch.equal(after, flow_warp_idw(features, flow, bayer_mask(6, 8)[2]))
 
 
 def test_idw_under_inference_mode():
@@ -360,16 +319,6 @@ def test_wrong_mask(mask):
 def test_wrong_neighbors(neighbors):
     with pytest.raises(ValueError, match="neighbors"):
         flow_warp_idw(IMAGE, FLOW, MASK, neighbors=neighbors)
-    with pytest.raises(ValueError, match="steps"):
-        flow_warp_idw(IMAGE, FLOW, MASK, steps=neighbors)
-
-
-@pytest.mark.parametrize("steps", [1, 3, 15, np.int64(3)])
-def test_odd_steps(steps):
-    """Half a pixel, where the picture ends, is no position of theirs."""
-    for call in (lambda: flow_warp_idw(IMAGE, FLOW, MASK, steps=steps), lambda: FlowWarpIdw(steps=steps)):
-        with pytest.raises(ValueError, match=r"steps: expected an even number .*, got "):
-            call()
 
 
 def test_bilinear_gather_is_flow_warp_with_second_derivatives():
