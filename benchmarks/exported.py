@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from in_turn import interleave, ratio
 
 from lightning_modules.inference.export import (
     FORMATS,
@@ -22,7 +23,7 @@ from lightning_modules.inference.export import (
 )
 from spikekit.arguments import whole
 from spikekit.tables import table
-from spikekit.timing import cpu_name, cpu_timer, interleave, ratio
+from spikekit.timing import cpu_name, cpu_timer
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -10,12 +10,13 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from in_turn import interleave, ratio
 from torch import Tensor
 
 from lightning_modules.data import StillScenes
 from lightning_modules.motion import ClassicalFlow, ZeroFlow
 from spikekit.tables import table
-from spikekit.timing import cpu_name, interleave, ratio, software, timer_of
+from spikekit.timing import cpu_name, software, timer_of
 
 
 class ScikitImage(ClassicalFlow):

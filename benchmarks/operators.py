@@ -17,11 +17,12 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
+from in_turn import interleave, ratio
 from kornia.color import CFA, raw_to_rgb, rgb_to_raw
 from torch import Tensor
 
 import spikekit as sk
-from spikekit.timing import cpu_name, interleave, ratio, software, timer_of
+from spikekit.timing import cpu_name, software, timer_of
 
 ROOT = Path(__file__).parents[1]
 HEADING = "operator", "case", "beside", "ours ms", "theirs ms", "ratio", "least", "most", "equal"

@@ -16,6 +16,7 @@ from statistics import mean
 
 import tolerance_fit
 import torch
+from in_turn import interleave, ratio
 from tolerance_fit import Clip, Errors, fit_error_model, loss, make_clips, measure_errors
 from torch import Tensor
 
@@ -29,7 +30,7 @@ from spikekit import psnr, read_picture
 from spikekit.arguments import whole
 from spikekit.scenes.analytic import Layer, Motion, Scene
 from spikekit.sensor.simulate import simulate_spikes
-from spikekit.timing import interleave, ratio, timer_of
+from spikekit.timing import timer_of
 
 TOLERANCES = 0.05, 0.1, 0.5, 1.0
 _LEGEND = """time: as a share of that without a tolerance (least to most of {rounds} rounds; {timer}).

@@ -10,7 +10,6 @@ from importlib import import_module
 from lightning_modules.cli import errors
 from lightning_modules.cli.short_help import VERBS, overview, usage
 from lightning_modules.configurations import with_found_configs
-from spikekit.completion import OPTION
 
 #: where the verbs that are not Lightning's are
 _OURS = {
@@ -55,11 +54,7 @@ def _run(verb: str, rest: Sequence[str], args: Sequence[str] | None) -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if "" not in sys.path and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # where users' own networks are; behind all else, so that it hides nothing
-    if verb == OPTION:
-        from lightning_modules.cli.completion import print_completion
-
-        print_completion("".join(rest), _OURS)
-    elif verb in _OURS:
+    if verb in _OURS:
         with errors.stopped_by_sigterm():
             getattr(import_module(f"lightning_modules.{_OURS[verb]}"), verb)(with_found_configs(rest))
     else:

@@ -1,19 +1,16 @@
-"""Timing: several functions in turn in one process, with their memory, and the machine and software."""
+"""Timing: how long a call takes, how much memory, and on what machine and software."""
 
 from __future__ import annotations
 
 import ctypes
-import math
 import platform
 import re
-import statistics
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 
@@ -21,9 +18,6 @@ Run = Callable[[], object]
 
 #: Takes a run and how often to call it; returns the seconds of one call.
 Timer = Callable[[Run, int], float]
-
-_SHORTEST = 2e-3  # seconds: what is faster is called several times within one timing
-_FEWEST_ROUNDS = 3
 
 
 def duration(seconds: float) -> str:
@@ -71,55 +65,6 @@ def timer_of(device: torch.device, threads: int) -> tuple[Timer, str]:
     if threads == 1:
         return cpu_timer(time.process_time), "process CPU time"
     return cpu_timer(time.perf_counter), "wall time"
-
-
-def interleave(runs: Mapping[str, Run], rounds: int, timer: Timer, seconds: float = math.inf) -> dict[str, list[float]]:
-    """Time all runs in turn, A B C A B C ..., so that whatever else the machine does falls on all of them alike.
-
-    Every run is called once before, to warm up and to learn how often it must be called for a timing of a few
-    milliseconds.
-
-    Args:
-        runs: what to time, by name.
-        rounds: how many timings of each.
-        timer: how.
-        seconds: no further round is begun after so much time, from the third one on.
-
-    Returns:
-        The seconds of one call, by name, as many as there were rounds.
-    """
-    number = {}
-    for name, run in runs.items():
-        number[name] = min(100, math.ceil(_SHORTEST / max(timer(run, 1), 1e-9)))
-    times: dict[str, list[float]] = {name: [] for name in runs}
-    spent = 0.0
-    for done in range(rounds):
-        if done >= _FEWEST_ROUNDS and spent > seconds:
-            break
-        for name, run in runs.items():
-            took = timer(run, number[name])
-            times[name].append(took)
-            spent += took * number[name]
-    return times
-
-
-class Ratio(NamedTuple):
-    """How many times as long one run takes as another: median, least and most of the rounds."""
-
-    median: float
-    least: float
-    most: float
-
-
-def ratio(times: Sequence[float], reference: Sequence[float]) -> Ratio:
-    """Compare round by round, as the two timings of one round saw the same machine.
-
-    Example:
-        >>> ratio([2.0, 30.0, 4.0], [1.0, 10.0, 1.0])
-        Ratio(median=3.0, least=2.0, most=4.0)
-    """
-    ratios = [a / max(b, 1e-9) for a, b in zip(times, reference, strict=True)]
-    return Ratio(statistics.median(ratios), min(ratios), max(ratios))
 
 
 def cpu_name() -> str:

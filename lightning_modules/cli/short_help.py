@@ -44,8 +44,7 @@ def overview() -> str:
     """Return what ``lightning --help`` says."""
     return (
         f"usage: lightning VERB ...\n\n{_aligned(VERBS)}\n\n"
-        "lightning VERB --help lists options of a verb, lightning --version prints the version, and\n"
-        "lightning --print-completion bash (or zsh) prints the script for tab completion."
+        "lightning VERB --help lists options of a verb, lightning --version prints the version."
     )
 
 

@@ -14,7 +14,6 @@ from typing import Any, NoReturn
 
 from spikekit._version import __version__
 from spikekit.arguments import UsageError, one_line, printable
-from spikekit.completion import OPTION, completion
 from spikekit.extras import remedy
 from spikekit.standard_output import BROKEN_PIPE, stop_printing
 
@@ -81,9 +80,6 @@ def _run(argv: Sequence[str] | None) -> int:
     try:
         with suppress(SystemExit):  # --help
             words = sys.argv[1:] if argv is None else list(argv)
-            if words[:1] == [OPTION]:
-                print(completion(_parser(*VERBS), "".join(words[1:])), end="")
-                return 0
             args = _parser(*words[:1]).parse_args(words)
             args.run(args)
         print(end="", flush=True)
@@ -122,7 +118,6 @@ def _parser(*asked: str) -> argparse.ArgumentParser:
     """Return a parser that knows the arguments of some verbs: those of the others would take importing them."""
     parser = _Parser(prog="spikekit", description="Look into spike recordings and turn them into pictures.")
     parser.add_argument("--version", action="version", version=f"spikekit {__version__}")
-    parser.add_argument(OPTION, metavar="SHELL", help="print what lets bash or zsh complete with the tab key")
     verbs = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
     for name, (summary, example) in VERBS.items():
         verb = verbs.add_parser(

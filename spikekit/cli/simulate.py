@@ -15,7 +15,7 @@ from spikekit.color.cfa import PATTERNS
 from spikekit.io.files import RECORDING_ENDINGS
 from spikekit.io.sidecar import Sidecar, read_sidecar
 from spikekit.io.video import VideoError
-from spikekit.scenes.simulation import Settings, Source, build, is_own, simulate
+from spikekit.scenes.simulation import INTERPOLATIONS, Settings, Source, simulate
 from spikekit.sensor.noise import SensorNoise
 from spikekit.standard_output import say
 
@@ -37,8 +37,7 @@ def run(args: argparse.Namespace) -> None:
     frame. OUT.json, the side-car, gets every setting, what of the scene was modelled, and hashes of the source and of
     the stream.
 
-    With OUT.json as INPUT, the same stream is made again, bit for bit, which is checked. An interpolation that is not
-    spikekit's runs code, so it must be typed again, with --interpolation and the same text.
+    With OUT.json as INPUT, the same stream is made again, bit for bit, which is checked.
 
     All appear under their names when they are complete, the side-car last: a stream without one is not to be
     believed.
@@ -59,7 +58,6 @@ def run(args: argparse.Namespace) -> None:
         settings, path = _settings(given), args.input
     with _options():
         source = Source(path, settings)
-        build(settings.interpolation)
     for line in simulate(source, settings, args.output, replayed):
         say(line)
 
@@ -91,18 +89,9 @@ def _settings(given: dict[str, Any]) -> Settings:
 
 
 def _settings_of(path: Path, sidecar: Sidecar, given: dict[str, Any]) -> Settings:
-    others = [f"--{name.replace('_', '-')}" for name in given if name != "interpolation"]
+    others = [f"--{name.replace('_', '-')}" for name in given]
     if others:
         raise UsageError(f"{path}: a side-car has its own settings, got {', '.join(others)} as well")
-    stored = sidecar.settings.get("interpolation", Settings.interpolation)
-    typed = given.get("interpolation")
-    if typed is not None and typed != stored:
-        raise UsageError(f"--interpolation: expected {stored!r}, as {path} has it, or none, got {typed!r}")
-    if typed is None and not is_own(stored):
-        raise UsageError(
-            f"{path}: its interpolation is not spikekit's and would run code: {stored[:200]!r}; if you trust it, give "
-            "--interpolation with the same text"
-        )
     try:
         settings = Settings(**sidecar.settings | {"noise": SensorNoise(**sidecar.settings["noise"])})
     except (TypeError, ValueError, KeyError) as error:
@@ -152,8 +141,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"{said}; {Settings.tolerance} if not given",
     )
     option("step", positive, "PIXELS", "largest displacement between latent frames, in sensor pixels", model)
-    said = "what makes latent frames: package.module.Class, or package.module.Class(name=value)"
-    option("interpolation", str, "CLASS", said, model)
+    said = f"what makes latent frames; {Settings.interpolation} if not given"
+    model.add_argument("--interpolation", choices=INTERPOLATIONS, help=said)
 
     noise = parser.add_argument_group("noise of the sensor, none if not given")
     for name, said in _NOISE.items():

@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> None:
     """Draw a sheet about one moment of a recording.
 
     It shows decoded pictures, spikes over time, how often pixels fire, and what moves. Only the frames that are shown
-    are read. For films, see spikekit decode.
+    are read. For pictures over time, see spikekit decode.
 
     Size, Bayer phase and brightness can be omitted if a side-car or --camera gives them.
     """

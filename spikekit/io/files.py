@@ -53,7 +53,8 @@ def read_spikes(
     Convention:
         ``.dat`` has no header: frame after frame, row by row, 8 neighbouring pixels a byte, the leftmost in the least
         significant bit. Where 8 does not divide H x W, every frame is padded to whole bytes. ``.npy`` holds one array
-        (T, H, W) of zeros and ones, ``.npz`` one named ``spk`` or ``spikes``, or else its only 3-D array.
+        (T, H, W) of zeros and ones, ``.npz`` one named ``spk`` or ``spikes``, or else its only 3-D array. One in
+        Fortran order is read whole, whatever part is asked for.
 
         Real cameras store frames upside down, which no format records: ``flip`` turns them. Pixel (0, 0) of the
         result is then the top left of the scene, and the Bayer phase counts from there.

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import ast
 import hashlib
-import importlib
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from spikekit.arguments import one_line
+from spikekit.flow.interpolate import Blend, FlowInterpolation, Still
 from spikekit.io.failures import writing
 from spikekit.io.files import write_spikes
 from spikekit.io.formats import SpikeFileError, dat_bytes
@@ -29,7 +26,9 @@ from spikekit.scenes.frame_sequence import FrameSequence
 from spikekit.sensor.noise import SensorNoise
 
 _SHOWN = 2  # intervals whose plans are told one by one
-_LARGEST = 64  # number among the arguments of an interpolation that a file names
+
+#: What makes latent frames, by name.
+INTERPOLATIONS = {kind.__name__: kind for kind in (FlowInterpolation, Blend, Still)}
 
 
 @dataclass(frozen=True)
@@ -48,12 +47,12 @@ class Settings:
         plan: what is modelled: ``scene`` for what the scene requires, ``everything``, or a number of latent frames.
         tolerance: share of the spikes that may change by not modelling more, under this name in side-cars.
         step: displacement between latent frames, in sensor pixels.
-        interpolation: what makes latent frames: a class by its path, with arguments or without.
+        interpolation: what makes latent frames, one of :data:`INTERPOLATIONS`.
         noise: what the sensor adds.
         calibration: the file of the sensor that was measured, whose pixels ``noise`` has.
 
     Raises:
-        ValueError: a plan that is unknown or has more latent frames than clocks.
+        ValueError: an unknown interpolation, or a plan that is unknown or has more latent frames than clocks.
     """
 
     scale: int
@@ -77,6 +76,8 @@ class Settings:
                 f"plan: expected scene, everything or 0 to {self.clocks - 1} latent frames in {self.clocks} clocks, "
                 f"got {self.plan}"
             )
+        if self.interpolation not in INTERPOLATIONS:
+            raise ValueError(f"interpolation: expected {', '.join(INTERPOLATIONS)}, got {self.interpolation[:80]!r}")
 
     def film(self, frames: Sequence[Tensor]) -> FrameSequence:
         """Return the film of these frames."""
@@ -89,7 +90,7 @@ class Settings:
             pattern=self.pattern,
             alpha=self.alpha,
             clocks=self.clocks,
-            interpolation=build(self.interpolation),
+            interpolation=INTERPOLATIONS[self.interpolation](),
             plan=plan,
             spike_tolerance=self.tolerance,
             step=self.step,
@@ -151,62 +152,6 @@ class Source:
     def file(self, name: str) -> Path:
         """Return where the frame of this name is read from."""
         return self.path / name if self.path.is_dir() else self.path
-
-
-def build(text: str) -> Any:
-    """Build an interpolation from its name.
-
-    Args:
-        text: ``package.module.Class`` or ``package.module.Class(name=value, ...)``; without a module, one of
-            :mod:`spikekit.flow.interpolate`.
-
-    Returns:
-        An object of the class.
-
-    Raises:
-        ValueError: no such class, or arguments that it does not take.
-    """
-    try:
-        module, name, values = _parts(text)
-        made = getattr(importlib.import_module(module or "spikekit.flow.interpolate"), name)(**values)
-        if not callable(made):
-            raise TypeError(f"expected what looks at two frames, got a {type(made).__name__}")
-    except Exception as error:
-        raise ValueError(f"interpolation: {text} cannot be made ({one_line(error)})") from error
-    return made
-
-
-def is_own(text: str) -> bool:
-    """Return whether an interpolation belongs to this package, so that a file may ask for it.
-
-    Args:
-        text: as for :func:`build`, but from a file that somebody else may have written.
-
-    Returns:
-        True for an interpolation of :mod:`spikekit.flow.interpolate` by its bare name, with numbers as arguments or
-        without; :func:`build` would import and call anything else.
-
-    Example:
-        >>> is_own("FlowInterpolation(shrink=2)"), is_own("os.system(command='id')")
-        (True, False)
-    """
-    own = {"Blend": (), "FlowInterpolation": ("shrink",), "Still": ()}
-    try:
-        module, name, values = _parts(text)
-    except Exception:  # what the parser raises depends on the text
-        return False
-    numbers = all(type(value) is int and 1 <= value <= _LARGEST for value in values.values())
-    return not module and name in own and numbers and all(key in own[name] for key in values)
-
-
-def _parts(text: str) -> tuple[str, str, dict[str, Any]]:
-    """Return the module, the class and the arguments in a text, without importing anything."""
-    path, bracket, rest = text.partition("(")
-    module, _, name = path.rpartition(".")
-    call = ast.parse(f"make({rest}" if bracket else "make()", mode="eval").body
-    if not isinstance(call, ast.Call) or call.args:
-        raise ValueError("arguments need names")
-    return module, name, {keyword.arg: ast.literal_eval(keyword.value) for keyword in call.keywords}
 
 
 def simulate(source: Source, settings: Settings, output: Path, replayed: Sidecar | None = None) -> list[str]:
