@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from spikekit.arguments import home_path, one_line
+from spikekit.arguments import home_path, one_line, printable
 from spikekit.check import check_planes, check_positive, check_whole
 from spikekit.color.cfa import bayer_pattern
 from spikekit.io.failures import no_pipe
@@ -184,14 +184,12 @@ def camera(name: str | Path) -> Camera:
         if own:
             no_pipe(file)
         data = json.loads(file.read_text(encoding="utf-8"))
-    except RecursionError as error:
-        raise ValueError(f"{name}: nested too deeply for what describes a camera") from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{name}: {one_line(error)}") from error
     wanted = [field.name for field in fields(Camera) if field.name != "name"]
     if not isinstance(data, dict) or set(data) != set(wanted):
-        got = " ".join(_differences(data, wanted).split())[:300]
-        raise ValueError(f"{name}: expected an object with {', '.join(wanted)}, got {got}")
+        got = ", ".join(data) if isinstance(data, dict) else type(data).__name__
+        raise ValueError(f"{name}: expected an object with {', '.join(wanted)}, got {printable(got)[:300]}")
     try:
         return Camera(**{"name": file.name.removesuffix(".json")} | {key: _frozen(data[key]) for key in wanted})
     except (TypeError, ValueError, RecursionError) as error:
@@ -219,11 +217,3 @@ def _are_places(values: object, count: int) -> bool:
         and len(values) == count
         and all(isinstance(value, int) and not isinstance(value, bool) and value >= 0 for value in values)
     )
-
-
-def _differences(data: object, wanted: list[str]) -> str:
-    if not isinstance(data, dict):
-        return type(data).__name__
-    missing, extra = [w for w in wanted if w not in data], [d for d in data if d not in wanted]
-    said = [f"{what} {', '.join(names)}" for what, names in (("none of", missing), ("also", extra)) if names]
-    return "; ".join(said)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import io
-import struct
-import zlib
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -33,13 +32,12 @@ def to_bytes(image: Tensor, bits: int = 8) -> Tensor:
     return pixels if pixels.ndim == 2 else pixels.movedim(-3, -1).contiguous()
 
 
-def png_bytes(image: Tensor, notes: Mapping[str, str] | None = None, *, bits: int = 8) -> bytes:
-    """Return the PNG file of an image.
+def png_bytes(image: Tensor, notes: Mapping[str, str] | None = None) -> bytes:
+    """Return the PNG file of an image, of 8 bits.
 
     Args:
         image: (3, H, W) or (H, W), floating, [0, 1], or uint8.
         notes: texts that stand in front of the pixels, by name, both ASCII.
-        bits: 8 or 16.
 
     Returns:
         The bytes of the file.
@@ -48,31 +46,12 @@ def png_bytes(image: Tensor, notes: Mapping[str, str] | None = None, *, bits: in
         >>> png_bytes(torch.zeros(3, 4, 6))[1:4]
         b'PNG'
     """
-    if bits == 16 and image.ndim == 3:  # which Pillow does not write
-        return _png16(to_bytes(image, 16).numpy(), notes or {})
     from PIL.PngImagePlugin import PngInfo
 
     said = PngInfo()
     for name, text in (notes or {}).items():
         said.add_text(name, text)
-    return _pillow_bytes(to_bytes(image, bits), "PNG", pnginfo=said)
-
-
-def _png16(pixels: np.ndarray, notes: Mapping[str, str]) -> bytes:
-    """Return the PNG of an array (H, W, 3), uint16."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    height, width, _ = pixels.shape
-    # filter 1 of the format: every byte less that of the pixel to its left
-    rows = pixels.astype(">u2").view(np.uint8).reshape(height, width, 6)
-    rows = np.diff(rows, axis=1, prepend=np.zeros((height, 1, 6), np.uint8)).reshape(height, -1)
-    rows = np.pad(rows, [(0, 0), (1, 0)], constant_values=1)
-    header = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
-    texts = b"".join(chunk(b"tEXt", f"{name}\0{text}".encode("latin-1")) for name, text in notes.items())
-    body = chunk(b"IHDR", header) + texts + chunk(b"IDAT", zlib.compress(rows.tobytes(), 2)) + chunk(b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + body
+    return _pillow_bytes(to_bytes(image), "PNG", pnginfo=said)
 
 
 def png_pixels(path: str | Path) -> Tensor:
@@ -119,10 +98,14 @@ def picture_bytes(image: Tensor, ending: str, *, bits: int = 8, quality: int | N
         raise ValueError(f"bits: expected 8, or 16 in .png and .tif, got {bits} in {ending}")
     if quality is not None and (kind not in ("JPEG", "WEBP") or not 1 <= quality <= 100):
         raise ValueError(f"quality: expected 1 to 100, of .jpg and .webp, got {quality} of {ending}")
-    if kind == "PNG":
-        return png_bytes(image, bits=bits)
     pixels = to_bytes(image, bits)
-    if bits == 16:
+    if bits == 16 and kind == "PNG" and pixels.ndim == 3:  # which Pillow does not write
+        from kornia_rs.io import write_image_png_u16
+
+        with tempfile.TemporaryDirectory() as folder:
+            write_image_png_u16(f"{folder}/rgb.png", pixels.numpy(), "rgb")
+            return Path(folder, "rgb.png").read_bytes()
+    if bits == 16 and kind == "TIFF":
         from tifffile import imwrite
 
         file = io.BytesIO()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from contextlib import suppress
@@ -31,10 +30,10 @@ _FARTHEST = 1e9  # the length of what is infinite
 def read_picture(path: str | Path) -> Tensor:
     """Read a picture file as a colour image, upright as its EXIF says.
 
-    Grey pictures get three equal channels, 16-bit files keep their depth (but for grey ones with alpha, CMYK, and
-    colour TIFFs that only Pillow can unpack, which get 8 bits). Alpha is laid over white, as a page shows it; dropping
-    it would bring up colours that nobody was meant to see, and where it is opaque it changes nothing. Values stay
-    gamma-encoded as in the file.
+    Grey pictures get three equal channels, 16-bit files keep their depth (but for grey ones with alpha, CMYK, colour
+    PNMs, and colour TIFFs that only Pillow can unpack, which get 8 bits). Alpha is laid over white, as a page shows it;
+    dropping it would bring up colours that nobody was meant to see, and where it is opaque it changes nothing. Values
+    stay gamma-encoded as in the file.
 
     Args:
         path: a PNG, JPEG, TIFF (its first page), PNM or any other file that Pillow reads.
@@ -124,15 +123,6 @@ def _pixels(path: Path) -> tuple[np.ndarray, int]:
             from kornia_rs.io import read_image_png_u16
 
             pixels = _unit(read_image_png_u16(str(path), "rgb" if head[25] == 2 else "rgba"), 16)
-        elif picture.format == "PPM" and picture.mode == "RGB" and (most := picture.tile[0].args[1]) not in ("G", 255):
-            # likewise, but the numbers are those of a grey picture three times as wide
-            with open(path, "rb") as file:
-                file.seek(picture.tile[0].offset)
-                kind = b"P2" if head[1:2] == b"3" else b"P5"
-                grey = b"%s %d %d %d\n%s" % (kind, 3 * picture.width, picture.height, most, file.read())
-            with Image.open(io.BytesIO(grey), formats=["PPM"]) as wide:
-                pixels = _unit(np.asarray(wide), 8 if wide.mode == "L" else 16)
-            pixels = pixels.reshape(picture.height, picture.width, 3)
         elif picture.mode.startswith("I;16") or (picture.mode == "I" and picture.format in ("PNG", "PPM")):
             tags = getattr(picture, "tag_v2", {})
             pixels = _unit(np.asarray(picture), tags.get(258, (16,))[0])

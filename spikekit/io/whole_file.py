@@ -36,7 +36,7 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
 
         The file keeps the mode of the one that it replaces. A link of that name is replaced, and what it points at
         stays as it is: a folder from a stranger may have links in it. A device, such as ``/dev/stdout``, is written
-        directly, and so is a pipe that somebody reads.
+        directly, and so is a pipe.
 
     Args:
         path: the file; its folder is made when it is missing.
@@ -64,7 +64,7 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
     path = home_path(path)
     chosen = path.is_dir() or not path.is_symlink() or path.parent == Path("/dev")  # no stranger's way to a device
     if chosen and path.exists() and not path.is_file():
-        with open(path, mode, opener=_without_waiting, **how) as file:  # a folder says so
+        with open(path, mode, **how) as file:  # a folder says so
             yield file
         return
     target = Path(os.path.realpath(path.parent), path.name)
@@ -93,19 +93,6 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
         raise
     file.close()  # so late, because the lock that says that somebody is at work ends here
     flush_folder(target.parent)
-
-
-def _without_waiting(path: str, flags: int) -> int:
-    """Open a device or a pipe; one that nobody reads is an error, rather than waited for."""
-    try:
-        handle = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
-    except OSError as error:
-        if error.errno == errno.ENXIO:
-            raise OSError(errno.ENXIO, "a pipe that nobody reads, expected a file", path) from error
-        raise
-    if os.name == "posix":
-        os.set_blocking(handle, True)
-    return handle
 
 
 def hidden_name(name: str) -> str:

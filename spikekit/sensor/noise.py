@@ -134,25 +134,6 @@ class SensorNoise:
         if self.calibration is not None and drawn:
             raise ValueError(f"{drawn[0]}: expected 0, as the calibration has it, got {getattr(self, drawn[0])}")
 
-    def scaled(self, share: float) -> SensorNoise:
-        """Return the noise of a better sensor: a share of every random source.
-
-        Args:
-            share: in (0, 1]; so many times the variance that photons make, the dark current of every pixel, the spread
-                of gains, and the hot and dead pixels.
-
-        Raises:
-            ValueError: another share.
-
-        Example:
-            >>> SensorNoise(photons=3000, gain_spread=0.06).scaled(0.5)
-            SensorNoise(photons=6000.0, dark_current=0.0, dark_spread=0.0, gain_spread=0.03, hot=0.0, dead=0.0)
-        """
-        if not 0 < share <= 1:
-            raise ValueError(f"share: expected a number in (0, 1], got {share}")
-        fewer = {name: share * getattr(self, name) for name in ("dark_current", "gain_spread", "hot", "dead")}
-        return replace(self, photons=self.photons and self.photons / share, **fewer)
-
     def spike_changes(self, light: float, frames: int) -> dict[str, SpikeChange]:
         r"""Tell how much each source that is on changes a clip, without simulating it.
 
