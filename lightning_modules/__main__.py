@@ -10,6 +10,7 @@ from importlib import import_module
 from lightning_modules.cli import errors
 from lightning_modules.cli.short_help import VERBS, overview, usage
 from lightning_modules.configurations import with_found_configs
+from spikekit.standard_output import stopped_by_sigterm
 
 #: where the verbs that are not Lightning's are
 _OURS = {
@@ -55,7 +56,7 @@ def _run(verb: str, rest: Sequence[str], args: Sequence[str] | None) -> None:
     if "" not in sys.path and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # where users' own networks are; behind all else, so that it hides nothing
     if verb in _OURS:
-        with errors.stopped_by_sigterm():
+        with stopped_by_sigterm():  # Lightning's verbs have a way of their own, which leaves a checkpoint
             getattr(import_module(f"lightning_modules.{_OURS[verb]}"), verb)(with_found_configs(rest))
     else:
         from lightning_modules.cli.command import Command, run

@@ -5,9 +5,7 @@ from __future__ import annotations
 import argparse
 import errno
 import io
-import signal
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NoReturn
@@ -15,7 +13,7 @@ from typing import NoReturn
 from spikekit.arguments import UsageError as SpikekitUsageError
 from spikekit.arguments import one_line
 from spikekit.extras import remedy
-from spikekit.standard_output import BROKEN_PIPE, FULL, stop_printing
+from spikekit.standard_output import BROKEN_PIPE, FULL, Terminated, stop_printing
 
 
 class InputError(ValueError):
@@ -63,30 +61,6 @@ def _of_users() -> tuple[type[BaseException], ...]:
     return tuple(known)
 
 
-class _Terminated(BaseException):
-    """SIGTERM."""
-
-
-def _terminate(*_: object) -> NoReturn:
-    raise _Terminated
-
-
-@contextmanager
-def stopped_by_sigterm() -> Iterator[None]:
-    """End at SIGTERM as at Ctrl-C: files that are being written are removed, and whole ones stay.
-
-    Not for Lightning's verbs: it has a way of its own, which leaves a checkpoint.
-    """
-    if threading.current_thread() is not threading.main_thread():  # nobody else may ask for signals
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, _terminate)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
 @contextmanager
 def as_one_line() -> Iterator[None]:
     """End the program with one line, and no traceback, if the user made a mistake, stopped it, or a disk is full.
@@ -120,6 +94,6 @@ def as_one_line() -> Iterator[None]:
         text = str(error).strip()
         said = text.splitlines()[-1].split("Error: ", 1)[-1] if "Traceback (" in text else text
         raise Ended(f"lightning: {said}", 2 if isinstance(error, UsageError) else 1) from error
-    except (_Terminated, KeyboardInterrupt) as error:
+    except (Terminated, KeyboardInterrupt) as error:
         name, status = ("Ctrl-C", 130) if isinstance(error, KeyboardInterrupt) else ("SIGTERM", 143)
         raise Ended(f"lightning: stopped by {name}; what is whole has been written", status) from None

@@ -6,16 +6,15 @@ import argparse
 import inspect
 import signal
 import sys
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
 from typing import Any, NoReturn
 
 from spikekit._version import __version__
 from spikekit.arguments import UsageError, one_line, printable
 from spikekit.extras import remedy
-from spikekit.standard_output import BROKEN_PIPE, stop_printing
+from spikekit.standard_output import BROKEN_PIPE, Terminated, stop_printing, stopped_by_sigterm
 
 #: what every verb does, and an example; ``add_arguments`` and ``run`` are those of the module of its name
 VERBS = {
@@ -34,27 +33,6 @@ VERBS = {
 }
 
 
-class _Terminated(BaseException):
-    """The command was asked to end, by SIGTERM."""
-
-
-def _terminate(*_: Any) -> NoReturn:
-    raise _Terminated
-
-
-@contextmanager
-def _ending_on_request() -> Iterator[None]:
-    """Unwind on SIGTERM, so that half files go; leave alone what somebody else has set, and other threads."""
-    ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-    if ours:
-        signal.signal(signal.SIGTERM, _terminate)
-    try:
-        yield
-    finally:
-        if ours:
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
@@ -66,12 +44,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         with suppress(AttributeError):  # in a notebook, which shows any name
             stream.reconfigure(errors="backslashreplace")
     try:
-        with _ending_on_request():
+        with stopped_by_sigterm():
             return _run(argv)
     except KeyboardInterrupt:
         print("spikekit: interrupted", file=sys.stderr)
         return 128 + signal.SIGINT
-    except _Terminated:
+    except Terminated:
         print("spikekit: terminated", file=sys.stderr)
         return 128 + signal.SIGTERM
 
