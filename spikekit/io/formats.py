@@ -21,6 +21,10 @@ from spikekit.io.quiet import quiet
 _ARRAY_NAMES = ("spk", "spikes")
 
 
+# Deflate makes at most 1,032 bytes of one.
+_MOST_DEFLATED = 1032
+
+
 class SpikeFileError(ValueError):
     """A recording that cannot be read or written; the message is one line and names the file."""
 
@@ -188,6 +192,8 @@ def _array(path: Path) -> Iterator[tuple[IO[bytes], tuple[int, int, int], np.dty
                 f"only one of three dimensions, got {found or 'no array'}"
             )
         member, shape, fortran, dtype = headers[name]
+        if member.file_size > _MOST_DEFLATED * min(member.compress_size, path.stat().st_size):
+            raise SpikeFileError(f"{path}: damaged, {name} claims {member.file_size} bytes of {member.compress_size}")
         with archive.open(member) as stream:
             _npy_header(stream)
             _check_array(path, name, shape, dtype, member.file_size - stream.tell())
