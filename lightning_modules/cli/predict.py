@@ -56,7 +56,11 @@ def parser() -> argparse.ArgumentParser:
         f"{SPEEDS['fast']:g} dB (fast) below them; the fastest",
     )
     add("--budget", help="instead, what a picture may cost, such as 2s, 25fps or 200MB: the best that fits")
-    add("--scale", type=whole(1), default=4, help="super-resolution factor, of speed and budget; 4 if not given")
+    add(
+        "--scale",
+        type=whole(1),
+        help="super-resolution factor, of speed and budget; 4 if not given, 1 for a grey camera",
+    )
     add("--weights", metavar="NAME", help="instead, a name that lightning models lists, a .safetensors, a .ckpt")
     add("-c", "--config", action="append", default=[], metavar="FILE", help="instead, the network of a configuration")
     add("--ckpt_path", metavar="FILE", help="its checkpoint; best and last are those of its output, or of -o")

@@ -48,7 +48,7 @@ def reconstruct(
     *,
     budget: str | None = None,
     network: Network | str | Path | None = None,
-    scale: int = 4,
+    scale: int | None = None,
     height: int | None = None,
     width: int | None = None,
     flip: bool = False,
@@ -74,7 +74,7 @@ def reconstruct(
             :func:`lightning_modules.inference.presets.choose`.
         budget: instead, what a picture may cost, such as ``"40ms"`` or ``"200MB"``, see there.
         network: instead, a network, the name of weights of the package, or a file of weights.
-        scale: super-resolution factor, of speed and budget.
+        scale: super-resolution factor, of speed and budget; when not given, 4, or 1 for a grey camera.
         height: rows; needed for a ``.dat`` without side-car or camera, as it has no header.
         width: columns; likewise.
         flip: turn the stored frames upside down, as real cameras need.
@@ -118,6 +118,7 @@ def reconstruct(
     notes: list[str] = []
     noisy = str(calibration) != "none" and may_be_noisy(recording)
     if network is None:
+        scale = scale or (1 if recording.pattern == GREY else 4)
         white = RecordingClips(recording).white if white is None else white
         speed = "balanced" if budget is None and speed is None else speed
         preset, notes = _chosen(recording, speed, budget, scale, frame, white, noisy)
