@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from typing import Any
 
@@ -15,7 +15,6 @@ from torch.utils.data import DataLoader, Dataset
 from lightning_modules.data.loading import process, start_worker
 from lightning_modules.data.margin import trim
 from lightning_modules.data.rendering import Gallery
-from lightning_modules.data.stills import StillClips
 
 _AT_ONCE = 128  # scenes rendered together
 _SYMMETRIC = "RGGB", "BGGR", "grey"  # phases that stay what they are when rows become columns
@@ -24,7 +23,7 @@ _SYMMETRIC = "RGGB", "BGGR", "grey"  # phases that stay what they are when rows 
 class _Drawn(Dataset):
     """The numbers of many scenes of one kind."""
 
-    def __init__(self, kinds: list[StillClips]) -> None:
+    def __init__(self, kinds: Sequence[Any]) -> None:
         self.kinds = kinds
 
     def __getitem__(self, wanted: tuple[int, int, int]) -> dict[str, np.ndarray]:
@@ -57,7 +56,7 @@ class ScenePool:
     def __init__(
         self,
         data: LightningDataModule,
-        kinds: list[StillClips],
+        kinds: Sequence[Any],
         shares: list[float],
         *,
         size: int,

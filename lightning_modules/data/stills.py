@@ -18,6 +18,7 @@ from lightning_modules.data.cache import ClipCache, clip_key, file_digest, unpac
 from lightning_modules.data.loading import ClipScenes, cut_key_frames
 from lightning_modules.data.margin import flow_margin, trim
 from lightning_modules.data.pictures import embedded_pictures, folder_pictures, split_pictures
+from lightning_modules.data.pool import ScenePool
 from lightning_modules.data.rendering import Gallery, Pictures, draw_cut, render_scene, see
 from lightning_modules.data.textures import outline
 from lightning_modules.signatures import inherit_signature
@@ -446,8 +447,6 @@ class StillScenes(ClipScenes):
     def train_dataloader(self) -> Any:  # noqa: D102
         if not self.pool:
             return super().train_dataloader()
-        from lightning_modules.data.pool import ScenePool
-
         how = {"size": self.pool, "reuse": self.reuse, "batch_size": self.batch_size, "workers": self.workers}
         return ScenePool(self, self._kinds, self._shares, length=self.train_clips // self.batch_size, **how)
 

@@ -119,6 +119,7 @@ def export_network(network: Network, path: str | Path, kind: str, *, still: bool
     if kind == "onnx":
         _check_onnx()
     network = network.eval().cpu().float()
+    network.by_sites = False  # of other programs' operators, none looks temporal pixels up
     films = isinstance(network, RecurrentCSCSR)
     module = as_exported(network, still)
     try:

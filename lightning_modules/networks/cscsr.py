@@ -26,7 +26,8 @@ from spikekit.color.cfa import count_colors
 from spikekit.warp.bayer_warp import bayer_warp_idw
 from spikekit.warp.site_search import SMALLEST, search_sites, site_table
 
-_STEPS = 16  # positions per pixel of the picture, along each axis, that exported programs round motion to
+#: positions per pixel of the picture, along each axis, that motion is rounded to: exported programs search in integers
+_STEPS = 16
 _SEARCHED = 1 << 19  # positions that are searched in one go on a CPU, whose cache is small
 _SEARCHED_ELSEWHERE = 1 << 25  # where a launch costs more
 
@@ -79,6 +80,21 @@ def _masks(height: int, width: int, pattern: str, scale: int, device: torch.devi
         return bayer_mask(height, width, pattern, scale=scale, device=device, dtype=torch.bool).unbind(0)
 
 
+def _kept_near(offsets: Tensor) -> Tensor:
+    """Let no offset (..., 2, H, W) lead further than half a pixel beyond the picture, where nothing more is known.
+
+    What it leads to is rounded as in an export, so that both find the same pixels; the gradient is that of no rounding.
+    """
+    kept = []
+    for axis, offset in zip((-1, -2), offsets.unbind(-3), strict=True):
+        length = offset.shape[axis]
+        at = torch.arange(length, device=offset.device, dtype=offset.dtype)
+        at = at if axis == -1 else at.unsqueeze(-1)
+        near = (offset + at).clamp(-0.5, length - 0.5) - at
+        kept.append(near + ((near * _STEPS).round() / _STEPS - near).detach())
+    return torch.stack(kept, dim=-3)
+
+
 class CSCSR(Network):
     r"""Super-resolution of a colour picture from a Bayer-pattern spike stream, or of a grey one from a grey stream.
 
@@ -93,6 +109,8 @@ class CSCSR(Network):
 
     Attributes:
         config: the configuration.
+        by_sites: look temporal pixels up a sensor pixel at a time, with one flow for each, where that is possible; an
+            export searches for every temporal pixel by itself.
 
     Shape:
         - Input: spikes :math:`(B, N, H, W)`, zeros and ones, any real dtype, any H and W of at least 3; optionally
@@ -116,6 +134,7 @@ class CSCSR(Network):
     """
 
     halo = 16  #: enough for every shipped network; its weights bring their own
+    by_sites = True
     flow_groups = ((), (3,))
     configuration: ClassVar[type[CSCSRConfig]] = CSCSRConfig  #: of the fields that ``settings`` are
 
@@ -212,7 +231,7 @@ class CSCSR(Network):
         if flow is None and self.colors == 1:  # all pixels are known, and nothing is searched
             return False
         learned = flow is not None and flow.requires_grad and torch.is_grad_enabled()
-        if learned or is_exporting() or torch.jit.is_tracing():
+        if learned or not self.by_sites or is_exporting() or torch.jit.is_tracing():
             return False
         known = config.search and config.representation == "bssr" and config.neighbors <= 4
         return known and self.fold == self.scale and min(spikes.shape[-2:]) >= SMALLEST
@@ -256,7 +275,7 @@ class CSCSR(Network):
         offsets = linear_motion(
             flow[:, :, 0], flow[:, :, 1], self.times, first=first, middle=middle, last=last, scale=self.scale
         )
-        return offsets.expand(-1, self.colors, -1, -1, -1, -1).unbind(1)
+        return _kept_near(offsets).expand(-1, self.colors, -1, -1, -1, -1).unbind(1)
 
     def _no_offset(self, planes: Tensor) -> Tensor:
         height, width = planes.shape[-2:]

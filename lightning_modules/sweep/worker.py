@@ -110,9 +110,10 @@ class _Cost(Callback):
     """Count the FLOPs of the first step, and time the others; a step may take several batches."""
 
     flops: int | None = None
+    _counted = 0
 
     def on_train_batch_start(self, trainer: Trainer, module: LightningModule, batch: Any, index: int) -> None:
-        if index == 0:
+        if self.flops is None:  # not of making the clips, between two batches
             self._counter = FlopCounterMode(display=False)
             self._counter.__enter__()
         self._wait()
@@ -120,9 +121,11 @@ class _Cost(Callback):
             self._began = time.monotonic()
 
     def on_train_batch_end(self, trainer: Trainer, *_: Any) -> None:
-        if trainer.global_step == 1 and self.flops is None:
+        if self.flops is None:
             self._counter.__exit__(None, None, None)
-            self.flops = self._counter.get_total_flops()
+            self._counted += self._counter.get_total_flops()
+            if trainer.global_step == 1:
+                self.flops = self._counted
         self._wait()
         self.seconds = (time.monotonic() - self._began) / max(1, trainer.global_step - _WARM_UP)
 

@@ -89,7 +89,7 @@ def test_fit_on_vimeo_and_on_films_without_flow(tmp_path, command, capsys, write
     septuplets(tmp_path / "vimeo", ["00001/0001", "00001/0002", "00002/0001"])
     (tmp_path / "vimeo/sep_trainlist.txt").write_text("00001/0001\n00002/0001\n")
     (tmp_path / "vimeo/sep_testlist.txt").write_text("00001/0002\n")
-    command("fit", "films", "--data.patch", 64, "--data.root", tmp_path / "vimeo", "-o", tmp_path / "run", scale=4)
+    command("fit", "films", "--data.patch", 16, "--data.root", tmp_path / "vimeo", "-o", tmp_path / "run", scale=4)
     for name in ("a", "b"):
         write_film(tmp_path / "films" / name, 4)
     blended = "--data.root", tmp_path / "films", "--data.interpolation", "spikekit.flow.interpolate.Blend"

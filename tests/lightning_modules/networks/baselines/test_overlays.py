@@ -92,7 +92,20 @@ def test_from_training_to_a_picture(kind, tmp_path):
     spikes = torch.rand(41, 10, 12, generator=torch.Generator().manual_seed(0)) < 0.3
     write_spikes(tmp_path / "clip.npz", spikes)
     weights = str(tmp_path / "small.safetensors")
-    main(["predict", str(tmp_path / "clip.npz"), "--weights", weights, "--white", "0.4", "-o", str(tmp_path / "out")])
+    main(
+        [
+            "predict",
+            str(tmp_path / "clip.npz"),
+            "--weights",
+            weights,
+            "--white",
+            "0.4",
+            "--precision",
+            "32-true",
+            "-o",
+            str(tmp_path / "out"),
+        ]
+    )
     [picture] = (tmp_path / "out").rglob("*.png")
     with torch.no_grad():
         expected = read(spikes[None])[0].clamp(0, 1)
