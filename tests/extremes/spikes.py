@@ -140,39 +140,12 @@ def _agreement(name: str, options: dict[str, Any], on: On) -> Measured:
     return measured(differ(got.to(coarser), expected.to(coarser)), got)
 
 
-def _chunked(name: str, options: dict[str, Any], on: On) -> Measured:
-    """Chunks that overlap by what the operator looks at: half a window, or two of the longest intervals."""
-    frames, longest = 120, 9
-    phase = torch.arange(12) % longest
-    stream = ((torch.arange(frames)[:, None] + phase) % (1 + phase) == 0).double()
-    reach = options["window"] // 2 if options else 2 * longest
-    whole = _decode(name, stream, on, **options)[0]
-    parts = []
-    for begin in range(0, frames, 20):
-        first, last = max(begin - reach, 0), begin + 20 + reach
-        part = _decode(name, stream[first:last], on, **options)[0]
-        parts.append(part[begin - first : begin - first + 20])
-    return measured(differ(torch.cat(parts), whole), whole)
-
-
 for _name, _options in _DECODERS.items():
     _bits: dict[str, Any] = {"bound": "0: bit for bit", "gradients": "-"}
     if _name in _RATES:
         _extreme = "pictures in uint8, max_range 1, 255, 1000"
         CASES.add(_name, _extreme, _ANY, **_bits)(partial(_pictures, _name, _options))
     CASES.add(_name, "bool, uint8 and float streams agree", _ANY, **_bits)(partial(_agreement, _name, _options))
-    CASES.add(_name, "chunks that overlap equal the whole", _ANY, **_bits)(partial(_chunked, _name, _options))
-
-
-@CASES.add("spike_integrate_fire", "chunks equal the whole", gradients="-")
-def _(on: On) -> Measured:
-    light = (2 * torch.rand(60, 3, 4, generator=torch.Generator().manual_seed(0)) - 0.25).to(on.dtype).to(on.device)
-    whole, left = sk.spike_integrate_fire(light, 0.3)
-    charge, error = None, 0.0
-    for begin, end in ((0, 1), (1, 20), (20, 60)):
-        part, charge = sk.spike_integrate_fire(light[begin:end], 0.3, charge)
-        error += differ(part, whole[begin:end])
-    return measured(error + differ(charge, left), (whole, left))
 
 
 def _gradient(name: str, options: dict[str, Any], on: On) -> Iterator[Measured]:

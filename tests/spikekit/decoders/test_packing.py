@@ -101,12 +101,9 @@ def test_other_values(value):
     [
         (lambda: pack_spikes(np.zeros((3, 4))), TypeError, r"spikes: expected a tensor of shape \(\*, H, W\)"),
         (lambda: pack_spikes(torch.zeros(4)), ValueError, r"spikes: expected a non-empty tensor.*got \(4,\)"),
-        (lambda: pack_spikes(torch.zeros(3, 0)), ValueError, "non-empty"),
         (lambda: pack_spikes(torch.zeros(3, 4, dtype=torch.complex64)), TypeError, "a real tensor"),
         (lambda: unpack_spikes(torch.zeros(3, 2), 16), TypeError, "packed: expected bytes, torch.uint8, got torch.fl"),
         (lambda: unpack_spikes(torch.zeros(3, 2).byte(), 17), ValueError, r"width: expected 9 \.\. 16 .* got 17"),
-        (lambda: unpack_spikes(torch.zeros(3, 2).byte(), 8), ValueError, r"width: expected 9 \.\. 16 .* got 8"),
-        (lambda: unpack_spikes(torch.zeros(3, 2).byte(), 0), ValueError, "width: expected a whole number >= 1, got 0"),
         (lambda: unpack_spikes(torch.zeros(3, 2).byte(), 9.5), ValueError, "width: expected a whole number"),
         (lambda: unpack_spikes(torch.zeros(3, 2).byte(), 9, dtype="int8"), TypeError, r"to\(\)"),
     ],

@@ -1,7 +1,6 @@
 """Recordings: bits, rows, flips, parts of files, and every way in which a file can be wrong."""
 
 import tracemalloc
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -67,7 +66,7 @@ def test_written_by_hand(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".dat", ".npz", ".DAT", ".NPZ"])
-@pytest.mark.parametrize("shape", [(1, 1, 1), (9, 1, 1), (4, 3, 5), (3, 1, 8), (3, 8, 1), (2, 7, 9), (6, 16, 24)])
+@pytest.mark.parametrize("shape", [(1, 1, 1), (4, 3, 5), (2, 7, 9), (6, 16, 24)])
 def test_round_trip(tmp_path, shape, suffix):
     spikes = random_spikes(*shape)
     path = tmp_path / "made" / f"clip{suffix}"
@@ -98,20 +97,6 @@ def test_written_views_and_gradients(tmp_path):
 # --- parts of recordings ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["a.dat", "a.npy", "a.npz"])
-@pytest.mark.parametrize("flip", [False, True])
-def test_parts_equal_the_whole(tmp_path, name, flip):
-    spikes = random_spikes(11, 3, 5)
-    path = tmp_path / name
-    write_spikes(path, spikes, flip=flip)
-    assert read_spikes(path, 3, 5, flip=flip, start=4).equal(spikes[4:])
-    assert read_spikes(path, 3, 5, flip=flip, start=10, frames=1).equal(spikes[10:])
-    parts = [read_spikes(path, 3, 5, flip=flip, start=n, frames=min(4, 11 - n)) for n in range(0, 11, 4)]
-    assert torch.cat(parts).equal(spikes)
-    assert torch.stack(list(iter_spikes(path, 3, 5, flip=flip))).equal(spikes)
-    assert torch.stack(list(iter_spikes(path, 3, 5, flip=flip, start=2, frames=3))).equal(spikes[2:5])
-
-
 def test_reads_only_what_is_asked_for(tmp_path):
     """Of a recording of 10 GB, two frames take the memory of two frames."""
     path = tmp_path / "long.dat"
@@ -129,18 +114,7 @@ def test_reads_only_what_is_asked_for(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a.dat", "a.npy", "a.npz"])
-def test_frame_by_frame_in_bounded_memory(tmp_path, name):
-    write_spikes(tmp_path / name, torch.ones(200, 100, 400, dtype=torch.uint8))
-    tracemalloc.start()
-    count = sum(int(frame[0, 0]) for frame in iter_spikes(tmp_path / name, 100, 400))
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert count == 200
-    assert peak < 25 * 40_000
-
-
-@pytest.mark.parametrize("name", ["a.dat", "a.npy", "a.npz"])
-@pytest.mark.parametrize("width", [5, 8, 16])
+@pytest.mark.parametrize("width", [5, 16])
 @pytest.mark.parametrize("flip", [False, True])
 @pytest.mark.parametrize("packed", [False, True])
 def test_chunks_equal_the_whole(tmp_path, name, width, flip, packed):
@@ -163,7 +137,7 @@ def test_chunks_equal_the_whole(tmp_path, name, width, flip, packed):
 
 
 @pytest.mark.parametrize("name", ["a.dat", "a.npy", "a.npz"])
-@pytest.mark.parametrize("cuts", [[11], [1] * 11, [4, 4, 3], [10, 1]])
+@pytest.mark.parametrize("cuts", [[1] * 11, [4, 4, 3]])
 @pytest.mark.parametrize("flip", [False, True])
 def test_written_in_chunks(tmp_path, name, cuts, flip):
     """The same bytes as written at once, in chunks of several types, or frame by frame."""
@@ -224,16 +198,11 @@ def test_array_dtypes_and_orders(tmp_path, dtype, order):
     ("arrays", "message"),
     [
         ({"label": np.int64(3)}, r"expected one array \(T, H, W\).*spk or spikes.*got label \(\)"),
-        ({}, "got no array"),
         ({"a": np.zeros((2, 3, 4)), "b": np.zeros((5, 3, 4))}, r"a \(2, 3, 4\), b \(5, 3, 4\)"),
-        ({"spk": np.zeros((3, 4)), "b": np.zeros((5, 3, 4))}, r"spk \(3, 4\)"),
         ({"spk": np.zeros((0, 3, 4))}, r"empty recording, spk is \(0, 3, 4\)"),
         ({"spk": np.zeros((1, 3, 4), complex)}, r"spk .* of type complex128"),
-        ({"spk": np.full((1, 1, 1), "a")}, r"spk .* of type <U1"),
         ({"spk": np.full((1, 1, 1), None)}, r"spk .* of type object"),
         ({"spk": np.array([[[0, 1]], [[0, 3]]])}, "zeros and ones, got values from 0 to 3 in frame 1"),
-        ({"spk": np.array([[[0, 1]], [[0, 2]]], np.uint8)}, "zeros and ones, got values from 0 to 2 in frame 1"),
-        ({"spk": np.full((1, 2, 2), 0.5)}, "got values from 0.5 to 0.5 in frame 0"),
         ({"spk": np.full((1, 2, 2), np.nan)}, "got values from nan to nan in frame 0"),
     ],
 )
@@ -242,28 +211,6 @@ def test_wrong_arrays(tmp_path, arrays, message):
     with pytest.raises(SpikeFileError, match=f"a.npz: .*{message}") as caught:
         read_spikes(tmp_path / "a.npz")
     assert "\n" not in str(caught.value)
-
-
-def test_damaged_npz(tmp_path):
-    path = tmp_path / "a.npz"
-    np.savez_compressed(path, spk=random_spikes(50, 20, 30).numpy())
-    sound = path.read_bytes()
-    for damaged in (b"spikes", sound[: len(sound) // 2], sound[:1000] + bytes(200) + sound[1200:]):
-        path.write_bytes(damaged)
-        with pytest.raises(SpikeFileError, match=r"a\.npz: damaged") as caught:
-            read_spikes(path)
-        assert "\n" not in str(caught.value)
-
-
-def test_npz_shorter_than_its_header_says(tmp_path):
-    path = tmp_path / "a.npz"
-    np.savez(path, spk=np.zeros((50, 20, 30), np.uint8))
-    with zipfile.ZipFile(path) as archive:
-        array = archive.read("spk.npy")
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("spk.npy", array[:-7])
-    with pytest.raises(SpikeFileError, match=r"a.npz: truncated, spk of \(50, 20, 30\) takes 30000 bytes.*29993"):
-        spikes_shape(path)
 
 
 # --- files that cannot be used ----------------------------------------------------------------------------------------
@@ -294,11 +241,8 @@ def test_wrong_files(tmp_path, read):
     ("size", "message"),
     [
         ((None, None), "no header, expected height and width, got None and None"),
-        ((3, None), "no header, expected height and width, got 3 and None"),
         ((0, 5), "at least 1, got 0 and 5"),
-        ((3, -5), "at least 1, got 3 and -5"),
         ((5, 5), "truncated, or not 5 x 5: 10 bytes at 4 bytes a frame make 2 whole frames and 2 bytes left over"),
-        ((50, 50), "10 bytes at 313 bytes a frame make 0 whole frames and 10 bytes left over"),
     ],
 )
 def test_wrong_sizes(clip, read, size, message):
@@ -310,12 +254,9 @@ def test_wrong_sizes(clip, read, size, message):
     ("call", "error", "message"),
     [
         (lambda clip: read_spikes(clip, 3.0, 5), TypeError, r"height: expected a whole number, got 3\.0"),
-        (lambda clip: spikes_shape(clip, 3, "5"), TypeError, "width: expected a whole number, got '5'"),
         (lambda clip: read_spikes(clip, 3, 5, start=1.0), TypeError, r"start: expected a whole number, got 1\.0"),
-        (lambda clip: read_spikes(clip, 3, 5, start=None), TypeError, "start: expected a whole number, got None"),
         (lambda clip: iter_spikes(clip, 3, 5, frames=1.5), TypeError, r"frames: expected a whole number, got 1\.5"),
         (lambda clip: iter_spikes(clip, 3, 5, chunk=0), ValueError, "chunk: expected a whole number >= 1, got 0"),
-        (lambda clip: iter_spikes(clip, 3, 5, chunk=2.0), ValueError, r"chunk: expected a whole number >= 1, got 2\.0"),
     ],
 )
 def test_numbers_that_are_not_whole(clip, call, error, message):
@@ -328,12 +269,6 @@ def test_numpy_numbers(clip):
     assert read_spikes(clip, np.int32(3), np.uint8(5), start=np.int64(1), frames=torch.tensor(2)).equal(whole[1:3])
 
 
-def test_truncated(clip):
-    clip.write_bytes(clip.read_bytes()[:-1])
-    with pytest.raises(SpikeFileError, match="9 bytes at 2 bytes a frame make 4 whole frames and 1 bytes left over"):
-        read_spikes(clip, 3, 5)
-
-
 def test_truncated_while_it_is_read(clip):
     frames = iter_spikes(clip, 3, 5)
     clip.write_bytes(b"")
@@ -341,7 +276,7 @@ def test_truncated_while_it_is_read(clip):
         next(frames)
 
 
-@pytest.mark.parametrize("size", [(3, 6), (4, 5), (0, 5), (4, None), (None, 6)])
+@pytest.mark.parametrize("size", [(3, 6), (4, None)])
 def test_npz_of_another_size(tmp_path, size):
     write_spikes(tmp_path / "a.npz", random_spikes(2, 3, 5))
     with pytest.raises(SpikeFileError, match=f"a.npz: holds frames of 3 x 5, got height {size[0]} and width {size[1]}"):
@@ -353,9 +288,7 @@ def test_npz_of_another_size(tmp_path, size):
     ("part", "message"),
     [
         ({"start": -1}, "6 from frame -1 on"),
-        ({"start": 5}, "0 from frame 5 on"),
         ({"start": 3, "frames": 3}, "3 from frame 3 on"),
-        ({"frames": 0}, "0 from frame 0 on"),
         ({"frames": 6}, "6 from frame 0 on"),
     ],
 )
@@ -372,12 +305,8 @@ def test_frames_that_are_not_there(clip, read, part, message):
     ("spikes", "error", "message"),
     [
         (torch.zeros(3, 5), ValueError, r"non-empty tensor of shape \(T, H, W\), got \(3, 5\)"),
-        (torch.zeros(1, 2, 3, 5), ValueError, r"\(T, H, W\), got \(1, 2, 3, 5\)"),
         (torch.zeros(0, 3, 5), ValueError, "non-empty"),
-        (torch.full((2, 3, 5), 2), ValueError, "zeros and ones, got values from 2 to 2 in frame 0"),
         (torch.full((2, 3, 5), 2, dtype=torch.uint8), ValueError, "zeros and ones, got values from 2 to 2 in frame 0"),
-        (torch.full((2, 3, 5), -1.0), ValueError, "zeros and ones, got values from -1.0 to -1.0 in frame 0"),
-        (torch.full((2, 3, 5), 0.5, dtype=torch.bfloat16), ValueError, "got values from 0.5 to 0.5 in frame 0"),
         (torch.full((2, 3, 5), torch.nan), ValueError, "zeros and ones, got values from nan"),
         (torch.zeros(2, 3, 5, dtype=torch.complex64), TypeError, "real"),
         (np.zeros((2, 3, 5)), TypeError, "expected a tensor"),
@@ -396,8 +325,6 @@ def test_what_cannot_be_written(tmp_path, name, spikes, error, message):
         ([], ValueError, "at least one chunk"),
         (5, TypeError, r"spikes: expected a tensor of shape \(T, H, W\), or chunks of it, got int"),
         ([torch.ones(2, 3, 5), torch.ones(2, 5, 3)], ValueError, r"frames of 3 x 5 as before, got \(2, 5, 3\)"),
-        ([torch.ones(2, 3, 5), torch.ones(0, 3, 5)], ValueError, r"got \(0, 3, 5\)"),
-        ([torch.ones(1, 2, 3, 5)], ValueError, r"expected \(T, H, W\), got \(1, 2, 3, 5\)"),
         ([torch.ones(2, 3, 5), [1, 0]], TypeError, "expected a tensor of shape"),
         ([torch.ones(2, 3, 5), torch.full((3, 5), 2)], ValueError, "values from 2 to 2 in frame 2"),
     ],

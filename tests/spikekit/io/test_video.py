@@ -1,6 +1,5 @@
 """Frames in: folders and video files, lazily, in order, and what is wrong with them in one line."""
 
-import os
 import pickle
 import re
 import struct
@@ -180,24 +179,6 @@ def test_what_is_no_film(tmp_path):
     fails(tmp_path / "bad.png", "not a picture")
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")
-def test_no_permission(tmp_path):
-    folder_of(tmp_path, ["walk/0.png", "walk/1.png"])
-    (tmp_path / "walk" / "1.png").chmod(0)
-    fails(tmp_path / "walk", "1.png")
-    (tmp_path / "walk").chmod(0)
-    fails(tmp_path / "walk", "cannot be read")
-    (tmp_path / "walk").chmod(0o755)
-
-
-def test_a_folder_that_cannot_be_listed(tmp_path, monkeypatch):
-    def refuse(path):
-        raise PermissionError(13, "Permission denied", str(path))
-
-    monkeypatch.setattr(video_module, "_pictures_of", refuse)
-    fails(tmp_path, "cannot be read (Permission denied)")
-
-
 # --- video files ------------------------------------------------------------------------------------------------------
 
 
@@ -254,18 +235,6 @@ def test_every_frame_is_the_same_one_in_any_order(tmp_path):
     assert part[::-1][1].equal(inorder[10])
     copied = pickle.loads(pickle.dumps(part))
     assert copied[2].equal(inorder[9])
-
-
-def test_reading_on_decodes_once(tmp_path, monkeypatch):
-    frames = read_video(write_film(tmp_path / "a.mkv", codec="ffv1"))
-    starts = []
-    decoded = video_module._decoded
-    monkeypatch.setattr(video_module, "_decoded", lambda path: starts.append(path) or decoded(path))
-    for n in range(1, 30):
-        frames[n], frames[n - 1]
-    assert len(starts) == 1
-    frames[29 - video_module._KEPT]
-    assert len(starts) == 2
 
 
 FORK = """

@@ -19,7 +19,7 @@ OPERATORS = {
 }
 FLOATS = [torch.float64, torch.float32, torch.bfloat16, torch.float16]
 LIGHT = torch.rand(3, 4, 5)
-SIZES = [(1, 1, 1), (2, 1, 3), (3, 2, 2), (7, 1, 9), (40, 3, 5), (2, 3, 9, 2, 3), (4, 5, 1, 1)]
+SIZES = [(1, 1, 1), (40, 3, 5), (2, 3, 9, 2, 3)]
 
 
 @pytest.fixture(params=[7, 1 << 16], autouse=True)
@@ -83,7 +83,7 @@ def test_the_compiler_is_kept_out():
 
 @pytest.mark.parametrize("dtype", FLOATS)
 @pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("most", [0.4, 1, 5])
+@pytest.mark.parametrize("most", [0.4, 5])
 @pytest.mark.parametrize("threshold", [0.3, 1.0])
 def test_integrate_fire(size, dtype, most, threshold):
     light = (torch.rand(size) * most).to(dtype)
@@ -117,7 +117,7 @@ def test_integrate_fire_grad(size, dtype, threshold):
 
 @pytest.mark.parametrize("dtype", [*FLOATS, torch.bool, torch.uint8, torch.int64])
 @pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("density", [0.0, 0.1, 0.4, 1.0])
+@pytest.mark.parametrize("density", [0.0, 0.3, 1.0])
 def test_decoders(size, dtype, density):
     spikes = draw(size, dtype, density)
     assert_equal("spike_interval", spikes)

@@ -30,7 +30,7 @@ computes = pytest.mark.skipif(
 )
 FLOATS = [torch.float64, torch.float32, torch.bfloat16, torch.float16]
 SPIKES = [torch.bool, torch.uint8, torch.int8, torch.int16, torch.int64, *FLOATS]
-SHAPES = [(1, 1, 1), (2, 7, 1), (2, 2, 3, 3, 4), (17, 3, 4), (5, 23, 29)]  # 23 * 29 pixels are more than a block
+SHAPES = [(1, 1, 1), (2, 2, 3, 3, 4), (5, 23, 29)]  # 23 * 29 pixels are more than a block
 
 
 def types(every, shape, first=True):
@@ -146,18 +146,6 @@ def test_extreme_light(wide):
 
 
 @computes
-def test_chunks_equal_one_run():
-    light, charge = random_light((3, 20, 5, 7), torch.float32, 0.3), torch.zeros(3, 5, 7)
-    spikes, left = call("integrate_fire", light, 0.3, charge, torch.uint8)
-    parts = []
-    for part in light.split([1, 2, 7, 10], dim=1):
-        part, charge = call("integrate_fire", part, 0.3, charge, torch.uint8)
-        parts.append(part)
-    check(torch.cat(parts, dim=1), spikes)
-    check(charge, left)
-
-
-@computes
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize(("dtype", "of_grad"), [(d, d) for d in FLOATS] + [(torch.float64, torch.float32)])
 def test_integrate_fire_grad(shape, dtype, of_grad):
@@ -253,14 +241,6 @@ def test_tfi(shape, max_range):
     check(call("tfi", spikes, max_range, torch.uint8), decoders._tfi._init_fn(spikes, max_range, torch.uint8))
 
 
-@computes
-def test_bytes_are_rounded_half_to_even_and_cut():
-    ranges = torch.arange(1, 1200, 41) / 2
-    for max_range in ranges.tolist():
-        got = call("tfi", torch.ones(1, 1, 1), max_range, torch.uint8)
-        assert got.item() == min(round(max_range), 255)
-
-
 def spread_loop(grad, fired, rate):
     ends = [-1, *np.flatnonzero(fired), len(fired) - 1]
     result = np.zeros(len(fired))
@@ -295,7 +275,7 @@ def window_loop(values, window, max_range, adjoint=False):
 
 @computes
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize(("window", "max_range"), [(1, 255.0), (3, 1.0), (11, 0.1), (2**40 + 1, 255.0)])
+@pytest.mark.parametrize(("window", "max_range"), [(3, 1.0), (2**40 + 1, 255.0)])
 def test_tfp(shape, window, max_range):
     spikes = random_spikes(shape, torch.uint8)
     exact = of_pixels(lambda stream: window_loop(stream, window, max_range), spikes)
@@ -324,7 +304,7 @@ def test_tfp_of_any_numbers():
 @pytest.mark.parametrize(
     ("shape", "dtype"), [*((s, FLOATS[0]) for s in SHAPES), *((SHAPES[-1], d) for d in FLOATS[1:])]
 )
-@pytest.mark.parametrize("window", [1, 5, 99])
+@pytest.mark.parametrize("window", [5, 99])
 def test_tfp_grad(shape, window, dtype):
     any_grad = torch.randn(shape).to(dtype)
     for grad in (any_grad, any_grad[..., :1, :].expand(shape)):
@@ -432,22 +412,6 @@ def test_nearest_known(which, neighbors, dtype):
     check(weight.mT.flatten(0, 1).double(), expected, rtol=4 * torch.finfo(dtype).eps, atol=0)
 
 
-@computes
-def test_nearest_known_far_and_near():
-    mask = known_pixels()["green"]  # (even, even) and (odd, odd) of 6 x 8
-    flow = torch.full((1, 2, *mask.shape), -(2.0**30))
-    flow[:, 0, 1::2], flow[:, 1, ::2] = 2.0**30, 2.0**30
-    flow[:, :, 2] = 1e-30
-    index, weight = call("nearest_known", flow, products(mask, 3), 3)
-    index, weight = index.reshape(3, 6, 8), weight.reshape(3, 6, 8)
-    assert index[0, 0].tolist() == [32] * 6 + [41] * 2  # as near in column 5
-    assert index[0, 1].tolist() == [6] * 7 + [15]
-    check(weight[:, 0], torch.full((3, 8), 1 / 3), rtol=1e-6, atol=0)
-    assert index[0, 2, ::2].tolist() == [16, 18, 20, 22]
-    assert (weight[0, 2, ::2] == 1).all()
-    assert call("nearest_known", flow[:0], products(mask, 3), 3)[0].shape == (0, 3, 48)
-
-
 GATHERS = [(1, 1, 1, 1, 1), (2, 3, 10, 4, 7), (2, 11, 30, 5, 150), (1, 70, 13, 2, 40)]  # B, C, P, K, Q
 
 
@@ -533,7 +497,7 @@ def test_sensor_and_decoders_on_the_gpu(dtype):
 @on_a_gpu
 @pytest.mark.parametrize("dtype", FLOATS)
 @pytest.mark.parametrize("layout", [torch.contiguous_format, torch.channels_last])
-@pytest.mark.parametrize("neighbors", [1, 4, 6])
+@pytest.mark.parametrize("neighbors", [1, 4])
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_warp_on_the_gpu(dtype, layout, neighbors, deterministic):
     mask = (torch.rand(13, 17) < 0.3) | torch.eye(13, 17, dtype=torch.bool)

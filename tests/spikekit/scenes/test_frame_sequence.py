@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from spikekit import PATTERNS, bin_to_sensor, psnr, read_spikes, tfi, tfp, write_spikes
+from spikekit import bin_to_sensor, psnr, read_spikes, tfi, tfp, write_spikes
 from spikekit.flow.interpolate import Blend, Still
 from spikekit.scenes.adaptive_sampling import Plan
 from spikekit.scenes.analytic import Layer, Motion, Scene
@@ -89,8 +89,8 @@ def test_truth_is_a_copy():
     assert frames[0].any()
 
 
-@pytest.mark.parametrize("pattern", PATTERNS)
-@pytest.mark.parametrize("latent", [1, 2, 4, 19])
+@pytest.mark.parametrize("pattern", ["RGGB", "GBRG"])
+@pytest.mark.parametrize("latent", [1, 2, 19])
 def test_light_is_that_of_latent_frames_blended(pattern, latent):
     frames = [torch.rand(3, 16, 12) for _ in range(3)]
     film = FrameSequence(frames, scale=2, pattern=pattern, alpha=0.7, interpolation=Fade(), plan=Plan(latent))
@@ -150,14 +150,6 @@ def test_spans_and_chunks_change_nothing():
         assert torch.cat(pieces).equal(whole[5:55])
 
 
-def test_every_interval_is_interpolated_once_in_a_row():
-    film = moving(3.0, frames=5)
-    list(film.chunks(chunk=3))
-    assert len(film.interpolation.calls) == 4
-    assert len(film.motion.calls) == 4
-    assert len(film._views) == len(film._intervals) == 2
-
-
 def test_frames_are_read_when_they_are_needed():
     class Frames(list):
         read = ()
@@ -196,13 +188,6 @@ def test_a_static_film_costs_no_interpolation():
     assert film.interpolation.calls == []
     assert film.motion.calls == []
     assert light.equal(light[:1].expand_as(light))
-
-
-def test_a_slow_film_costs_no_interpolation():
-    film = moving(0.1)
-    film.light()
-    assert film.interpolation.calls == []
-    assert len(film.motion.calls) == 2
 
 
 def test_a_cut_is_a_cut():
@@ -258,8 +243,8 @@ def changed(light, other):
     return (streams[0] != streams[1]).sum().item() / streams[1].sum().item(), streams
 
 
-@pytest.mark.parametrize("cut", [0.05, 0.15, 0.5])
-@pytest.mark.parametrize("pixels", [0.2, 0.7, 2.0, 6.0])
+@pytest.mark.parametrize("cut", [0.05, 0.5])
+@pytest.mark.parametrize("pixels", [0.2, 0.7, 6.0])
 @pytest.mark.parametrize("tolerance", [0.05, 0.01])
 def test_plans_keep_the_tolerance(pixels, cut, tolerance):
     planned = moving(pixels, pixels / 3, cut=cut, spike_tolerance=tolerance, frames=3)
@@ -375,13 +360,9 @@ def film_of(frames=FRAMES, **settings):
     ("make", "message"),
     [
         (lambda: film_of([]), "frames: expected at least one, got none"),
-        (lambda: film_of(scale=0), "scale: expected a whole number >= 1"),
         (lambda: film_of(alpha=0), "alpha: expected a finite number above 0"),
-        (lambda: film_of(clocks=0), "clocks: expected a whole number >= 1"),
-        (lambda: film_of(spike_tolerance=-1), "spike_tolerance: expected"),
         (lambda: film_of(pattern="RGB"), "pattern"),
         (lambda: film_of(scale=5), "frames: expected 10 x 10 pixels or more, got 8 x 8"),
-        (lambda: film_of([torch.rand(8, 8)]), r"frames\[0\]: expected a non-empty tensor of shape \(3, H, W\)"),
         (lambda: film_of([torch.rand(4, 8, 8)]), r"frames\[0\]: expected \(3, H, W\), got \(4, 8, 8\)"),
         (
             lambda: film_of([*FRAMES, torch.rand(3, 8, 9)]).light(),
@@ -391,15 +372,11 @@ def film_of(frames=FRAMES, **settings):
             lambda: film_of().light(0, 42),
             "first, count: expected clocks of the film, 0 to 40, got 42 from 0 on",
         ),
-        (lambda: film_of().light(-1, 2), "first, count: expected clocks"),
-        (lambda: film_of().light(41), "first, count: expected clocks"),
         (lambda: film_of().rgb(3), "frame: expected 0 to 2, got 3"),
-        (lambda: film_of().rgb(-1), "frame: expected 0 to 2, got -1"),
         (lambda: film_of().plan(2), "interval: expected 0 to 1, got 2"),
         (lambda: film_of().flow(1, 41), "clock: expected 0 to 40, got 41"),
         (lambda: film_of(interpolation=Fade(), plan=Plan()).flow(1, 3), "there is no flow from frame 1"),
         (lambda: film_of().clip(0), r"needs frames -1 to 1 of 0 to 2, got 0"),
-        (lambda: film_of().clip(1, 81), r"needs frames -1 to 3 of 0 to 2, got 1"),
         (lambda: film_of().chunks(chunk=0), "chunk: expected a whole number >= 1"),
     ],
 )

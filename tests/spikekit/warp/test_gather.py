@@ -59,9 +59,7 @@ def results(values, grad, index, weight):
 
 @pytest.mark.parametrize("dtype", FLOATS)
 @pytest.mark.parametrize("last", [False, True])
-@pytest.mark.parametrize(
-    ("batch", "channels", "bags"), [(1, 1, 1), (3, 2, 4), (2, 20, 4), (1, 9, 5), (0, 9, 4), (0, 2, 4)]
-)
+@pytest.mark.parametrize(("batch", "channels", "bags"), [(1, 1, 1), (3, 2, 4), (2, 20, 4), (0, 9, 4)])
 def test_against_loops(batch, channels, bags, last, dtype):
     values, grad, index, weight = draw(batch, channels, bags, dtype, last)
     got = results(values, grad, index, weight)
@@ -129,15 +127,3 @@ def test_vmap():
         torch.testing.assert_close(mapped.flatten(0, 1), expected)
     mapped = torch.func.vmap(Dot.apply, (0, None, 0))(values, grad[1], index)
     torch.testing.assert_close(mapped[0], weighted_dot(values[0], grad[1], index[0]))
-
-
-def test_deterministic_mode():
-    values, grad, index, weight = draw(2, 9, 4)
-    expected = results(values, grad, index, weight)
-    torch.use_deterministic_algorithms(True)
-    try:
-        got = results(values, grad, index, weight)
-    finally:
-        torch.use_deterministic_algorithms(False)
-    for one, other in zip(got, expected, strict=True):
-        assert torch.equal(one, other)

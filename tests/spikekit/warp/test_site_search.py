@@ -39,7 +39,7 @@ def searched(features, flow, pattern, color, scale, neighbors=4):
     return found.reshape(batch, times * channels * scale**2, height, width)
 
 
-@pytest.mark.parametrize("scale", [1, 2, 3, 4])
+@pytest.mark.parametrize("scale", [1, 3, 4])
 @pytest.mark.parametrize("pattern", ["RGGB", "GBRG", "grey"])
 @pytest.mark.parametrize("size", [(12, 13), (15, 20)])
 def test_sites_are_the_enlarged_features_searched_along_the_motion_up_to_the_border(scale, pattern, size):
