@@ -90,7 +90,7 @@ def _kept_near(offsets: Tensor) -> Tensor:
         length = offset.shape[axis]
         at = torch.arange(length, device=offset.device, dtype=offset.dtype)
         at = at if axis == -1 else at.unsqueeze(-1)
-        near = (offset + at).clamp(-0.5, length - 0.5) - at
+        near = offset.maximum(-0.5 - at).minimum(length - 0.5 - at)
         kept.append(near + ((near * _STEPS).round() / _STEPS - near).detach())
     return torch.stack(kept, dim=-3)
 

@@ -109,7 +109,9 @@ def test_flows_reach_their_time_points(given):
     assert len(seen) == 3
     for offsets in seen:
         expected = torch.tensor([3 * (-1 * (20 - t) if t < 20 else 2 * (t - 20)) / 15 for t in network.times])
-        torch.testing.assert_close(offsets, expected.reshape(1, 11, 1, 1, 1).expand_as(offsets))
+        inside = offsets[..., 8:-8, 8:-8]  # as far from the border as anything moves
+        expected = expected.reshape(1, 11, 1, 1, 1).expand_as(inside)
+        torch.testing.assert_close(inside, expected, rtol=0, atol=1 / 32)  # rounded to 1/16
 
 
 def test_result_moves_with_the_scene_by_whole_bayer_periods():
