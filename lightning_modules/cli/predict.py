@@ -77,7 +77,7 @@ def parser() -> argparse.ArgumentParser:
     add("--interpolated", type=whole(0), metavar="N", help="pictures between two that the network makes")
     add("--future", type=whole(0), metavar="N", help="pictures that one may wait for, of weights for films")
     add("--device", help="such as cpu or cuda:1; a GPU where there is one")
-    add("--precision", choices=["32-true", "bf16-mixed"], help="bf16-mixed on a GPU that supports it, if not given")
+    add("--precision", choices=["32-true", "bf16-mixed"], help="bf16-mixed where the device has it, if not given")
     add = made.add_argument_group("the output").add_argument
     add("--fps", type=positive, default=25.0, help="pictures shown in a second of a film; 25 if not given")
     add("--beside", choices=list(DECODERS), help="show what this decoder makes of the clip left of every picture")
