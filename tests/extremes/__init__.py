@@ -1,7 +1,7 @@
 """The operators at the extremes of physics and floating point: ``python -m pytest tests/extremes [--device cuda]``.
 
 Every row is an operator at an extreme in one dtype: the worst error against a brute-force reference
-(:mod:`extremes.reference`), the bound that is asserted and where it comes from, and whether values and gradients are
+(``tests/brute_force.py``), the bound that is asserted and where it comes from, and whether values and gradients are
 finite, or which other outcome is the documented one. ``--table FILE`` writes the rows.
 """
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import spikekit as sk
-from extremes import reference
+import brute_force
 from extremes.table import FLOATS, Cases, Measured, On, differ, measured, rounded_once, state, ulps, worst
 
 CASES = Cases()
@@ -51,7 +51,7 @@ def _drift(light: Tensor, spikes: Tensor, charge: Tensor, threshold: float, star
     theta = Fraction(charge.new_tensor(threshold).item())
     errors = []
     for p in range(light.shape[1]):
-        exact, left = reference.integrate_fire(light[:, p].tolist(), theta, start)
+        exact, left = brute_force.integrate_fire(light[:, p].tolist(), theta, start)
         early = spikes[:, p].double().cumsum(0) - torch.tensor(exact, dtype=torch.float64).cumsum(0)
         drift = int(early[-1]) + (Fraction(charge[p].item()) - left) / theta
         if light[:, p].max() > threshold:  # a surplus may be a whole threshold, and lost, or not, by its last bit
@@ -117,9 +117,9 @@ def _broken_pixel(value: float, fires: bool, on: On) -> Measured:
     steady = [0.375] * 24
     broken = [*steady[:5], value, *steady[6:]]
     _, spikes, grad, charge = _fire([steady, broken, steady], 1.0, on)
-    whole, left = reference.integrate_fire(steady, 1.0)
-    before, _ = reference.integrate_fire(steady[:5], 1.0)
-    after, after_left = reference.integrate_fire(steady[6:], 1.0) if fires else ([False] * 18, value)
+    whole, left = brute_force.integrate_fire(steady, 1.0)
+    before, _ = brute_force.integrate_fire(steady[:5], 1.0)
+    after, after_left = brute_force.integrate_fire(steady[6:], 1.0) if fires else ([False] * 18, value)
     expected = torch.tensor([whole, [*before, fires, *after], whole], dtype=torch.float64).T
     slope = torch.ones_like(expected)
     slope[5, 1] = 0
@@ -162,7 +162,7 @@ def _(on: On) -> Iterator[Measured]:
         lights = [-_INF, -1.0, -info.tiny, -0.0, 0.0, info.tiny, below, at.item(), above, 1e4, _INF, float("nan")]
         light, _, grad, _ = _fire([[one] for one in lights], threshold, on)
         theta = torch.tensor(threshold, dtype=torch.promote_types(on.dtype, torch.float32)).item()
-        exact = [float(reference.straight_through(one, theta)) for one in light[0].tolist()]
+        exact = [float(brute_force.straight_through(one, theta)) for one in light[0].tolist()]
         yield measured(ulps(grad[0], torch.tensor(exact, dtype=torch.float64)), (), grad)
 
 

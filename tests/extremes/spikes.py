@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import spikekit as sk
-from extremes import reference
+import brute_force
 from extremes.table import (
     BITS,
     FLOATS,
@@ -75,14 +75,14 @@ def _by_pixel(function: Callable[..., Any], *streams: Tensor, **options: Any) ->
 
 def _intervals(stream: Tensor, on: On) -> Measured:
     (result,) = _decode("spike_interval", stream, on)
-    return measured(differ(result, _by_pixel(reference.spike_interval, stream)), result)
+    return measured(differ(result, _by_pixel(brute_force.spike_interval, stream)), result)
 
 
 def _rates(name: str, options: dict[str, Any], stream: Tensor, on: On) -> Iterator[Measured]:
     for most in (1.0, 255.0):
         how = {**options, "max_range": most}
         result, *grad = _decode(name, stream, on, **how)
-        yield measured(ulps(result, _by_pixel(getattr(reference, name), stream, **how)), result, grad)
+        yield measured(ulps(result, _by_pixel(getattr(brute_force, name), stream, **how)), result, grad)
 
 
 _ONCE: dict[str, Any] = {"limit": rounded_once(0.5), "bound": "0.5 ulp: rounded once"}
@@ -128,7 +128,7 @@ def _pictures(name: str, options: dict[str, Any], on: On) -> Iterator[Measured]:
     for most in (1.0, 255.0, 1000.0):
         how = {**options, "max_range": most}
         (got,) = _decode(name, stream, on, **how, dtype=torch.uint8)
-        exact = _by_pixel(getattr(reference, name), stream, **how)
+        exact = _by_pixel(getattr(brute_force, name), stream, **how)
         yield measured(differ(got, exact.round().clamp(max=255)), got)
 
 
@@ -154,7 +154,7 @@ def _gradient(name: str, options: dict[str, Any], on: On) -> Iterator[Measured]:
         weight = torch.randint(1, 9, stream.shape, generator=torch.Generator().manual_seed(0)).double()
         result, grad = _decode(name, stream, on, weight, **how)
         yield measured(
-            ulps(grad, _by_pixel(getattr(reference, f"{name}_gradient"), stream, weight, **how)), result, grad
+            ulps(grad, _by_pixel(getattr(brute_force, f"{name}_gradient"), stream, weight, **how)), result, grad
         )
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import spikekit as sk
-from extremes import reference
+import brute_force
 from extremes.table import (
     FLOATS,
     Cases,
@@ -63,7 +63,7 @@ def _exact(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Result, its derivative by the flow, and the largest neighbour, for what the operator gets in its dtype."""
     got = flow.to(dtype).double().nan_to_num(nan=0.0, posinf=_FAR, neginf=-_FAR)
-    arrays = reference.idw(features.to(dtype).double().numpy(), got.numpy(), mask.numpy(), columns=columns)
+    arrays = brute_force.idw(features.to(dtype).double().numpy(), got.numpy(), mask.numpy(), columns=columns)
     return tuple(torch.from_numpy(array) for array in arrays)  # type: ignore[return-value]
 
 
@@ -234,7 +234,7 @@ def _bilinear(
 ) -> tuple[Tensor, Tensor]:
     got = flow.to(dtype).double().nan_to_num(nan=0.0, posinf=_FAR, neginf=-_FAR)
     image = image.to(dtype).double()
-    exact = torch.from_numpy(reference.bilinear(image.numpy(), got.numpy(), columns))
+    exact = torch.from_numpy(brute_force.bilinear(image.numpy(), got.numpy(), columns))
     return exact, image.abs().amax(dim=(1, 2), keepdim=True).expand_as(exact)
 
 
