@@ -7,11 +7,11 @@ from fractions import Fraction
 from functools import partial
 from typing import Any
 
+import brute_force
 import torch
 from torch import Tensor
 
 import spikekit as sk
-import brute_force
 from extremes.table import FLOATS, Cases, Measured, On, differ, measured, rounded_once, state, ulps, worst
 
 CASES = Cases()

@@ -7,11 +7,11 @@ from functools import partial
 from itertools import product
 from typing import Any
 
+import brute_force
 import torch
 from torch import Tensor
 
 import spikekit as sk
-import brute_force
 from extremes.table import (
     BITS,
     FLOATS,

@@ -4,12 +4,12 @@ import math
 import sys
 from fractions import Fraction
 
+import brute_force
 import numpy as np
 import pytest
 import torch
 
 import spikekit as sk
-import brute_force
 from extremes import CASES, autograd, sizes
 from extremes.table import Cases, Measured, On, differ, rounded_once, short, state, ulps
 

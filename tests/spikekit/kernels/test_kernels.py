@@ -1,4 +1,10 @@
-"""The kernels of the CPU against the torch paths of the same operators, at every size of tile."""
+"""The kernels of the sensor and the decoders, on CPU and GPU, against the torch paths of the same operators.
+
+On the CPU tiles are of any size. Without a GPU its kernels run by Triton's interpreter, see test_kernels_gpu.py.
+"""
+
+import importlib.util
+import os
 
 import pytest
 import torch
@@ -19,31 +25,42 @@ OPERATORS = {
 }
 FLOATS = [torch.float64, torch.float32, torch.bfloat16, torch.float16]
 LIGHT = torch.rand(3, 4, 5)
-SIZES = [(1, 1, 1), (40, 3, 5), (2, 3, 9, 2, 3)]
+
+INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+GPU = ["gpu"] if importlib.util.find_spec("triton") and (INTERPRETED or torch.cuda.is_available()) else []
+DEVICE = "cpu" if INTERPRETED else "cuda"
 
 
-@pytest.fixture(params=[7, 1 << 16], autouse=True)
-def tile(request, monkeypatch):
-    monkeypatch.setattr(cpu, "_TILE", request.param)
+@pytest.fixture(params=[*([] if INTERPRETED else ["tiles of 7", "one tile"]), *GPU], name="run")
+def _run(request, monkeypatch):
+    """Run a kernel and bring its results back, always several."""
+    if request.param == "gpu":
+        from spikekit.kernels import gpu as kernels
+    else:
+        kernels = cpu
+        monkeypatch.setattr(cpu, "_TILE", 7 if request.param == "tiles of 7" else 1 << 16)
+
+    def run(name, *args):
+        where = DEVICE if kernels is not cpu else "cpu"
+        results = getattr(kernels, name)(*[a.to(where) if isinstance(a, torch.Tensor) else a for a in args])
+        return [result.cpu() for result in (results if isinstance(results, tuple) else (results,))]
+
+    run.on_gpu, run.kernels = kernels is not cpu, kernels
+    return run
 
 
-def both(name, *args):
-    """Results of the kernel and of the torch path."""
-    fast, plain = OPERATORS[name](*args), OPERATORS[name]._init_fn(*args)
-    return (fast, plain) if isinstance(fast, tuple) else ((fast,), (plain,))
+def check(run, name, *args, rtol=0.0, atol=0.0):
+    """As the torch path, bit for bit unless told otherwise; the interpreter cuts bfloat16 instead of rounding it."""
+    plain = OPERATORS[name]._init_fn(*args)
+    for got, expected in zip(run(name, *args), plain if isinstance(plain, tuple) else (plain,), strict=True):
+        least = 2**-7 if INTERPRETED and got.dtype is torch.bfloat16 else 0
+        torch.testing.assert_close(got, expected, rtol=max(rtol, least), atol=atol, equal_nan=True)
 
 
-def assert_equal(name, *args, atol=0.0):
-    for fast, plain in zip(*both(name, *args), strict=True):
-        assert fast.dtype == plain.dtype
-        assert fast.shape == plain.shape
-        torch.testing.assert_close(fast, plain, rtol=0, atol=atol, equal_nan=True)
+of_the_cpu = pytest.mark.skipif(INTERPRETED, reason="the interpreter has nothing to do with it")
 
 
-def draw(size, dtype, density=0.3):
-    return (torch.rand(size) < density).to(dtype)
-
-
+@of_the_cpu
 @pytest.mark.parametrize(
     ("name", "args"),
     [
@@ -67,6 +84,7 @@ def test_the_kernel_is_what_runs(name, args, monkeypatch, without_kernels):
         OPERATORS[name](*args)
 
 
+@of_the_cpu
 def test_the_compiler_is_kept_out():
     traced = []
 
@@ -81,89 +99,117 @@ def test_the_compiler_is_kept_out():
     assert traced == [True, True, False, False]
 
 
+@pytest.mark.filterwarnings("ignore:invalid value")
 @pytest.mark.parametrize("dtype", FLOATS)
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("most", [0.4, 5])
-@pytest.mark.parametrize("threshold", [0.3, 1.0])
-def test_integrate_fire(size, dtype, most, threshold):
-    light = (torch.rand(size) * most).to(dtype)
-    light.flatten()[:: 2 + light.numel() // 3] = threshold
-    charge = torch.rand(*size[:-3], *size[-2:], dtype=torch.promote_types(dtype, torch.float32)) * threshold
-    for out in (dtype, torch.uint8, torch.bool, torch.float16):
-        assert_equal("integrate_fire", light, threshold, charge, out)
-    assert_equal("integrate_fire", light, threshold, charge.double(), dtype)
-
-
-@pytest.mark.parametrize("dtype", FLOATS)
-def test_integrate_fire_of_strange_light(dtype):
-    values = torch.tensor([0, -0.0, -0.5, -3, 0.25, 1, 2, 7.75, float("nan"), float("inf"), -float("inf"), 1e4])
-    light = torch.stack(torch.meshgrid(values, values, values, indexing="ij")).to(dtype)
-    light = light.movedim(1, 0).reshape(12, 3, 12, 12)
-    charge = torch.zeros(12, 12, 12, dtype=torch.promote_types(dtype, torch.float32))
-    assert_equal("integrate_fire", light, 1.0, charge, dtype)
+def test_any_light(run, dtype):
+    """Three clocks of ordinary and of strange light, each after each."""
+    wide, inf = torch.promote_types(dtype, torch.float32), float("inf")
+    theta = torch.tensor(0.3, dtype=wide)
+    # of the last two float32's remainder is above theta, or below 0
+    values = [
+        0,
+        -0.0,
+        -0.5,
+        0.1,
+        0.3,
+        theta.nextafter(theta * 0),
+        1e-12,
+        7.75,
+        float("nan"),
+        inf,
+        -inf,
+        5036367.5,
+        50865,
+    ]
+    values = torch.tensor(values, dtype=torch.float64)
+    light = torch.cartesian_prod(values, values, values).to(dtype).T.reshape(3, 13, 169)
+    for charge in (torch.zeros(13, 169), torch.rand(13, 169) * 0.29):
+        for out in {dtype, torch.uint8}:
+            check(run, "integrate_fire", light, 0.3, charge.to(wide), out)
     grad = torch.randn_like(light)
-    grad[0] = float("inf")
-    assert_equal("integrate_fire_grad", grad, light, 1.0)
+    grad[0] = inf
+    check(run, "integrate_fire_grad", grad, light, 0.3)
+    check(run, "integrate_fire_grad", grad.double(), light, 0.3, rtol=1e-6)
+
+
+def sizes(dtype):
+    """The interpreter is slow; 23 * 29 pixels are more than a block."""
+    if INTERPRETED:
+        return [(2, 5, 2, 3), (3, 23, 29)] if dtype in (torch.uint8, torch.float64) else [(2, 5, 2, 3)]
+    return [(1, 1, 1), (40, 23, 29), (2, 3, 9, 2, 3)]
+
+
+def draw(size, dtype):
+    """Pixels of every density, silent ones and ones that always fire among them."""
+    return (torch.rand(size) < 1.6 * torch.rand((*size[:-3], 1, *size[-2:])) - 0.3).to(dtype)
+
+
+@pytest.mark.parametrize("dtype", [torch.bool, torch.uint8, torch.int8, torch.int64, *FLOATS])
+def test_decoders(run, dtype):
+    for size in sizes(dtype):
+        spikes = draw(size, dtype)
+        check(run, "spike_interval", spikes)
+        for out in (*FLOATS, torch.uint8) if dtype is torch.uint8 else (torch.float32,):
+            check(run, "tfi", spikes, 255.0, out)
+            for window in (3, 301):
+                check(run, "tfp", spikes, window, 255.0, out)
 
 
 @pytest.mark.parametrize("dtype", FLOATS)
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("threshold", [0.3, 1.0])
-def test_integrate_fire_grad(size, dtype, threshold):
-    light = ((torch.rand(size) * 3 - 1) * threshold).to(dtype)
-    light.flatten()[::3] = threshold
-    assert_equal("integrate_fire_grad", torch.randn(size).to(dtype), light, threshold)
-
-
-@pytest.mark.parametrize("dtype", [*FLOATS, torch.bool, torch.uint8, torch.int64])
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("density", [0.0, 0.3, 1.0])
-def test_decoders(size, dtype, density):
-    spikes = draw(size, dtype, density)
-    assert_equal("spike_interval", spikes)
-    for out in (torch.float32, torch.float64, torch.float16, torch.bfloat16, torch.uint8):
-        assert_equal("tfi", spikes, 255.0, out)
-        for window in (1, 3, 9, 301):
-            assert_equal("tfp", spikes, window, 255.0, out)
-
-
-def test_decoders_count_what_is_no_bit():
-    for spikes in (torch.randint(0, 256, (30, 2, 3), dtype=torch.uint8), torch.randint(-900, 900, (30, 2, 3))):
-        for window in (1, 7, 259):
-            assert_equal("tfp", spikes, window, 1.0, torch.float32)
-    spikes = torch.randn(30, 2, 3, dtype=torch.float64)
-    assert_equal("tfp", spikes, 7, 2.0, torch.float64, atol=1e-13)
-
-
-@pytest.mark.parametrize("dtype", FLOATS)
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("density", [0.0, 0.2, 1.0])
-def test_decoder_gradients(size, dtype, density):
+def test_gradients(run, dtype):
     """On eighths, whose sums are exact."""
-    grad = (torch.randint(-16, 17, size) / 8).to(dtype)
-    spikes = draw(size, dtype, density)
-    assert_equal("tfi_grad", grad, spikes, sk.tfi(spikes))
-    for window in (1, 3, 9, 301):
-        atol = 64 * torch.finfo(dtype).eps
-        assert_equal("tfp_grad", grad, window, 2.0, dtype, atol=atol)
+    for size in sizes(dtype):
+        grad, spikes = (torch.randint(-16, 17, size) / 8).to(dtype), draw(size, dtype)
+        check(run, "tfi_grad", grad, spikes, sk.tfi(spikes))
+        for window in (3, 301):
+            check(run, "tfp_grad", grad, window, 2.0, dtype, atol=64 * torch.finfo(dtype).eps)
 
 
-def test_long_streams():
-    """From T = 32767 on, intervals need 32 bits."""
+def test_what_is_no_bit(run):
+    """Any value but 0 is a spike of TFI, and TFP adds up what there is."""
+    for spikes in (torch.tensor([0.0, -0.0, 1e-45, float("nan"), -2.0, 0.0]), torch.tensor([0, 2**40, 0])):
+        check(run, "spike_interval", spikes.reshape(-1, 1, 1))
+    for spikes in (torch.randint(0, 256, (20, 2, 3), dtype=torch.uint8), torch.randint(-(2**20), 2**20, (20, 2, 3))):
+        for window in (7, 259):
+            check(run, "tfp", spikes, window, 1.0, torch.float64, rtol=1e-15)
+    check(run, "tfp", torch.randn(30, 2, 3, dtype=torch.float64), 7, 2.0, torch.float64, atol=1e-13)
+
+
+def test_long_streams(run, monkeypatch):
+    """From T = 32767 on intervals need 32 bits; a frame takes the interpreter two milliseconds, and it sees fewer."""
     for frames in (32766, 32767):
+        dtype = torch.int16 if frames < 32767 else torch.int32
+        assert run("spike_interval", torch.zeros(0, frames, 1, 1))[0].dtype is dtype
+        if INTERPRETED:
+            frames -= 32500
+            monkeypatch.setattr(run.kernels, "_LONGEST", 266)
         spikes = torch.zeros(frames, 1, 4, dtype=torch.uint8)
         spikes[[5, frames - 3], :, 1] = 1
         spikes[0, :, 2] = spikes[-1, :, 3] = 1
-        assert_equal("spike_interval", spikes)
-        interval = sk.spike_interval(spikes)
-        assert interval.dtype == (torch.int16 if frames < 32767 else torch.int32)
+        (interval,) = run("spike_interval", spikes)
+        assert interval.dtype is dtype
         assert interval[100].flatten().tolist() == [frames + 1, frames - 8, frames, frames]
 
 
-def test_strides():
-    light = torch.rand(6, 5, 4, 3).permute(3, 0, 2, 1)
-    assert_equal("integrate_fire", light, 1.0, torch.zeros(4, 5).expand(3, 4, 5), torch.float32)
-    spikes = (light > 0.4)[:, ::2]
-    assert_equal("spike_interval", spikes)
-    assert_equal("tfp", spikes[..., ::2], 3, 1.0, torch.float32)
-    assert_equal("spike_interval", (torch.rand(1, 4, 5) < 0.5).expand(7, 4, 5))
+@pytest.mark.parametrize(
+    ("name", "args"),
+    {
+        "integrate_fire": lambda x: (x, 0.6, x[..., 0, :, :].float(), torch.uint8),
+        "integrate_fire_grad": lambda x: (x, x, 0.6),
+        "spike_interval": lambda x: (x.round(),),
+        "tfi": lambda x: (x.round(), 1.0, torch.float16),
+        "tfi_grad": lambda x: (x, x.round(), x),
+        "tfp": lambda x: (x, 3, 1.0, torch.float64),
+        "tfp_grad": lambda x: (x, 3, 1.0, torch.float64),
+    }.items(),
+)
+def test_layouts(run, name, args):
+    """Of the input; a GPU's result has the same."""
+    x = torch.rand(2, 9, 5, 4)
+    views = [x[:, :1].expand(2, 9, 5, 4), torch.rand(2, 9, 5, 8)[..., 1::2], x[0], x[:0]]
+    for order in ([3, 2, 1, 0], [0, 1, 3, 2], [1, 2, 3, 0], [2, 3, 0, 1]):
+        views.append(x.permute(order).contiguous().permute([order.index(i) for i in range(4)]))
+        if run.on_gpu:
+            assert run(name, *args(views[-1]))[0].stride() == torch.empty_like(views[-1]).stride()
+    for view in views:
+        check(run, name, *args(view), rtol=1e-6, atol=1e-6)
