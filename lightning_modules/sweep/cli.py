@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import time
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,17 +13,16 @@ from lightning_modules.cli.errors import Ended, InputError, UsageError, VerbPars
 from lightning_modules.cli.folder_lock import locked_folder
 from lightning_modules.configurations import find_configs
 from lightning_modules.sweep.budget import seconds
-from lightning_modules.sweep.cost import measure_variants
 from lightning_modules.sweep.engines import run_locally, run_on_ray
-from lightning_modules.sweep.plot import plot
-from lightning_modules.sweep.state import COSTS, PROGRESS, RESULT
+from lightning_modules.sweep.state import LOG, PROGRESS, RESULT, read_progress, read_result
 from lightning_modules.sweep.table import collect, markdown, write_csv
 from lightning_modules.sweep.trials import Trial, make_trials
-from lightning_modules.sweep.view import View
-from spikekit.arguments import one_line, positive, whole
+from spikekit.arguments import home_path, one_line, positive, whole
 from spikekit.io.whole_file import whole_file
 
 _ENGINES = {"local": run_locally, "ray": run_on_ray}
+
+_A_WHILE = 60  # seconds between two lines about a trial that is running
 
 
 def _time(text: str) -> float:
@@ -30,10 +30,6 @@ def _time(text: str) -> float:
         return seconds(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
-
-
-def _folder(text: str) -> Path:
-    return Path(text).expanduser()
 
 
 def parser() -> argparse.ArgumentParser:
@@ -50,10 +46,10 @@ trains. The same command typed again goes on where it was stopped, in whatever w
 failed ones are tried again, the others go on from their last checkpoint. A folder with a trial of other settings is
 refused.
 
-The result is sweep.md, sweep.csv and sweep.png: a row a variant, mean and spread over seeds, the difference from J or
-from the first row, and the paper's Table 3 for overlays of a folder `ablation`. Where networks of the paper's Table 2
-are among them, its rows stand beside ours, and the difference is that from the first CSCSR. At the end time, memory and
-multiplications of a frame are measured for all of them, in turns. Every trial lies in a folder of its own:
+The result is sweep.md and sweep.csv: a row a variant, mean and spread over seeds, and the difference from J or from the
+first row. `lightning trade` measures what the variants cost.
+
+Every trial lies in a folder of its own:
   lightning test -c runs/sweep/c-s-seed1/trial.yaml --ckpt_path last
 
 examples:
@@ -108,7 +104,7 @@ examples:
     )
     how = made.add_argument_group("how")
     how.add_argument(
-        "-o", "--output", type=_folder, default=Path("runs/sweep"), metavar="DIR", help="default: runs/sweep"
+        "-o", "--output", type=home_path, default=Path("runs/sweep"), metavar="DIR", help="default: runs/sweep"
     )
     how.add_argument(
         "--engine",
@@ -158,39 +154,38 @@ def sweep(args: Sequence[str]) -> None:
 
 def _run(trials: Sequence[Trial], asked: argparse.Namespace) -> dict[Path, str]:
     failed: dict[Path, str] = {}
-    by_folder = {trial.folder: trial for trial in trials}
     waiting = [trial.folder for trial in trials if not (trial.folder / RESULT).is_file()]
     print(f"{asked.output}: {len(trials)} trials, {len(trials) - len(waiting)} of them finished before")
     for folder in waiting:
         (folder / PROGRESS).unlink(missing_ok=True)
-    view = View(trials, failed)
+    said = dict.fromkeys(waiting, 0.0)
     try:
         for ended in _ENGINES[asked.engine](waiting, asked.jobs, asked.every) if waiting else []:
             for folder, reason in ended.items():
-                if reason is None and not (folder / RESULT).is_file():
-                    reason = "it ended without a result"
-                if reason is not None:
-                    failed[folder] = one_line(ValueError(reason))  # the last line of a log
-                view.ended(by_folder[folder])
+                said.pop(folder)
+                result = read_result(folder) if reason is None else None
+                if result is None:
+                    failed[folder] = one_line(ValueError(reason or "it ended without a result"))
+                    print(f"{folder.name}  FAILED: {failed[folder]} ({folder / LOG})", flush=True)
+                else:
+                    scores = ", ".join(f"{name} {value:.4g}" for name, value in result["scores"].items())
+                    print(f"{folder.name}  done, {scores}  [{len(said)} of {len(trials)} to go]", flush=True)
                 _write_tables(trials, failed, asked)
-            view.draw()
+            for folder in said:
+                if time.monotonic() - said[folder] > _A_WHILE and (text := read_progress(folder)):
+                    said[folder] = time.monotonic()
+                    print(f"{folder.name}  {text}", flush=True)
     except KeyboardInterrupt:
         raise Ended("lightning: sweep: interrupted; the same command resumes it", 130) from None
-    finally:
-        view.close()
-    print(f"\n{_write_tables(trials, failed, asked, with_costs=True)}")
-    print(", ".join(str(path) for path in sorted(asked.output.glob("sweep.*"))))
+    print(f"\n{_write_tables(trials, failed, asked)}")
+    print(", ".join(str(asked.output / name) for name in ("sweep.csv", "sweep.md")))
     return failed
 
 
-def _write_tables(
-    trials: Sequence[Trial], failed: dict[Path, str], asked: argparse.Namespace, with_costs: bool = False
-) -> str:
+def _write_tables(trials: Sequence[Trial], failed: dict[Path, str], asked: argparse.Namespace) -> str:
     rows = collect(trials, failed)
-    costs = measure_variants(rows, asked.output / COSTS) if with_costs else None
-    text = markdown(rows, costs)
+    text = markdown(rows)
     with whole_file(asked.output / "sweep.md", "w") as file:
         file.write(text)
-    write_csv(rows, asked.output / "sweep.csv", costs)
-    plot(rows, asked.output / "sweep.png")
+    write_csv(rows, asked.output / "sweep.csv")
     return text

@@ -1,4 +1,4 @@
-"""State of a sweep on disk: small JSON and YAML files, written whole, and checked when they are read."""
+"""State of a sweep on disk: small files, written whole, and checked when they are read."""
 
 from __future__ import annotations
 
@@ -9,29 +9,11 @@ from typing import Any
 import yaml
 
 from lightning_modules.cli.errors import InputError
-from spikekit.arguments import one_line
+from spikekit.arguments import one_line, printable
 from spikekit.io.failures import no_pipe
 from spikekit.io.whole_file import whole_file
 
-PROGRESS, RESULT, LOG, COSTS = "progress.json", "result.json", "log.txt", "costs.json"
-
-_NUMBER, _PERHAPS = (int, float), (int, float, type(None))
-_BY_NAME = "by name"  # a dictionary with any keys, whose values are all of one kind
-
-# Kinds of values by the name of the file; a key that is missing counts as None.
-_KINDS: dict[str, Any] = {
-    PROGRESS: {
-        "phase": str, "step": _PERHAPS, "steps": _PERHAPS, "share": _PERHAPS, "rate": _PERHAPS,
-        "val": ({_BY_NAME: _NUMBER}, None),
-    },
-    RESULT: {
-        "metrics": {_BY_NAME: {_BY_NAME: _NUMBER}}, "method": (str, type(None)), "steps": int,
-        "seconds_per_step": _PERHAPS, "parameters": int,
-        "network": {"class": (str, type(None)), "scale": (int, type(None))},
-        "optimizer": {_BY_NAME: (*_PERHAPS, str, list, bool)},
-    },
-    COSTS: {"trials": {_BY_NAME: str}, "variants": {_BY_NAME: {_BY_NAME: _PERHAPS}}, "where": str},
-}  # fmt: skip
+PROGRESS, RESULT, LOG = "progress.txt", "result.json", "log.txt"
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -40,13 +22,13 @@ def write_json(path: Path, value: Any) -> None:
         file.write(json.dumps(value, indent=1))
 
 
-def read_json(path: Path) -> dict[str, Any] | None:
-    """Return what :func:`write_json` wrote, ``None`` where it did not.
+def read_json(path: Path) -> dict[str, Any]:
+    """Return what :func:`write_json` wrote.
 
     Raises:
         InputError: the file cannot be read, or is damaged; the message is one line and names it.
     """
-    return _read(path, json.loads) if path.is_file() else None
+    return _read(path, json.loads)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -58,11 +40,49 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return _read(path, yaml.safe_load)
 
 
+def read_result(folder: Path) -> dict[str, Any] | None:
+    """Return the result of a trial, None where there is none yet.
+
+    Raises:
+        InputError: the file cannot be read, or is damaged; the message is one line and names it.
+    """
+    path = folder / RESULT
+    return _read(path, lambda text: check_result(json.loads(text))) if path.is_file() else None
+
+
+def check_result(result: dict[str, Any]) -> dict[str, Any]:
+    """Return a result where all of it is numbers.
+
+    Args:
+        result: ``scores`` by name, ``steps``, ``seconds_per_step`` and ``parameters``.
+
+    Raises:
+        ValueError: it is not.
+    """
+    for name, value in {**result, "scores": 0, **result["scores"]}.items():
+        if not isinstance(value, (int, float)) or not abs(value) < 1 << 53:
+            raise ValueError(f"{name}: expected a number, got {value!s:.80}")
+    return {name: result[name] for name in ("scores", "steps", "seconds_per_step", "parameters")}
+
+
+def say_progress(folder: Path, text: str) -> None:
+    """Leave a line about a trial that is running."""
+    with whole_file(folder / PROGRESS, "w") as file:
+        file.write(text)
+
+
+def read_progress(folder: Path) -> str:
+    """Return that line; nothing where there is none."""
+    path = folder / PROGRESS
+    return printable(path.read_text(encoding="utf-8", errors="replace")[:200]) if path.is_file() else ""
+
+
 def _read(path: Path, parse: Any) -> dict[str, Any]:
     try:
         value = parse(no_pipe(path).read_text(encoding="utf-8"))
+        if not isinstance(value, dict):
+            raise ValueError(f"expected names and values, got {type(value).__name__}")
         _check_text(value)
-        _check(value, _KINDS.get(path.name, dict), "")
     except Exception as error:  # what the parser of YAML raises depends on the text
         raise InputError(f"{path}: damaged ({one_line(error)[:300]}); delete it, or the folder") from error
     return value
@@ -77,20 +97,3 @@ def _check_text(value: Any) -> None:
             _check_text(inner)
     elif isinstance(value, str) and not value.replace("\n", "").replace("\t", "").isprintable():
         raise ValueError("expected text that can be printed, got control characters")
-
-
-def _check(value: Any, kind: Any, name: str) -> None:
-    """Raise unless a value is of a kind: types, or a dictionary of kinds."""
-    if isinstance(kind, tuple) and isinstance(kind[0], dict):
-        kind = kind[0] if value is not None else type(None)
-    if isinstance(kind, dict):
-        _check(value, dict, name)
-        kinds = dict.fromkeys(value, kind[_BY_NAME]) if _BY_NAME in kind else kind
-        for key, inner in kinds.items():
-            _check(value.get(key), inner, f"{name}.{key}".strip("."))
-    elif not isinstance(value, kind):
-        kinds = kind if isinstance(kind, tuple) else (kind,)
-        expected = " or ".join(one.__name__ for one in kinds)
-        raise ValueError(f"{name or 'the file'}: expected {expected}, got {type(value).__name__}")
-    elif isinstance(value, int) and abs(value) > 1 << 63:
-        raise ValueError(f"{name}: expected a number of 64 bits, got more")

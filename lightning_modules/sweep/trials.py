@@ -37,7 +37,6 @@ class Trial:
         folder: where everything lies that it leaves.
         config: its configuration, resolved, as ``lightning fit -c`` reads it.
         budget: as :func:`lightning_modules.sweep.budget.with_budget` takes it.
-        letter: the variant of the paper's Table 3 that it is: the name of its overlay in a folder ``ablation``.
     """
 
     labels: tuple[str, ...]
@@ -45,7 +44,6 @@ class Trial:
     folder: Path
     config: dict[str, Any]
     budget: dict[str, float]
-    letter: str = ""
 
     @property
     def variant(self) -> str:
@@ -107,15 +105,13 @@ def make_trials(
     for combination in progress(list(itertools.product(*groups)), "combinations built"):
         labels = tuple(label for label, _ in combination) or (Path(configs[-1]).stem,)
         args = [*common, *(word for _, words in combination for word in words)]
-        overlays = [Path(words[-1]) for _, words in combination]
-        letter = next((path.stem.upper() for path in overlays if path.parent.name == "ablation"), "")
         config = _resolve(args, f"{'-'.join(labels)}: ") if combination else base
         for seed in seeds or [None]:
             name = "-".join(labels) + ("" if seed is None else f"-seed{seed}")
             folder = output / _folder_name(name)
             own = {} if seed is None else {"seed_everything": seed}
             resolved = with_budget({**config, **own, "output": str(folder)}, budget)
-            trials.append(Trial(labels, seed, folder, resolved, budget, letter))
+            trials.append(Trial(labels, seed, folder, resolved, budget))
     folders = [trial.folder for trial in trials]
     twice = next((folder for folder in folders if folders.count(folder) > 1), None)
     if twice:

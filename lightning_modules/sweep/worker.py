@@ -14,7 +14,7 @@ from typing import Any
 import torch
 import yaml
 from pytorch_lightning import Callback, LightningModule, Trainer
-from pytorch_lightning.callbacks import ModelCheckpoint, Timer
+from pytorch_lightning.callbacks import ModelCheckpoint
 from torch.utils.flop_counter import FlopCounterMode
 
 from lightning_modules.cli.command import Command, run
@@ -22,7 +22,8 @@ from lightning_modules.cli.errors import as_one_line
 from lightning_modules.cli.processes import end_with_parent
 from lightning_modules.storage.checkpoint import DivergedError, read_checkpoint
 from lightning_modules.sweep.budget import has_end, with_budget
-from lightning_modules.sweep.state import PROGRESS, RESULT, read_json, read_yaml, write_json
+from lightning_modules.sweep.state import RESULT, check_result, read_json, read_yaml, say_progress, write_json
+from lightning_modules.tasks.pace import share_done
 from spikekit.io.whole_file import whole_file
 
 _A_MOMENT = 0.5  # seconds between two reports
@@ -35,17 +36,17 @@ class Report(Callback):
     """Say in a file where training stands, and stop it where the loss is no number any more.
 
     Args:
-        path: the file.
+        folder: of the trial.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
         self.steps, self.seconds = 0, 0.0  # without validation; of all runs that went on with each other
 
     def on_train_start(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
         self._began = self._reported = time.monotonic()
         self._ended: float | None = None
-        self._first = trainer.global_step
+        self._first, self._share = trainer.global_step, share_done(trainer)
         self._say(trainer)
 
     def on_train_batch_end(  # noqa: D102
@@ -70,9 +71,7 @@ class Report(Callback):
         self._say(trainer)
 
     def on_test_start(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
-        write_json(self.path, {**(read_json(self.path) or {}), "phase": "testing", "share": 1.0})
-
-    def on_test_end(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
+        say_progress(self.folder, "testing")
         self.parameters = sum(parameter.numel() for parameter in module.parameters())
 
     def state_dict(self) -> dict[str, Any]:  # noqa: D102
@@ -86,24 +85,13 @@ class Report(Callback):
             raise DivergedError(f"the loss is {float(self._loss)} at step {trainer.global_step}")
 
     def _say(self, trainer: Trainer) -> None:
-        step, steps = trainer.global_step, trainer.max_steps
-        now = time.monotonic()
-        shares = [step / steps] if steps > 0 else []
-        for timer in trainer.callbacks:
-            if isinstance(timer, Timer) and timer.time_remaining() is not None:
-                passed = timer.time_elapsed()
-                shares.append(passed / (passed + max(timer.time_remaining(), 0)))
-        write_json(
-            self.path,
-            {
-                "phase": "training",
-                "step": step,
-                "steps": steps if steps > 0 else None,
-                "share": max(shares, default=None),
-                "rate": (step - self._first) / (now - self._began) if step > self._first else None,
-                "val": {key: value.item() for key, value in trainer.callback_metrics.items() if key[:4] == "val/"},
-            },
-        )
+        share = share_done(trainer)
+        words = [f"step {trainer.global_step}", f"{share:.0%}"]
+        words += [f"{name} {value:.4g}" for name, value in trainer.callback_metrics.items() if name[:4] == "val/"]
+        if share > self._share:
+            left = (time.monotonic() - self._began) / (share - self._share) * (1 - share)
+            words.append(f"{timedelta(seconds=round(left))} left")
+        say_progress(self.folder, ", ".join(words))
 
 
 class _Cost(Callback):
@@ -151,11 +139,11 @@ def plan(folder: Path) -> Path:
     has an end, a few steps are timed. That is done once: a resumed trial has the plan that it began with.
     """
     own, planned = folder / "trial.yaml", folder / "plan.yaml"
-    config, budget = read_yaml(own), read_json(folder / "budget.json") or {}
+    config, budget = read_yaml(own), read_json(folder / "budget.json")
     if "flops" not in budget and not ("seconds" in budget and has_end(config)):
         return own
     if not planned.is_file():
-        write_json(folder / PROGRESS, {"phase": "measuring"})
+        say_progress(folder, "measuring a step")
         batches = (1 if "flops" in budget else _TIMED) * config["trainer"]["accumulate_grad_batches"]
         cost = _Cost()
         run(["fit", "-c", str(own), f"--trainer.fast_dev_run={batches}"], _command([cost]))
@@ -179,7 +167,7 @@ def train_and_test(folder: Path, every: float) -> None:
         every: seconds between two checkpoints, besides those at the end of each epoch.
     """
     config = plan(folder)
-    report = Report(folder / PROGRESS)
+    report = Report(folder)
     checkpoints = folder / "checkpoints"
     last = checkpoints / "last.ckpt"
     if not last.is_file():  # stopped before there was one to go on from
@@ -195,33 +183,26 @@ def train_and_test(folder: Path, every: float) -> None:
 
 def _result(folder: Path, last: Path, report: Report) -> dict[str, Any]:
     checkpoint = read_checkpoint(last)
-    network = checkpoint["network"]
-    optimizer = checkpoint["optimizer_states"][0]["param_groups"][0]
-    return {
-        "metrics": _metrics(folder / "test.csv"),
-        "method": network.get("class"),
+    result = {
+        "scores": _scores(folder / "test.csv", checkpoint["network"].get("class", "")),
         "steps": checkpoint["global_step"],
-        "seconds_per_step": report.seconds / report.steps if report.steps else None,
+        "seconds_per_step": report.seconds / max(report.steps, 1),
         "parameters": report.parameters,
-        # as the checkpoint has them: what was trained, whatever was asked for
-        "network": network,
-        "optimizer": {
-            "lr": optimizer.get("initial_lr", optimizer["lr"]),
-            "weight_decay": optimizer.get("weight_decay"),
-        },
     }
+    try:
+        return check_result(result)
+    except ValueError as error:
+        raise DivergedError(f"the test: {error}") from error
 
 
-def _metrics(path: Path) -> dict[str, dict[str, float]]:
-    """Return the means of a test by method."""
+def _scores(path: Path, network: str) -> dict[str, float]:
+    """Return the means of a test's row for the network, of a network for films that for films."""
     if not path.is_file():
         return {}  # a module whose test writes no table
     with open(path, newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["clip"] == "mean"]
-    return {
-        row["method"]: {key: float(value) for key, value in row.items() if key not in ("method", "clip")}
-        for row in rows
-    }
+        means = [row for row in csv.DictReader(file) if row["clip"] == "mean"]
+    own = [row for row in means if row["method"] in (network, f"{network}, film")] or means
+    return {name: float(value) for name, value in own[-1].items() if name not in ("method", "clip")}
 
 
 if __name__ == "__main__":

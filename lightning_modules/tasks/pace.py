@@ -44,7 +44,7 @@ class Pace(Callback):
     def on_train_batch_start(  # noqa: D102
         self, trainer: Trainer, module: LightningModule, batch: Any, batch_index: int
     ) -> None:
-        share = min(max(_done(trainer), 0.0), 1.0)
+        share = min(max(share_done(trainer), 0.0), 1.0)
         factor = (0.505 + 0.495 * math.cos(math.pi * share)) * min(1, (trainer.global_step + 1) / self.warm_up)
         for optimizer in trainer.optimizers:
             for group in optimizer.param_groups:
@@ -63,7 +63,7 @@ class Pace(Callback):
             steps = (trainer.global_step - self._step) / took
             if trainer.is_global_zero:
                 sys.stdout.write(
-                    f"step {trainer.global_step}, {_done(trainer):.0%}: {steps:.2f} steps/s, {rate:.0f} clips/s, "
+                    f"step {trainer.global_step}, {share_done(trainer):.0%}: {steps:.2f} steps/s, {rate:.0f} clips/s, "
                     f"loss {loss:.5f}, lr {trainer.optimizers[0].param_groups[0]['lr']:.2g}\n"
                 )
                 sys.stdout.flush()
@@ -99,7 +99,7 @@ def averaged(trainer: Trainer, module: LightningModule) -> nn.Module:
     return module
 
 
-def _done(trainer: Trainer) -> float:
+def share_done(trainer: Trainer) -> float:
     """Share of the training that is done, by steps or by time."""
     shares = [trainer.global_step / trainer.max_steps] if trainer.max_steps > 0 else []
     for callback in trainer.callbacks:

@@ -10,21 +10,16 @@ from pathlib import Path
 
 from lightning_modules.cli.errors import InputError, UsageError, VerbParser
 from lightning_modules.cli.folder_lock import locked_folder
-from lightning_modules.cost.measure import Measurement, measure, running
-from lightning_modules.cost.runner import CannotRunError, Runner, make_runner
 from lightning_modules.trade.films import PICTURES, measure_films
-from lightning_modules.trade.plot import plot
+from lightning_modules.trade.measure import Measurement, measure, running
+from lightning_modules.trade.runner import CannotRunError, Runner, make_runner
 from lightning_modules.trade.settings import Setting, read_setting, usual_settings
 from lightning_modules.trade.table import COLUMNS, markdown, write_csv
-from spikekit.arguments import whole
+from spikekit.arguments import home_path, whole
 from spikekit.io.whole_file import whole_file
 from spikekit.progress import progress
 
 _OUTPUT, _ROUNDS = Path("runs/trade"), 9
-
-
-def _folder(text: str) -> Path:
-    return Path(text).expanduser()
 
 
 def parser() -> argparse.ArgumentParser:
@@ -46,8 +41,8 @@ and in turns: every setting once in every round, on the same clip.
 With --film EVERY, the test scenes are films of {PICTURES} pictures, EVERY clocks apart, and time, work and energy are
 those of a picture in a film; PSNR, SSIM and LPIPS are of the pictures between the first and the last.
 
-The result is trade.md, trade.csv and trade.png, with the Pareto front of time and PSNR, and for every row the command
-that measures it alone.
+The result is trade.md and trade.csv, with the Pareto front of time and PSNR, and for every row the command that
+measures it alone.
 
 columns:
 {COLUMNS}
@@ -71,14 +66,7 @@ examples:
     )
     add("--rounds", type=whole(1), default=_ROUNDS, metavar="N", help=f"timings of every setting; default {_ROUNDS}")
     add("--film", type=whole(1), metavar="EVERY", help="measure films, with a picture every so many clocks")
-    add(
-        "-o",
-        "--output",
-        type=_folder,
-        default=_OUTPUT,
-        metavar="DIR",
-        help=f"default: {_OUTPUT}",
-    )
+    add("-o", "--output", type=home_path, default=_OUTPUT, metavar="DIR", help=f"default: {_OUTPUT}")
     return made
 
 
@@ -130,9 +118,8 @@ def _measured(rows: Sequence[Measurement], base: Runner, asked: argparse.Namespa
     with whole_file(asked.output / "trade.md", "w") as file:
         file.write(text)
     write_csv(rows, commands, timed, asked.output / "trade.csv")
-    plot(rows, asked.output / "trade.png")
     print(f"\n{text}")
-    print(", ".join(str(path) for path in sorted(asked.output.glob("trade.*"))))
+    print(", ".join(str(path) for path in (asked.output / "trade.csv", asked.output / "trade.md")))
 
 
 def _own_weights(base: Runner) -> list[str]:

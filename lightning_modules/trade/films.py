@@ -14,12 +14,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lightning_modules.cli.errors import UsageError
-from lightning_modules.cost.measure import Measurement, Timed, attempt, measure_costs, running
-from lightning_modules.cost.runner import Runner
 from lightning_modules.data import FilmScenes, StillScenes
 from lightning_modules.data.sequences import SequenceClips
 from lightning_modules.metrics.flicker import film_flicker
 from lightning_modules.metrics.image import measures
+from lightning_modules.trade.measure import Measurement, Timed, attempt, measure_costs, running
+from lightning_modules.trade.runner import Runner
 from spikekit import Scene
 from spikekit.scenes.frame_sequence import SequenceClip
 
@@ -136,7 +136,7 @@ def _film_scene(spikes: Tensor, view: Scene | SequenceClip, every: int, scale: i
 def measure_films(
     rows: Sequence[Measurement], data: LightningDataModule, frames: int, every: int, rounds: int
 ) -> Timed:
-    """Measure settings as :func:`lightning_modules.cost.measure.measure` does, on films.
+    """Measure settings as :func:`lightning_modules.trade.measure.measure` does, on films.
 
     Args:
         rows: of settings that can run; their runners become those of films.

@@ -7,14 +7,39 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from inspect import signature
+from typing import NamedTuple
 
 from lightning_modules.cli.arguments import arguments_preset, preset_arguments
 from lightning_modules.cli.errors import UsageError
-from lightning_modules.cost.setting import Setting
 from lightning_modules.inference.presets import Preset
 from lightning_modules.networks import Network
 from lightning_modules.registry import Model, list_models
 from spikekit.decoders.methods import DECODERS
+
+
+class Setting(NamedTuple):
+    """Arguments to be measured, and what they are called.
+
+    Args:
+        name: what it is called.
+        args: arguments of ``lightning test`` that make it, behind those that all settings share.
+        preset: the same as columns of a table; ``None`` where the arguments say what a preset cannot.
+    """
+
+    name: str
+    args: list[str]
+    preset: Preset | None = None
+
+    @property
+    def text(self) -> str:
+        """As :func:`read_setting` takes it.
+
+        Example:
+            >>> Setting("small tiles", ["--tile", "32"]).text
+            'small tiles: --tile 32'
+        """
+        typed = shlex.join(self.args)
+        return typed if typed == self.name else f"{self.name}: {typed}".rstrip()
 
 
 def read_setting(text: str) -> Setting:

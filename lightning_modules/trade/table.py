@@ -10,11 +10,10 @@ from statistics import mean
 
 import torch
 
-from lightning_modules.cost.measure import Measurement, Timed, quartiles, running
 from lightning_modules.inference.presets import Preset
 from lightning_modules.metrics.image import why_no_lpips
 from lightning_modules.trade.films import PICTURES
-from lightning_modules.trade.pareto import pareto_front
+from lightning_modules.trade.measure import Measurement, Timed, quartiles, running
 from spikekit.io.whole_file import whole_file
 from spikekit.tables import table
 from spikekit.timing import cpu_name, software
@@ -70,10 +69,13 @@ def figures(rows: Sequence[Measurement]) -> list[dict[str, float | None]]:
 
 def front(rows: Sequence[Measurement]) -> list[int]:
     """Return which rows are on the Pareto front of time and PSNR, to 0.01 dB, fastest first."""
-    shown = figures(rows)
-    there = [n for n, values in enumerate(shown) if values]
-    found = pareto_front([shown[n]["ms"] for n in there], [round(shown[n]["psnr"], 2) for n in there])
-    return [there[n] for n in found]
+    points = {n: (values["ms"], -round(values["psnr"], 2)) for n, values in enumerate(figures(rows)) if values}
+    found: list[int] = []
+    for n in sorted(points, key=points.get):
+        best = points[found[-1]] if found else None
+        if best is None or points[n][1] < best[1] or points[n] == best:
+            found.append(n)
+    return found
 
 
 def machine(rows: Sequence[Measurement], timed: Timed) -> str:

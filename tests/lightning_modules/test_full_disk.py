@@ -11,8 +11,6 @@ import yaml
 
 from lightning_modules.__main__ import main
 from lightning_modules.cli.command import Configuration
-from lightning_modules.cost.charts import chart
-from lightning_modules.cost.measure import Measurement, Timed
 from lightning_modules.data.cache import ClipCache
 from lightning_modules.inference import export
 from lightning_modules.networks import ClassicalDecoder
@@ -25,6 +23,7 @@ from lightning_modules.sweep.trials import Trial
 from lightning_modules.tasks.callbacks import TestReport
 from lightning_modules.tasks.checkpoint_io import Checkpoints
 from lightning_modules.trade import table as trade_table
+from lightning_modules.trade.measure import Measurement, Timed
 from lightning_modules.trade.settings import read_setting
 from spikekit import write_spikes
 
@@ -34,13 +33,8 @@ TRIAL = {
 }
 
 
-def draw(path):
-    with chart(path, 3, 2) as axes:
-        axes.plot([0, 1])
-
-
 def trials(path):
-    return [Trial((str(n),), None, path.parent / f"trial{n}", TRIAL, {"steps": 6}) for n in range(50)]
+    return [Trial((str(n),), None, path.parent / f"trial{n}", TRIAL, {"steps": 6}) for n in range(500)]
 
 
 def sweep_csv(path):
@@ -49,16 +43,15 @@ def sweep_csv(path):
 
 def sweep_md(path):
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("write_csv", "plot"):
-            patch.setattr(sweep_cli, name, lambda *_: None)
+        patch.setattr(sweep_cli, "write_csv", lambda *_: None)
         sweep_cli._write_tables(trials(path), {}, Namespace(output=path.parent))
 
 
 def trade_csv(path):
     runner = SimpleNamespace(network=torch.nn.Linear(2, 3))
-    settings = [read_setting(f"{n}: --model.tile 8") for n in range(50)]
+    settings = [read_setting(f"{n}: --model.tile 8") for n in range(500)]
     rows = [Measurement(setting, runner, psnr=[20.0], ssim=[0.5], seconds=[1.0], macs=1.0) for setting in settings]
-    trade_table.write_csv(rows, ["command"] * 50, Timed(1, (8, 8), 2, "wall time"), path)
+    trade_table.write_csv(rows, ["command"] * len(rows), Timed(1, (8, 8), 2, "wall time"), path)
 
 
 def configuration(path):
@@ -88,7 +81,6 @@ def program(path, kind="torch"):
 @pytest.mark.parametrize(
     ("name", "write"),
     [
-        ("chart.png", draw),
         ("a.ckpt", lambda path: Checkpoints().save_checkpoint({"state_dict": {"a": torch.rand(9999)}}, path)),
         ("a.safetensors", lambda path: write_weights(Weights(path, {}, {}, {"a": torch.rand(9999)}), path)),
         ("a.json", lambda path: write_json(path, list(range(9999)))),

@@ -2,7 +2,6 @@
 
 import csv
 import fcntl
-import json
 import re
 import statistics
 import subprocess
@@ -16,15 +15,14 @@ import torch
 import yaml
 
 from lightning_modules.__main__ import main
+from lightning_modules.cli.command import run
 from lightning_modules.cli.errors import InputError
 from lightning_modules.storage.checkpoint import DivergedError
 from lightning_modules.sweep import cli, engines, worker
 from lightning_modules.sweep.budget import seconds
-from lightning_modules.sweep.paper import TABLE_3
-from lightning_modules.sweep.table import VariantResults
-from lightning_modules.sweep.trials import make_trials
-from lightning_modules.sweep.view import View
-from spikekit import read_picture
+from lightning_modules.sweep.state import say_progress
+from lightning_modules.sweep.table import collect, markdown, reference
+from lightning_modules.sweep.trials import Trial, _Resolver, make_trials
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 
@@ -127,18 +125,7 @@ def test_every_combination_has_a_name_and_a_configuration(overlays, tmp_path):
         assert trial.config["trainer"]["max_steps"] == 5
         assert trial.config["data"]["init_args"]["brightness"] == [0.5, 0.8]
         assert trial.config["output"] == str(trial.folder)
-        assert trial.letter == variant.upper()
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_overlay_called_e_is_not_the_variant_e(tmp_path):
-    (tmp_path / "e.yaml").write_text("model: {network: {init_args: {width: 6}}}")
-    sizes, variants = [tmp_path / "e.yaml"], [CONFIGS / "ablation" / "e.yaml"]
-    for over, letter in ([sizes], ""), ([variants], "E"), ([sizes, [CONFIGS / "ablation/a.yaml"]], "A"):
-        [trial] = make_trials([CONFIGS / "x4.yaml"], over, [], [], {"steps": 5}, tmp_path)
-        assert trial.letter == letter
-        row = VariantResults([trial], {None: {"network": {"scale": 4}}})
-        assert row.paper == {"E": 26.66, "A": 28.57}.get(letter)
 
 
 @pytest.mark.slow
@@ -169,56 +156,32 @@ def test_table_is_that_of_the_tests(swept):
     assert cells["n"] == "2"
     assert cells["PSNR (dB)"] == f"{statistics.mean(c):.2f} ± {statistics.stdev(c):.2f}"
     assert cells["PSNR (dB) - j"] == f"{statistics.mean(gaps):+.2f} ± {statistics.stdev(gaps):.2f}"
-    assert (cells["paper, PSNR on REDS (dB)"], cells["paper - J"]) == ("28.06", "-0.71")
     assert dict(zip(header, j_row, strict=True))["parameters"] == "14,310"
-    assert cells["`representation`"] == "interval"
-    assert not [name for name in header if name in ("`width`", "`scale`", "`lr`")]  # the same for all
-    assert read_picture(output / "sweep.png").shape[0] == 3
 
 
 @pytest.mark.slow
-def test_one_checkpoint_tested_by_hand_scores_what_the_table_says(swept, capsys):
-    output, _ = swept
-    before = (output / "c-seed1" / "test.csv").read_text()
-    (output / "c-seed1" / "test.csv").unlink()
-    main(["test", "-c", str(output / "c-seed1" / "trial.yaml"), "--ckpt_path", "last"])
-    assert (output / "c-seed1" / "test.csv").read_text() == before
-    printed = re.search(r"\n\| CSCSR +\| (\S+)", capsys.readouterr().out).group(1)
-    assert f"{float(table(output)[1]['psnr']):.2f}" == printed
-
-
-@pytest.mark.slow
-def test_finished_trials_are_not_run_again(swept, capsys, monkeypatch):
+def test_finished_trials_are_not_run_again_and_those_of_other_settings_refused(swept, capsys, monkeypatch):
     output, command = swept
     files = [path for path in output.rglob("*") if path.is_file() and path.parent != output]
     before = {path: path.stat().st_mtime_ns for path in files}
     monkeypatch.setitem(cli._ENGINES, "local", lambda *_: pytest.fail("something was run"))
     main(command)
     assert "4 trials, 4 of them finished before" in capsys.readouterr().out
+    steps = command.index("--steps") + 1
+    for words, message in (
+        ([*command[:steps], "5", *command[steps + 1 :]], "budget.steps=4, and this sweep asks for 5"),
+        ([*command, "--set", "model.network.width=5"], "model.network.width=4, and this sweep asks for 5"),
+    ):
+        with pytest.raises(SystemExit, match=f"c-seed0: holds .*{message}"):
+            main(words)
     assert {path: path.stat().st_mtime_ns for path in files} == before
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (["--steps", "5"], r"c-seed0: holds a trial with budget.steps=4, and this sweep asks for 5"),
-        (["--set", "model.network.width=5"], r"c-seed0: holds .* model.network.width=4, and this sweep asks for 5"),
-    ],
-)
-def test_trials_of_other_settings_are_refused(swept, change, message):
-    _, command = swept
-    words = [*command[: command.index("--steps")], *command[command.index("--steps") + 2 :]]
-    words += change if change[0] == "--steps" else ["--steps", "4", *change]
-    with pytest.raises(SystemExit, match=message):
-        main(words)
-
-
-@pytest.mark.slow
 def test_a_killed_sweep_goes_on_and_ends_as_an_unbroken_one(typed, overlays, tmp_path, monkeypatch, forked):
-    settings = ["data.train_clips=24", "data.val_clips=1", "model.network.features=1,2"]  # epochs of 12 steps
+    settings = ["data.train_clips=12", "data.val_clips=1", "model.network.features=1,2"]  # epochs of 6 steps
     sets = [word for setting in settings for word in ("--set", setting)]
-    command = [*typed, "-c", str(overlays / "cosine.yaml"), *sets, "--steps", "20", "-o", str(tmp_path / "broken")]
+    command = [*typed, "-c", str(overlays / "cosine.yaml"), *sets, "--steps", "10", "-o", str(tmp_path / "broken")]
     first, second = (tmp_path / "broken" / f"features={features}" for features in (1, 2))
     with monkeypatch.context() as patch:
         patch.setitem(cli._ENGINES, "local", engines.run_locally)
@@ -230,20 +193,20 @@ def test_a_killed_sweep_goes_on_and_ends_as_an_unbroken_one(typed, overlays, tmp
         time.sleep(0.02)
     sweep.kill()  # and nobody tells the trial
     sweep.join()
-    time.sleep(2)
+    time.sleep(1)
     reached = (first / "checkpoints" / "last.ckpt").stat().st_mtime_ns
-    assert 1 <= weights(first)["global_step"] < 20
+    assert 1 <= weights(first)["global_step"] < 10
     time.sleep(1)
     assert (first / "checkpoints" / "last.ckpt").stat().st_mtime_ns == reached  # the trial has ended with the sweep
     assert not list(second.glob("checkpoints"))
 
     main(command)
     configs = [typed[1], typed[3], overlays / "cosine.yaml"]
-    unbroken, _ = make_trials(configs, [], settings, [], {"steps": 20}, tmp_path / "unbroken")
+    unbroken, _ = make_trials(configs, [], settings, [], {"steps": 10}, tmp_path / "unbroken")
     unbroken.write()
     worker.train_and_test(unbroken.folder, 60)
     ours, theirs = weights(first), weights(unbroken.folder)
-    assert ours["global_step"] == theirs["global_step"] == weights(second)["global_step"] == 20
+    assert ours["global_step"] == theirs["global_step"] == weights(second)["global_step"] == 10
     assert all(ours["state_dict"][key].equal(value) for key, value in theirs["state_dict"].items())
     assert (first / "test.csv").read_text() == (unbroken.folder / "test.csv").read_text()
     # it went on: the step after a start is not timed
@@ -270,45 +233,35 @@ def test_a_trial_that_fails_is_reported_and_the_others_go_on(typed, overlays, tm
 
 
 @pytest.mark.slow
-def test_flops_pay_for_steps(typed, overlays, tmp_path, convolutions):
-    words = [*typed[1:], "-c", str(overlays / "cosine.yaml")]
-    [trial] = make_trials([words[0], words[2], words[4]], [], [], [], {"flops": 1e9}, tmp_path)
-    trial.write()
-    planned = yaml.safe_load((text := worker.plan(trial.folder)).read_text())
+def test_flops_pay_for_steps_of_all_batches_that_gradients_are_accumulated_over(overlays, tmp_path, convolutions):
+    configs = [CONFIGS / "x4.yaml", overlays / "tiny.yaml", overlays / "cosine.yaml"]
+    accumulated = ["trainer.accumulate_grad_batches=1,2"]
+    one, two = make_trials(configs, [], accumulated, [], {"flops": 1e9}, tmp_path)
+    counted, steps = [], []
+    for trial in (one, two):
+        trial.write()
+        text = worker.plan(trial.folder).read_text()
+        counted.append(float(re.search(r"(\S+) FLOPs", text).group(1)))
+        planned = yaml.safe_load(text)
+        steps.append(planned["trainer"]["max_steps"])
+        assert planned["model"]["init_args"]["lr_scheduler"]["init_args"]["T_max"] == steps[-1]
 
-    from lightning_modules.cli.command import run
-    from lightning_modules.sweep.trials import _Resolver
-
-    built = run(["fit", "-c", str(trial.folder / "trial.yaml")], _Resolver)
+    built = run(["fit", "-c", str(one.folder / "trial.yaml")], _Resolver)
     batch = next(iter(built.datamodule.train_dataloader()))
     convolutions.clear()
     built.model.network(batch["spikes"], batch["flow"])
     # forward, for the weights, and for what comes in where that was computed
     count = sum(2 * products * (2 + computed) for products, computed in convolutions)
-    counted = float(re.search(r"(\S+) FLOPs", text.read_text()).group(1))
-    assert counted == pytest.approx(count, rel=1e-4)
-    steps = int(1e9 / count)
-    assert planned["trainer"]["max_steps"] == steps
-    assert planned["model"]["init_args"]["lr_scheduler"]["init_args"]["T_max"] == steps
-    before = text.stat().st_mtime_ns
-    assert worker.plan(trial.folder).stat().st_mtime_ns == before  # a resumed trial keeps its plan
+    assert counted == pytest.approx([count, 2 * count], rel=1e-4)
+    assert steps == [int(1e9 / count), int(1e9 / (2 * count))]
+    (one.folder / "plan.yaml").write_text("# a resumed trial keeps its plan")
+    assert worker.plan(one.folder).read_text() == "# a resumed trial keeps its plan"
 
 
 def test_a_checkpoint_in_a_configuration_is_refused(overlays, tmp_path):
     (tmp_path / "goes_on.yaml").write_text("ckpt_path: last")
     with pytest.raises(InputError, match=r"ckpt_path: expected none, .* got last"):
         make_trials([CONFIGS / "x4.yaml", tmp_path / "goes_on.yaml"], [], [], [], {}, tmp_path)
-
-
-@pytest.mark.slow
-def test_a_step_is_all_batches_that_gradients_are_accumulated_over(overlays, tmp_path):
-    configs = [CONFIGS / "x4.yaml", overlays / "tiny.yaml"]
-    counted = []
-    for trial in make_trials(configs, [], ["trainer.accumulate_grad_batches=1,2"], [], {"flops": 1e9}, tmp_path):
-        trial.write()
-        counted.append(float(re.search(r"(\S+) FLOPs", worker.plan(trial.folder).read_text()).group(1)))
-    one, two = counted
-    assert two == pytest.approx(2 * one, rel=1e-4)
 
 
 @pytest.mark.parametrize("batches", [1, 3])
@@ -318,7 +271,7 @@ def test_steps_are_timed_whole(batches, monkeypatch, tmp_path):
     monkeypatch.setattr(worker.time, "monotonic", lambda: clock[0])
     trainer = SimpleNamespace(global_step=0, accumulate_grad_batches=batches, max_steps=-1, callbacks=[])
     trainer.callback_metrics = {}
-    cost, report = worker._Cost(), worker.Report(tmp_path / "progress.json")
+    cost, report = worker._Cost(), worker.Report(tmp_path)
     report.on_train_start(trainer, None)
     for index in range(worker._TIMED * batches):
         cost.on_train_batch_start(trainer, None, None, index)
@@ -355,22 +308,13 @@ def test_time_ends_training(typed, overlays, tmp_path):
     [
         ([], "expected a configuration, such as configs/x4.yaml"),
         (["X", "--steps", "3", "--time", "00:00:01"], "--time: not allowed with argument --steps"),
-        (["X", "--steps", "0"], "--steps: expected a whole number, 1 or more, got 0"),
-        (["X", "--time", "5"], "--time: expected HH:MM:SS or DD:HH:MM:SS, got 5"),
-        (["X", "--flops", "-1"], "--flops: expected a number above 0, got -1"),
         (["X", "--set", "width"], "--set: expected KEY=VALUE"),
-        (["X", "--set", "model.width=8,16"], "width"),
         (["X", "--set", "model.network.widht=8,16"], "widht=8: model.network: Option 'widht' is not accepted"),
-        (
-            ["X", "--set", "model.network.width=8,x"],
-            "width=x: model.network.width: expected int, got 'x'",
-        ),
         (["X", "--set", "data.motion=1,-1"], "motion=-1: motion: expected 0 or more, got -1.0"),
         (["X", "--set", "trainer.devices=2"], "trainer.devices: expected 1, the one of a trial, got 2"),
         (["X", "--over", "nowhere.yaml"], "nowhere: config: File does not exist"),
         (["X", "--over", "X", "X"], "two trials are called x4"),
         (["X", "--set", "output=there"], "--set: expected the folder of the sweep as -o DIR, got output=there"),
-        (["X", "--set", "ckpt_path=a.ckpt"], "ckpt_path: expected none, a trial goes on from its own; model.weights"),
         (["X", "--set", "trainer.max_steps=5,6", "--steps", "4"], "same settings for max_steps=5 and max_steps=6"),
         (
             ["X", "--set", "model.weights=cscsr_small_x4", "--over", "A", "J", "--seeds", "0", "1"],
@@ -401,21 +345,29 @@ def test_two_sweeps_in_one_folder_are_refused(typed, tmp_path):
 
 
 def test_a_result_is_of_the_checkpoint_and_of_the_table_of_its_test(tmp_path):
-    optimizer = {"lr": 0.05, "initial_lr": 0.1, "weight_decay": 0.2}
-    network = {"class": "CSCSR", "scale": 4}
+    network = {"class": "RecurrentCSCSR", "scale": 4}
     state = {"state_dict": {}, "network": network, "global_step": 6, "pytorch-lightning_version": "2.6.0"}
-    torch.save({**state, "optimizer_states": [{"param_groups": [optimizer]}]}, tmp_path / "last.ckpt")
-    (tmp_path / "test.csv").write_text("method,clip,psnr\nTFI,0,1.5\nTFI,mean,2.5\n")
+    torch.save(state, tmp_path / "last.ckpt")
     report = SimpleNamespace(seconds=3.0, steps=6, parameters=100)
-    assert worker._result(tmp_path, tmp_path / "last.ckpt", report) == {
-        "metrics": {"TFI": {"psnr": 2.5}},
-        "method": "CSCSR",
-        "steps": 6,
-        "seconds_per_step": 0.5,
-        "parameters": 100,
-        "network": network,
-        "optimizer": {"lr": 0.1, "weight_decay": 0.2},
-    }
+    tested = "method,clip,psnr\nTFI,mean,1.5\nRecurrentCSCSR,mean,2.5\nRecurrentCSCSR,0,9\n"
+    for more, psnr in ("", 2.5), ('"RecurrentCSCSR, film",mean,3.5\n', 3.5):
+        (tmp_path / "test.csv").write_text(tested + more)
+        assert worker._result(tmp_path, tmp_path / "last.ckpt", report) == {
+            "scores": {"psnr": psnr},
+            "steps": 6,
+            "seconds_per_step": 0.5,
+            "parameters": 100,
+        }
+    (tmp_path / "test.csv").write_text(tested.replace("2.5", "nan"))
+    with pytest.raises(DivergedError, match="psnr: expected a number, got nan"):
+        worker._result(tmp_path, tmp_path / "last.ckpt", report)
+
+
+def test_variants_are_compared_with_j_of_the_same_kind_or_with_the_first(tmp_path):
+    names = [("c", "size=tiny"), ("j", "size=tiny"), ("c", "size=small"), ("j", "size=small"), ("c", "size=large")]
+    rows = collect([Trial(name, None, tmp_path / "-".join(name), {}, {}) for name in names], {})
+    assert [reference(row, rows).labels for row in rows] == [names[1], names[1], names[3], names[3], names[0]]
+    assert "Not finished: 5 trials." in markdown(rows)
 
 
 def test_trials_end_as_their_processes_do(tmp_path, monkeypatch):
@@ -459,49 +411,25 @@ def test_a_sweep_that_stops_ends_its_trials(tmp_path, monkeypatch):
     assert processes[0].poll() == 0
 
 
-def test_what_is_shown(tmp_path, overlays, capsys, monkeypatch):
-    trials = make_trials([CONFIGS / "x4.yaml", overlays / "tiny.yaml"], [], [], [0, 1, 2], {}, tmp_path)
-    for trial in trials:
-        trial.write()
-    failed = {}
-    view = View(trials, failed)
-    told = {"phase": "training", "step": 30, "steps": 90, "share": 1 / 3, "rate": 2.0, "val": {"val/psnr": 21.5}}
-    (trials[0].folder / "progress.json").write_text(json.dumps(told))
-    view.draw()
-    view.draw()  # nothing new
-    failed[trials[1].folder] = "out of memory"
-    view.ended(trials[1])
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 2
-    assert lines[0].startswith("tiny-seed0  step 30/90, 2 it/s, val/psnr 21.5, 0:30 left")
-    assert "0 of 3 trials done, 1 running" in lines[0]
-    assert lines[1] == f"tiny-seed1  FAILED: out of memory ({trials[1].folder / 'log.txt'})"
+def test_what_is_shown(typed, tmp_path, capsys, monkeypatch):
+    def engine(folders, *_):
+        say_progress(folders[0], "step 30\x1b[31m")
+        say_progress(folders[1], "testing")
+        yield {}
+        yield {folders[1]: "out of memory"}
+        yield {folders[0]: None}  # as one whose process SIGTERM ended
 
-    view.live = True
-    view.draw()
-    view.draw()
-    first, again = capsys.readouterr().out.split("\x1b[2A\x1b[J")
-    assert first == again
-    assert "0 of 3 trials done, 1 failed, 1 running" in again
-    (trials[0].folder / "progress.json").write_text(json.dumps({**told, "phase": "testing"}))
-    view.draw()
-    assert "tiny-seed0  testing\n" in capsys.readouterr().out
-    monkeypatch.setenv("COLUMNS", "12")
-    view.draw()
-    view.close()
-    assert capsys.readouterr().out.endswith("\x1b[2A\x1b[Jtiny-seed0 \n0 of 3 tria\n\x1b[2A\x1b[J")
-
-
-def test_the_paper_is_copied_right():
-    assert TABLE_3[2]["A"] == 33.04
-    assert TABLE_3[3]["E"] == 27.08
-    assert TABLE_3[4]["J"] == 28.77
-    assert [max(scores, key=scores.get) for scores in TABLE_3.values()] == ["J", "J", "J"]
-    assert [sorted(scores, key=scores.get)[:3] for scores in TABLE_3.values()] == [
-        list("HEC"),
-        list("EHC"),
-        list("HEC"),
+    monkeypatch.setitem(cli._ENGINES, "local", engine)
+    with pytest.raises(SystemExit, match="2 of 2 trials failed; the same command"):
+        main([*typed, "--seeds", "0", "1", "-o", str(tmp_path)])
+    first, second = tmp_path / "tiny-seed0", tmp_path / "tiny-seed1"
+    assert capsys.readouterr().out.splitlines()[1:5] == [
+        "tiny-seed0  step 30?[31m",
+        "tiny-seed1  testing",
+        f"tiny-seed1  FAILED: out of memory ({second / 'log.txt'})",
+        f"tiny-seed0  FAILED: it ended without a result ({first / 'log.txt'})",
     ]
+    assert "tiny, seed 0, failed: it ended without a result" in (tmp_path / "sweep.md").read_text()
 
 
 @pytest.mark.parametrize("text", ["", "5", "00:00:00", "1:60:00", "a:b:c", "1:2:3:4:5"])
@@ -526,14 +454,6 @@ def test_ray_runs_trials(typed, overlays, tmp_path, monkeypatch):
     main([*typed, "--over", over[1], "--steps", "4", "-o", str(tmp_path / "local")])
     ours, theirs = (weights(tmp_path / engine / "wide")["state_dict"] for engine in ("ray", "local"))
     assert all(ours[name].equal(value) for name, value in theirs.items())
-
-
-def test_a_trial_that_ends_without_a_result_has_failed(typed, tmp_path, monkeypatch):
-    """As one whose process SIGTERM ended."""
-    monkeypatch.setitem(cli._ENGINES, "local", lambda folders, *_: [dict.fromkeys(folders)])
-    with pytest.raises(SystemExit, match="1 of 1 trials failed; the same command"):
-        main([*typed, "-o", str(tmp_path)])
-    assert "ended without a result" in (tmp_path / "sweep.md").read_text()
 
 
 def test_ctrl_c_ends_a_sweep_with_130(typed, tmp_path, monkeypatch):

@@ -13,7 +13,6 @@ from lightning_modules import networks
 from lightning_modules.__main__ import main
 from lightning_modules.data import StillScenes
 from lightning_modules.storage.pretrained import read_weights
-from lightning_modules.sweep.paper import TABLE_2, method_of
 from spikekit import read_picture, write_spikes
 
 CONFIGS = Path(__file__).parents[4] / "configs"
@@ -55,18 +54,6 @@ def test_narrowed_to_the_work_of_size_small(name, changed, expected):
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
         made(torch.zeros(1, 41, 16, 16), static=True)
     assert counter.get_total_flops() / 2 / 16**2 / 1e6 == pytest.approx(expected, abs=0.05)
-
-
-def test_every_method_of_the_paper_is_a_baseline_or_an_argument_more():
-    found = set()
-    for name in BASELINES:
-        kind = getattr(networks, name)
-        for more in ({}, {"decoder": "tfp"}, {"per_channel": True}):
-            if more.keys() <= signature(kind).parameters.keys():
-                with torch.device("meta"):
-                    settings = kind(scale=4, **more).settings
-                found.add(method_of({"class": kind.__name__, **settings}))
-    assert found == TABLE_2[4].keys() - {"CSCSR"}
 
 
 @pytest.mark.slow

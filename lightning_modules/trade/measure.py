@@ -12,10 +12,10 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 from torch.utils.flop_counter import FlopCounterMode
 
-from lightning_modules.cost.energy import energy_meter, energy_per_call
-from lightning_modules.cost.runner import Runner
-from lightning_modules.cost.setting import Setting
 from lightning_modules.metrics.image import measures
+from lightning_modules.trade.energy import energy_meter, energy_per_call
+from lightning_modules.trade.runner import Runner
+from lightning_modules.trade.settings import Setting
 from spikekit.arguments import one_line
 from spikekit.progress import progress
 from spikekit.timing import Timer, peak_memory, timer_of
