@@ -41,18 +41,6 @@ def test_constant_light_gives_its_rate(light, start, half, dtype):
         assert torch.isin(rates[between], possible.to(dtype)).all()
 
 
-@given(st.integers(1, 20), st.integers(1, 60), FLOATS)
-def test_light_of_a_whole_period_is_decoded_exactly(period, periods, dtype):
-    """A spike every so many clocks: TFI is one over it, and so is TFP of a window of whole periods."""
-    spikes, _ = sk.spike_integrate_fire(torch.ones(period * (periods + 1), 1, 1), float(period))
-    expected = (torch.ones(1, dtype=torch.float64) / period).to(dtype)
-    assert (sk.tfi(spikes.to(dtype)) == expected).all()
-    window = period * periods
-    if window % 2:
-        middle = sk.tfp(spikes.to(dtype), window)[window // 2 : -(window // 2) or None]
-        assert (middle == expected).all()
-
-
 @given(SEEDS, st.integers(0, 12), st.integers(0, 12), st.floats(0, 1), st.sampled_from([1, 3, 11]))
 def test_a_shifted_stream_is_decoded_shifted(seed, before, after, density, window):
     """What lies outside the window, or beyond the enclosing spikes, does not matter; nor does the clip's start."""
@@ -133,15 +121,3 @@ def test_idw_of_a_constant_is_that_constant(warp, constant, dtype):
     # in half precision exactly so: shares add up to one within float32, and the sum is rounded once
     ulps = 0 if dtype in (torch.bfloat16, torch.float16) else 4
     torch.testing.assert_close(warped, features, rtol=ulps * torch.finfo(dtype).eps, atol=torch.finfo(dtype).tiny)
-
-
-@given(warps(), st.integers(0, 3), st.integers(0, 3))
-def test_idw_of_a_larger_picture_is_shifted(warp, right, down):
-    """Rows and columns without a known pixel, above and to the left, move everything and change nothing."""
-    features, flow, known, neighbors = warp
-
-    def padded(tensor):
-        return torch.nn.functional.pad(tensor.float(), (right, 0, down, 0))
-
-    warped = sk.flow_warp_idw(padded(features), padded(flow), padded(known[None])[0], neighbors=neighbors)
-    assert torch.equal(warped[..., down:, right:], sk.flow_warp_idw(features, flow, known, neighbors=neighbors))

@@ -14,10 +14,6 @@ def color_at(pattern, y, x):
     return "RGB".index(pattern[2 * (y % 2) + x % 2])
 
 
-def test_patterns():
-    assert sorted(sk.PATTERNS) == sorted(PATTERNS)
-
-
 @pytest.mark.parametrize("pattern", PATTERNS)
 @pytest.mark.parametrize("scale", [1, 3, 4])
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 5), (4, 2)])
@@ -32,14 +28,6 @@ def test_bayer_mask(pattern, scale, height, width):
     assert (mask.sum(0) == 1).all()
 
 
-@pytest.mark.parametrize("dtype", [torch.bool, torch.uint8, torch.bfloat16, torch.float64])
-def test_bayer_mask_dtype(dtype):
-    mask = sk.bayer_mask(3, 4, dtype=dtype)
-    assert mask.dtype == dtype
-    assert torch.equal(mask.double(), sk.bayer_mask(3, 4, dtype=torch.float64))
-    assert torch.equal(sk.BayerMask(scale=2)(mask), sk.bayer_mask(3, 4, scale=2, dtype=dtype))
-
-
 @pytest.mark.parametrize("cfa", list(CFA))
 def test_kornia_cfa(cfa):
     rgb = torch.rand(2, 3, 4, 6)
@@ -52,18 +40,6 @@ def test_kornia_cfa(cfa):
 def test_a_phase_in_small_letters():
     assert sk.bayer_mask(4, 4, "grbg").equal(sk.bayer_mask(4, 4, "GRBG"))
     assert sk.BinToSensor("bggr", scale=2).pattern == "BGGR"
-
-
-def test_kornia_bg_is_rggb():
-    assert sk.bayer_pattern(CFA.BG) == "RGGB"
-
-
-@pytest.mark.parametrize("pattern", PATTERNS)
-def test_bayer_sites(pattern):
-    sites = sk.bayer_sites(pattern)
-    assert [color for color, _, _ in sites] == [0, 1, 1, 2]
-    assert all(color_at(pattern, row, column) == color for color, row, column in sites)
-    assert sites[1][1] < sites[2][1]  # G1 is the upper one
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
@@ -89,14 +65,6 @@ def test_bin_to_sensor(pattern, scale, lead):
 def test_bin_to_sensor_sums_wide():
     rgb = torch.full((3, 4, 4), 60000.0, dtype=torch.float16)
     assert sk.bin_to_sensor(rgb, scale=4).item() == rgb[0, 0, 0].item()
-
-
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.bool, torch.float16])
-def test_mosaic_any_dtype(dtype):
-    rgb = torch.randint(0, 2, (3, 3, 5)).to(dtype)
-    raw = sk.mosaic(rgb, "GRBG")
-    assert raw.dtype == dtype
-    assert all(raw[y, x] == rgb[color_at("GRBG", y, x), y, x] for y in range(3) for x in range(5))
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
@@ -161,16 +129,6 @@ def test_split_colors_keeps_a_bad_pixel_to_its_colour():
     assert blue.tolist() == [[0, 0], [0, 1]]
 
 
-@pytest.mark.parametrize("size", [(1.5, 2), (2, 0), (True, 2), ("2", 2)])
-def test_wrong_size_of_a_mask(size):
-    with pytest.raises(ValueError, match="expected a whole number"):
-        sk.bayer_mask(*size)
-
-
-def test_merge_of_an_empty_batch():
-    assert sk.merge_bayer(torch.zeros(4, 0, 3, 5)).shape == (0, 6, 10)
-
-
 def test_scale_of_numpy():
     """A byte as the scale: sizes are no bytes, or they would run over."""
     expected = sk.bayer_mask(100, 90, scale=3)
@@ -179,9 +137,3 @@ def test_scale_of_numpy():
     rgb = torch.rand(3, 300, 270)
     assert torch.equal(sk.bin_to_sensor(rgb, scale=np.uint8(3)), sk.bin_to_sensor(rgb, scale=3))
     assert torch.equal(sk.BinToSensor(scale=np.uint8(3))(rgb), sk.bin_to_sensor(rgb, scale=3))
-
-
-@pytest.mark.parametrize("dtype", ["float32", np.float32, float])
-def test_wrong_dtype_of_a_mask(dtype):
-    with pytest.raises(TypeError, match="dtype: expected a type of torch, got "):
-        sk.bayer_mask(2, 2, dtype=dtype)

@@ -7,7 +7,6 @@ import torch
 from kornia.color import rgb_to_grayscale
 
 import spikekit as sk
-from spikekit.color.cfa import cfa_pattern, count_colors
 
 FLOAT = torch.float64
 
@@ -46,23 +45,12 @@ def test_of_grey_there_is_nothing_to_split_or_to_fill_in():
         assert module.pattern == "grey"
 
 
-def test_the_gradient_of_grey_light_is_that_of_its_luminance():
-    rgb = torch.rand(1, 3, 4, 4, dtype=FLOAT, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda rgb: sk.bin_to_sensor(rgb, "grey", scale=2), (rgb,))
-
-
 @pytest.mark.parametrize("operator", [sk.split_bayer, sk.SplitBayer(), sk.bayer_sites, sk.bayer_pattern])
 def test_what_needs_a_bayer_cell_refuses_grey(operator):
     given = [torch.zeros(2, 2)] if operator is sk.split_bayer else []
     call = type(operator) if isinstance(operator, torch.nn.Module) else operator
     with pytest.raises(ValueError, match=r"pattern: expected one of RGGB.*got 'grey'"):
         call(*given, "grey")
-
-
-def test_patterns_are_counted_and_named():
-    assert [count_colors(pattern) for pattern in ("grey", "Grey", "bggr")] == [1, 1, 3]
-    with pytest.raises(ValueError, match=r"RGGB, BGGR, GRBG, GBRG, grey.*got 'gray'"):
-        cfa_pattern("gray")
 
 
 def test_whole_flow_copies_pixels_of_a_grey_sensor():

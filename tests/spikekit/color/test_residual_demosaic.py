@@ -106,14 +106,6 @@ def test_against_loops(pattern, size):
     torch.testing.assert_close(demosaic_residual(raw, pattern), expected, rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize("pattern", PATTERNS)
-def test_phases_are_flips_of_each_other(pattern):
-    raw = torch.rand(8, 10, dtype=torch.float64)
-    rgb = demosaic_residual(raw, pattern)
-    torch.testing.assert_close(demosaic_residual(raw.flip(1), HFLIP[pattern]), rgb.flip(-1))
-    torch.testing.assert_close(demosaic_residual(raw.flip(0), VFLIP[pattern]), rgb.flip(-2))
-
-
 def test_borders_are_mirrored():
     raw = torch.rand(1, 40, 44, dtype=torch.float64)
     larger = F.pad(raw, (32, 32, 32, 32), "reflect")

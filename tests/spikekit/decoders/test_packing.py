@@ -66,26 +66,6 @@ def test_torch_path(width):
         _pack_bits._init_fn(2 * spikes)
 
 
-def test_as_in_a_file(tmp_path):
-    """Where 8 divides the width, packed frames are the bytes of a .dat."""
-    spikes = random_spikes(5, 6, 16)
-    pack_spikes(spikes).numpy().tofile(tmp_path / "a.dat")
-    from spikekit import read_spikes
-
-    assert read_spikes(tmp_path / "a.dat", 6, 16).equal(spikes)
-    assert np.array_equal(np.packbits(spikes.numpy(), axis=-1, bitorder="little"), pack_spikes(spikes).numpy())
-
-
-def test_bits_beyond_the_width_say_nothing():
-    assert unpack_spikes(torch.full((2, 1), 255, dtype=torch.uint8), 3).tolist() == [[1, 1, 1]] * 2
-
-
-def test_empty_batch():
-    packed = pack_spikes(torch.zeros(0, 4, 9))
-    assert packed.shape == (0, 4, 2)
-    assert unpack_spikes(packed, 9).shape == (0, 4, 9)
-
-
 @pytest.mark.parametrize("value", [2, -1, 0.5, float("nan"), float("inf")])
 def test_other_values(value):
     for dtype in (torch.float32, torch.bfloat16, torch.float64):

@@ -70,14 +70,6 @@ def test_linear_motion(lead, scale):
             assert (offsets[..., n, :, :, :] == 0).all()
 
 
-def test_constant_motion():
-    """Pixels that move v per frame are t - j frames away, on both sides and beyond."""
-    velocity = torch.tensor([0.5, -0.25]).reshape(2, 1, 1).expand(2, 2, 3)
-    offsets = linear_motion(velocity * -20, velocity * 20, range(-2, 45), first=0, middle=20, last=40, scale=2)
-    for n, t in enumerate(range(-2, 45)):
-        assert torch.allclose(offsets[n, :, 0, 0], velocity[:, 0, 0] * 2 * (t - 20), rtol=1e-6, atol=1e-6)
-
-
 def test_ends_of_the_times_by_default():
     to_first, to_last = torch.randn(2, 1, 2, 2, 2)
     times = range(5, 36, 3)
@@ -111,26 +103,6 @@ FLOW = torch.zeros(1, 2, 3, 3)
 def test_errors(error, call):
     with pytest.raises(error):
         call()
-
-
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-def test_halves_are_rounded_once(dtype):
-    flow = torch.randn(2, 2, 5, 7).to(dtype)
-    assert torch.equal(upsample_flow(flow, 3), upsample_flow(flow.float(), 3).to(dtype))
-    times = [0.0, 2.0, 5.0]
-    for scale in (1, 3):
-        assert torch.equal(
-            linear_motion(flow, -flow, times, scale=scale),
-            linear_motion(flow.float(), -flow.float(), times, scale=scale).to(dtype),
-        )
-
-
-def test_joint_flow_of_an_empty_batch_and_of_no_flow():
-    assert joint_flow(torch.zeros(4, 0, 2, 3, 5)).shape == (0, 2, 3, 5)
-    with pytest.raises(ValueError, match="flows"):
-        joint_flow(torch.zeros(0, 2, 3, 5))
-    with pytest.raises(TypeError, match="flows"):
-        joint_flow(3)
 
 
 def test_numbers_of_numpy():

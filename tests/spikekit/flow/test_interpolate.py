@@ -142,30 +142,6 @@ def test_known_translation(x, y):
         assert error.abs().mean() < 0.1
 
 
-def test_a_feature_goes_straight_on():
-    y, x = torch.meshgrid(torch.arange(150.0), torch.arange(150.0), indexing="ij")
-    spot = 0.9 * torch.exp(-((x - 75) ** 2 + (y - 75) ** 2) / (2 * 4.0**2))
-    scene = Scene([Layer(spot.expand(3, -1, -1), Motion((0.3, -0.2)), (-35, -35))], 80, 80, frames=21)
-    between = FlowInterpolation()(*ends(scene))
-
-    def place(picture):
-        mass = picture[0].clamp(min=0.05) - 0.05
-        return torch.stack([(mass * x[:80, :80]).sum(), (mass * y[:80, :80]).sum()]) / mass.sum()
-
-    start = place(scene.rgb(0))
-    path = torch.stack([place(between.at(tau)) - start for tau in (0.1, 0.25, 0.5, 0.75, 0.9)])
-    expected = torch.tensor([0.1, 0.25, 0.5, 0.75, 0.9])[:, None] * torch.tensor([6.0, -4.0])
-    assert (path - expected).abs().max() < 0.15
-
-
-def test_double_is_more_than_single():
-    single, double = panning(3.0, 1.0), panning(3.0, 1.0, dtype=torch.float64)
-    made = FlowInterpolation()(*ends(double)).at(0.5)
-    assert made.dtype == torch.float64
-    assert not made.equal(made.float().double())
-    assert torch.allclose(made.float(), FlowInterpolation()(*ends(single)).at(0.5), atol=1e-3)
-
-
 @pytest.mark.parametrize("tau", [0.25, 0.5, 0.75])
 def test_what_an_object_hides(tau):
     scene = passing()
@@ -194,27 +170,6 @@ def test_a_ball_that_moves_farther_than_it_is_wide(radius, pixels, tau, least):
     assert psnr(FlowInterpolation()(*ends(scene)).at(tau), scene.rgb(20 * tau)) > least
 
 
-@pytest.mark.parametrize("method", [Blend(), FlowInterpolation()], ids=lambda method: type(method).__name__)
-def test_the_nearer_frame_counts_more(method):
-    scene = panning(3.0, 2.0)
-    grain = torch.randn(2, 3, scene.height, scene.width) * 0.05
-    first, second = ((frame + noise).clamp(0, 1) for frame, noise in zip(ends(scene), grain, strict=True))
-    between = method(first, second)
-    for tau, frame in ((0.05, first), (0.95, second)):
-        assert psnr(between.at(tau), frame) > 33
-
-
-def test_what_comes_in_from_outside():
-    scene = panning(12.0, 0.0)
-    first, second = ends(scene)
-    between = FlowInterpolation()(first, second)
-    truth = scene.rgb(10)
-    # half way, the leftmost pixels are in the second frame alone, the rightmost in the first alone
-    for columns in (slice(0, 5), slice(-5, None)):
-        error = (between.at(0.5) - truth)[..., columns].abs().mean()
-        assert error < 0.8 * (Blend()(first, second).at(0.5) - truth)[..., columns].abs().mean()
-
-
 @pytest.mark.parametrize("gain", [0.5, 0.9, 1.3])
 def test_light_that_changes_is_not_motion(gain):
     scene = panning(2.0, 1.0)
@@ -222,17 +177,6 @@ def test_light_that_changes_is_not_motion(gain):
     between = FlowInterpolation()(first * 0.7, second * 0.7 * gain)
     assert not between.cut
     assert psnr(between.at(0.5), scene.rgb(10) * 0.7 * (1 + gain) / 2) > 50
-
-
-def test_shrink_finds_the_motion_too():
-    scene = panning(4.0, 3.0)
-    truth = scene.rgb(10)
-    fine, coarse = (FlowInterpolation(shrink)(*ends(scene)) for shrink in (1, 2))
-    assert not fine.forward.equal(coarse.forward)
-    for between in (fine, coarse):
-        assert psnr(between.at(0.5), truth) > psnr(Blend()(*ends(scene)).at(0.5), truth) + 6
-        error = between.forward[:, 20:-20, 20:-20] - torch.tensor([4.0, 3.0]).reshape(2, 1, 1)
-        assert error.abs().mean() < 0.1
 
 
 # --- cuts, chance -----------------------------------------------------------------------------------------------------
@@ -257,7 +201,7 @@ def test_motion_and_noise_are_no_cut(scene):
 
 
 def test_the_same_whatever_the_threads():
-    first, second = ends(panning(2.3, 1.1, size=(203, 179)))
+    first, second = ends(panning(2.3, 1.1, size=(101, 99)))
     made, before = [], torch.get_num_threads()
     try:
         for threads in (1, 2):

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from spikekit import PATTERNS, bin_to_sensor
 from spikekit.scenes.adaptive_sampling import Plan, SceneProfile, profile_interval
 from spikekit.sensor.noise import SensorNoise
 
@@ -42,27 +41,11 @@ def test_where_nothing_changes_motion_is_not_looked_for():
     assert profile.plan().latent == 0
 
 
-@pytest.mark.parametrize("pattern", PATTERNS)
-def test_brightness_is_that_of_the_light(pattern):
-    first, second = torch.rand(2, 3, 16, 24).unbind()
-    light = 0.7 * torch.stack([bin_to_sensor(frame, pattern, scale=2) for frame in (first, second)])
-    expected = light.min().item(), light.mean().item(), light.max().item()
-    assert profile_of(first, second, alpha=0.7, pattern=pattern).brightness == pytest.approx(expected)
-
-
 def test_displacement_is_in_sensor_pixels_per_clock():
     first, second = torch.rand(2, 3, 64, 64).unbind()
     profile = profile_of(first, second, Steady(0.75, 1.0), clocks=10)  # cells are two sensor pixels wide
     assert profile.displacement == pytest.approx(2 * 1.25 / 10)
     assert profile.displacement_max == pytest.approx(2 * 1.25 / 10)
-
-
-@pytest.mark.parametrize("scale", [1, 2, 3])
-def test_motion_is_looked_for_in_cells_of_the_sensor(scale):
-    motion = Steady()
-    first, second = torch.rand(2, 3, 12 * scale, 20 * scale).unbind()
-    profile_of(first, second, motion, scale=scale)
-    assert motion.sizes == [(3, 6, 10)]
 
 
 def test_only_what_changes_is_looked_at():
@@ -134,33 +117,12 @@ def test_motion_where_nothing_is_seen_does_not_count():
     assert profile.displacement_max == pytest.approx(2 * 2.0 / 20)
 
 
-def test_blending_stands_for_pixels_without_flow_too():
-    """Half of the pixels have flow that is not consistent: the estimate is that of the other half, twice."""
-    first, second = torch.rand(2, 3, 64, 64).unbind()
-
-    def motion(one, other):
-        between = Steady(0.5)(one, other)
-        backward = between.backward.clone()
-        backward[:, 8:] = 9.0
-        return SimpleNamespace(forward=between.forward, backward=backward)
-
-    everywhere = profile_of(first, second, Steady(0.5)).blending
-    assert profile_of(first, second, motion).blending == pytest.approx(everywhere, rel=0.3)
-
-
 def test_blending_along_a_diagonal():
     """A wave bends along the way across it, and not at all along its crests."""
     y, x = torch.meshgrid(torch.arange(64.0), torch.arange(64.0), indexing="ij")
     first, second = ((0.5 + 0.4 * torch.sin((x + y) / 4 + phase)).expand(3, 64, 64) for phase in (0.0, 0.5))
     across, along = (profile_of(first, second, Steady(0.5, y)).blending for y in (0.5, -0.5))
     assert along < 0.2 * across
-
-
-def test_flicker_is_the_mean_of_all_pixels():
-    first = torch.full((3, 160, 160), 0.5)
-    second = first.clone()
-    second[:, 40:60, 40:60] += 0.1
-    assert profile_of(first, second).flicker == pytest.approx(0.4 * 0.1 * 400 / 160**2, rel=1e-3)
 
 
 def test_inconsistent_flow_does_not_count():
@@ -185,11 +147,6 @@ def test_where_motion_is_not_found_everything_is_modelled(backward):
     assert "latent frames: 19 an interval, as motion is not found, for all pixels" in str(profile.plan())
 
 
-def test_pairs_of_two_sizes():
-    with pytest.raises(ValueError, match=r"first, second: expected one size, got \(3, 8, 8\) and \(3, 8, 12\)"):
-        profile_of(torch.rand(3, 8, 8), torch.rand(3, 8, 12))
-
-
 @pytest.mark.parametrize(
     ("displacement", "step", "latent"), [(0.0, 0.5, 0), (0.024, 0.5, 0), (0.026, 0.5, 1), (0.1, 0.5, 3), (0.1, 0.25, 7)]
 )
@@ -203,10 +160,6 @@ def test_detail_asks_for_more_frames():
     assert replace(MOVING, blending=0.05 * 36).plan().latent == 5
     assert replace(MOVING, blending=0.05 * 36.1).plan().latent == 6
     assert replace(MOVING, blending=0.05 * 36).plan(spike_tolerance=0.2).latent == 3
-
-
-def test_never_more_than_a_frame_a_clock():
-    assert replace(MOVING, displacement=9.0).plan() == Plan.everything(20)
 
 
 def test_the_region_has_a_margin_and_whole_cells():
@@ -246,16 +199,6 @@ def test_profiles_join():
     assert joined.flicker == -0.2
     with pytest.raises(ValueError, match="profiles: expected at least one"):
         SceneProfile.join([])
-
-
-def test_plans_are_printed():
-    text = str(MOVING.plan())
-    assert "latent frames: 3 an interval, 0.5 sensor pixels apart, for all pixels" in text
-    assert "0.1 sensor pixels per clock (at most 0.12)" in text
-    small = replace(MOVING, size=(200, 300), region=(100, 150, 6, 6)).plan()
-    assert f"for {small.region[2]} x {small.region[3]} of 200 x 300 pixels" in str(small)
-    assert "none, nothing moves" in str(SceneProfile((4, 4), 20, (0, 0, 0)).plan())
-    assert str(Plan(latent=2)) == "latent frames: 2 an interval"
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """Films: light against a plain loop over interpolated frames, the frames' own pixels, and what plans cost and save."""
 
-import pickle
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
@@ -81,14 +80,6 @@ def test_truth_is_the_frame_from_the_top_left():
         assert film.light(20 * n, 1)[0].equal(0.4 * bin_to_sensor(frames[n][:, :36, :48], scale=3))
 
 
-def test_truth_is_a_copy():
-    frames = [torch.rand(3, 8, 8) for _ in range(2)]
-    film = FrameSequence(frames, scale=2)
-    film.rgb(0).zero_()
-    assert film.rgb(0).equal(frames[0])
-    assert frames[0].any()
-
-
 @pytest.mark.parametrize("pattern", ["RGGB", "GBRG"])
 @pytest.mark.parametrize("latent", [1, 2, 19])
 def test_light_is_that_of_latent_frames_blended(pattern, latent):
@@ -113,13 +104,6 @@ def test_light_is_that_of_latent_frames_blended(pattern, latent):
         torch.testing.assert_close(light[clock], expected, atol=1e-6, rtol=0)
     if latent == 19:
         assert light[7].equal(knot(0, 7))
-
-
-def test_without_latent_frames_the_ends_are_blended():
-    frames, interpolation = [torch.rand(3, 8, 8) for _ in range(2)], Fade()
-    light = FrameSequence(frames, scale=2, clocks=8, interpolation=interpolation, plan=Plan()).light()
-    torch.testing.assert_close(light[2], torch.lerp(light[0], light[8], 0.25))
-    assert interpolation.calls == []
 
 
 def test_a_region_is_interpolated_and_the_rest_blended():
@@ -170,12 +154,6 @@ def test_a_film_of_one_frame():
     assert film.light().shape == (1, 4, 4)
     assert film.profile().static == 1
     assert film.flow(0, 0).equal(torch.zeros(2, 4, 4))
-
-
-def test_a_film_goes_to_other_processes():
-    film = moving(3.0)
-    copy = pickle.loads(pickle.dumps(FrameSequence(film.frames, scale=2, plan=Plan())))
-    assert copy.light().equal(FrameSequence(film.frames, scale=2, plan=Plan()).light())
 
 
 # --- plans ------------------------------------------------------------------------------------------------------------
@@ -257,12 +235,6 @@ def test_plans_keep_the_tolerance(pixels, cut, tolerance):
     torch.testing.assert_close(*quality, atol=0.1, rtol=0)
 
 
-def test_blending_alone_would_not_keep_it():
-    planned, blended = moving(2.0), moving(2.0, plan=Plan())
-    exact = moving(2.0, plan=Plan.everything(20)).light()
-    assert changed(planned.light(), exact)[0] <= 0.05 < changed(blended.light(), exact)[0]
-
-
 @pytest.mark.parametrize("cut", [0.08, 0.3])
 @pytest.mark.parametrize("pixels", [0.3, 0.6])
 def test_the_estimate_of_what_blending_changes(pixels, cut):
@@ -303,12 +275,6 @@ def test_flows_are_followed():
     torch.testing.assert_close(film.flow(0, 40)[0], expected.expand(4, 16))
 
 
-def test_where_nothing_moves_flow_is_zero_and_costs_nothing():
-    film = FrameSequence([torch.ones(3, 8, 8)] * 3, scale=2, interpolation=Fade())
-    assert film.flow(1, 33).equal(torch.zeros(2, 4, 4))
-    assert film.interpolation.calls == []
-
-
 def test_a_clip_is_a_scene():
     film = moving(2.0, frames=5)
     clip = film.clip(2)
@@ -341,12 +307,6 @@ def test_spikes_are_those_of_the_whole(tmp_path):
     write_spikes(tmp_path / "film.dat", film.spikes(noise=noise, seed=3, chunk=7))
     assert read_spikes(tmp_path / "film.dat", 32, 32).equal(whole)
     assert not torch.cat(list(film.spikes(noise=noise, seed=4))).equal(whole)
-
-
-def test_spikes_of_slow_read_outs():
-    film = moving(2.0)
-    expected = SpikeSensor(readout=4).expose(film.light(0, 40))
-    assert torch.cat(list(film.spikes(readout=4, chunk=6))).equal(expected)
 
 
 FRAMES = [torch.rand(3, 8, 8) for _ in range(3)]
@@ -383,11 +343,6 @@ def film_of(frames=FRAMES, **settings):
 def test_errors(make, message):
     with pytest.raises(ValueError, match=message):
         make()
-
-
-def test_frames_are_tensors_of_floats():
-    with pytest.raises(TypeError, match=r"frames\[0\]: expected a floating-point tensor, got torch.uint8"):
-        FrameSequence([torch.zeros(3, 8, 8, dtype=torch.uint8)], scale=2)
 
 
 def test_several_threads_share_a_sequence():

@@ -16,11 +16,13 @@ def rounded(flow):
     return ((moved - pixel) * 16).round() / 16
 
 
-@pytest.mark.parametrize("scale", [1, 2, 3, 4])
-@pytest.mark.parametrize(("pattern", "neighbors"), [("RGGB", 4), ("GBRG", 4), ("BGGR", 1), ("grey", 4), ("grey", 1)])
-def test_it_is_the_same_warp(scale, pattern, neighbors):
+@pytest.mark.parametrize(
+    ("pattern", "neighbors", "scale"),
+    [("RGGB", 4, 1), ("GBRG", 4, 2), ("BGGR", 1, 3), ("RGGB", 4, 4), ("grey", 4, 2), ("grey", 1, 1)],
+)
+def test_it_is_the_same_warp(pattern, neighbors, scale):
     generator = torch.Generator().manual_seed(scale)
-    for height, width in ((8, 10), (30, 16)):
+    for height, width in ((8, 10), (20, 14)):
         features = torch.rand(2, 3, scale * height, scale * width, generator=generator)
         flow = 6 * torch.randn(2, 2, scale * height, scale * width, generator=generator)
         flow[:, :, ::3] = (2 * flow[:, :, ::3]).round() / 2  # where neighbours are equally far

@@ -70,17 +70,6 @@ def test_against_loops(batch, channels, bags, last, dtype):
         torch.testing.assert_close(one.double(), expected, rtol=2 * eps, atol=50 * torch.finfo(wide).eps)
 
 
-def test_of_two_dtypes():
-    values, grad, index, weight = draw(2, 9, 4)
-    for one, other, third in [
-        (torch.float16, torch.float64, torch.float32),
-        (torch.float32, torch.float32, torch.float64),
-    ]:
-        args = values.to(one), grad.to(other), index, weight.to(third)
-        for got, expected in zip(results(*args), loops(*args), strict=True):
-            torch.testing.assert_close(got.double(), expected, rtol=1e-3, atol=1e-5)
-
-
 @pytest.mark.parametrize("channels", [1, 2, 9])
 @pytest.mark.parametrize("last", [False, True])
 def test_layout_is_that_of_the_values(channels, last):

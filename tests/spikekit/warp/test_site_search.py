@@ -39,9 +39,17 @@ def searched(features, flow, pattern, color, scale, neighbors=4):
     return found.reshape(batch, times * channels * scale**2, height, width)
 
 
-@pytest.mark.parametrize("scale", [1, 3, 4])
-@pytest.mark.parametrize("pattern", ["RGGB", "GBRG", "grey"])
-@pytest.mark.parametrize("size", [(12, 13), (15, 20)])
+@pytest.mark.parametrize(
+    ("scale", "pattern", "size"),
+    [
+        (1, "RGGB", (12, 13)),
+        (1, "grey", (15, 20)),
+        (3, "GBRG", (15, 20)),
+        (3, "grey", (12, 13)),
+        (4, "RGGB", (15, 20)),
+        (4, "GBRG", (12, 13)),
+    ],
+)
 def test_sites_are_the_enlarged_features_searched_along_the_motion_up_to_the_border(scale, pattern, size):
     generator = torch.Generator().manual_seed(scale)
     features = torch.randn(2, 4, 2, *size, dtype=torch.float64, generator=generator)
@@ -128,7 +136,7 @@ def test_results_have_their_channels_last_and_compile_in_one_graph():
 def test_compiled_loops_give_what_plain_torch_gives():
     size = 17, 14
     features, flow = torch.randn(2, 4, 3, *size), torch.randn(2, 2, 2, *size) * 4
-    for scale in (1, 2, 3):
+    for scale in (1, 3):
         table = table_for(size, "GRBG", 1, scale)
         plain = site_search._search_sites(features, flow, SHARES, *table.arguments)
         torch.testing.assert_close(search_sites(features, flow, SHARES, table), plain, rtol=0, atol=1e-5)
