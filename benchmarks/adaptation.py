@@ -96,11 +96,11 @@ def main() -> None:
         longest = max(teacher.frames, load_network(args.weights).frames)
         shared = noise, args.alpha, teacher.scale, longest
         seen = [record(path, n, *shared, folder / f"{n}.npz") for n, path in enumerate(chosen)]
-        for n, (one, other) in enumerate(zip(seen, [*seen[1:], seen[0]], strict=True)):
+        for one, other in zip(seen, [*seen[1:], seen[0]], strict=True):
             student = load_network(args.weights).eval()
             before = one.psnr(student), other.psnr(student)
             lessons = make_lessons(student, teacher, one.clips(longest))
-            alike = learn(student, lessons, args.steps, folder / str(n), enable_progress_bar=False)
+            alike = learn(student, lessons, args.steps)
             after = one.psnr(student), other.psnr(student)
             rows.append([before[0], after[0], one.psnr(teacher), *alike, before[1], after[1]])
     rows.append(torch.tensor(rows).mean(0).tolist())

@@ -6,22 +6,20 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import torch
 
-from lightning_modules.adaptation.learn import STATE, learn
-from lightning_modules.adaptation.lessons import ROOM, Lessons, make_lessons
-from lightning_modules.cli.errors import InputError, UsageError, VerbParser
+from lightning_modules.adaptation.learn import learn
+from lightning_modules.adaptation.lessons import ROOM, make_lessons
+from lightning_modules.cli.errors import InputError, UsageError, VerbParser, input_errors
 from lightning_modules.cli.folder_lock import check_folder, locked_folder
 from lightning_modules.inference.clips import RecordingClips
 from lightning_modules.inference.export import load_network
-from lightning_modules.inference.output import check_place, file_identity
+from lightning_modules.inference.output import check_place
 from lightning_modules.inference.reconstruct import may_be_noisy, precision_of
 from lightning_modules.networks import Network, RecurrentCSCSR
-from lightning_modules.registry import find_model, list_models
+from lightning_modules.registry import list_models
 from lightning_modules.storage.pretrained import Weights, motion_of, settings_of, write_weights
-from spikekit.arguments import UsageError as SpikekitUsageError
 from spikekit.arguments import whole
 from spikekit.cli import recordings
 from spikekit.recording import Recording
@@ -29,9 +27,6 @@ from spikekit.timing import duration
 
 #: dB by which the held-out pictures have to come nearer to the teacher's
 LEAST_GAIN = 0.1
-
-#: file of the lessons
-LESSONS = "lessons.safetensors"
 
 _WRITTEN = "adapted.safetensors"
 _LEAST_SIDE = 4  # pixels of a recording
@@ -72,45 +67,24 @@ def adapt(args: Sequence[str]) -> None:
     weights = asked.weights
     begin, written = perf_counter(), asked.output / _WRITTEN
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    try:
+    with input_errors():
         check_folder(asked.output)
-        for name in (LESSONS, STATE, _WRITTEN):
-            check_place(asked.output / name)
+        check_place(written)
         student = _student(weights).to(device)
         recording = recordings.opened(asked)
         noisy = asked.calibration != "none" and may_be_noisy(recording)
         clips, name = clips_and_teacher(recording, student, asked.teacher, noisy)
-        known = {"recording": _identity(str(asked.file)), "sensor": _sensor(clips)}
-        known |= {"weights": _identity(weights), "teacher": _identity(name), "steps": asked.steps}
         with locked_folder(asked.output, "adaptation"):
-            lessons = _lessons(asked.output, known, student, name, clips)
+            lessons = make_lessons(student, load_network(name).to(device).eval(), clips)
             precision = precision_of(torch.device(device)) if device == "cuda" else "32-true"
-            before, after = learn(student, lessons, asked.steps, asked.output, precision)
-            said = (
-                f"{before:.2f} dB from the held-out pictures of {name} before, {after:.2f} dB after {asked.steps} steps"
-            )
+            before, after = learn(student, lessons, asked.steps, precision)
+            held_out = f"dB from the held-out pictures of {name}"
+            said = f"{before:.2f} {held_out} before, {after:.2f} dB after {asked.steps} steps"
             if not after >= before + LEAST_GAIN:
                 raise InputError(f"{said}: expected {LEAST_GAIN} dB more; nothing written, go on using {weights}")
             tensors = student.cpu().state_dict()
             write_weights(Weights(written, settings_of(student), motion_of(student), tensors), written)
-    except InputError:
-        raise
-    except (OSError, ValueError) as error:
-        raise (UsageError if isinstance(error, SpikekitUsageError) else InputError)(str(error)) from error
     print(f"{said}\n{written}: in {duration(perf_counter() - begin)}; for lightning predict --weights {written}")
-
-
-def _lessons(folder: Path, known: dict[str, Any], student: Network, teacher: str, clips: RecordingClips) -> Lessons:
-    """Return the lessons that are in a folder already, or make them."""
-    path = folder / LESSONS
-    if path.is_file():
-        return Lessons.read(path, known)
-    if (folder / STATE).exists():
-        raise ValueError(f"{folder / STATE}: expected the lessons of this training beside it; -o goes elsewhere")
-    device = next(student.parameters()).device
-    lessons = make_lessons(student, load_network(teacher).to(device).eval(), clips)
-    lessons.write(path, known)
-    return lessons
 
 
 def _student(weights: str) -> Network:
@@ -166,15 +140,3 @@ def _slowest(recording: Recording, student: Network, noisy: bool) -> str:
 def _too_short(recording: Recording, frames: int) -> str:
     least = f"at least {ROOM * frames} frames, {ROOM} clips of {frames}"
     return f"{recording.path}: expected {least}, got {recording.frames}"
-
-
-def _identity(source: str) -> str:
-    """Return what tells a file from another, and from itself after it has changed; the name of shipped weights."""
-    return source if find_model(source) or not Path(source).is_file() else str(file_identity(source))
-
-
-def _sensor(clips: RecordingClips) -> str:
-    """Return what the spikes depend on besides the file."""
-    one = clips.recording
-    measured = one.calibration and {name: str(value) for name, value in vars(one.calibration).items()}
-    return f"{clips.size}, {clips.top}, {clips.left}, {one.flip}, {one.pattern}, {one.alpha}, {measured}"

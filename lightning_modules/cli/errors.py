@@ -46,6 +46,17 @@ class VerbParser(argparse.ArgumentParser):
         raise UsageError(f"{self.prog.removeprefix('lightning ')}: {message}")
 
 
+@contextmanager
+def input_errors() -> Iterator[None]:
+    """Take a file that cannot be used, or a value that cannot be, for a mistake of the user and not of the program."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (OSError, ValueError, ImportError) as error:
+        raise (UsageError if isinstance(error, SpikekitUsageError) else InputError)(str(error)) from error
+
+
 def _of_users() -> tuple[type[BaseException], ...]:
     """Return what is raised where a user made a mistake; importing it takes torch."""
     from lightning_modules.storage.checkpoint import DivergedError
