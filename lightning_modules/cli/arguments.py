@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,8 +20,6 @@ from spikekit.arguments import one_line
 from spikekit.io.failures import no_pipe
 
 WEIGHTS = "--model.weights", "--model.init_args.weights"
-
-_MOTION = re.compile(r"--model\.(init_args\.)?network\.(init_args\.)?motion(\.class_path)?")
 
 #: options that the arguments of a preset are, in the order in which they are typed
 _PRESET = {
@@ -40,15 +39,13 @@ _PRESET = {
     "interpolated": "--interpolated",
     "precision": "--trainer.precision",
 }
-#: arguments of the Trainer that count batches where they are whole, and are shares where they are not
-_COUNTS = {f"limit_{stage}_batches" for stage in ("train", "val", "test", "predict")}
-_COUNTS |= {"overfit_batches", "val_check_interval"}
 
 
 def with_network_of_weights(args: Sequence[str]) -> list[str]:
     """Insert the network that belongs to ``--model.weights``, so that it need not be specified again.
 
-    The motion estimator and the gain can be exchanged freely: those of the weights are used unless others are named.
+    It stands behind all configurations, where other arguments still override it. Of these, the motion estimator and the
+    gain that they name are kept.
 
     Args:
         args: verb and arguments of ``lightning``.
@@ -57,18 +54,16 @@ def with_network_of_weights(args: Sequence[str]) -> list[str]:
         FileNotFoundError: there are no such weights.
         ValueError: the file is damaged, of something else, or of a network or estimator that is not of this package.
     """
-    asked, named, alpha = None, None, None
-    for _, option, value in options(args):
+    asked, kept, place = None, {}, 1
+    for end, option, value in options(args):
         if option in ("-c", "--config"):
-            model = inner_arguments(_part_of(value, "model"))
+            place = end
+            model = inner_arguments(read_config(value).get("model")) if os.path.exists(value) else {}
             asked = model.get("weights") or asked
             network = inner_arguments(model.get("network"))
-            named = _with_class(network.get("motion")) or named
-            alpha = network.get("alpha", alpha)
+            kept |= {name: network[name] for name in ("motion", "alpha") if network.get(name) is not None}
         elif option in WEIGHTS:
             asked = value
-        elif _MOTION.fullmatch(option):
-            named = _with_class(_parsed(value, option)) or named
     if asked in (None, "", "null"):
         return list(args)
     if not isinstance(asked, str):
@@ -79,65 +74,26 @@ def with_network_of_weights(args: Sequence[str]) -> list[str]:
     if issubclass(kind, MotionEstimator):
         takes = f"of the estimator {kind.__name__}; --model.network.motion.weights takes them"
         raise ValueError(f"model.weights: expected weights of a network, got {asked}, {takes}")
-    network = {"class_path": kind.__name__, "init_args": arguments}
-    chosen = named
-    if found.motion and not named:
-        estimator, arguments = own_class(found.motion, found.source, ESTIMATORS)
-        chosen = {"class_path": estimator.__name__, "init_args": arguments}
-    if chosen:
-        network["init_args"]["motion"] = chosen
-    if alpha is not None:
-        network["init_args"]["alpha"] = alpha
-    return behind_configurations(args, ["--config", json.dumps({"model": {"network": network}}, default=str)])
+    if found.motion:
+        estimator, its = own_class(found.motion, found.source, ESTIMATORS)
+        arguments["motion"] = {"class_path": estimator.__name__, "init_args": its}
+    network = {"class_path": kind.__name__, "init_args": arguments | kept}
+    inserted = "--config", json.dumps({"model": {"network": network}}, default=str)
+    return [*args[:place], *inserted, *args[place:]]
 
 
 def options(args: Sequence[str]) -> Iterator[tuple[int, str, str]]:
-    """Yield the position after an option and its value, the option, and the value."""
+    """Yield the position after an option and its value, the option, and the value.
+
+    Example:
+        >>> list(options(["-cA.yaml", "--config=B.yaml", "-c", "C.yaml"]))
+        [(1, '-c', 'A.yaml'), (2, '--config', 'B.yaml'), (4, '-c', 'C.yaml'), (5, 'C.yaml', '')]
+    """
     for n, word in enumerate(args):
         option, equals, value = word.partition("=")
         if re.match(r"-[a-z][^=]", word):  # -cFILE
             option, equals, value = word[:2], "=", word[2:]
         yield (n + 1, option, value) if equals else (n + 2, option, args[n + 1] if n + 1 < len(args) else "")
-
-
-def behind_configurations(args: Sequence[str], more: Sequence[str]) -> list[str]:
-    """Insert more arguments after the verb and all configurations, where other arguments still override them."""
-    place = max((end for end, option, _ in options(args) if option in ("-c", "--config")), default=1)
-    return [*args[:place], *more, *args[place:]]
-
-
-def classes_first(args: Sequence[str]) -> list[str]:
-    """Move an option that names a class before the first argument of that class, where the parser needs it.
-
-    Example:
-        >>> classes_first(["predict", "--data.path", "a.dat", "--data", "Recording"])
-        ['predict', '--data', 'Recording', '--data.path', 'a.dat']
-    """
-    args = list(args)
-    for key in ("--model", "--model.network", "--model.network.motion", "--data"):
-        first = next((n for n, word in enumerate(args) if word.startswith(f"{key}.")), len(args))
-        place = next((n for n, word in enumerate(args) if word == key or word.startswith(f"{key}=")), 0)
-        if place > first:
-            end = place + 1 + (args[place] == key)
-            args[first:end] = [*args[place:end], *args[first:place]]
-    return args
-
-
-def whole_counts(args: Sequence[str]) -> dict[str, int]:
-    """Return the Trainer's whole numbers of batches, by name; the parser would turn 1 into 1.0, everything.
-
-    Example:
-        >>> whole_counts(["test", "--trainer.limit_test_batches", "1", "--trainer.limit_val_batches", "0.5"])
-        {'limit_test_batches': 1}
-    """
-    given: dict[str, Any] = {}
-    for _, option, value in options(args):
-        if option in ("-c", "--config"):
-            trainer = _part_of(value, "trainer")
-            given |= trainer if isinstance(trainer, dict) else {}
-        elif option.startswith("--trainer."):
-            given[option.removeprefix("--trainer.")] = int(value) if value.isdecimal() else value
-    return {name: given[name] for name in sorted(_COUNTS & given.keys()) if type(given[name]) is int}
 
 
 def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -180,28 +136,6 @@ def inner_arguments(choice: Any) -> dict[str, Any]:
         return {}
     inner = choice.get("init_args")
     return {**choice, **inner} if isinstance(inner, dict) else choice
-
-
-def _part_of(config: str, name: str) -> Any:
-    """Return what a configuration says about a part; what is not there, or text, is the parser's affair."""
-    try:
-        there = bool(config) and Path(config).exists() and not Path(config).is_dir()
-    except (OSError, ValueError):  # a text that no name can be
-        there = False
-    return read_config(config).get(name) if there else None
-
-
-def _parsed(text: str, name: str) -> Any:
-    try:
-        return yaml.safe_load(text)
-    except Exception as error:  # what the parser raises depends on the text
-        raise ValueError(f"{name}: not a configuration ({one_line(error)[:300]})") from error
-
-
-def _with_class(choice: Any) -> dict[str, Any] | None:
-    """Return an object of a configuration as a dictionary, ``None`` where it does not say of what class it is."""
-    choice = {"class_path": choice} if isinstance(choice, str) else choice
-    return choice if isinstance(choice, dict) and choice.get("class_path") else None
 
 
 def preset_arguments(preset: Preset) -> list[str]:

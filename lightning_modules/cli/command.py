@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import logging
 import os
 import sys
@@ -15,8 +14,6 @@ from time import perf_counter
 from typing import Any, NoReturn
 
 import torch
-import yaml
-from jsonargparse import ArgumentParser
 from pytorch_lightning import Callback, LightningDataModule, LightningModule, Trainer
 from pytorch_lightning.callbacks import LearningRateMonitor, ModelCheckpoint
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
@@ -24,37 +21,23 @@ from pytorch_lightning.loggers import TensorBoardLogger
 from pytorch_lightning.utilities import rank_zero_only
 from pytorch_lightning.utilities.exceptions import MisconfigurationException, SIGTERMException
 
-from lightning_modules.cli.arguments import classes_first, flatten, whole_counts, with_network_of_weights
+from lightning_modules.cli.arguments import flatten, with_network_of_weights
 from lightning_modules.cli.configured import run_checkpoint
-from lightning_modules.cli.errors import Ended, InputError, UsageError
-from lightning_modules.cli.folder_lock import FolderError, check_folder, locked_folder
+from lightning_modules.cli.errors import Ended, InputError, UsageError, input_errors
+from lightning_modules.cli.folder_lock import check_folder, locked_folder
 from lightning_modules.cli.reasons import reason
 from lightning_modules.configurations import with_found_configs
-from lightning_modules.data import FilmScenes, StillScenes
 from lightning_modules.data.loading import end_when_orphaned
-from lightning_modules.motion import Spike2Flow
-from lightning_modules.networks import CSCSR
 from lightning_modules.storage.checkpoint import read_checkpoint
 from lightning_modules.storage.pretrained import check_settings
+from lightning_modules.tasks import optical_flow, super_resolution  # noqa: F401  (classes that --model names)
 from lightning_modules.tasks.base import BaseTask
 from lightning_modules.tasks.checkpoint_io import Checkpoints, LastCheckpoint, requeued_checkpoint
-from lightning_modules.tasks.optical_flow import FlowTraining
 from lightning_modules.tasks.resume import check_resume, load_weights_of
-from lightning_modules.tasks.super_resolution import SuperResolution
 from spikekit.arguments import one_line
 from spikekit.io import PictureError, SpikeFileError, VideoError
 from spikekit.io.whole_file import whole_file
 from spikekit.timing import duration
-
-#: classes whose arguments ``--help`` lists, by the option that names them
-CHOICES = (
-    ("model", SuperResolution),
-    ("model.network", CSCSR),
-    ("model", FlowTraining),
-    ("model.network", Spike2Flow),
-    ("data", StillScenes),
-    ("data", FilmScenes),
-)
 
 # warnings about the insides of Lightning and jsonargparse, about seeds, and about data that need no processes to read
 _NOTHING_TO_DO = (
@@ -67,27 +50,16 @@ _NOTHING_TO_DO = (
     r".*the `outputs` folder",
 )
 
+# numbers of batches where they are whole, and shares where they are not
+_COUNTS = {f"trainer.limit_{stage}_batches" for stage in ("train", "val", "test", "predict")}
+_COUNTS |= {"trainer.overfit_batches", "trainer.val_check_interval"}
+
 # environment variable: number of the process that starts the others, where a run has several
 _FIRST = "SPIKEKIT_FIRST_PROCESS"
 
-_LOADERS = {
-    "fit": "train_dataloader",
-    "validate": "val_dataloader",
-    "test": "test_dataloader",
-}
-
 
 class Parser(LightningArgumentParser):
-    """A parser whose help also lists the arguments of the classes that a configuration may name."""
-
-    def format_help(self) -> str:  # noqa: D102
-        text = super().format_help()
-        if any(action.dest == "model" for action in self._actions):
-            for option, choice in CHOICES:
-                parser = ArgumentParser(add_help=False, usage=argparse.SUPPRESS)
-                parser.add_class_arguments(choice, option)
-                text += f"\nwith --{option} {choice.__name__}:\n\n{parser.format_help()}"
-        return text
+    """A parser whose errors are one line."""
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Report the error in one line: jsonargparse would show every option and everything it tried to build."""
@@ -123,7 +95,7 @@ class Command(LightningCLI):
 
     def subcommands(self) -> dict[str, set[str]]:
         """Return only the verb that was typed, because building the parser of every verb takes time."""
-        verbs = {verb: given for verb, given in LightningCLI.subcommands().items() if verb in _LOADERS}
+        verbs = {verb: LightningCLI.subcommands()[verb] for verb in ("fit", "validate", "test")}
         return {verb: verbs[verb] for verb in self.typed[:1] if verb in verbs} or verbs
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:  # noqa: D102
@@ -134,6 +106,9 @@ class Command(LightningCLI):
             default="runs",
             help="Folder of the run: checkpoints, TensorBoard files, config.yaml, tables and pictures.",
         )
+        for action in parser._actions:
+            if action.dest in _COUNTS:  # 1 is one batch, which as 1.0 would be all of them
+                action._typehint = int | float | None
         parser.set_defaults({"model": {"class_path": "SuperResolution"}})
         network = "model.init_args.network.init_args"
         for name in ("scale", "frames", "alpha"):
@@ -142,18 +117,14 @@ class Command(LightningCLI):
         parser.link_arguments("model", "data.init_args.flow_times", _ends, apply_on="instantiate")
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:  # noqa: D102
-        args = classes_first(self.typed)
         try:
-            try:
-                args = with_network_of_weights(args)
-            except (OSError, ValueError) as error:
-                raise InputError(str(error)) from error
+            with input_errors():
+                args = with_network_of_weights(self.typed)
             self.config = parser.parse_args(args)
         except SystemExit as error:
             if not isinstance(error.code, str):
                 raise
             raise UsageError(f"{error.code} (see lightning {self.typed[0]} --help)") from error
-        self.counts = whole_counts(args)
 
     def _parse_ckpt_path(self) -> None:
         """Take no hyper-parameters out of a checkpoint: jsonargparse would build whatever they name."""
@@ -172,25 +143,15 @@ class Command(LightningCLI):
             # a run that was killed before its first last.ckpt has best.ckpt alone
             alone = asked == "last" and not (checkpoints / "last.ckpt").is_file() and any(checkpoints.glob("best.ckpt"))
             config.ckpt_path = str(run_checkpoint(checkpoints, "best" if alone else asked))
-        if asked and not Path(config.ckpt_path).is_file():
-            raise InputError(f"{config.ckpt_path}: no such checkpoint")
         if asked:
-            try:
+            with input_errors():
                 read_checkpoint(config.ckpt_path)
-            except (OSError, ValueError) as error:
-                raise InputError(str(error)) from error
-        if (
-            self.subcommand == "fit"
-            and not asked
-            and not config.trainer.fast_dev_run
-            and any(checkpoints.glob("*.ckpt"))
-        ):
+        elif self.subcommand == "fit" and not config.trainer.fast_dev_run and any(checkpoints.glob("*.ckpt")):
             raise InputError(f"{checkpoints}: holds a run already; --ckpt_path last goes on with it, -o goes elsewhere")
 
     def _run_subcommand(self, subcommand: str) -> None:
         config = self.config[subcommand]
-        begun, begin = Begun(), perf_counter()
-        self.trainer.callbacks.append(begun)
+        begin = perf_counter()
         try:
             if config.ckpt_path:  # before a folder is made and scenes are loaded
                 checkpoint = read_checkpoint(config.ckpt_path)
@@ -209,30 +170,24 @@ class Command(LightningCLI):
             raise
         except (MisconfigurationException, ModuleNotFoundError) as error:  # of Lightning's, such as a callback's
             raise InputError(one_line(error)) from error
-        except ValueError as error:
-            if begun or isinstance(error, FolderError):
-                raise
-            raise InputError(str(error)) from error
         if rank_zero_only.rank == 0:
             print(f"{config.output}: {subcommand} took {duration(perf_counter() - begin)}")
 
-    def _dump_config(self) -> None:
-        # as it is there, without looking a second time at what parse_args has looked at
-        if not hasattr(self, "config_dump"):
-            text = self.parser.dump(self.config, skip_link_targets=False, skip_none=False, skip_validation=True)
-            self.config_dump = yaml.safe_load(text)[self.subcommand]
-
     def instantiate_classes(self) -> None:  # noqa: D102
         config = self.config[self.subcommand]
-        if self.subcommand == "fit":
-            _check_trainer(config.trainer)
         try:
             super().instantiate_classes()
             # here, so that what is wrong with it is known before anything is written
-            _check_verb(self.subcommand, self.model, self.datamodule)
             self.datamodule.setup(self.subcommand)
-            _check_agreement(self.model, self.datamodule)
+            if (workers := getattr(self.datamodule, "workers", 0)) < 0:
+                raise ValueError(f"data.workers: expected 0 or more, got {workers}")
+            for name, expected in self.model.needs.items():
+                if (got := self.datamodule.options.get(name, expected)) != expected:
+                    raise ValueError(f"data.{name}: expected {expected}, as the model has it, got {got}")
             if self.subcommand == "fit":
+                if not any(parameter.requires_grad for parameter in self.model.network.parameters()):
+                    raise UsageError(f"fit: expected a network that learns, got {type(self.model.network).__name__}")
+                self.model.configure_optimizers()
                 chosen = self.config_dump["model"]["init_args"]
                 self.model.recipe = {name: chosen.get(name) for name in ("optimizer", "lr_scheduler")}
                 if config.ckpt_path:
@@ -247,7 +202,6 @@ class Command(LightningCLI):
         output = Path(self._get(self.config_init, "output"))
         config = self._get(self.config_init, "trainer")
         kwargs["default_root_dir"] = output
-        kwargs |= self.counts
         if config.get("logger") is None:
             # the tables and pictures of the other commands are files of their own
             kwargs["logger"] = TensorBoardLogger(output, name="", version="") if self.subcommand == "fit" else False
@@ -274,20 +228,6 @@ class Command(LightningCLI):
                 self.model.pictures(),
             ]
         return [self.model.report(output)] if self.subcommand == "test" else []
-
-
-class Begun(Callback):
-    """Is true once a run has restored what there is to restore: an error is then no longer the user's."""
-
-    _begun = False
-
-    def __bool__(self) -> bool:
-        return self._begun
-
-    def _begin(self, *_: Any) -> None:
-        self._begun = True
-
-    on_train_start = on_validation_start = on_test_start = on_predict_start = _begin
 
 
 def _ends(model: BaseTask) -> tuple[int, int]:
@@ -319,22 +259,6 @@ def _listed(value: Any) -> list[Any]:
     return value if isinstance(value, list) else [] if value is None else [value]
 
 
-def _check_trainer(trainer: Any) -> None:
-    """Settings of Lightning that would leave a run without what the other commands need."""
-    if trainer.enable_checkpointing is False:
-        raise UsageError("trainer.enable_checkpointing: expected true, checkpoints are what fit is for, got false")
-    if trainer.limit_val_batches == 0:
-        raise UsageError("trainer.limit_val_batches: expected more than 0, validation chooses best.ckpt, got 0")
-
-
-def _check_verb(verb: str, model: BaseTask, data: LightningDataModule) -> None:
-    loader = _LOADERS[verb]
-    if getattr(type(data), loader) is getattr(LightningDataModule, loader):
-        raise UsageError(f"{verb}: expected scenes whose truth is known, got {type(data).__name__}")
-    if verb == "fit" and not any(parameter.requires_grad for parameter in model.network.parameters()):
-        raise UsageError(f"fit: expected a network that learns, got {type(model.network).__name__}")
-
-
 def _check_continuation(path: str, model: BaseTask, trainer: Trainer | None) -> None:
     """Refuse to go on with another network, optimizer or schedule: the checkpoint's would win without a word."""
     checkpoint = read_checkpoint(path)
@@ -348,18 +272,6 @@ def _check_continuation(path: str, model: BaseTask, trainer: Trainer | None) -> 
             raise UsageError(f"model.{name}: expected {expected}, got {here.get(key)}; {anew}")
     if trainer is not None:  # a rehearsal has none
         check_resume(path, model, trainer)
-
-
-def _check_agreement(model: BaseTask, data: LightningDataModule) -> None:
-    """Refuse a model and data that disagree; a recording has a Bayer phase of its own."""
-    if not isinstance(data, (StillScenes, FilmScenes)):
-        return
-    if data.workers < 0:
-        raise ValueError(f"data.workers: expected 0 or more, got {data.workers}")
-    for name, expected in model.needs.items():
-        got = data.options[name]
-        if got != expected:
-            raise ValueError(f"data.{name}: expected {expected}, as the model has it, got {got}")
 
 
 def precision_of(accelerator: str) -> str:

@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from mimetypes import guess_type
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
 from lightning_modules.cli.errors import InputError, UsageError
+from spikekit.io.failures import writing
 from spikekit.io.video import PICTURE_ENDINGS, VIDEO_ENDINGS
 
 # of what users may take the output for
 _FILE_ENDINGS = (*PICTURE_ENDINGS, *VIDEO_ENDINGS, ".gif", ".html", ".npz", ".dat", ".ckpt", ".safetensors")
-
-
-class FolderError(InputError):
-    """A folder that a run cannot write to."""
-
-
-class FolderInUseError(FolderError):
-    """A folder that another run is using."""
 
 
 def check_folder(output: str | Path) -> None:
@@ -32,30 +23,11 @@ def check_folder(output: str | Path) -> None:
         InputError: it is a file, or inside one, or new and ends like a picture, a film or another file.
     """
     ending = Path(output).suffix.lower()
-    kind = guess_type(Path(output).name)[0] or ""
-    looks_like_file = ending in _FILE_ENDINGS or kind.startswith(("image/", "video/", "audio/"))
-    if looks_like_file and not Path(output).is_dir():
+    if ending in _FILE_ENDINGS and not Path(output).is_dir():
         raise UsageError(f"-o: expected a folder, got {output}, which ends like a file, in {ending}")
     there = next(path for path in (Path(output).absolute(), *Path(output).absolute().parents) if path.exists())
     if not there.is_dir():
         raise UsageError(f"-o: expected a folder, got the file {there}")
-
-
-def make_folder(folder: str | Path) -> None:
-    """Make a folder and try to write to it, so that a run does not fail at its end.
-
-    Args:
-        folder: where.
-
-    Raises:
-        FolderError: it cannot be made, or not be written to.
-    """
-    try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise FolderError(f"-o: {folder} cannot be written to ({error.strerror or error})") from error
 
 
 @contextmanager
@@ -70,22 +42,20 @@ def locked_folder(folder: str | Path, what: str, name: str = "lock") -> Iterator
         name: of the file that is locked, and stays; runs that lock different files are no trouble to each other.
 
     Raises:
-        FolderInUseError: another process, or another run of this one, is at work there.
-        FolderError: the folder or the file in it cannot be made.
+        InputError: another process, or another run of this one, is at work there; or it cannot be written to.
     """
-    make_folder(folder)
     path = Path(folder) / name
     if path.is_symlink() or (path.exists() and not path.is_file()):  # it would be emptied, or waited for
-        raise FolderError(f"-o: {path}: expected the file of a lock, got a link, a pipe or a folder")
+        raise InputError(f"-o: {path}: expected the file of a lock, got a link, a pipe or a folder")
     lock = FileLock(path, timeout=0)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise FolderInUseError(f"{folder}: another {what} is at work here; -o goes elsewhere") from None
-    except OSError as error:
-        raise FolderError(f"-o: {path} cannot be written ({error.strerror or error})") from error
-    except NotImplementedError:
-        pass
+    with writing(f"-o: {path}", InputError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            lock.acquire()
+        except Timeout:
+            raise InputError(f"{folder}: another {what} is at work here; -o goes elsewhere") from None
+        except NotImplementedError:
+            pass
     try:
         yield
     finally:

@@ -57,11 +57,7 @@ def usage(verb: str) -> str:
     """
     return (
         f"lightning {verb}: {VERBS[verb]}\n\n{_aligned(_OPTIONS)}\n\nexample:\n  {_EXAMPLES[verb]}\n\n"
-        f"lightning {verb} --help=all lists every option, also those of networks, data and Lightning's Trainer, and "
-        "--print_config prints what would be used."
+        f"lightning {verb} --help=all lists every option, also those of Lightning's Trainer; --model.help CLASS and "
+        "--data.help CLASS those of a model and of data, such as SuperResolution and StillScenes; and --print_config "
+        "prints what would be used."
     )
-
-
-def options_of(verb: str) -> list[str]:
-    """Return the options that :func:`usage` lists, without their values."""
-    return [name.split()[0] for name in _OPTIONS]

@@ -16,7 +16,7 @@ import torch
 import yaml
 from pytorch_lightning.callbacks import ModelCheckpoint
 
-from lightning_modules.cli.arguments import whole_counts, with_network_of_weights
+from lightning_modules.cli.arguments import with_network_of_weights
 from lightning_modules.cli.errors import InputError
 from lightning_modules.data.cache import ClipCache, _digest
 from lightning_modules.inference import presets
@@ -105,7 +105,6 @@ def test_configurations(fuzz):
 
     def read(path):
         with_network_of_weights(["fit", "-c", str(path)])
-        whole_counts(["fit", "-c", str(path)])
 
     assert fuzz(read, lambda rng: fuzz.damage(good, rng), "a.yaml") > 100
     assert fuzz(read, _odd_tags, "a.yaml", cases=300) > 100
@@ -127,8 +126,6 @@ def test_values_of_a_configuration_beside_the_weights(tmp_path):
         with_network_of_weights(["fit", "-c", str(config)])
     config.write_text("model: {weights: cscsr_tiny_x4, network: {alpha: 2020-01-01}}")
     assert '"alpha": "2020-01-01"' in with_network_of_weights(["fit", "-c", str(config)])[4]  # for the parser to refuse
-    with pytest.raises(ValueError, match=r"--model\.network\.motion: not a configuration"):
-        with_network_of_weights(["fit", "--model.network.motion", "{"])
 
 
 def test_tables_of_presets(fuzz, monkeypatch):

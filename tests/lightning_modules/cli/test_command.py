@@ -13,16 +13,13 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from pytorch_lightning.callbacks import LearningRateMonitor
 
 import spikekit
 from lightning_modules import list_models
 from lightning_modules.__main__ import main
-from lightning_modules.cli.arguments import behind_configurations, options
 from lightning_modules.cli.command import run as run_command
 from lightning_modules.cli.errors import InputError
 from lightning_modules.cli.rehearsal import Rehearsal
-from lightning_modules.cli.short_help import options_of
 from lightning_modules.storage.checkpoint import read_checkpoint
 from spikekit import read_picture, write_spikes
 
@@ -66,11 +63,6 @@ class Fit(Rehearsal):
     """All of ``lightning fit`` but the training."""
 
     verb = "fit"
-
-
-def run(*args):
-    command = [sys.executable, "-m", "lightning_modules", *map(str, args)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
 
 
 def weights(output, name="last"):
@@ -186,16 +178,6 @@ def test_predict_takes_the_network_and_the_checkpoint_of_a_run(trained, overlay,
 
 
 @pytest.mark.slow
-def test_a_checkpoint_of_another_scale_is_refused(trained, overlay, configs, tmp_path):
-    args = ["-c", configs / "x2.yaml", "-c", overlay, "--ckpt_path", trained / "checkpoints/last.ckpt"]
-    with pytest.raises(SystemExit) as exit:
-        main(["validate", *map(str, args), "-o", str(tmp_path)])
-    said = str(exit.value.code)  # a text, with which Python ends with 1
-    assert said.startswith("lightning: ")
-    assert said.endswith("last.ckpt was trained with scale=4; this run asks for scale=2")
-
-
-@pytest.mark.slow
 def test_a_finished_run_is_not_written_over(trained, overlay, configs):
     before = weights(trained)["state_dict"]
     with pytest.raises(SystemExit, match="holds a run already"):
@@ -204,82 +186,24 @@ def test_a_finished_run_is_not_written_over(trained, overlay, configs):
     assert all(after[name].equal(value) for name, value in before.items())
 
 
-@pytest.mark.parametrize(
-    ("args", "message"),
-    [
-        (["test", "--ckpt_path", "best"], "checkpoints/best.ckpt: no such checkpoint"),
-        (["fit", "--data.root", "nowhere"], "nowhere"),
-        (["fit", "--data.motion", "-1"], "motion: expected 0 or more, got -1"),
-        (["fit", "--model.network.frames", "40"], "frames, window, stride: expected odd frames"),
-        (["fit", "--data.pattern", "BGGR"], "pattern"),
-        (["fit", "--model.network.motion_fusion", "assembled"], "flow: expected 'estimated' with motion_fusion"),
-        (["test", "--model.weights", "spike2flow"], "expected weights of a network, got spike2flow, of"),
-        (["fit", "--model.network", "ClassicalDecoder"], "fit: expected a network that learns, got ClassicalDecoder"),
-        (["fit", "--trainer.enable_checkpointing", "false"], "trainer.enable_checkpointing: expected true"),
-        (["fit", "--trainer.limit_val_batches", "0"], "trainer.limit_val_batches: expected more than 0"),
-        (["fit", "--data.workers", "-1"], "data.workers: expected 0 or more, got -1"),
-    ],
-)
-def test_errors_are_one_line(args, message, configs, tmp_path, overlay):
-    with pytest.raises(SystemExit) as exit:
-        main([args[0], "-c", str(configs / "x4.yaml"), *args[1:], "-o", str(tmp_path / "run")])
-    assert message in str(exit.value)
-    assert str(exit.value).startswith("lightning: ")
-    assert "\n" not in str(exit.value)
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("verb", ["fit", "validate", "test", "sweep"])
-@pytest.mark.parametrize("inside", ["", "run"])
-def test_a_file_is_no_folder_for_the_output(verb, inside, configs, tmp_path):
-    (tmp_path / "file").touch()
-    config = [str(configs / "x4.yaml")] if verb == "sweep" else ["-c", str(configs / "x4.yaml")]
-    with pytest.raises(SystemExit) as exit:
-        main([verb, *config, "-o", str(tmp_path / "file" / inside)])
-    assert str(exit.value) == f"lightning: -o: expected a folder, got the file {tmp_path / 'file'}"
-
-
-@pytest.mark.parametrize("typed", [[], ["foo"]])
-def test_every_verb_is_named_where_none_was_typed(typed):
-    with pytest.raises(SystemExit) as exit:
-        main(typed)
-    verbs = "fit, validate, test, predict, sweep, trade, adapt, export, models"
-    got = typed[0] if typed else "none"
-    assert str(exit.value) == f"lightning: expected a verb, one of {verbs}, got {got} (see lightning --help)"
-
-
-@pytest.mark.parametrize("verb", ["fit", "validate", "test"])
-def test_the_short_help_names_options_that_there_are(verb, capsys):
-    main([verb, "--help"])
-    assert len(capsys.readouterr().out.splitlines()) < 40
-    with pytest.raises(SystemExit):
-        main([verb, "--help=all"])
-    text = capsys.readouterr().out
-    assert [option for option in options_of(verb) if option not in text] == []
-
-
-@pytest.mark.parametrize(
-    ("typed", "said"),
-    [
-        (["--data.patern", "RGGB"], "data: Option 'patern' is not accepted"),
-        (["--trainer.logger", "WandbLogger"], "Requirement 'wandb"),
-        (["--data.patch", "many"], "data.patch: expected int, got 'many'"),
-        (["--trainer.callbacks", "Foo"], "trainer.callbacks: expected the name of a class, got Foo"),
-    ],
-)
-def test_a_mistake_is_one_line_with_its_cause(typed, said, configs, tmp_path, capsys):
-    with pytest.raises(SystemExit) as exit:
-        main(["fit", "-c", str(configs / "x4.yaml"), *typed, "-o", str(tmp_path / "out")])
-    shown = capsys.readouterr().err + (exit.value.code if isinstance(exit.value.code, str) else "")
-    assert said in shown
-    assert len(shown.strip().splitlines()) == 1
+def test_the_short_help_names_options_that_there_are(capsys):
+    main(["fit", "--help"])
+    short, known = capsys.readouterr().out, ""
+    assert len(short.splitlines()) < 30
+    for more in ("--help=all", "--model.help=SuperResolution", "--data.help=StillScenes"):
+        with pytest.raises(SystemExit):
+            main(["fit", more])
+        known += capsys.readouterr().out
+    named = re.findall(r"^  (-[\w.-]+)", short, re.MULTILINE)
+    assert "--model.weights" in named
+    assert [option for option in named if option not in known] == []
 
 
 def test_a_number_of_batches_is_no_share(configs, overlay, tmp_path):
     words = ["fit", "-c", str(configs / "x4.yaml"), "-c", str(overlay), "-o", str(tmp_path)]
-    command = run_command([*words, "--trainer.limit_val_batches", "1"], Fit)
-    assert command.trainer.limit_val_batches == 1
-    assert isinstance(command.trainer.limit_val_batches, int)
+    words += ["--trainer.limit_val_batches", "1", "--trainer.limit_train_batches", "1.0", "--trainer.logger", "false"]
+    trainer = run_command(words, Fit).trainer
+    assert repr((trainer.limit_val_batches, trainer.limit_train_batches)) == "(1, 1.0)"
 
 
 def test_help_answers_without_lightning():
@@ -357,23 +281,19 @@ def _checkpoint(begun, overlay, configs, tmp_path):
 )
 def test_a_run_does_not_go_on_with_what_the_checkpoint_would_override(checkpoint, change, said):
     words, path = checkpoint
-    with pytest.raises(InputError, match=said) as refused:
+    with pytest.raises(InputError, match=said):
         run_command([*words, change], Fit)
-    assert "\n" not in str(refused.value)
     assert [file.name for file in path.parents[1].iterdir()] == ["checkpoints"]
 
 
-@pytest.mark.parametrize("lacking", ["epoch", "global_step", "optimizer_states", "lr_schedulers", "loops"])
+@pytest.mark.parametrize("lacking", ["optimizer_states", "loops"])
 def test_a_run_does_not_go_on_from_weights_alone(checkpoint, lacking):
     words, path = checkpoint
     content = torch.load(path, weights_only=True)
     del content[lacking]
     torch.save(content, path)
-    with pytest.raises(
-        InputError, match=rf"last.ckpt: training cannot resume from this checkpoint: .*{lacking}"
-    ) as refused:
+    with pytest.raises(InputError, match=rf"last.ckpt: training cannot resume from this checkpoint: .*{lacking}"):
         run_command(words, Fit)
-    assert "\n" not in str(refused.value)
 
 
 def test_a_run_goes_on_for_longer_with_other_data_and_from_older_checkpoints(checkpoint):
@@ -383,35 +303,6 @@ def test_a_run_goes_on_for_longer_with_other_data_and_from_older_checkpoints(che
     del content["recipe"]
     torch.save(content, path)
     run_command([*words, "--model.optimizer.lr=1e-3"], Fit)
-
-
-@pytest.mark.parametrize(("logger", "expected"), [("null", 1), ("true", 1), ("false", 0)])
-def test_the_learning_rate_is_monitored_where_there_is_a_logger(logger, expected, overlay, configs, tmp_path):
-    words = ["fit", "-c", str(configs / "x4.yaml"), "-c", str(overlay), "-o", str(tmp_path)]
-    trainer = run_command([*words, f"--trainer.logger={logger}"], Fit).trainer
-    assert sum(isinstance(callback, LearningRateMonitor) for callback in trainer.callbacks) == expected
-
-
-def test_configurations_are_found_however_they_are_typed():
-    words = ["fit", "-cA.yaml", "-c=B.yaml", "-c", "C.yaml", "--config=D=.yaml", "--data.motion", "-1"]
-    found = [value for _, option, value in options(words) if option in ("-c", "--config")]
-    assert found == ["A.yaml", "B.yaml", "C.yaml", "D=.yaml"]
-    assert behind_configurations(["fit", "-cA.yaml", "--x=1"], ["more"]) == ["fit", "-cA.yaml", "more", "--x=1"]
-
-
-def test_help_explains_every_option(configs, capsys):
-    with pytest.raises(SystemExit):
-        main(["fit", "-c", str(configs / "x4.yaml"), "--help=all"])
-    text = " ".join(capsys.readouterr().out.split())
-    for option, words in (
-        ("--model.network.width", "channels of refinement and reconstruction"),
-        ("--model.network.stride", "spike frames between two time points"),
-        ("--data.brightness", "darkest and brightest exposure"),
-        ("--output", "Folder of the run"),
-        ("--trainer.max_steps", "Stop training after this number of steps"),
-    ):
-        assert option in text
-        assert words in text
 
 
 def test_the_scales_differ_in_the_scale_alone(configs):
