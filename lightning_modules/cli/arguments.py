@@ -11,7 +11,6 @@ from typing import Any
 
 import yaml
 
-from lightning_modules.inference.presets import Preset
 from lightning_modules.motion import ESTIMATORS, MotionEstimator
 from lightning_modules.networks import NETWORKS
 from lightning_modules.storage.pretrained import check_weights, read_weights
@@ -20,25 +19,6 @@ from spikekit.arguments import one_line
 from spikekit.io.failures import no_pipe
 
 WEIGHTS = "--model.weights", "--model.init_args.weights"
-
-#: options that the arguments of a preset are, in the order in which they are typed
-_PRESET = {
-    "weights": "--model.weights",
-    "network": "--model.network",
-    "method": "--model.network.method",
-    "window": "--model.network.window",
-    "order": "--model.network.order",
-    "scale": "--model.network.scale",
-    "frames": "--model.network.frames",
-    "motion": "--model.network.motion",
-    "motion_weights": "--model.network.motion.weights",
-    "motion_iterations": "--model.network.motion.iterations",
-    "tile": "--tile",
-    "psnr_tolerance": "--psnr_tolerance",
-    "self_ensemble": "--self_ensemble",
-    "interpolated": "--interpolated",
-    "precision": "--trainer.precision",
-}
 
 
 def with_network_of_weights(args: Sequence[str]) -> list[str]:
@@ -136,32 +116,3 @@ def inner_arguments(choice: Any) -> dict[str, Any]:
         return {}
     inner = choice.get("init_args")
     return {**choice, **inner} if isinstance(inner, dict) else choice
-
-
-def preset_arguments(preset: Preset) -> list[str]:
-    """Return the arguments of a setting of ``lightning trade`` that make a preset.
-
-    Example:
-        >>> preset_arguments(Preset("cscsr_small_x4", motion="ZeroFlow", tile=64))
-        ['--model.weights', 'cscsr_small_x4', '--model.network.motion', 'ZeroFlow', '--tile', '64']
-    """
-    return [word for name, text in preset.write().items() if text for word in (_PRESET[name], text)]
-
-
-def arguments_preset(args: Sequence[str]) -> Preset | None:
-    """Return the preset that arguments describe; ``None`` if a preset cannot express them.
-
-    Example:
-        >>> arguments_preset(["--model.weights=cscsr_small_x4"]).weights
-        'cscsr_small_x4'
-        >>> arguments_preset(["--config", "my.yaml"])
-    """
-    words = [part for word in args for part in (word.split("=", 1) if word.startswith("--") else [word])]
-    names = {option: name for name, option in _PRESET.items()}
-    given = {names.get(option): value for option, value in zip(words[::2], words[1::2], strict=False)}
-    if None in given or 2 * len(given) != len(words):
-        return None
-    try:
-        return Preset.read(given)
-    except ValueError:
-        return None

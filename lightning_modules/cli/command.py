@@ -28,6 +28,7 @@ from lightning_modules.cli.folder_lock import check_folder, locked_folder
 from lightning_modules.cli.reasons import reason
 from lightning_modules.configurations import with_found_configs
 from lightning_modules.data.loading import end_when_orphaned
+from lightning_modules.inference.reconstruct import precision_of
 from lightning_modules.storage.checkpoint import read_checkpoint
 from lightning_modules.storage.pretrained import check_settings
 from lightning_modules.tasks import optical_flow, super_resolution  # noqa: F401  (classes that --model names)
@@ -207,7 +208,8 @@ class Command(LightningCLI):
             kwargs["logger"] = TensorBoardLogger(output, name="", version="") if self.subcommand == "fit" else False
         kwargs["plugins"] = [Checkpoints(), *_listed(config.get("plugins"))]
         if config.get("precision") is None:
-            kwargs["precision"] = precision_of(config.get("accelerator"))
+            gpu = config.get("accelerator") in ("auto", "gpu", "cuda") and torch.cuda.is_available()
+            kwargs["precision"] = precision_of(torch.device("cuda")) if gpu else "32-true"
         kwargs["callbacks"] = [*_listed(config.get("callbacks")), *self._callbacks(output)]
         if self.subcommand != "fit":
             self.save_config_callback = None  # config.yaml is the record of the training
@@ -272,12 +274,6 @@ def _check_continuation(path: str, model: BaseTask, trainer: Trainer | None) -> 
             raise UsageError(f"model.{name}: expected {expected}, got {here.get(key)}; {anew}")
     if trainer is not None:  # a rehearsal has none
         check_resume(path, model, trainer)
-
-
-def precision_of(accelerator: str) -> str:
-    """Return bfloat16 for a GPU that supports it, float32 otherwise."""
-    wanted = accelerator in ("auto", "gpu", "cuda") and torch.cuda.is_available() and torch.cuda.is_bf16_supported()
-    return "bf16-mixed" if wanted else "32-true"
 
 
 def without_chatter() -> None:

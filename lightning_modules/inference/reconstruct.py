@@ -38,8 +38,6 @@ _APART, _FARTHER_APART = 6, 12
 _WRITING = 7e-5
 # white pixels between two pictures
 _GAP = 4
-# spikes of a white pixel in a clip, below which pictures by a decoder are mostly noise
-_ENOUGH = 8
 
 
 def reconstruct(
@@ -299,16 +297,7 @@ def _digest(values: Any) -> str:
 
 
 def grey_model(models: Sequence[Model], speed: str, film: bool) -> Model | None:
-    """Return the weights that a speed stands for: the largest for ``best``, the smallest for ``fastest``.
-
-    Args:
-        models: those for grey cameras at one scale.
-        speed: one of ``SPEEDS``.
-        film: whether pictures are near enough to know each other; weights that make use of it are picked, if any.
-
-    Raises:
-        ValueError: another speed.
-    """
+    """Return those of the weights for grey cameras that a speed stands for, from the smallest to the largest."""
     if speed not in SPEEDS:
         raise ValueError(f"speed: expected one of {', '.join(SPEEDS)}, got {speed!r}")
     able = [model for model in models if model.film == film] or [model for model in models if not model.film]
@@ -357,9 +346,9 @@ def _chosen(
             "--interpolated 0 makes all by the network"
         )
     if speed:
-        ideal = choose(speed=speed, frames=recording.frames, **asked)
-        said += _longer(ideal, choice, clips)
-    said += _sensor(choice.preset, recording, scale, noisy) + _noise(choice.preset, white)
+        said += _longer(choose(speed=speed, frames=recording.frames, **asked), choice, recording)
+    if noisy:
+        said.append(_unmeasured(choice.preset, recording, scale))
     return replace(choice.preset, interpolated=interpolated or None), said
 
 
@@ -371,34 +360,20 @@ def _interpolated(preset: Preset, every: int, speed: str | None) -> int:
     return max(apart // every - 1, 0)
 
 
-def _longer(ideal: Choice, choice: Choice, clips: RecordingClips) -> list[str]:
+def _longer(ideal: Choice, choice: Choice, recording: Recording) -> list[str]:
     """Return a hint where clips at the ends of the recording keep longer ones from being chosen."""
     gain, half = ideal.psnr - choice.psnr, ideal.preset.clip // 2
     if ideal.preset.clip <= choice.preset.clip or gain < _WORTH_ROOM:
         return []
-    return [
-        f"clips of {ideal.preset.clip} frames would be about {gain:.1f} dB better: --frame "
-        f"{half}:{clips.recording.frames - half} leaves room for them"
-    ]
+    leaves = f"--frame {half}:{recording.frames - half} leaves room for them"
+    return [f"clips of {ideal.preset.clip} frames would be about {gain:.1f} dB better: {leaves}"]
 
 
-def _sensor(preset: Preset, recording: Recording, scale: int, noisy: bool) -> list[str]:
+def _unmeasured(preset: Preset, recording: Recording, scale: int) -> str:
     """Return what follows for a camera whose pixels nobody measured."""
-    if not noisy:
-        return []
     model = find_model(preset.weights or "")
     dark = ", with a recording in the dark," if recording.calibration is not None else ""
     measure = f"spikekit calibrate{dark} measures it, --calibration none takes it for ideal"
-    if model and model.noise:
-        return [f"nobody has measured this sensor: weights trained for noisy ones, dB as for ideal ones; {measure}"]
-    return [f"nobody has measured this sensor, and there are no weights for noisy ones at scale {scale}; {measure}"]
-
-
-def _noise(preset: Preset, white: float) -> list[str]:
-    """Return a hint where a decoder has too few spikes for a picture, by those of a white pixel in a frame."""
-    if not preset.method or (spikes := white * preset.clip) >= _ENOUGH:
-        return []
-    return [
-        f"a white pixel fires {spikes:.1f} times in {preset.clip} frames: a decoder's picture is noisy; --speed fast "
-        "and slower ones use a network, which sees less noise"
-    ]
+    noisy = "weights trained for noisy ones, dB as for ideal ones"
+    said = noisy if model and model.noise else f"there are no weights for noisy ones at scale {scale}"
+    return f"nobody has measured this sensor: {said}; {measure}"

@@ -5,16 +5,20 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Sequence
-from dataclasses import replace
 from inspect import signature
 from typing import NamedTuple
 
-from lightning_modules.cli.arguments import arguments_preset, preset_arguments
 from lightning_modules.cli.errors import UsageError
 from lightning_modules.inference.presets import Preset
 from lightning_modules.networks import Network
 from lightning_modules.registry import Model, list_models
 from spikekit.decoders.methods import DECODERS
+
+#: columns of a table, by the options that say the same
+_COLUMNS = {f"--model.network.{name}": name for name in ("method", "window", "order", "scale", "frames", "motion")}
+_COLUMNS |= {f"--model.network.motion.{name}": f"motion_{name}" for name in ("weights", "iterations")}
+_COLUMNS |= {f"--{name}": name for name in ("tile", "psnr_tolerance", "self_ensemble", "interpolated")}
+_COLUMNS |= {"--model.weights": "weights", "--model.network": "network", "--trainer.precision": "precision"}
 
 
 class Setting(NamedTuple):
@@ -23,12 +27,32 @@ class Setting(NamedTuple):
     Args:
         name: what it is called.
         args: arguments of ``lightning test`` that make it, behind those that all settings share.
-        preset: the same as columns of a table; ``None`` where the arguments say what a preset cannot.
     """
 
     name: str
     args: list[str]
-    preset: Preset | None = None
+
+    @property
+    def preset(self) -> Preset | None:
+        """The same as columns of a table; ``None`` where the arguments say what a preset cannot.
+
+        Example:
+            >>> Setting("small", ["--model.weights=cscsr_small_x4"]).preset.weights
+            'cscsr_small_x4'
+            >>> Setting("mine", ["--config", "my.yaml"]).preset
+        """
+        words = [part for word in self.args for part in (word.split("=", 1) if word.startswith("--") else [word])]
+        given = {_COLUMNS.get(option): value for option, value in zip(words[::2], words[1::2], strict=False)}
+        if (
+            None in given
+            or 2 * len(given) != len(words)
+            or given.get("network", "ClassicalDecoder") != "ClassicalDecoder"
+        ):
+            return None
+        try:
+            return Preset.read(given)
+        except ValueError:
+            return None
 
     @property
     def text(self) -> str:
@@ -63,27 +87,27 @@ def read_setting(text: str) -> Setting:
     if not named and not typed.lstrip().startswith("-"):
         expected = "expected arguments of lightning test, or a name, a colon and such arguments"
         raise UsageError(f"--setting: {expected}, as in 'small tiles: --tile 32', got {text!r}")
-    return Setting(named[1].strip() if named else shlex.join(args), args, arguments_preset(args))
+    return Setting(named[1].strip() if named else shlex.join(args), args)
 
 
-#: what is tried on every network: behind its name, and what it changes
-_NO_MOTION, _TWO_VIEWS = ("no motion", {"motion": "ZeroFlow"}), ("self-ensemble of 2", {"self_ensemble": 2})
+#: what is tried on every network: behind its name, and what is typed for it
+_NO_MOTION, _TWO_VIEWS = ("no motion", "--model.network.motion ZeroFlow"), ("self-ensemble of 2", "--self_ensemble 2")
 
 #: what is tried on the largest, besides: a larger network is worth more than more views of a smaller one
-_MOST = [(f"self-ensemble of {views}", {"self_ensemble": views}) for views in (4, 8)]
+_MOST = [(f"self-ensemble of {views}", f"--self_ensemble {views}") for views in (4, 8)]
 
 #: what is tried on the reference, besides
+_SPIKE2FLOW = "--model.network.motion Spike2Flow --model.network.motion.weights spike2flow"
 _VARIANTS = [
-    ("bf16-true", {"precision": "bf16-true"}),
-    ("bf16-mixed", {"precision": "bf16-mixed"}),
-    ("no tiles", {"tile": 0}),
-    ("tiles of 64", {"tile": 64}),
-    ("tolerance 0.1 dB", {"psnr_tolerance": 0.1}),
-    ("tolerance 0.5 dB", {"psnr_tolerance": 0.5}),
+    ("Spike2Flow", _SPIKE2FLOW),
+    ("Spike2Flow, once", f"{_SPIKE2FLOW} --model.network.motion.iterations 1"),
+    ("bf16-true", "--trainer.precision bf16-true"),
+    ("bf16-mixed", "--trainer.precision bf16-mixed"),
+    ("no tiles", "--tile 0"),
+    ("tiles of 64", "--tile 64"),
+    ("tolerance 0.1 dB", "--psnr_tolerance 0.1"),
+    ("tolerance 0.5 dB", "--psnr_tolerance 0.5"),
 ]
-
-_SPIKE2FLOW = {"motion": "Spike2Flow", "motion_weights": "spike2flow"}
-_LEARNED = [("Spike2Flow", _SPIKE2FLOW), ("Spike2Flow, once", {**_SPIKE2FLOW, "motion_iterations": 1})]
 
 
 def usual_settings(
@@ -108,35 +132,34 @@ def usual_settings(
     models.sort(key=lambda model: model.macs)
     largest = models[-1].name if models else None
     reference = _reference(models) if models else None
-    networks = {one.name: Preset(one.name) for one in sorted(models, key=lambda one: one is not reference)}
+    networks = {one.name: f"--model.weights {one.name}" for one in sorted(models, key=lambda one: one is not reference)}
     if own:
-        networks, largest = {"own weights": Preset()}, "own weights"
-    lacking: set[str] = set()
-    if network is not None:
-        lacking = {"motion"} - signature(type(network)).parameters.keys()
-        if network.halo is None:  # it is never cut into tiles
-            lacking |= {"tile", "psnr_tolerance"}
-    presets = dict(networks)
-    for place, (weights, preset) in enumerate(networks.items()):
-        more = [_TWO_VIEWS, *(_MOST if weights == largest else []), *([*_LEARNED, *_VARIANTS] if place == 0 else [])]
-        fixed = {"motion"} if preset.network else set()
+        networks, largest = {"own weights": ""}, "own weights"
+    lacking: tuple[str, ...] = ()
+    if network is not None and "motion" not in signature(type(network)).parameters:
+        lacking += ("--model.network.motion",)
+    if network is not None and network.halo is None:  # it is never cut into tiles
+        lacking += "--tile", "--psnr_tolerance"
+    typed = dict(networks)
+    for place, (weights, text) in enumerate(networks.items()):
+        more = [_TWO_VIEWS, *(_MOST if weights == largest else []), *(_VARIANTS if place == 0 else [])]
         for name, changes in [_NO_MOTION, *([] if film else more)]:
-            if not (lacking | fixed) & changes.keys():
-                presets[f"{weights}, {name}"] = replace(preset, **changes)
-    usual = {"frames": 41} if frames > 41 else {}  # of a picture by a decoder, whatever a network sees
+            if not changes.startswith(lacking):
+                typed[f"{weights}, {name}"] = f"{text} {changes}"
     decoders = {
-        name: Preset(network="ClassicalDecoder", scale=scale, method=method, **usual, **options)
+        name: {"method": method, "scale": scale, **({"frames": 41} if frames > 41 else {}), **options}
         for method, decoder in DECODERS.items()
         for name, options in decoder.shown.items()
     }
-    if usual:  # in little light a decoder, too, gains by what it sees of a longer clip
+    if frames > 41:  # in little light a decoder, too, gains by what it sees of a longer clip
         window = 2 * ((frames - 1) // 6) + 1
-        longer = Preset(network="ClassicalDecoder", scale=scale, method="tfp", window=window, order=3, frames=frames)
+        longer = {"method": "tfp", "scale": scale, "window": window, "order": 3, "frames": frames}
         decoders[f"TFP {window}, order 3"] = longer
-    without = [word for option in own for word in (option, "null")]  # decoders take no weights
-    return [Setting(name, preset_arguments(preset), preset) for name, preset in presets.items()] + [
-        Setting(name, [*preset_arguments(preset), *without], preset) for name, preset in decoders.items()
-    ]
+    without = " ".join(f"{option} null" for option in own)  # decoders take no weights
+    for name, options in decoders.items():
+        given = " ".join(f"--model.network.{option} {value}" for option, value in options.items())
+        typed[name] = f"--model.network ClassicalDecoder {given} {without}"
+    return [Setting(name, text.split()) for name, text in typed.items()]
 
 
 def _reference(models: Sequence[Model]) -> Model:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from lightning_modules.inference import presets as speed
-from lightning_modules.inference.presets import SPEEDS, Choice, Preset, choices, choose, pace
+from lightning_modules.inference.presets import SPEEDS, Preset, choices, choose, pace
 from lightning_modules.inference.tiles import TILE
 from lightning_modules.networks import CSCSR, RecurrentCSCSR
 from lightning_modules.registry import find_model
@@ -68,14 +68,11 @@ def test_speeds(table, name, expected):
     ("budget", "size", "expected"),
     [
         ("400ms", (40, 50), "all"),
-        ("0.4s", (40, 50), "all"),
-        ("399 ms", (40, 50), "no motion"),
         ("399ms", (20, 50), "all"),
         ("399ms", (80, 100), "tfp"),
         ("20MiB", (40, 50), "small tiles"),
         ("20MB", (40, 50), "tfp"),
-        ("1GB", (40, 50), "all"),
-        ("2.5fps", (40, 50), "all"),
+        ("0.4s", (40, 50), "all"),
         ("2.6 fps", (40, 50), "no motion"),
     ],
 )
@@ -111,29 +108,17 @@ def test_little_light_has_tables_of_its_own(table, monkeypatch):
     """Those of films before those of pictures; without any, those of more light."""
     assert choose(3, "best", white=0.1).name == choose(3, "best").name == "all"
     lines = (table / "x3.csv").read_text().splitlines()
+    reference = next(line for line in lines if line.startswith("all,")).replace(",30.0,", ",20.0,")
     for name, best in (("x3_dim", "tfp"), ("x3_film", "tfi"), ("x3_dim_film", "no motion")):
-        rows = [line.replace(",29.", ",30.").replace(",25.0", ",30.9") for line in lines if line.startswith(best)]
-        reference = next(line for line in lines if line.startswith("all,"))
-        (table / f"{name}.csv").write_text("\n".join([lines[0], reference.replace(",30.0,", ",24.0,"), *rows]))
-        if name == "x3_dim":
-            assert choose(3, "best", white=0.1, film=True).name == "tfp"
-    found = {
-        (white, film): choose(3, "best", None, (40, 50), film, 41, white).name
-        for white in (0.05, 0.19, 0.2, 0.4)
-        for film in (False, True)
-    }
-    assert found == {
-        (0.05, False): "tfp",
-        (0.05, True): "no motion",
-        (0.19, False): "tfp",
-        (0.19, True): "no motion",
-        (0.2, False): "all",
-        (0.2, True): "tfi",
-        (0.4, False): "all",
-        (0.4, True): "tfi",
-    }
+        row = next(line for line in lines if line.startswith(f"{best},"))
+        (table / f"{name}.csv").write_text("\n".join([lines[0], reference, row]))
+    whites, films = (0.19, 0.2), (False, True)
+    found = [choose(3, "best", film=film, white=white).name for white in whites for film in films]
+    assert found == ["tfp", "no motion", "all", "tfi"]
     monkeypatch.setattr(speed, "pace", lambda *asked: asked[1] + asked[2])
     assert choose(3, budget="2s", size=(40, 50), film=True, white=0.1).where.split(",")[1].split()[2] == "1.1"
+    (table / "x3_dim_film.csv").unlink()
+    assert choose(3, "best", film=True, white=0.1).name == "tfp"
 
 
 def test_in_little_light_the_longer_clips_are_chosen():
@@ -144,15 +129,6 @@ def test_in_little_light_the_longer_clips_are_chosen():
         assert choose(4, "best", film=film, frames=101, white=0.4).preset.weights != weights
         # hardly slower than the other decoders, and 4 dB better
         assert choose(4, "fastest", film=film, frames=101, white=0.07).name == "TFP 33, order 3"
-
-
-@pytest.mark.parametrize(("column", "cell"), [("tile", "wide"), ("psnr", "-1"), ("height", "4.5"), ("ms", "inf")])
-def test_a_damaged_table_is_named(table, column, cell):
-    lines = (table / "x3.csv").read_text().splitlines()
-    row = dict(zip(HEADER, lines[2].split(","), strict=True)) | {column: cell}
-    (table / "x3.csv").write_text("\n".join([*lines[:2], ",".join(row.values()), *lines[3:]]))
-    with pytest.raises(ValueError, match=r"x3.csv: not a table of lightning trade, or a damaged one"):
-        choose(3, "best")
 
 
 @pytest.fixture(name="longer")
@@ -190,12 +166,6 @@ def test_memory_beyond_a_tile_is_that_of_the_picture_and_of_motion():
         assert found["no motion"] == pytest.approx(2 * pixels + 68 * tile)
 
 
-def test_memory_of_a_tile_goes_by_the_halo_of_the_weights(monkeypatch):
-    before = [choice.mib for choice in choices(4, (400, 500)) if choice.preset.weights]
-    monkeypatch.setattr(CSCSR, "halo", 30)
-    assert [choice.mib for choice in choices(4, (400, 500)) if choice.preset.weights] == before
-
-
 @pytest.mark.parametrize(("here", "expected"), [(2.0, "no motion"), (0.1, "all"), (50.0, "tfi")])
 def test_a_budget_of_time_is_one_of_this_machine(table, monkeypatch, here, expected):
     monkeypatch.setattr(speed, "pace", lambda *_: here)
@@ -226,13 +196,6 @@ def test_pace_is_measured_on_the_reference(monkeypatch):
     assert seen == [(CSCSR, (1, 41, 20, 25), {})] * 2
 
 
-def test_what_it_says(table):
-    said = str(choose(3, "fast", size=(80, 50)))
-    assert said == "tfp: about 20 ms and 10 MiB a frame on the machine of the table, 0.40 dB below the best"
-    slow = Choice("slow", Preset("cscsr_huge_x4"), 24.0, 0.0, ms=15_500, mib=2048)
-    assert str(slow).startswith("slow: about 15.5 s and 2 GiB a frame")
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -260,25 +223,10 @@ def test_presets_are_read_as_they_are_written():
         Preset.read({"tile": "wide"})
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"network": "CSCSR"}, "network: expected 'ClassicalDecoder', or weights of another, got 'CSCSR'"),
-        (DECODER | WEIGHTS, "weights: expected none with network='ClassicalDecoder', got 'tiny.ckpt'"),
-        (WEIGHTS | {"scale": 3}, "scale: expected the name of a network with it, got None"),
-        (WEIGHTS | {"frames": 41}, "frames: expected the name of a network with it, got None"),
-        (WEIGHTS | {"window": 5}, "window: expected network='ClassicalDecoder' with it, got None"),
-        (WEIGHTS | {"motion_iterations": 2}, "motion_iterations: expected the estimator's class as motion with it"),
-    ],
-)
-def test_presets_that_contradict_themselves(given, message):
-    with pytest.raises(ValueError, match=message):
-        Preset(**given)
-
-
 def test_presets_that_cannot_be_built():
-    with pytest.raises(ValueError, match="expected weights or the name of a network"):
-        Preset(tile=32).build()
+    for nothing in (Preset(tile=32), Preset(network="CSCSR")):
+        with pytest.raises(ValueError, match="preset: expected weights, or ClassicalDecoder as network"):
+            nothing.build()
     with pytest.raises(ValueError, match=r"motion: expected one of .*ZeroFlow.*, got 'os'"):
         Preset("cscsr_small_x4", motion="os").build()
     with pytest.raises(FileNotFoundError, match="nowhere"):

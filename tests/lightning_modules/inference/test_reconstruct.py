@@ -76,9 +76,8 @@ def test_a_dim_recording_is_shown_bright(tmp_path):
     assert rgb.max() < 0.2
 
 
-@pytest.mark.parametrize("speed", ["best", "balanced", "fast", "fastest"])
-def test_weights_for_noise_are_chosen_where_nobody_has_measured_the_sensor(flat, speed):
-    pictures = reconstruct(flat(0.4), speed)
+def test_weights_for_noise_are_chosen_where_nobody_has_measured_the_sensor(flat):
+    pictures = reconstruct(flat(0.4), "fastest")
     assert find_model(pictures.notes[0].split(",")[0].split(":")[0]).noise
     assert "nobody has measured this sensor" in pictures.notes[-1]
 
@@ -91,15 +90,6 @@ def test_ideal_sensors_get_the_weights_for_them(flat, tmp_path, monkeypatch):
     spikekit_main(["simulate", "photo.png", "-o", "a.dat", "--scale", "1"])
     simulated = reconstruct("a.dat", "fastest")
     assert isinstance(simulated.network, ClassicalDecoder)
-
-
-@pytest.mark.parametrize(
-    ("white", "speed", "hint"), [(0.05, "fastest", True), (0.4, "fastest", False), (0.05, "fast", False)]
-)
-def test_a_decoder_of_a_dark_recording_is_said_to_be_noisy(flat, white, speed, hint):
-    pictures = reconstruct(flat(white), speed, calibration="none")
-    assert isinstance(pictures.network, ClassicalDecoder) == (speed == "fastest")
-    assert any("picture is noisy" in line for line in pictures.notes) == hint
 
 
 @pytest.mark.parametrize(
@@ -120,7 +110,7 @@ def test_a_white_that_is_given_decides_what_is_little_light(flat):
 
 @pytest.mark.parametrize(
     ("every", "speed", "interpolated"),
-    [(1, "balanced", 11), (6, "balanced", 1), (3, "best", 1), (4, "best", 0), (20, "balanced", 0), (3, "fastest", 0)],
+    [(1, "balanced", 11), (3, "best", 1), (4, "best", 0), (20, "balanced", 0), (3, "fastest", 0)],
 )
 def test_pictures_close_to_each_other_are_interpolated(flat, every, speed, interpolated):
     pictures = reconstruct(flat(0.3), speed, frame=f"60:120:{every}", calibration="none")
@@ -134,23 +124,21 @@ def test_a_film_is_that_of_the_stream_and_parts_of_it_are_the_same(recording):
     network = RecurrentCSCSR(**TINY).eval()
     for weight in (network.fusion.share.weight, network.fusion.rest.weight):
         torch.nn.init.normal_(weight, std=0.05)
-    for future in (0, 3):
-        pictures = reconstruct(recording, network=network, frame="20:79:10", white=0.3, future=future, **EXACT)
-        unbroken = dict(pictures)
-        shown = dict(film(network, [read_spikes(recording)], 10, future=future, white=0.3))
-        assert unbroken.keys() == shown.keys()
-        for clock, rgb in shown.items():
-            torch.testing.assert_close(unbroken[clock], rgb)
-        parts = [dict(pictures.pictures(part=(n, 2))) for n in range(2)]
-        again = dict(pictures.pictures(made=[20, 30, 50, 60]))
-        assert again.keys() == {40, 70}
-        for found in (*parts, again):
-            assert all(torch.allclose(rgb, unbroken[clock]) for clock, rgb in found.items())
-        assert [*parts[0], *parts[1]] == [*unbroken]
+    pictures = reconstruct(recording, network=network, frame="20:79:10", white=0.3, future=3, **EXACT)
+    unbroken = dict(pictures)
+    shown = dict(film(network, [read_spikes(recording)], 10, future=3, white=0.3))
+    assert unbroken.keys() == shown.keys()
+    for clock, rgb in shown.items():
+        torch.testing.assert_close(unbroken[clock], rgb)
+    parts = [dict(pictures.pictures(part=(n, 2))) for n in range(2)]
+    again = dict(pictures.pictures(made=[20, 30, 50, 60]))
+    assert again.keys() == {40, 70}
+    for found in (*parts, again):
+        assert all(torch.allclose(rgb, unbroken[clock]) for clock, rgb in found.items())
+    assert [*parts[0], *parts[1]] == [*unbroken]
 
 
-@pytest.mark.parametrize("parts", [1, 2, 3])
-@pytest.mark.parametrize(("future", "interpolated"), [(0, 0), (2, 0), (0, 2), (1, 1)])
+@pytest.mark.parametrize(("parts", "future", "interpolated"), [(1, 0, 0), (2, 2, 0), (3, 0, 2), (3, 1, 1)])
 def test_what_comes_before_a_wanted_picture_is_seen_again(recording, parts, future, interpolated):
     network = RecurrentCSCSR(**TINY).eval()
     network.warm_up = 4

@@ -14,7 +14,6 @@ import torch
 from pytorch_lightning import LightningDataModule
 
 from lightning_modules.__main__ import main
-from lightning_modules.cli.arguments import arguments_preset
 from lightning_modules.cli.errors import InputError, UsageError
 from lightning_modules.data import FilmScenes
 from lightning_modules.inference import presets
@@ -251,8 +250,8 @@ def test_usual_settings_are_the_networks_of_the_package_and_the_decoders():
     assert settings["cscsr_tiny_x4, no motion"].preset == Preset("cscsr_tiny_x4", motion="ZeroFlow")
     assert len([name for name in settings if name.startswith("cscsr_tiny_x4")]) == 3
     assert len([name for name in settings if name.startswith("cscsr_huge_x4")]) == 5  # larger ensembles of the largest
-    assert settings["TFI"].args[-3:] == ["tfi", "--model.network.scale", "4"]
-    assert all(arguments_preset(setting.args) == setting.preset for setting in settings.values())
+    assert settings["TFI"].preset == Preset(network="ClassicalDecoder", method="tfi", scale=4)
+    assert all(setting.preset is not None for setting in settings.values())
 
 
 def test_usual_settings_of_ones_own_weights_take_the_place_of_the_package():
@@ -288,7 +287,7 @@ def test_usual_settings_of_longer_scenes_have_networks_and_decoders_of_longer_cl
 @pytest.mark.parametrize("name", ["small tiles", "a, b|c", "it's"])
 @pytest.mark.parametrize("args", [[], ["-c", "my file.yaml"], ["--model.network.motion", "{class_path: ZeroFlow}"]])
 def test_settings_are_read_as_they_are_written(name, args):
-    assert read_setting(Setting(name, args).text)[:2] == (name, args)
+    assert read_setting(Setting(name, args).text) == (name, args)
 
 
 @pytest.mark.parametrize(
@@ -309,7 +308,7 @@ def test_what_is_typed_is_a_preset_where_columns_can_say_it(typed, preset):
 
 
 def test_a_setting_without_a_name_is_called_by_its_arguments():
-    assert read_setting("--tile  8") == ("--tile 8", ["--tile", "8"], Preset(tile=8))
+    assert read_setting("--tile  8") == ("--tile 8", ["--tile", "8"])
     setting = read_setting("-c 'a: b.yaml'")
     assert setting.args == ["-c", "a: b.yaml"]
     assert read_setting(setting.text) == setting
