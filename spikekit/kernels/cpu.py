@@ -100,25 +100,6 @@ def _integrate_tile(light: np.ndarray, theta: np.floating, charge: np.ndarray, s
     return charge
 
 
-def integrate_fire_grad(grad: Tensor, light: Tensor, threshold: float) -> Tensor:
-    """Three passes over memory: gradient and light in, gradient out."""
-    result = _Output(grad.shape, grad.dtype)
-    grads, lights = _flat(grad), _flat(light)
-    theta = _wide(grad.dtype)(threshold)
-    for tile, out in result.tiles():
-        planes = zip(_read(grads, tile), _read(lights, tile), out, strict=True)
-        linear, beyond = np.empty(out.shape[1:], bool), np.empty(out.shape[1:], bool)
-        mask = np.empty(out.shape[1:], f"i{out.itemsize}")
-        for grad_t, light_t, out_t in planes:
-            np.greater_equal(light_t, 0, out=linear)
-            np.less_equal(light_t, theta, out=beyond)
-            np.logical_and(linear, beyond, out=linear)
-            np.negative(linear.view(np.int8), out=mask)  # all bits or none: 0 times infinity is not 0
-            np.divide(grad_t, theta, out=out_t)
-            np.bitwise_and(out_t.view(mask.dtype), mask, out=out_t.view(mask.dtype))
-    return result.tensor
-
-
 def spike_interval(spikes: Tensor) -> Tensor:
     """Read the spikes once, write the intervals twice."""
     interval = _Output(spikes.shape, torch.int16 if spikes.shape[-3] < 32767 else torch.int32)
@@ -193,34 +174,6 @@ def _store(value: np.ndarray, out: np.ndarray) -> None:
         np.rint(value, out=value)
         np.clip(value, 0, 255, out=value)
     np.copyto(out, value, casting="unsafe")
-
-
-def tfi_grad(grad: Tensor, spikes: Tensor, rate: Tensor) -> Tensor:
-    """Sum the gradient over every interval, spread the sum on it, and weigh it by the rate."""
-    result = _Output(spikes.shape, spikes.dtype)
-    grads, fired, rates = _flat(grad), _flat(spikes), _flat(rate)
-    for tile, out in result.tiles():
-        spikes_tile = _read(fired, tile)
-        plane = out.shape[1:]
-        chosen, running, sums = np.empty(plane, bool), np.zeros(plane, out.dtype), np.empty(out.shape, out.dtype)
-        bits = np.dtype(f"i{out.itemsize}")
-        mask, change = np.empty(plane, bits), np.empty(plane, bits)
-        for grad_n, spikes_n, sums_n in zip(_read(grads, tile), spikes_tile, sums, strict=True):
-            np.add(running, grad_n, out=sums_n)
-            np.equal(spikes_n, 0, out=chosen)
-            np.negative(chosen.view(np.int8), out=mask)
-            np.bitwise_and(sums_n.view(bits), mask, out=running.view(bits))
-        spread = sums[-1].copy()
-        for rate_n, spikes_n, sums_n, out_n in zip(
-            _read(rates, tile)[::-1], spikes_tile[::-1], sums[::-1], out[::-1], strict=True
-        ):
-            np.not_equal(spikes_n, 0, out=chosen)
-            np.negative(chosen.view(np.int8), out=mask)
-            np.bitwise_xor(spread.view(bits), sums_n.view(bits), out=change)
-            np.bitwise_and(change, mask, out=change)
-            np.bitwise_xor(spread.view(bits), change, out=spread.view(bits))
-            np.multiply(spread, rate_n, out=out_n)
-    return result.tensor
 
 
 def tfp(spikes: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Tensor:

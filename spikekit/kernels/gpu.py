@@ -97,26 +97,6 @@ def integrate_fire(light: Tensor, threshold: float, charge: Tensor, dtype: torch
     return _as(light, spikes), _as(charge, left)
 
 
-@triton.jit
-def _integrate_fire_grad_kernel(grad, light, threshold, result, size, block: tl.constexpr):
-    """A block of elements: two reads, one write."""
-    _, element, inside = my_pixels(size, block)
-    theta = tl.load(threshold)
-    value = tl.load(light + element, mask=inside, other=0).to(theta.dtype)
-    share = _divide(tl.load(grad + element, mask=inside, other=0).to(theta.dtype), theta)
-    linear = (value >= 0) & (value <= theta)
-    store(result + element, tl.where(linear, share, 0), inside)
-
-
-def integrate_fire_grad(grad: Tensor, light: Tensor, threshold: float) -> Tensor:
-    """Three passes over memory: gradient and light in, gradient out."""
-    flat, light = grad.detach().contiguous(), light.detach().contiguous()
-    result = torch.empty_like(flat)
-    arguments = flat, light, _scalar(threshold, light, wide_dtype(light)), result, result.numel()
-    launch(_integrate_fire_grad_kernel, triton.cdiv(result.numel(), _BLOCK), *arguments, block=_BLOCK)
-    return _as(grad, result)
-
-
 @triton.jit(do_not_specialize=["frames"])
 def _next_spike_kernel(spikes, following, first, frames, pixels, spikes_b, spikes_t, spikes_p, block: tl.constexpr):
     """Next spike of every frame, T where there is none, and the first complete interval, for a block of pixels.
@@ -187,64 +167,6 @@ def spike_interval(spikes: Tensor) -> Tensor:
 def tfi(spikes: Tensor, max_range: float, dtype: torch.dtype) -> Tensor:
     """Read the spikes once, write and read the next spike as int16, and write the light once."""
     return _intervals(spikes, max_range, dtype)
-
-
-@triton.jit(do_not_specialize=["frames"])
-def _sums_kernel(
-    grad, spikes, sums, frames, pixels, grad_b, grad_t, grad_p, spikes_b, spikes_t, spikes_p, block: tl.constexpr
-):
-    """Sums of the gradient since the last spike, for a block of pixels: two reads, one write."""
-    b, pixel, inside = my_pixels(pixels, block)
-    grad += b * grad_b + pixel * grad_p
-    spikes += b * spikes_b + pixel * spikes_p
-    grad_t, spikes_t = tl.cast(grad_t, tl.int64), tl.cast(spikes_t, tl.int64)
-    pixels = tl.cast(pixels, tl.int64)
-    sums += b * frames * pixels + pixel
-    total = tl.zeros([block], sums.dtype.element_ty)
-    for n in tl.range(frames, num_stages=_STAGES):
-        total += tl.load(grad + n * grad_t, mask=inside, other=0).to(total.dtype)
-        tl.store(sums + n * pixels, total, mask=inside)
-        fired = tl.load(spikes + n * spikes_t, mask=inside, other=0) != 0
-        total = tl.where(fired, 0, total)
-
-
-@triton.jit(do_not_specialize=["frames"])
-def _spread_kernel(
-    sums, spikes, rate, result, frames, pixels, spikes_b, spikes_t, spikes_p, rate_b, rate_t, rate_p,
-    block: tl.constexpr,
-):  # fmt: skip
-    """The sum at the end of every interval, weighed, on all its frames, for a block of pixels: three reads, one write.
-
-    The result may lie on ``sums``.
-    """
-    b, pixel, inside = my_pixels(pixels, block)
-    spikes += b * spikes_b + pixel * spikes_p
-    rate += b * rate_b + pixel * rate_p
-    spikes_t, rate_t = tl.cast(spikes_t, tl.int64), tl.cast(rate_t, tl.int64)
-    pixels = tl.cast(pixels, tl.int64)
-    sums += b * frames * pixels + pixel
-    result += b * frames * pixels + pixel
-    spread = tl.load(sums + (frames - 1) * pixels, mask=inside, other=0)
-    for i in tl.range(frames, num_stages=_STAGES):
-        n = frames - 1 - i
-        fired = tl.load(spikes + n * spikes_t, mask=inside, other=0) != 0
-        spread = tl.where(fired, tl.load(sums + n * pixels, mask=inside, other=0), spread)
-        share = spread * tl.load(rate + n * rate_t, mask=inside, other=0).to(spread.dtype)
-        store(result + n * pixels, share, inside)
-
-
-def tfi_grad(grad: Tensor, spikes: Tensor, rate: Tensor) -> Tensor:
-    """Sum the gradient over every interval, spread the sum on it, and weigh it by the rate."""
-    flat, fired, rates = _flat(grad), _flat(spikes), _flat(rate)
-    _, frames, pixels = flat.shape
-    result = fired.new_empty(fired.shape, dtype=spikes.dtype)
-    wide = wide_dtype(grad, spikes)
-    sums = result if result.dtype is wide else result.new_empty(result.shape, dtype=wide)
-    sizes = frames, pixels, *flat.stride(), *fired.stride()
-    launch(_sums_kernel, _blocks(flat), flat, fired, sums, *sizes, block=_BLOCK)
-    sizes = frames, pixels, *fired.stride(), *rates.stride()
-    launch(_spread_kernel, _blocks(flat), sums, fired, rates, result, *sizes, block=_BLOCK)
-    return _as(spikes, result)
 
 
 @triton.jit

@@ -28,13 +28,6 @@ def _integrate_fire(light: Tensor, threshold: float, charge: Tensor, dtype: torc
     return spikes, charge
 
 
-@operator(lambda grad, light, threshold: torch.empty_like(grad))
-def _integrate_fire_grad(grad: Tensor, light: Tensor, threshold: float) -> Tensor:
-    wide = torch.promote_types(light.dtype, torch.float32)
-    light, theta = light.to(wide), light.new_tensor(threshold, dtype=wide)
-    return torch.where((light >= 0) & (light <= theta), grad.to(wide) / theta, 0).to(grad.dtype)
-
-
 class _StraightThrough(torch.autograd.Function):
     generate_vmap_rule = True
 
@@ -50,26 +43,12 @@ class _StraightThrough(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad_spikes: Tensor, _: Tensor) -> tuple[Tensor, None, None, None]:
-        return _Linear.apply(grad_spikes, *ctx.saved_tensors, ctx.threshold), None, None, None
-
-
-class _Linear(torch.autograd.Function):
-    """The gradient, which is linear in the one that comes: differentiated again, the same once more."""
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(grad: Tensor, light: Tensor, threshold: float) -> Tensor:
-        return _integrate_fire_grad(grad, light, threshold)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-        _, light, ctx.threshold = inputs
-        ctx.save_for_backward(light)
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        return _Linear.apply(grad, *ctx.saved_tensors, ctx.threshold), None, None
+        (light,) = ctx.saved_tensors
+        wide = torch.promote_types(light.dtype, torch.float32)
+        theta = light.new_tensor(ctx.threshold, dtype=wide)
+        linear = (light.to(wide) >= 0) & (light.to(wide) <= theta)
+        # not a product: 0 times infinity is not 0
+        return torch.where(linear, grad_spikes.to(wide) / theta, 0).to(grad_spikes.dtype), None, None, None
 
 
 def spike_integrate_fire(

@@ -165,7 +165,6 @@ def test_compile_of_bits(op, dtype):
     ("op", "arguments"),
     [
         (torch.ops.spikekit.integrate_fire, ((SPIKES * 0.7).requires_grad_(), 1.0, RGB[:, 0], torch.float64)),
-        (torch.ops.spikekit.integrate_fire_grad, (SPIKES.clone().requires_grad_(), SPIKES * 0.7, 1.0)),
         (torch.ops.spikekit.tfi, (SPIKES.clone().requires_grad_(), 1.0, torch.float64)),
         (torch.ops.spikekit.tfi_grad, (SPIKES, SPIKES, SPIKES)),
         (torch.ops.spikekit.tfp, (SPIKES.clone().requires_grad_(), 3, 1.0, torch.float64)),

@@ -209,8 +209,6 @@ def compile_calls():
     for x, dtype in [*((stream, d) for d in FLOATS), (torch.zeros(1, 1, 1, 1), torch.float32)]:
         wide, x = torch.promote_types(dtype, torch.float32), x.to(dtype)
         yield "integrate_fire", x, 0.3, x[..., 0, :, :].to(wide), dtype
-        yield "integrate_fire_grad", x, x, 0.3
-        yield "tfi_grad", x, x, x
         yield "tfi", x > 0, 1.0, dtype
         yield "tfp", x > 0, 3, 1.0, dtype
         yield "tfp_grad", x, 3, 1.0, dtype
