@@ -10,18 +10,9 @@ from torch import Tensor
 
 
 def check_planes(name: str, value: Tensor, ndim: int, shape: str, *, floating: bool = False) -> None:
-    """Raise unless ``value`` is a tensor of at least ``ndim`` dimensions, none of the last ``ndim`` empty.
+    """Raise unless ``value`` is a tensor of real numbers with ``ndim`` dimensions or more, none of the last empty.
 
-    Args:
-        name: what the caller calls it.
-        value: what came.
-        ndim: how many trailing dimensions the operator reads.
-        shape: the expected shape, for the message, such as ``"(*, T, H, W)"``.
-        floating: refuse integer and bool tensors.
-
-    Raises:
-        TypeError: not a tensor, complex, or not floating where that is asked for.
-        ValueError: too few dimensions, or one of the last ``ndim`` is empty.
+    ``shape`` is the expected one for the message, such as ``"(*, T, H, W)"``.
     """
     if not isinstance(value, Tensor):
         remedy = "; torch.from_numpy makes a tensor of it" if isinstance(value, np.ndarray) else ""
@@ -36,42 +27,21 @@ def check_planes(name: str, value: Tensor, ndim: int, shape: str, *, floating: b
 def check_picture(
     name: str, value: Tensor, shape: str = "(3, H, W)", *, grey: bool = False, floating: bool = True
 ) -> None:
-    """Raise unless ``value`` is one picture, (3, H, W), or perhaps (H, W); not of a batch.
-
-    Args:
-        name: what the caller calls it.
-        value: what came.
-        shape: the expected shape, for the message.
-        grey: take (H, W), too.
-        floating: refuse integer and bool tensors.
-
-    Raises:
-        TypeError: as :func:`check_planes`.
-        ValueError: another shape.
-    """
+    """Raise unless ``value`` is one picture, (3, H, W), or, if ``grey``, (H, W); not a batch."""
     check_planes(name, value, 2 if grey else 3, shape, floating=floating)
     if value.ndim > 3 or (value.ndim == 3 and value.shape[0] != 3):
         raise ValueError(f"{name}: expected {shape}, got {tuple(value.shape)}")
 
 
 def check_dtype(dtype: torch.dtype | None, *others: torch.dtype) -> None:
-    """Raise unless the type asked for is None, floating, or one of ``others``.
-
-    Raises:
-        TypeError: another type, or no type.
-    """
+    """Raise unless the type asked for is None, floating, or one of ``others``."""
     known = dtype is None or isinstance(dtype, torch.dtype)
     if not known or not (dtype is None or dtype.is_floating_point or dtype in others):
         raise TypeError(f"dtype: expected a floating-point type{''.join(f' or {o}' for o in others)}, got {dtype!r}")
 
 
 def check_positive(name: str, value: float) -> None:
-    """Raise unless ``value`` is a finite number above zero.
-
-    Raises:
-        TypeError: no number.
-        ValueError: zero, negative, infinite or NaN.
-    """
+    """Raise unless ``value`` is a finite number above zero."""
     try:
         good = bool(0 < value < float("inf"))
     except (TypeError, RuntimeError, ValueError):  # a tensor of many is none of them
@@ -81,11 +51,7 @@ def check_positive(name: str, value: float) -> None:
 
 
 def check_index(name: str, value: int) -> int:
-    """Return ``value`` as an int; raise unless it is a whole number, such as Python's or NumPy's.
-
-    Raises:
-        TypeError: anything else.
-    """
+    """Return ``value`` as an int; raise a TypeError unless it is a whole number, such as Python's or NumPy's."""
     try:
         return operator.index(value)
     except TypeError:
@@ -93,11 +59,7 @@ def check_index(name: str, value: int) -> int:
 
 
 def check_whole(name: str, value: int) -> int:
-    """Return ``value`` as an int; raise unless it is a whole number, 1 or more.
-
-    Raises:
-        ValueError: anything else, True and False among it.
-    """
+    """Return ``value`` as an int; raise a ValueError unless it is a whole number, 1 or more; True is none."""
     if isinstance(value, torch.SymInt):  # a size that torch.export leaves open
         return value
     if not isinstance(value, int) and hasattr(value, "__index__"):  # NumPy's

@@ -45,21 +45,7 @@ def bayer_pattern(pattern: str | CFA) -> str:
 
 
 def cfa_pattern(pattern: str | CFA) -> str:
-    """Return the name of a Bayer phase, or ``"grey"``, of a sensor without colour filters.
-
-    Args:
-        pattern: as for :func:`bayer_pattern`, or ``"grey"``.
-
-    Returns:
-        One of :data:`PATTERNS`, or :data:`GREY`.
-
-    Raises:
-        ValueError: none of these.
-
-    Example:
-        >>> cfa_pattern("grey"), cfa_pattern("rggb")
-        ('grey', 'RGGB')
-    """
+    """Return the name of a Bayer phase, see :func:`bayer_pattern`, or :data:`GREY`."""
     if isinstance(pattern, str) and pattern.lower() == GREY:
         return GREY
     try:
@@ -70,34 +56,12 @@ def cfa_pattern(pattern: str | CFA) -> str:
 
 
 def count_colors(pattern: str | CFA) -> int:
-    """Return how many colours a sensor sees: 3 through a Bayer filter, 1 where it is grey.
-
-    Raises:
-        ValueError: the pattern is unknown, see :func:`bayer_pattern`.
-
-    Example:
-        >>> count_colors("GBRG"), count_colors("grey")
-        (3, 1)
-    """
+    """Return how many colours a sensor sees: 3 through a Bayer filter, 1 where it is grey."""
     return 1 if cfa_pattern(pattern) == GREY else 3
 
 
 def cfa_sites(pattern: str | CFA) -> tuple[tuple[tuple[int, int, int], ...], int]:
-    """Return ``(colour, row, column)`` of the pixels of one cell of a colour filter array, and the cell's side.
-
-    Args:
-        pattern: see :func:`bayer_pattern`.
-
-    Returns:
-        Those of :func:`bayer_sites` and 2; a cell of a grey sensor is a single pixel.
-
-    Raises:
-        ValueError: the pattern is unknown.
-
-    Example:
-        >>> cfa_sites("grey")
-        (((0, 0, 0),), 1)
-    """
+    """Return the sites of one cell of a colour filter array, see :func:`bayer_sites`, and its side: 2, 1 of grey."""
     return (((0, 0, 0),), 1) if cfa_pattern(pattern) == GREY else (bayer_sites(pattern), 2)
 
 
@@ -197,7 +161,16 @@ def bayer_mask(
     return torch.stack(planes).to(dtype or torch.get_default_dtype())  # type: ignore[arg-type]
 
 
-class BayerMask(nn.Module):
+class _ScaledPattern(PatternModule):
+    def __init__(self, pattern: str | CFA, scale: int) -> None:
+        super().__init__(pattern)
+        self.scale = check_whole("scale", scale)
+
+    def extra_repr(self) -> str:
+        return f"{super().extra_repr()}, scale={self.scale}"
+
+
+class BayerMask(_ScaledPattern):
     r"""See the Convention block on :func:`bayer_mask`.
 
     Shape:
@@ -210,17 +183,12 @@ class BayerMask(nn.Module):
     """
 
     def __init__(self, pattern: str | CFA = "RGGB", *, scale: int = 1) -> None:
-        super().__init__()
-        self.scale = check_whole("scale", scale)
-        self.pattern = cfa_pattern(pattern)
+        super().__init__(pattern, scale)
 
     def forward(self, raw: Tensor) -> Tensor:  # noqa: D102
         check_planes("raw", raw, 2, "(*, H, W)")
         height, width = raw.shape[-2:]
         return bayer_mask(height, width, self.pattern, scale=self.scale, device=raw.device, dtype=raw.dtype)
-
-    def extra_repr(self) -> str:  # noqa: D102
-        return f"pattern={self.pattern!r}, scale={self.scale}"
 
 
 def mosaic(rgb: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
@@ -338,7 +306,7 @@ def _sum(parts: list[Tensor], dtype: torch.dtype) -> Tensor:
     return torch.stack(parts).sum(dim=0, dtype=dtype) if len(parts) > 1 else parts[0]
 
 
-class BinToSensor(nn.Module):
+class BinToSensor(_ScaledPattern):
     r"""See the Convention block on :func:`bin_to_sensor`.
 
     Shape:
@@ -351,15 +319,10 @@ class BinToSensor(nn.Module):
     """
 
     def __init__(self, pattern: str | CFA = "RGGB", *, scale: int) -> None:
-        super().__init__()
-        self.scale = check_whole("scale", scale)
-        self.pattern = cfa_pattern(pattern)
+        super().__init__(pattern, scale)
 
     def forward(self, rgb: Tensor) -> Tensor:  # noqa: D102
         return bin_to_sensor(rgb, self.pattern, scale=self.scale)
-
-    def extra_repr(self) -> str:  # noqa: D102
-        return f"pattern={self.pattern!r}, scale={self.scale}"
 
 
 def split_colors(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:

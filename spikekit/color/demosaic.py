@@ -70,15 +70,8 @@ def demosaic(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
 def _fill_in(phases: Tensor, row: int, column: int, *, green: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Estimate what is missing at one site of all cells, by the filters of Malvar, He and Cutler (2004), Fig. 2.
 
-    Args:
-        phases: the four phases of mosaics that have two more pixels at each border, (B, 4, h + 2, w + 2).
-        row: of the site in its cell.
-        column: likewise.
-        green: whether the site is green.
-
-    Returns:
-        The site's own colour; at a green one, the colours of its row and of its column, else green twice; and the
-        colour of the diagonals, each (B, h, w).
+    Of the four phases (B, 4, h + 2, w + 2) of mosaics with two more pixels at each border: the site's own colour; at a
+    green one, the colours of its row and of its column, else green twice; and the colour of the diagonals.
     """
     height, width = phases.shape[-2] - 2, phases.shape[-1] - 2
 
@@ -100,15 +93,7 @@ def _fill_in(phases: Tensor, row: int, column: int, *, green: bool) -> tuple[Ten
 
 
 def wide_mosaics(raw: Tensor) -> Tensor:
-    """Check mosaics and return them as (B, H, W), float32 or wider.
-
-    Args:
-        raw: mosaics (*, H, W).
-
-    Raises:
-        TypeError: not a floating-point tensor.
-        ValueError: fewer than two dimensions, or smaller than 3 x 3.
-    """
+    """Check mosaics (*, H, W) and return them as (B, H, W), float32 or wider."""
     check_planes("raw", raw, 2, "(*, H, W)", floating=True)
     if min(raw.shape[-2:]) < 3:
         raise ValueError(f"raw: expected (*, H, W) of at least 3 x 3, got {tuple(raw.shape)}")

@@ -86,15 +86,7 @@ class DemosaicResidual(PatternModule):
 
 
 def interpolate_green(known: Tensor, green: Tensor) -> Tensor:
-    """Fill in green.
-
-    Args:
-        known: mosaics (B, H, W), float32 or float64.
-        green: which pixels of it are green, (H, W), bool.
-
-    Returns:
-        (B, H, W).
-    """
+    """Fill in green in mosaics (B, H, W), given which of their pixels are green, (H, W)."""
     known, green = _with_border(known), _with_border(green)
     across = _green_minus_other(known, green)
     down = _green_minus_other(known.mT, green.mT).mT
@@ -111,16 +103,7 @@ def interpolate_green(known: Tensor, green: Tensor) -> Tensor:
 
 
 def guided_by_green(known: Tensor, greens: Tensor, mask: Tensor) -> Tensor:
-    """Fill in red or blue.
-
-    Args:
-        known: mosaics (B, H, W), float32 or float64.
-        greens: green everywhere, (B, H, W).
-        mask: which pixels are of the colour, (H, W), bool.
-
-    Returns:
-        (B, H, W).
-    """
+    """Fill in red or blue in mosaics (B, H, W), given green everywhere and which pixels are of the colour, (H, W)."""
     known, greens, mask = _with_border(known), _with_border(greens), _with_border(mask)
     filled = _predict(greens, known, mask, _RADIUS, lambda residual: _between(_between(residual, -1), -2))
     return _without_border(torch.where(mask, known, filled))

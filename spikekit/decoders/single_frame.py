@@ -242,17 +242,7 @@ def tfp_at(
 
 
 def tfp_weights(frames: int, frame: int, window: int, order: int) -> tuple[int, list[float]]:
-    """Find what the mean of means at one frame of a clip is a sum of.
-
-    Args:
-        frames: of the clip.
-        frame: where the mean is taken.
-        window: frames of a mean, odd.
-        order: how often it is taken.
-
-    Returns:
-        The first frame that counts, and the weights of it and those that follow.
-    """
+    """First frame that counts in the mean of means at one frame of a clip, and weights of it and those after it."""
     half = window // 2
     first, last = max(frame - order * half, 0), min(frame + order * half, frames - 1)
     seen = range(first, last + 1)

@@ -81,18 +81,7 @@ def _improve(pictures: Tensor, times: Tensor, limit: Tensor, flow: Tensor, warps
 
 
 def refine(pictures: Tensor, times: Tensor, limit: Tensor, flow: Tensor, warps: int) -> Tensor:
-    """Improve the flow of a level.
-
-    Args:
-        pictures: (B, 2, H, W).
-        times: (B, 2).
-        limit: (B, H, W), how far, in slopes, a round may follow the pictures.
-        flow: (B, 2, H, W).
-        warps: how often.
-
-    Returns:
-        (B, 2, H, W).
-    """
+    """Improve the flow (B, 2, H, W) of a level; a round follows its pictures by ``limit`` (B, H, W) slopes at most."""
     time = times.to(pictures)[..., None, None, None]
     height, width = flow.shape[-2:]
     # by component and direction: what to add to the right and below, kept with a zero on the other side

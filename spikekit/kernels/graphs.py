@@ -16,11 +16,8 @@ class Replayed:
     """A function of tensors on a GPU that is captured once for every set of sizes, and replayed from then on.
 
     The first call with some sizes runs as it is, so that kernels are compiled and libraries have chosen theirs; the
-    second captures. No gradient. Results are copies, and calls from several threads wait for each other.
-
-    Args:
-        function: of one hashable argument and tensors, without effects, and that never waits for the GPU.
-        most: sizes whose graphs, and their memory, are kept.
+    second captures. No gradient. Results are copies, and calls from several threads wait for each other. The function
+    takes a hashable argument and tensors, has no effects, and never waits for the GPU; ``most`` sizes are kept.
     """
 
     def __init__(self, function: Callable[..., Tensor], most: int = 8) -> None:

@@ -102,7 +102,6 @@ class SceneProfile:
         displacement_max: of the very fastest pixel.
         blending: share of the spikes that would change if the ends of an interval were blended, estimated from the
             displacements and from how the light bends along them, and on the safe side.
-        flicker: by how much the mean light changes in an interval, beyond what motion explains.
     """
 
     size: tuple[int, int]
@@ -113,7 +112,6 @@ class SceneProfile:
     displacement: float = 0.0
     displacement_max: float = 0.0
     blending: float = 0.0
-    flicker: float = 0.0
 
     @classmethod
     def join(cls, profiles: Iterable[SceneProfile]) -> SceneProfile:
@@ -135,7 +133,6 @@ class SceneProfile:
             sum(one.static for one in every) / len(every),
             region,
             *(max(getattr(one, name) for one in every) for name in ("displacement", "displacement_max", "blending")),
-            max((one.flicker for one in every), key=abs),
         )
 
     def plan(
@@ -183,11 +180,11 @@ class SceneProfile:
             region = _grown(self.region, self.size, math.ceil(moves) + _MARGIN) if steps > 1 and self.region else None
             if region and region[2] * region[3] > _NEARLY_ALL * height * width:
                 region = None
+        darkest, mean, brightest = self.brightness
         because = [
             f"scene: {self.static:.0%} static, the rest moves {self.displacement:.3g} sensor pixels per clock "
             f"(at most {self.displacement_max:.3g})",
-            f"light: {self.brightness[1]:.3g} thresholds per clock ({self.brightness[0]:.3g} to "
-            f"{self.brightness[2]:.3g}), flicker {self.flicker:.2g}",
+            f"light: {mean:.3g} thresholds per clock ({darkest:.3g} to {brightest:.3g})",
         ]
         if steps > 1:
             where = f"{region[2]} x {region[3]} of {height} x {width}" if region else "all"
@@ -197,13 +194,11 @@ class SceneProfile:
             blended = f"blending changes {self.blending:.2%} of the spikes" if self.static < 1 else "nothing moves"
             because.append(f"latent frames: none, {blended}")
         if noise is not None:
-            needed = noise.required(self.brightness[1], frames, spike_tolerance * min(1.0, self.brightness[1]))
-            on = noise.spike_changes(self.brightness[1], frames)
-            kept = needed.spike_changes(self.brightness[1], frames)
+            needed = noise.required(mean, frames, spike_tolerance * min(1.0, mean))
+            on, kept = noise.spike_changes(mean, frames), needed.spike_changes(mean, frames)
             left_out = [source for source in on if source not in kept]
-            because.append(
-                f"noise: {', '.join(kept) or 'none'}" + (f" (left out: {', '.join(left_out)})" if left_out else "")
-            )
+            without = f" (left out: {', '.join(left_out)})" if left_out else ""
+            because.append(f"noise: {', '.join(kept) or 'none'}{without}")
             noise = needed
         return Plan(steps - 1, region, noise, tuple(because))
 
@@ -235,30 +230,10 @@ def profile_interval(
         charge that is off by E moves a spike with probability E, and a spike that moves changes two bits. The estimate
         is multiplied by four for detail that is finer than the sensor's pixels.
 
-    Args:
-        first: ``rgb`` (3, H, W), H and W multiples of ``2 * scale``.
-        second: the next frame, of the same size.
-        scale: how many pixels a sensor pixel is wide.
-        pattern: Bayer phase of the sensor, see :func:`spikekit.bayer_pattern`.
-        alpha: light of a white pixel per clock.
-        clocks: T, clocks of the interval.
-        spike_tolerance: share of the spikes that may change.
-        motion: what finds it, a call like that of an interpolation; ``FlowInterpolation(shrink=1)`` by default, because
-            Bayer cells are small already.
-
-    Returns:
-        The profile of the interval.
-
-    Raises:
-        ValueError: frames of two sizes.
-
-    Example:
-        >>> picture = torch.rand(3, 32, 32)
-        >>> profile_interval(picture, picture, scale=4).plan().latent
-        0
+    Frames are (3, H, W), H and W multiples of ``2 * scale``; the other arguments are those of
+    :class:`spikekit.FrameSequence`. Motion is found by ``FlowInterpolation(shrink=1)`` by default, because Bayer cells
+    are small already.
     """
-    if first.shape != second.shape:
-        raise ValueError(f"first, second: expected one size, got {tuple(first.shape)} and {tuple(second.shape)}")
     light = [alpha * bin_to_sensor(frame, pattern, scale=scale) for frame in (first, second)]
     ends = torch.stack(light)
     size = tuple(ends.shape[-2:])
@@ -293,14 +268,12 @@ def profile_interval(
         mosaic(plane.abs(), pattern) for plane in _derivatives(small[0], forward[0] / distance.clamp(min=_FINE))
     )
     error = (torch.minimum(distance.square(), distance) * bend * sure).sum() * (moving.sum() / sure.sum())
-    unexplained = flow_warp(small[1:], forward)[0] - small[0]
     pixels = ends[0].numel()
     return replace(
         lost,
         displacement=_fast(distance, slope.square() * sure) / clocks,
         displacement_max=(distance * sure).max().item() / clocks,
         blending=_SAFETY * clocks / 6 * alpha * error.item() / pixels / mean,
-        flicker=alpha * unexplained.mean().item() * height * width / pixels,
     )
 
 

@@ -12,13 +12,7 @@ from spikekit.scenes.adaptive_sampling import Plan, Region, SceneProfile
 
 
 class Interval:
-    """Two neighbouring frames and the light between them, computed on demand.
-
-    Args:
-        film: the :class:`spikekit.FrameSequence` that it is a part of, whose settings count.
-        first: ``rgb`` (3, H, W), its sides multiples of ``2 * film.scale``.
-        second: the next frame.
-    """
+    """Two neighbouring frames and the light between them, computed on demand, by the settings of their film."""
 
     def __init__(self, film: Any, first: Tensor, second: Tensor) -> None:
         self.film, self.frames = film, (first, second)

@@ -152,23 +152,6 @@ class FrameSequence:
             light.append(self._interval(frame).light(phase) if phase else self._seen(self._view(frame)))
         return torch.stack(light)
 
-    def chunks(self, first: int = 0, count: int | None = None, *, chunk: int = 64) -> Iterator[Tensor]:
-        """Iterate over the light of a span, a chunk of clocks at a time, in bounded memory.
-
-        Args:
-            first: the first clock.
-            count: how many; up to the film's end when not given.
-            chunk: clocks in a chunk; the last may be shorter.
-
-        Returns:
-            An iterator over chunks of :meth:`light`.
-
-        Raises:
-            ValueError: as :meth:`light`, and a chunk below 1.
-        """
-        last, chunk = first + self._count(first, count), check_whole("chunk", chunk)
-        return (self.light(start, min(chunk, last - start)) for start in range(first, last, chunk))
-
     def spikes(
         self,
         first: int = 0,
@@ -195,11 +178,12 @@ class FrameSequence:
             An iterator over chunks of spikes (T, height / scale, width / scale), uint8.
 
         Raises:
-            ValueError: as :meth:`chunks` and :class:`spikekit.SpikeSensor`.
+            ValueError: as :meth:`light` and :class:`spikekit.SpikeSensor`, and a chunk below 1.
         """
         sensor = SpikeSensor(noise, readout=readout, seed=seed)
-        count = self._count(first, count) // readout * readout if count is None else count
-        return map(sensor.expose, self.chunks(first, count, chunk=-(-check_whole("chunk", chunk) // readout) * readout))
+        count = self._count(first, count) // readout * readout if count is None else self._count(first, count)
+        chunk, last = -(-check_whole("chunk", chunk) // readout) * readout, first + count
+        return (sensor.expose(self.light(at, min(chunk, last - at))) for at in range(first, last, chunk))
 
     def clip(self, frame: int, frames: int = 41) -> SequenceClip:
         """Return a clip that is centred on a source frame.

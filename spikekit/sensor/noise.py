@@ -237,13 +237,7 @@ def random_numbers(seed: int, purpose: str, clock: int = 0) -> np.random.Generat
 
 
 class NoisyPixels:
-    """The pixels of one sensor: their fixed pattern, and the noise of every clock.
-
-    Args:
-        noise: its sources.
-        size: (*, H, W), how many pixels there are.
-        seed: random seed, 0 or more.
-    """
+    """The pixels (*, H, W) of one sensor: their fixed pattern, and the noise of every clock."""
 
     def __init__(self, noise: SensorNoise, size: tuple[int, ...], seed: int) -> None:
         if noise.calibration is not None and noise.calibration.size != tuple(size[-2:]):

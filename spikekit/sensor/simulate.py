@@ -88,9 +88,6 @@ class SpikeSensor:
                 differs from that of the light before or does not fit the charge.
         """
         check_planes("light", light, 3, "(*, T, H, W)", floating=True)
-        return self._expose(light)
-
-    def _expose(self, light: Tensor) -> Tensor:
         size, frames = light.shape[:-3] + light.shape[-2:], light.shape[-3]
         if self._pixels is None:
             self._pixels = NoisyPixels(self.noise, tuple(size), self.seed)
@@ -151,12 +148,11 @@ def simulate_spikes(
     Reference:
         Dong et al., CVPR 2024, section 5.1.
     """
-    check_planes("light", light, 3, "(*, T, H, W)", floating=True)
-    check_positive("threshold", threshold)
     if charge is None:
+        check_planes("light", light, 3, "(*, T, H, W)", floating=True)
         size, dtype = light.shape[:-3] + light.shape[-2:], torch.promote_types(light.dtype, torch.float32)
         charge = torch.rand(size, generator=generator, device=light.device, dtype=dtype) * threshold
     seed = 0
     if noise is not None:
         seed = int(torch.randint(2**63 - 1, (), generator=generator, device=light.device))
-    return SpikeSensor(noise, threshold=threshold, readout=readout, seed=seed, charge=charge)._expose(light)
+    return SpikeSensor(noise, threshold=threshold, readout=readout, seed=seed, charge=charge).expose(light)

@@ -100,16 +100,7 @@ def demosaic_along_motion(
 
 
 def _along(flow: Tensor, sigma_space: float, tau: float) -> tuple[Tensor, Tensor]:
-    """Find the 3 x 3 pixels around every place on the trajectories, and weigh them by distance and time.
-
-    Args:
-        flow: (B, T, 2, H, W).
-        sigma_space: see :func:`demosaic_along_motion`.
-        tau: likewise.
-
-    Returns:
-        Where they are in a plane that is one row, and their weights, each (B, T, 9, H, W).
-    """
+    """Flat places of the 3 x 3 pixels around the trajectories, and weights by distance and time: (B, T, 9, H, W)."""
     _, frames, _, height, width = flow.shape
     x = torch.arange(width, device=flow.device) + flow[:, :, :1]
     y = torch.arange(height, device=flow.device)[:, None] + flow[:, :, 1:]

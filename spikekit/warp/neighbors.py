@@ -156,17 +156,7 @@ def _weigh(index: Tensor, width: int, cell: Tensor, part: Tensor) -> Tensor:
 
 
 def _nearest_known(flow: Tensor, mask: Tensor, neighbors: int) -> tuple[Tensor, Tensor]:
-    """Flat indices of the ``neighbors`` known pixels nearest to where flow points to, and their weights.
-
-    Args:
-        flow: (N, 2, H, W), float32 or float64, finite and less than 2^30.
-        mask: (H, W).
-        neighbors: how many known pixels to weigh, K.
-
-    Returns:
-        Index, int64, and weight, in the dtype of ``flow``: both (N, K, H W), the nearest first. Where fewer pixels
-        are known, the nearest is repeated with weight 0.
-    """
+    """Do what :func:`idw_neighbors` does with flow that is float32 or float64, finite and less than 2^30."""
     count, _, height, width = flow.shape
     products = products_of(mask, neighbors)
     # double, so that what is nearer does not depend on rounding

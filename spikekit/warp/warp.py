@@ -62,13 +62,7 @@ def flow_warp(image: Tensor, flow: Tensor) -> Tensor:
 
 
 def _bilinear(planes: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Do what ``remap`` does, with derivatives of any order that are the same every time.
-
-    Args:
-        planes: (B, C, H, W), float32 or wider.
-        x: (B, H, W).
-        y: likewise.
-    """
+    """Do what ``remap`` does, with derivatives of any order that are the same every time."""
     height, width = planes.shape[-2:]
     (left, right, share), (top, bottom, part) = _between(x, width), _between(y, height)
     index = torch.stack([row * width + column for row in (top, bottom) for column in (left, right)], dim=1)

@@ -68,7 +68,7 @@ def test_a_change_below_the_tolerance_is_none(change, static):
     assert profile_of(first, first + step).static == static
 
 
-def test_a_gain_is_flicker_and_no_motion():
+def test_a_gain_is_no_motion():
     first = 0.2 + 0.3 * torch.rand(3, 32, 32)
     seen = []
 
@@ -78,16 +78,7 @@ def test_a_gain_is_flicker_and_no_motion():
 
     profile = profile_of(first, 1.25 * first, motion)
     torch.testing.assert_close(seen[0], seen[1], atol=1e-3, rtol=0)
-    assert profile.flicker == pytest.approx(0.4 * 0.25 * first.mean().item(), rel=1e-3)
     assert profile.plan().latent == 0
-
-
-def test_motion_that_explains_the_change_is_no_flicker():
-    picture = torch.linspace(0, 1, 72).expand(3, 64, 72)
-    first, second = picture[..., 8:], picture[..., :-8]  # what is seen moves by 8 pixels, 4 of the sensor, 2 cells
-    change = 0.4 * 8 / 71
-    assert profile_of(first, second).flicker == pytest.approx(-change, rel=0.01)
-    assert abs(profile_of(first, second, Steady(2.0)).flicker) < 0.1 * change
 
 
 @pytest.mark.parametrize(("fast_rows", "cells"), [(1, 1.0), (12, 2.0)])  # of 300
@@ -190,13 +181,12 @@ def test_noise_that_changes_nothing_is_left_out():
 
 
 def test_profiles_join():
-    other = SceneProfile((64, 64), 20, (0.1, 0.4, 0.5), 1.0, (10, 70, 4, 6), 0.3, 0.4, 0.01, -0.2)
+    other = SceneProfile((64, 64), 20, (0.1, 0.4, 0.5), 1.0, (10, 70, 4, 6), 0.3, 0.4, 0.01)
     joined = SceneProfile.join([replace(MOVING, region=(20, 30, 10, 10)), other, replace(MOVING, region=None)])
     assert joined.brightness == pytest.approx((0.0, 0.8 / 3, 0.5))
     assert joined.static == pytest.approx(1 / 3)
     assert joined.region == (10, 30, 20, 46)
     assert (joined.displacement, joined.displacement_max, joined.blending) == (0.3, 0.4, 0.02)
-    assert joined.flicker == -0.2
     with pytest.raises(ValueError, match="profiles: expected at least one"):
         SceneProfile.join([])
 

@@ -121,17 +121,13 @@ def test_a_region_is_interpolated_and_the_rest_blended():
     assert part.equal(blended)
 
 
-def test_spans_and_chunks_change_nothing():
+def test_spans_change_nothing():
     film = moving(3.0, frames=4)
     whole = film.light()
     assert whole.shape == (61, 32, 32)
     for first, count in ((59, 2), (0, 1), (13, 30), (20, 20), (60, 1), (7, 3)):
         assert moving(3.0, frames=4).light(first, count).equal(whole[first : first + count])
         assert film.light(first, count).equal(whole[first : first + count])
-    for chunk in (1, 7, 20, 100):
-        pieces = list(film.chunks(5, 50, chunk=chunk))
-        assert max(len(piece) for piece in pieces) <= chunk
-        assert torch.cat(pieces).equal(whole[5:55])
 
 
 def test_frames_are_read_when_they_are_needed():
@@ -337,7 +333,7 @@ def film_of(frames=FRAMES, **settings):
         (lambda: film_of().flow(1, 41), "clock: expected 0 to 40, got 41"),
         (lambda: film_of(interpolation=Fade(), plan=Plan()).flow(1, 3), "there is no flow from frame 1"),
         (lambda: film_of().clip(0), r"needs frames -1 to 1 of 0 to 2, got 0"),
-        (lambda: film_of().chunks(chunk=0), "chunk: expected a whole number >= 1"),
+        (lambda: film_of().spikes(chunk=0), "chunk: expected a whole number >= 1"),
     ],
 )
 def test_errors(make, message):
