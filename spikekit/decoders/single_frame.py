@@ -52,13 +52,7 @@ def _(spikes: Tensor, frame: int) -> Tensor:
 def search(plane: Callable[[int], np.ndarray], frame: int, clip: range) -> np.ndarray:
     """Find the intervals at one frame of a clip whose frames are made when they are needed.
 
-    Args:
-        plane: gives the frame of a number: an array of any shape, uint8, anything but 0 is a spike.
-        frame: where to find the intervals.
-        clip: the numbers of the clip's frames, consecutive.
-
-    Returns:
-        The intervals as :func:`spikekit.spike_interval` gives them for the clip.
+    ``plane`` gives the frame of a number, uint8, anything but 0 being a spike; ``clip`` has the numbers of all frames.
     """
     size = plane(frame).shape
     onwards, backwards = range(frame, clip.stop), range(frame - 1, clip.start - 1, -1)
@@ -72,49 +66,32 @@ def search(plane: Callable[[int], np.ndarray], frame: int, clip: range) -> np.nd
     return interval
 
 
-class _Counter:
-    """Counts planes, at every pixel, in bytes as long as these will do."""
-
-    def __init__(self, size: tuple[int, ...], most: int) -> None:
-        self._few = np.zeros(size, np.uint8)
-        self.total = np.zeros(size, np.int16 if most < 32767 else np.int32)
-        self._steps = 0
-
-    def add(self, mask: np.ndarray) -> None:
-        self._few += mask.view(np.uint8)
-        self._steps += 1
-        if self._steps == 255:
-            self.close()
-
-    def close(self) -> np.ndarray:
-        self.total += self._few
-        self._few.fill(0)
-        self._steps = 0
-        return self.total
-
-
 def _silence(planes: Iterable[np.ndarray], size: tuple[int, ...], most: int) -> tuple[np.ndarray, np.ndarray]:
     """Count the planes before the first spike of every pixel, all where there is none; and say where there is none."""
-    silent, count = np.ones(size, bool), _Counter(size, most)
+    silent, count = np.ones(size, bool), np.zeros(size, _counter(most))
     for plane in planes:
         np.greater(silent.view(np.uint8), plane, out=silent)
-        count.add(silent)
+        count += silent
         if not silent.any():
             break
-    return count.close(), silent
+    return count, silent
 
 
 def _first_interval(planes: Iterable[np.ndarray], wanted: np.ndarray, most: int) -> np.ndarray:
     """Count the planes from the first spike to the second, at the wanted pixels; 0 where there is no second."""
-    waiting, once, count = wanted.copy(), np.zeros_like(wanted), _Counter(wanted.shape, most)
+    waiting, once, count = wanted.copy(), np.zeros_like(wanted), np.zeros(wanted.shape, _counter(most))
     for plane in planes:
         fired = plane != 0
         np.greater(waiting, once & fired, out=waiting)
         once |= fired
-        count.add(waiting & once)
+        count += waiting & once
         if not waiting.any():
             break
-    return count.close() * ~waiting
+    return count * ~waiting
+
+
+def _counter(most: int) -> type[np.signedinteger]:
+    return np.int16 if most < 32767 else np.int32
 
 
 def spike_interval_at(spikes: Tensor, frame: int) -> Tensor:

@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_map
 
 from spikekit.check import wide_dtype
 from spikekit.kernels import cpu_warp, custom_operator, gpu_kernel, register_kernel, register_on_gpu
@@ -61,9 +62,8 @@ def fold_into_batch(op: Any, count: int) -> None:
             return (value.expand(info.batch_size, *value.shape) if dim is None else value.movedim(dim, 0)).flatten(0, 1)
 
         result = op(*map(folded, args[:count], in_dims), *args[count:])
-        results = result if isinstance(result, tuple) else (result,)
-        unfolded = tuple(value.unflatten(0, (info.batch_size, -1)) for value in results)
-        return (unfolded, (0,) * len(unfolded)) if isinstance(result, tuple) else (unfolded[0], 0)
+        result = tree_map(lambda value: value.unflatten(0, (info.batch_size, -1)), result)
+        return result, tree_map(lambda _: 0, result)
 
     op.register_vmap(rule)
 
