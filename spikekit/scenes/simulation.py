@@ -33,42 +33,22 @@ INTERPOLATIONS = {kind.__name__: kind for kind in (FlowInterpolation, Blend, Sti
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings that a stream depends on, besides its source.
-
-    Args:
-        scale: how many pixels a sensor pixel is wide.
-        pattern: Bayer phase of the sensor.
-        alpha: light of a white pixel per clock, in thresholds.
-        clocks: clocks from one source frame to the next.
-        frame: the source frame at the middle of a clip; the middle one when not given.
-        frames: frames of the stream; ``None`` for the whole film.
-        readout: clocks for every frame of the stream.
-        seed: random seed.
-        plan: what is modelled: ``scene`` for what the scene requires, ``everything``, or a number of latent frames.
-        tolerance: share of the spikes that may change by not modelling more, under this name in side-cars.
-        step: displacement between latent frames, in sensor pixels.
-        interpolation: what makes latent frames, one of :data:`INTERPOLATIONS`.
-        noise: what the sensor adds.
-        calibration: the file of the sensor that was measured, whose pixels ``noise`` has.
-
-    Raises:
-        ValueError: an unknown interpolation, or a plan that is unknown or has more latent frames than clocks.
-    """
+    """Settings that a stream depends on, besides its source, as in side-cars; see :class:`spikekit.FrameSequence`."""
 
     scale: int
     pattern: str = "RGGB"
     alpha: float = 0.4
     clocks: int = 20
-    frame: int | None = None
-    frames: int | None = 41
+    frame: int | None = None  #: the source frame at the middle of a clip; the middle one when not given
+    frames: int | None = 41  #: of the stream; ``None`` for the whole film
     readout: int = 1
     seed: int = 0
-    plan: str | int = "scene"
+    plan: str | int = "scene"  #: what the scene requires, ``everything``, or a number of latent frames
     tolerance: float = 0.05
     step: float = 0.5
-    interpolation: str = "FlowInterpolation"
+    interpolation: str = "FlowInterpolation"  #: one of :data:`INTERPOLATIONS`
     noise: SensorNoise = field(default_factory=SensorNoise)
-    calibration: str | None = None
+    calibration: str | None = None  #: the file of the sensor that was measured, whose pixels ``noise`` has
 
     def __post_init__(self) -> None:
         if not (self.plan in ("scene", "everything") or self.plan in range(self.clocks)):
@@ -98,16 +78,7 @@ class Settings:
 
 
 class Source:
-    """The frames that a stream is made of, read when they are needed.
-
-    Args:
-        path: a folder of pictures, a video file, or a picture, which stands still.
-        settings: which of its frames.
-
-    Raises:
-        VideoError: there are no frames to read.
-        ValueError: a frame that is not there, or too few around it.
-    """
+    """The frames of a folder, of a video file or of one still picture that a stream is made of, read when needed."""
 
     def __init__(self, path: Path, settings: Settings) -> None:
         self.path, self.film_frames = path, read_video(path)
@@ -155,19 +126,9 @@ class Source:
 
 
 def simulate(source: Source, settings: Settings, output: Path, replayed: Sidecar | None = None) -> list[str]:
-    """Write a stream, its ground truth and its side-car.
+    """Write a stream, and beside it its ground truth and its side-car; return what was done, line by line.
 
-    Args:
-        source: the frames.
-        settings: all else.
-        output: the stream, see :func:`spikekit.write_spikes`; truth and side-car get its name with other endings.
-        replayed: a side-car that the source and the stream must agree with.
-
-    Returns:
-        What was done, line by line.
-
-    Raises:
-        ValueError: a frame that cannot be read, a file that cannot be written, or not what the side-car says.
+    Source and stream must be those of a side-car that is ``replayed``.
     """
     stem = output.stem
     names = source.used.names
