@@ -8,9 +8,6 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-#: what names frames: N, A:B or A:B:STEP
-FRAMES = r"\d+|\d*:\d*(:0*[1-9]\d*)?"
-
 
 class UsageError(ValueError):
     """A command line that asks for something impossible."""
@@ -32,22 +29,13 @@ def whole(least: int) -> Callable[[str], int]:
 
 
 def frames_of(text: str, first: int, last: int, step: int = 1) -> range:
-    """Return the frames that ``N`` or ``A:B[:STEP]`` asks for, from A to B - 1.
-
-    Args:
-        text: what was typed.
-        first: the first frame that there is, which stands for a missing A.
-        last: the last frame that there is; the one after it stands for a missing B.
-        step: stands for a missing STEP.
-
-    Raises:
-        ValueError: another text, none of the frames, or some that are not there.
+    """Return the frames that ``N`` or ``A:B[:STEP]`` asks for, from A to B - 1, of those from ``first`` to ``last``.
 
     Example:
         >>> list(frames_of("20:80:20", 20, 99)), list(frames_of(":23", 20, 99))
         ([20, 40, 60], [20, 21, 22])
     """
-    if not re.fullmatch(FRAMES, text, re.ASCII):
+    if not re.fullmatch(r"\d+|\d*:\d*(:0*[1-9]\d*)?", text, re.ASCII):
         raise ValueError(f"expected a whole number, 0 or more, or A:B or A:B:STEP, got {text}")
     if ":" in text:
         begin, end, every = (text + ":").split(":")[:3]

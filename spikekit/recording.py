@@ -28,29 +28,17 @@ _BLOCK = 1 << 24
 
 @dataclass(frozen=True)
 class Recording:
-    """A file of spikes, read as the camera saw the scene: upright, only pixels, no border.
-
-    Args:
-        path: the file.
-        frames: how many it holds.
-        stored: (H, W) of its frames.
-        flip: whether they are stored upside down.
-        pattern: Bayer phase of what is read, or ``"grey"``; ``None`` where nobody says.
-        alpha: light of a white pixel per clock, where it is known.
-        camera: where it is known.
-        calibration: that of the pixels that are read, where it is known.
-        note: a line that whoever sees a picture of it should read, or nothing.
-    """
+    """A file of spikes, read as the camera saw the scene: upright, only pixels, no border."""
 
     path: Path
     frames: int
-    stored: tuple[int, int]
-    flip: bool = False
-    pattern: str | None = None
-    alpha: float | None = None
+    stored: tuple[int, int]  # (H, W) of its frames
+    flip: bool = False  # whether they are stored upside down
+    pattern: str | None = None  # Bayer phase of what is read, or "grey"; None where nobody says
+    alpha: float | None = None  # light of a white pixel per clock, where it is known
     camera: Camera | None = None
-    calibration: Calibration | None = None
-    note: str = ""
+    calibration: Calibration | None = None  # that of the pixels that are read
+    note: str = ""  # what whoever sees a picture of it should read
 
     @property
     def bayer(self) -> str | None:
@@ -131,20 +119,7 @@ def open_recording(
     camera: str | Path | None = None,
     calibration: str | Path | None = None,
 ) -> Recording:
-    """Open a recording with all that is known of it.
-
-    Args:
-        path: a file ending in ``.dat``, ``.npy`` or ``.npz``.
-        height: rows of a frame; a ``.dat`` without side-car or camera needs it.
-        width: columns of a frame; likewise.
-        flip: whether the frames are stored upside down.
-        pattern: Bayer phase after the flip, or ``"grey"``; that of the side-car or the camera when not given.
-        camera: what recorded it, see :func:`spikekit.camera`; gives the size, the flip, the Bayer phase and the crop.
-        calibration: what ``spikekit calibrate`` measured of the pixels; the recording's own, beside it, when not given,
-            and ``"none"`` for none.
-
-    Returns:
-        The recording; nothing but its size has been read.
+    """Open a recording with all that is known of it; the arguments are those of the commands.
 
     Raises:
         UsageError: a headerless file whose size nobody knows, a camera and a size as well, or an unknown pattern.

@@ -8,15 +8,7 @@ from tabulate import tabulate
 
 
 def table(heading: Sequence[str], rows: Iterable[Sequence[object]], *, markdown: bool = True) -> str:
-    """Return a table whose columns are aligned.
-
-    Args:
-        heading: of the columns.
-        rows: the cells of each; None is an empty one.
-        markdown: as Markdown, with a rule under the heading; otherwise as plain text.
-
-    Returns:
-        Lines without a newline at the end.
+    """Return a table whose columns are aligned, as Markdown or as plain text; None is an empty cell.
 
     Example:
         >>> print(table(["decoder", "PSNR (dB)"], [["TFI", "26.10"], ["TFP", None]]))

@@ -20,7 +20,6 @@ from lightning_modules.storage.pretrained import (
     settings_of,
     write_weights,
 )
-from spikekit.io.failures import writing
 from spikekit.timing import duration
 
 
@@ -63,13 +62,12 @@ def export(args: Sequence[str]) -> None:
         raise InputError(f"-o: expected a name that ends in {ending} for {asked.format}, got {asked.output}")
     said = ""
     try:
-        with writing(asked.output):
-            if asked.format in FORMATS:
-                own = bool(asked.config)
-                network = configured_network(asked.config, asked.weights) if own else load_network(asked.weights)
-                said = f", {export_network(network, asked.output, asked.format, still=asked.still)}"
-            else:
-                write_weights(_weights(asked), asked.output)
+        if asked.format in FORMATS:
+            own = bool(asked.config)
+            network = configured_network(asked.config, asked.weights) if own else load_network(asked.weights)
+            said = f", {export_network(network, asked.output, asked.format, still=asked.still)}"
+        else:
+            write_weights(_weights(asked), asked.output)
     except (OSError, ValueError, ImportError) as error:
         raise (UsageError if isinstance(error, UsageError) else InputError)(str(error)) from error
     size = Path(asked.output).stat().st_size / 2**20

@@ -15,7 +15,6 @@ from PIL import Image
 from torch import Tensor
 
 from spikekit import write_video
-from spikekit.io.failures import writing
 from spikekit.io.image_bytes import PictureError, png_bytes, png_pixels
 from spikekit.io.quiet import quiet
 from spikekit.io.video import VIDEO_ENDINGS
@@ -87,7 +86,7 @@ class Output:
         if not rgb.isfinite().all():  # it would be black there, and nothing would say why
             raise PictureError(f"{path}: expected a picture, the network makes NaN of this clip; nothing is written")
         _check_picture(path)
-        with writing(path, PictureError), whole_file(path) as file:
+        with whole_file(path) as file:
             file.write(png_bytes(rgb, {_NOTE: self._record}))
         return path
 
@@ -100,8 +99,7 @@ class Output:
             write_video(self.output, progress(pictures, "film", len(self._paths)), fps)
         else:
             (path,) = self._paths.values()
-            with writing(self.output, PictureError):
-                path.replace(self.output)
+            path.replace(self.output)
 
     def clear(self) -> None:
         """Remove the folder beside a film or a picture; what others have put there stays, and the folder with it."""

@@ -60,18 +60,11 @@ class Calibration:
             if plane.shape != self.gain.shape or plane.ndim != 2 or plane.dtype != kind:
                 got = f"{tuple(plane.shape)} of {plane.dtype}"
                 raise ValueError(f"{name}: expected (H, W) of {kind}, all of one size, got {got}")
-        for name, good in {
-            "gain": (self.gain >= _LEAST_GAIN) & (self.gain <= 1 / _LEAST_GAIN),
-            "dark": (self.dark >= 0) & (self.dark <= 1),
-            "defects": self.defects <= HOT,
-        }.items():
+        for name, least, most in (("gain", _LEAST_GAIN, 1 / _LEAST_GAIN), ("dark", 0, 1), ("defects", WORKS, HOT)):
+            plane = getattr(self, name)
+            good = (plane >= least) & (plane <= most)
             if not good.all():
-                expected = {
-                    "gain": f"{_LEAST_GAIN:g} to {1 / _LEAST_GAIN:g}",
-                    "dark": "0 to 1",
-                    "defects": "0, 1 or 2",
-                }
-                raise ValueError(f"{name}: expected {expected[name]}, got {getattr(self, name)[~good][0].item():g}")
+                raise ValueError(f"{name}: expected {least:g} to {most:g}, got {plane[~good][0].item():g}")
 
     @property
     def size(self) -> tuple[int, int]:

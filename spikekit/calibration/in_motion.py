@@ -13,7 +13,6 @@ from torch import Tensor
 
 from spikekit.calibration.calibration import Calibration, colors
 from spikekit.calibration.measure import Measured
-from spikekit.check import check_planes
 from spikekit.color.cfa import bayer_mask
 from spikekit.color.demosaic import demosaic
 from spikekit.flow.tvl1 import tvl1_flow
@@ -41,15 +40,10 @@ _GREY = torch.tensor([[0.25, 0.5, 0.25]])  # each pixel the mean of the Bayer ce
 
 
 class Segments(NamedTuple):
-    """Counts of the spikes of every pixel in segments of a recording that follow each other without a gap.
+    """Counts of the spikes of every pixel in segments of a recording that follow each other without a gap."""
 
-    Args:
-        counts: (J, H, W), uint8.
-        frames: how many each of them is long.
-    """
-
-    counts: Tensor
-    frames: int
+    counts: Tensor  # (J, H, W), uint8
+    frames: int  # of each
 
 
 def segment_length(rate: float) -> int:
@@ -58,34 +52,17 @@ def segment_length(rate: float) -> int:
 
 
 def count_segments(chunks: Iterable[Tensor], frames: int) -> Segments:
-    """Count spikes in segments of so many frames; what is left over at the end does not count.
-
-    Args:
-        chunks: (T_i, H, W) of one recording, in order.
-        frames: of a segment, 1 to 255.
-
-    Raises:
-        ValueError: fewer frames than a segment has, or a segment of another length.
+    """Count spikes of chunks (T_i, H, W) in segments of 1 to 255 frames; what is left over does not count.
 
     Example:
         >>> count_segments([torch.ones(30, 1, 1), torch.zeros(15, 1, 1)], 20).counts.flatten().tolist()
         [20, 10]
     """
-    if not 1 <= frames <= 255:
-        raise ValueError(f"frames: expected 1 to 255, got {frames}")
-    counts, partial, seen = [], None, 0
+    counts, left = [], None
     for chunk in chunks:
-        check_planes("chunks", chunk, 3, "(T, H, W)")
-        fired = chunk != 0
-        while len(fired):
-            part, fired = fired.split([(taken := min(frames - seen, len(fired))), len(fired) - taken])
-            partial = part.sum(0) if partial is None else partial + part.sum(0)
-            seen += taken
-            if seen == frames:
-                counts.append(partial.byte())
-                partial, seen = None, 0
-    if not counts:
-        raise ValueError(f"chunks: expected at least {frames} frames, got {seen}")
+        left = chunk if left is None else torch.cat([left, chunk])
+        *whole, left = left.tensor_split(tuple(range(frames, len(left) + 1, frames)))
+        counts += [(segment != 0).sum(0).byte() for segment in whole]
     return Segments(torch.stack(counts), frames)
 
 
@@ -108,57 +85,32 @@ def calibrate_in_motion(segments: Segments, known: Calibration, pattern: str | N
         quarters of the pixels or if the halves correlate by less than 0.4. Dark rates are not told from gains: a pixel
         of much leak in little light is given a larger gain.
 
-    Args:
-        segments: counts, at least 12 of them.
-        known: the dead and hot pixels, see :func:`spikekit.calibration.measure.find_defects`.
-        pattern: Bayer phase; ``None`` for a grey sensor.
-
-    Returns:
-        What was measured, or ``None`` where too little moves or the halves of the recording do not agree, as those of
-        an ideal sensor do not.
-
-    Raises:
-        ValueError: too few segments, or pixels of another size than ``known``.
+        ``known`` are the dead and hot pixels. ``None`` where too little moves or the halves of the recording do not
+        agree, as those of an ideal sensor do not.
 
     Reference:
         Registration-based non-uniformity correction: Hardie, Hayat, Armstrong and Yasuda, Scene-based nonuniformity
         correction with video sequences and registration, Applied Optics 39(8), 2000.
     """
-    counts = segments.counts
-    check_planes("segments", counts, 3, "(J, H, W)")
-    if len(counts) < LEAST_SEGMENTS or tuple(counts.shape[1:]) != known.size:
-        expected = f"at least {LEAST_SEGMENTS} segments of {known.size[0]} x {known.size[1]} pixels"
-        raise ValueError(f"segments: expected {expected}, got {tuple(counts.shape)}")
-    works = known.defects == WORKS
+    counts, works = segments.counts, known.defects == WORKS
     if min(known.size) < _LEAST_SIDE:
         return None
     planes = [torch.from_numpy(plane) & works for plane in colors(known.size, pattern)]
     measured = Measured(known)
     with progress(what="motion and gains", total=2 * _ROUNDS * len(counts)) as bar:
         for _ in range(_ROUNDS):
-            halves = _Halves(len(counts), known.size)
+            # over both halves: how often each pixel was seen, its light, and by how much more often it fires
+            halves = torch.zeros(3, 2, *known.size, dtype=torch.float64)
             for number, (light, seen) in enumerate(_expected(segments, measured.calibration, pattern, bar.update)):
-                halves.add(number, counts[number] / segments.frames, light, seen & works)
+                excess = counts[number] / segments.frames - light
+                halves[:, 2 * number // len(counts)] += torch.stack([torch.ones_like(light), light, excess]) * (
+                    seen & works
+                )
             found = _most_likely(halves, works, planes, known)
             if found is None:
                 return None
             measured = found
     return measured
-
-
-class _Halves:
-    """Means over both halves of a recording: what a pixel should see, and by how much more often it fires."""
-
-    def __init__(self, segments: int, size: tuple[int, int]) -> None:
-        self.segments = segments
-        self.count, self.light, self.excess = torch.zeros(3, 2, *size, dtype=torch.float64)
-
-    def add(self, number: int, rate: Tensor, light: Tensor, seen: Tensor) -> None:
-        """Add a segment: its rates, what light was expected, and at which pixels."""
-        half = 2 * number // self.segments
-        self.count[half] += seen
-        self.light[half] += light * seen
-        self.excess[half] += (rate - light) * seen
 
 
 def _expected(
@@ -223,14 +175,15 @@ def _inside(flow: Tensor) -> Tensor:
     return (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
 
 
-def _most_likely(halves: _Halves, works: Tensor, planes: list[Tensor], known: Calibration) -> Measured | None:
+def _most_likely(halves: Tensor, works: Tensor, planes: list[Tensor], known: Calibration) -> Measured | None:
     """Gains, given what both halves of a recording say."""
     from scipy.optimize import nnls
 
-    used = works & (halves.count >= _LEAST_COUNT).all(0)
+    count = halves[0]
+    used = works & (count >= _LEAST_COUNT).all(0)
     if used.sum() < _SHARE * works.sum():
         return None
-    light, excess = (part[:, used] / halves.count[:, used] for part in (halves.light, halves.excess))
+    light, excess = (part[:, used] / count[:, used] for part in halves[1:])
     common = excess.prod(0).mean()
     if not common > _AGREE * excess.square().mean():  # nor where nothing fires
         return None
@@ -238,7 +191,7 @@ def _most_likely(halves: _Halves, works: Tensor, planes: list[Tensor], known: Ca
     # dark pixels are less exact, relative to their light
     terms = torch.stack([light.square().mean(0), torch.ones_like(light[0])], dim=1)
     weight = 1 / (terms[:, :1] + terms[:, 0].mean())
-    differ = torch.zeros_like(halves.count[0])
+    differ = torch.zeros_like(count[0])
     differ[used] = excess.diff(dim=0)[0].square() / 2
     shape, floor = nnls((terms * weight).numpy(), (differ[used] * weight[:, 0]).numpy())[0]
     error = (shape * light.square() + floor).maximum(_mean_around(differ, used)[used])

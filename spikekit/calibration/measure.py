@@ -21,13 +21,7 @@ _NEAR = 5  # side of the window that a pixel of a scene is compared with, in pix
 
 
 class Measured(NamedTuple):
-    """A calibration, and how exact it is.
-
-    Args:
-        calibration: that of the sensor.
-        gain_error: standard error of a pixel's gain; ``None`` where it was not measured.
-        dark_error: that of its dark rate; likewise.
-    """
+    """A calibration, and the standard errors of a pixel's gain and dark rate, ``None`` where they were not measured."""
 
     calibration: Calibration
     gain_error: float | None = None
@@ -51,22 +45,10 @@ def calibrate(
         Errors are told by the two halves of a recording: the root mean square of what they differ by, halved. That is
         right where light or charge come in single electrons, and more than the error where they come evenly.
 
-    Args:
-        flat: rates of both halves of a recording in even light.
-        dark: likewise in the dark.
-        pattern: Bayer phase; ``None`` for a grey sensor.
-
-    Returns:
-        What was measured.
-
     Raises:
-        ValueError: neither recording, recordings of other sizes, a flat one that is no brighter than the dark one or
-            so bright that its pixels are saturated.
+        ValueError: a flat recording that is no brighter than the dark one, or so bright that its pixels are saturated.
     """
-    sizes = {tuple(halves[0].count.shape) for halves in (flat, dark) if halves is not None}
-    if len(sizes) != 1:
-        raise ValueError(f"expected a flat or a dark recording, or both of one size, got sizes {sorted(sizes)}")
-    size = next(iter(sizes))
+    size = tuple((flat or dark)[0].count.shape)
     leak, gain = torch.zeros(size, dtype=torch.float64), torch.ones(size, dtype=torch.float64)
     defects = torch.zeros(size, dtype=torch.uint8)
     gain_error = dark_error = None
@@ -109,13 +91,6 @@ def find_defects(scene: PixelRates, pattern: str | None = None) -> Measured:
         which fire at least ten times, and hot if it fires at nearly every clock where they do so at less than half.
         Gains stay 1: at rest they cannot be told from the texture of the scene; where it moves, see
         :func:`spikekit.calibration.in_motion.calibrate_in_motion`.
-
-    Args:
-        scene: rates of a recording.
-        pattern: Bayer phase; ``None`` for a grey sensor.
-
-    Returns:
-        What was found.
     """
     size = tuple(scene.count.shape)
     defects = torch.zeros(size, dtype=torch.uint8)

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from spikekit.check import check_planes
-
 
 @dataclass(frozen=True, eq=False)
 class PixelRates:
@@ -21,33 +19,22 @@ class PixelRates:
         In light that does not change, n spikes are n - 1 whole thresholds, and only the two ends are rounded to clocks:
         the error is about :math:`0.4 \, r / T`, where that of n / T is 0.4 / T.
 
-    Args:
-        frames: T.
-        count: n, (H, W), int64.
-        first: frame of the first spike, (H, W), int64; T where there is none.
-        last: frame of the last spike; -1 where there is none.
-
     Example:
         >>> spikes = torch.tensor([0, 1, 0, 0, 1, 0, 0, 1, 0, 0]).reshape(10, 1, 1)
         >>> PixelRates.of([spikes]).rate.item()
         0.333...
     """
 
-    frames: int
-    count: Tensor
-    first: Tensor
-    last: Tensor
+    frames: int  # T
+    count: Tensor  # n, (H, W), int64
+    first: Tensor  # frame of the first spike; T where there is none
+    last: Tensor  # of the last one; -1 where there is none
 
     @classmethod
     def of(cls, chunks: Iterable[Tensor]) -> PixelRates:
-        """Count chunks (T_i, H, W) of one recording.
-
-        Raises:
-            ValueError: there are none.
-        """
+        """Count chunks (T_i, H, W) of one recording."""
         whole = None
         for spikes in chunks:
-            check_planes("chunks", spikes, 3, "(T, H, W)")
             fired, frames = spikes != 0, len(spikes)
             silent = ~fired.any(0)
             part = cls(
@@ -57,8 +44,6 @@ class PixelRates:
                 (frames - 1 - fired.flip(0).byte().argmax(0)).masked_fill(silent, -1),
             )
             whole = part if whole is None else whole + part
-        if whole is None:
-            raise ValueError("chunks: expected at least one, got none")
         return whole
 
     def __add__(self, later: PixelRates) -> PixelRates:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 from torch import Tensor
@@ -22,7 +21,6 @@ from spikekit.calibration.in_motion import (
 from spikekit.calibration.measure import Measured, calibrate, find_defects
 from spikekit.calibration.pixel_rates import PixelRates
 from spikekit.cli import recordings
-from spikekit.io.failures import writing
 from spikekit.io.files import iter_spikes
 from spikekit.progress import progress
 from spikekit.recording import Recording, open_recording, own_calibration
@@ -45,9 +43,16 @@ def run(args: argparse.Namespace) -> None:
     --calibration.
     """
     output = args.output or own_calibration(args.file)
-    recording = _open(args, args.file)
-    _check_output(output)
-    others = {name: _open(args, path) for name in ("flat", "dark") if (path := getattr(args, name))}
+    known = recordings.known(args) | {"calibration": "none"}
+    recording = open_recording(args.file, **known)
+    if output.suffix != ".safetensors":
+        raise UsageError(f"--output: expected a name that ends in .safetensors, got {output}")
+    if output.exists():  # and is no calibration, such as the weights of a network
+        try:
+            read_calibration(output)
+        except ValueError as error:
+            raise ValueError(f"{output}: would be lost, and is not a calibration; choose another name") from error
+    others = {name: open_recording(path, **known) for name in ("flat", "dark") if (path := getattr(args, name))}
     for other in others.values():
         if other.size != recording.size:
             sizes = " x ".join(map(str, recording.size)), " x ".join(map(str, other.size))
@@ -57,30 +62,25 @@ def run(args: argparse.Namespace) -> None:
         if others:
             found, said = calibrate(seen.get("flat"), seen.get("dark"), recording.bayer), None
         else:
-            found = find_defects(seen["scene"][0] + seen["scene"][1], recording.bayer)
-            moved, said = _in_motion(recording, seen["scene"][0] + seen["scene"][1], found.calibration)
+            rates = seen["scene"][0] + seen["scene"][1]
+            found = find_defects(rates, recording.bayer)
+            moved, said = _in_motion(recording, rates, found.calibration)
             found = moved or found
     except ValueError as error:
         raise ValueError(f"{(args.flat or args.dark or args.file)}: {error}") from error
-    known = found.calibration
-    with writing(output):
-        write_calibration(output, known.flip() if recording.flip else known)
-    works = known.defects == WORKS
+    measured = found.calibration
+    write_calibration(output, measured.flip() if recording.flip else measured)
+    works = measured.defects == WORKS
     if said:
         print(f"gain         {said}")
     if found.gain_error is not None:
-        print(f"gain         {known.gain[works].std():.2%} apart, each known to {found.gain_error:.2%}")
+        print(f"gain         {measured.gain[works].std():.2%} apart, each known to {found.gain_error:.2%}")
     if found.dark_error is not None:
-        dark = known.dark[works]
+        dark = measured.dark[works]
         print(f"dark rate    {dark.mean():.2g} spikes a frame, {dark.std():.2g} apart, known to {found.dark_error:.1g}")
     for name, kind in (("dead", DEAD), ("hot", HOT)):
-        print(f"{name:12} {int((known.defects == kind).sum())} of {works.numel()} pixels")
+        print(f"{name:12} {int((measured.defects == kind).sum())} of {works.numel()} pixels")
     say(f"{output}: {', '.join(f'{name} {half[0].frames + half[1].frames} frames' for name, half in seen.items())}")
-
-
-def _open(args: argparse.Namespace, path: Path) -> Recording:
-    """Open a file of the sensor, uncorrected."""
-    return open_recording(path, **recordings.known(args), calibration="none")
 
 
 def _halves(recording: Recording) -> tuple[PixelRates, PixelRates]:
@@ -115,19 +115,6 @@ def _in_motion(recording: Recording, rates: PixelRates, known: Calibration) -> t
         segments = count_segments(_parts(recording, 0, frames, bar), length)
     found = calibrate_in_motion(segments, known, recording.bayer)
     return found, None if found else f"not measured in {frames} frames: too little moves, or gains are all but equal"
-
-
-def _check_output(output: Path) -> None:
-    """Refuse what is no calibration already, such as the weights of a network."""
-    if output.is_dir():
-        raise ValueError(f"{output}: expected a file to write, got a folder")
-    if output.suffix != ".safetensors":
-        raise UsageError(f"--output: expected a name that ends in .safetensors, got {output}")
-    if output.exists():
-        try:
-            read_calibration(output)
-        except ValueError as error:
-            raise ValueError(f"{output}: would be lost, and is not a calibration; choose another name") from error
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

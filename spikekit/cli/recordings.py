@@ -18,12 +18,7 @@ _OPTIONS = [name for name in signature(open_recording).parameters if name != "pa
 
 
 def add_arguments(parser: Any, *, calibration: bool = True) -> None:
-    """Add FILE and what is to be known of it: size, flip, pattern, camera and, perhaps, calibration.
-
-    Args:
-        parser: of ``argparse``, or one of its groups.
-        calibration: whether the verb corrects pixels.
-    """
+    """Add FILE and what is to be known of it; the calibration too, where the verb corrects pixels."""
     add = parser.add_argument
     add("file", type=home_path, metavar="FILE", help="a recording, .dat (8 pixels a byte, no header), .npy or .npz")
     add("--height", type=whole(1), metavar="H", help="rows of a frame; a .dat without side-car or camera needs it")

@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 import io
 import math
-from dataclasses import dataclass
-from functools import cached_property
+import re
 
 import numpy as np
 import torch
@@ -18,7 +17,6 @@ from spikekit.cli import recordings
 from spikekit.color.demosaic import demosaic
 from spikekit.decoders.single_frame import search
 from spikekit.flow.fields import upsample_flow
-from spikekit.io.failures import writing
 from spikekit.io.images import flow_to_rgb
 from spikekit.io.sidecar import check_unclaimed
 from spikekit.io.whole_file import whole_file
@@ -42,60 +40,46 @@ def run(args: argparse.Namespace) -> None:
     """
     shown = recordings.opened(args)
     begin, end = _span(args.frames, shown)
-    if args.output.is_dir():
-        raise ValueError(f"{args.output}: expected a file to write, got a folder")
     check_unclaimed([args.output], args.file)
     if args.row is not None and args.row >= shown.size[0]:
         raise UsageError(f"--row: expected 0 .. {shown.size[0] - 1}, got {args.row}")
-    window = min(args.window or _WINDOW, end - begin)
-    moment = Moment(shown, begin, end, window, args.alpha or shown.alpha, args.row)
+    moment = Moment(shown, begin, end, args.window or _WINDOW, args.alpha or shown.alpha, args.row)
     data = moment.sheet()
-    with writing(args.output), whole_file(args.output) as file:
+    with whole_file(args.output) as file:
         file.write(data)
-    say(f"{args.output}: frames {begin} .. {end - 1} of {shown.frames}, {moment.said}")
+    white = f"alpha {moment.alpha:g} is white" if moment.alpha else f"{moment.white:.3g} spikes a frame are white"
+    say(f"{args.output}: frames {begin} .. {end - 1} of {shown.frames}, {white}{shown.said}")
     if moment.hint and not args.window:
         print(moment.hint)
 
 
-@dataclass(frozen=True)
 class Moment:
-    """A span of a recording, and what can be seen in it.
+    """Frames of a recording, from ``begin`` to before ``end``, and what can be seen around the one in their middle.
 
-    Args:
-        recording: the file.
-        begin: first frame.
-        end: the frame after the last.
-        window: frames that TFP averages.
-        alpha: light of a white pixel, where it is known.
-        row: of the pixels whose spikes are drawn; the middle one when not given.
+    ``window`` is how many frames TFP averages, ``alpha`` the light of a white pixel, where it is known, ``row`` the one
+    whose spikes are drawn, the middle one when not given.
     """
 
-    recording: Recording
-    begin: int
-    end: int
-    window: int
-    alpha: float | None
-    row: int | None
-
-    @property
-    def frame(self) -> int:
-        """The frame in the middle of those drawn."""
-        return (self.begin + self.end) // 2
-
-    @property
-    def near(self) -> range:
-        """The frames that are drawn: those around the one in the middle."""
-        return range(max(self.begin, self.frame - REACH), min(self.end, self.frame + REACH + 1))
-
-    @property
-    def averaged(self) -> range:
-        """The frames that TFP averages."""
-        first = max(self.near.start, self.frame - self.window // 2)
-        return range(first, min(first + self.window, self.near.stop))
-
-    @cached_property
-    def _planes(self) -> list[np.ndarray]:
-        return list(self.recording.packed(self.near.start, len(self.near)))
+    def __init__(
+        self, recording: Recording, begin: int, end: int, window: int, alpha: float | None, row: int | None
+    ) -> None:
+        self.recording, self.alpha = recording, alpha
+        self.row = recording.size[0] // 2 if row is None else row
+        self.frame = frame = (begin + end) // 2
+        self.near = near = range(max(begin, frame - REACH), min(end, frame + REACH + 1))
+        first = max(near.start, frame - min(window, end - begin) // 2)
+        self.averaged = range(first, min(first + window, near.stop))
+        self._planes = list(recording.packed(near.start, len(near)))
+        self.rates = self._rate(near)  # spikes a frame of every pixel
+        self.white = alpha or white_rate(recording.correct(self.rates))
+        share = self.rates.mean().item()
+        self.hint = ""
+        if 0 < window * share < _FEW and window < end - begin:
+            longer = min(2 * math.ceil(_ENOUGH / (2 * share)) + 1, end - begin)
+            self.hint = (
+                f"{share:.1%} of the bits are set, {window * share:.1f} spikes of a pixel in {window} frames: "
+                f"--window {longer} shows less noise, and more blur where something moves"
+            )
 
     def _plane(self, n: int) -> np.ndarray:
         return self.recording.unpack(self._planes[n - self.near.start])
@@ -103,34 +87,6 @@ class Moment:
     def _rate(self, frames: range) -> Tensor:
         total = sum(map(self._plane, frames), start=np.float32(0))
         return torch.from_numpy(total / np.float32(len(frames)))
-
-    @cached_property
-    def rates(self) -> Tensor:
-        """How often every pixel fires in the frames that are drawn, in spikes a frame."""
-        return self._rate(self.near)
-
-    @property
-    def white(self) -> float:
-        """The value shown as white."""
-        return self.alpha or white_rate(self.recording.correct(self.rates))
-
-    @property
-    def said(self) -> str:
-        """The value shown as white, in words."""
-        white = f"alpha {self.alpha:g} is white" if self.alpha else f"{self.white:.3g} spikes a frame are white"
-        return white + self.recording.said
-
-    @property
-    def hint(self) -> str:
-        """A longer window, where a pixel hardly fires in this one; nothing where there is enough to see."""
-        share = self.rates.mean().item()
-        if not 0 < self.window * share < _FEW or self.window == self.end - self.begin:
-            return ""
-        longer = min(2 * math.ceil(_ENOUGH / (2 * share)) + 1, self.end - self.begin)
-        return (
-            f"{share:.1%} of the bits are set, {self.window * share:.1f} spikes of a pixel in {self.window} frames: "
-            f"--window {longer} shows less noise, and more blur where something moves"
-        )
 
     def picture(self, raw: Tensor) -> Tensor:
         """Return raw light as it is shown, (3, H, W) or (H, W)."""
@@ -148,13 +104,8 @@ class Moment:
 
     def raster(self) -> Tensor:
         """The spikes of one row of pixels, (W, T)."""
-        spikes = np.stack([self._plane(n)[self.line].copy() for n in self.near])  # a view would hold its frame
+        spikes = np.stack([self._plane(n)[self.row].copy() for n in self.near])  # a view would hold its frame
         return torch.from_numpy(spikes).T
-
-    @property
-    def line(self) -> int:
-        """The row of pixels whose spikes are drawn."""
-        return self.recording.size[0] // 2 if self.row is None else self.row
 
     def motion(self) -> tuple[Tensor, float, float] | None:
         """Motion from a window before the middle to one after it: colours, longest displacement, time between."""
@@ -201,7 +152,7 @@ class Moment:
         begin, end = self.near.start - 0.5, self.near.stop - 0.5
         sides = begin, end, self.recording.size[1] - 0.5, -0.5
         axes[1, 1].imshow(1 - self.raster().numpy(), "gray", vmin=0, vmax=1, extent=sides, aspect="auto")
-        axes[1, 1].set(title=f"spikes of row {self.line}", xlabel="frame", ylabel="column")
+        axes[1, 1].set(title=f"spikes of row {self.row}", xlabel="frame", ylabel="column")
         silent = (self.rates == 0).float().mean()
         axes[1, 2].hist(self.rates.flatten().numpy(), bins=min(len(self.near), 80))
         axes[1, 2].set(
@@ -216,12 +167,11 @@ class Moment:
 
 def _span(text: str | None, recording: Recording) -> tuple[int, int]:
     """Return the first frame to show and the one after the last."""
-    begin, end = ((text or ":") + ":").split(":")[:2]
-    first, stop = int(begin or 0), int(end or recording.frames)
+    typed = re.fullmatch(r"(\d*):(\d*)", text or ":", re.ASCII)
+    first, stop = (int(typed[1] or 0), int(typed[2] or recording.frames)) if typed else (0, 0)
     if not first < stop <= recording.frames:
         raise UsageError(
-            f"--frames: expected A:B within 0:{recording.frames}, as {recording.path} has {recording.frames} frames, "
-            f"got {text}"
+            f"--frames: expected A:B within 0:{recording.frames}, the frames of {recording.path}, got {text}"
         )
     return first, stop
 
@@ -235,13 +185,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--alpha", type=positive, metavar="A", help="gain of a simulated recording: a white pixel fires A times a frame"
     )
-    add("--frames", type=_frames, metavar="A:B", help="which frames to show, from A to B - 1; all if not given")
+    add("--frames", metavar="A:B", help="which frames to show, from A to B - 1; all if not given")
     add("--window", type=whole(1), metavar="W", help=f"frames that tfp averages; {_WINDOW} if not given")
     add("--row", type=whole(0), metavar="Y", help="row of pixels whose spikes are drawn; the middle one if not given")
-
-
-def _frames(text: str) -> str:
-    begin, colon, end = text.partition(":")
-    if not colon or not all(part == "" or (part.isascii() and part.isdigit()) for part in (begin, end)):
-        raise argparse.ArgumentTypeError(f"expected A:B, got {text}")
-    return text

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import dataclass, fields
 from functools import cache
 from importlib.resources import files
@@ -65,16 +64,11 @@ class Camera:
     source: str
 
     def __post_init__(self) -> None:
-        kinds = {"name": str, "title": str, "source": str, "flip": bool}
-        kinds |= dict.fromkeys(("rate", "gain", "gamma"), int | float)
-        for name, kind in kinds.items():
+        for name, kind in {"name": str, "title": str, "source": str, "flip": bool}.items():
             if not isinstance(getattr(self, name), kind):
-                said = "a number" if name in ("rate", "gain", "gamma") else kind.__name__
-                raise TypeError(f"{name}: expected {said}, got {repr(getattr(self, name))[:80]}")
+                raise TypeError(f"{name}: expected {kind.__name__}, got {repr(getattr(self, name))[:80]}")
         for name in ("rate", "gain", "gamma"):
             check_positive(name, getattr(self, name))
-            if getattr(self, name) > sys.float_info.max:  # a whole number has no end
-                raise ValueError(f"{name}: expected a finite number, got more than {sys.float_info.max:g}")
         for name in ("height", "width"):
             check_whole(name, getattr(self, name))
         if self.pattern is not None:
@@ -128,9 +122,8 @@ class Camera:
         height, width = spikes.shape[-2:]
         if height != self.height or width not in (self.width, self.stored_width):
             widths = " or ".join(str(w) for w in dict.fromkeys((self.width, self.stored_width)))
-            raise ValueError(
-                f"spikes: expected {self.height} x {widths} of the camera {self.name}, got {height} x {width}"
-            )
+            expected = f"{self.height} x {widths} of the camera {self.name}"
+            raise ValueError(f"spikes: expected {expected}, got {height} x {width}")
         if width != self.width:
             kept = [spikes[..., a:b] for a, b in zip(self._edges[::2], self._edges[1::2], strict=True)]
             spikes = torch.cat(kept, dim=-1)
@@ -188,8 +181,8 @@ def camera(name: str | Path) -> Camera:
         raise ValueError(f"{name}: {one_line(error)}") from error
     wanted = [field.name for field in fields(Camera) if field.name != "name"]
     if not isinstance(data, dict) or set(data) != set(wanted):
-        got = ", ".join(data) if isinstance(data, dict) else type(data).__name__
-        raise ValueError(f"{name}: expected an object with {', '.join(wanted)}, got {printable(got)[:300]}")
+        got = printable(", ".join(data) if isinstance(data, dict) else type(data).__name__)[:300]
+        raise ValueError(f"{name}: expected an object with {', '.join(wanted)}, got {got}")
     try:
         return Camera(**{"name": file.name.removesuffix(".json")} | {key: _frozen(data[key]) for key in wanted})
     except (TypeError, ValueError, RecursionError) as error:

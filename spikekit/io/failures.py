@@ -13,11 +13,7 @@ from spikekit.arguments import one_line
 
 
 def no_pipe(path: str | Path) -> Path:
-    """Return the path of what is to be read; a pipe or a device would be waited for.
-
-    Raises:
-        OSError: it is one.
-    """
+    """Return the path of what is to be read; raise OSError of a pipe or a device, which would be waited for."""
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError):  # whoever reads it says so
@@ -29,13 +25,7 @@ def no_pipe(path: str | Path) -> Path:
 
 @contextmanager
 def reading(path: str | Path, kind: type[ValueError], what: str = "", otherwise: str = "{}") -> Iterator[None]:
-    """Turn any error while reading a file into one line.
-
-    Args:
-        path: the file.
-        kind: of the error that is raised; one of this kind passes as it is.
-        what: of the file was read, such as ``"frame 3: "``.
-        otherwise: how to say what neither the system nor the memory is to blame for.
+    """Turn any error while reading a file, or ``what`` of it, into one line; one of its kind passes as it is.
 
     Example:
         >>> with reading("clip.npz", ValueError, otherwise="damaged ({})"):
@@ -54,18 +44,3 @@ def reading(path: str | Path, kind: type[ValueError], what: str = "", otherwise:
     except Exception as error:
         said = one_line(error).removeprefix(f"{path}: ")[:300]
         raise kind(f"{path}: {what}{otherwise.format(said)}") from error
-
-
-@contextmanager
-def writing(path: str | Path, kind: type[ValueError] = ValueError, wrong: type[Exception] = OSError) -> Iterator[None]:
-    """Turn any error while writing a file into one line.
-
-    Args:
-        path: the file.
-        kind: of the error that is raised.
-        wrong: what is turned into it.
-    """
-    try:
-        yield
-    except wrong as error:
-        raise kind(f"{path}: cannot be written ({one_line(error)})") from error

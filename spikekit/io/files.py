@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
@@ -26,7 +25,6 @@ from spikekit.io.formats import (
     reading,
     stored_blocks,
     write_array,
-    writing,
 )
 from spikekit.io.images import MOST_PIXELS
 from spikekit.io.whole_file import whole_file
@@ -193,7 +191,8 @@ def write_spikes(path: str | Path, spikes: Tensor | Iterable[Tensor], *, flip: b
         flip: store the frames upside down, as real cameras do.
 
     Raises:
-        SpikeFileError: another ending, or the file cannot be written.
+        SpikeFileError: another ending.
+        OSError: the file cannot be written; what was there before, or nothing, is then there.
         TypeError: ``spikes`` is not a tensor of real numbers, nor an iterable of such.
         ValueError: another shape, an empty clip, frames of several sizes, or values other than 0 and 1.
 
@@ -214,49 +213,28 @@ def write_spikes(path: str | Path, spikes: Tensor | Iterable[Tensor], *, flip: b
     """
     path = home_path(path)
     suffix = _check_suffix(path)
-    with _opened(path) as file:
+    with whole_file(path) as file:
         if suffix == ".dat":
-            _write_bits(path, file, spikes, flip)
+            _write_bits(file, spikes, flip)
             return
-        with writing(
-            path
-        ):  # the header of an array says how many frames there are; a file without a name needs no care
-            bits = tempfile.TemporaryFile(dir=path.parent)  # noqa: SIM115
-        with bits:
-            frames, height, width = _write_bits(path, bits, spikes, flip)
-            with writing(path):
-                stored = stored_blocks(bits, Wanted(path, height, width, 0, frames, 1))
-                write_array(file, suffix, (frames, height, width), stored)
+        # the header of an array says how many frames there are
+        with tempfile.TemporaryFile(dir=path.parent) as bits:
+            frames, height, width = _write_bits(bits, spikes, flip)
+            stored = stored_blocks(bits, Wanted(path, height, width, 0, frames, 1))
+            write_array(file, suffix, (frames, height, width), stored)
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[IO[bytes]]:
-    """Open a whole file; what goes wrong with it is said in one line, and what the chunks raise is not about it."""
-    whole = whole_file(path)
-    with writing(path):
-        file = whole.__enter__()
-    try:
-        yield file
-    except BaseException as error:
-        whole.__exit__(type(error), error, error.__traceback__)
-        raise
-    with writing(path):
-        whole.__exit__(None, None, None)
-
-
-def _write_bits(path: Path, file: IO[bytes], spikes: Tensor | Iterable[Tensor], flip: bool) -> tuple[int, int, int]:
-    """Write packed frames to a file, on the way to ``path``; return (T, H, W)."""
+def _write_bits(file: IO[bytes], spikes: Tensor | Iterable[Tensor], flip: bool) -> tuple[int, int, int]:
+    """Write packed frames to a file; return (T, H, W)."""
     written = 0
     for chunk in _chunks(spikes):
         height, width = chunk.shape[1:]
         for block in chunk.split(max(1, _BLOCK // (height * width))):
             block = block.float() if block.dtype is torch.bfloat16 else block  # NumPy has no bfloat16
             bits = binary(block.cpu().resolve_neg().numpy(), "spikes", written, ValueError)[:, :: -1 if flip else 1]
-            with writing(path):
-                file.write(dat_bytes(bits))
+            file.write(dat_bytes(bits))
             written += len(bits)
-    with writing(path):
-        file.flush()
+    file.flush()
     return written, height, width
 
 

@@ -26,11 +26,10 @@ _MOST_DEFLATED = 1032
 
 
 class SpikeFileError(ValueError):
-    """A recording that cannot be read or written; the message is one line and names the file."""
+    """A recording that cannot be read, or a name that no recording has; the message is one line and names the file."""
 
 
 reading = partial(failures.reading, kind=SpikeFileError, otherwise="damaged ({})")
-writing = partial(failures.writing, kind=SpikeFileError)
 
 
 class Wanted(NamedTuple):

@@ -33,19 +33,7 @@ def to_bytes(image: Tensor, bits: int = 8) -> Tensor:
 
 
 def png_bytes(image: Tensor, notes: Mapping[str, str] | None = None) -> bytes:
-    """Return the PNG file of an image, of 8 bits.
-
-    Args:
-        image: (3, H, W) or (H, W), floating, [0, 1], or uint8.
-        notes: texts that stand in front of the pixels, by name, both ASCII.
-
-    Returns:
-        The bytes of the file.
-
-    Example:
-        >>> png_bytes(torch.zeros(3, 4, 6))[1:4]
-        b'PNG'
-    """
+    """Return the PNG file of an image, (3, H, W) or (H, W), of 8 bits; ASCII notes stand in front of the pixels."""
     from PIL.PngImagePlugin import PngInfo
 
     said = PngInfo()
@@ -55,11 +43,7 @@ def png_bytes(image: Tensor, notes: Mapping[str, str] | None = None) -> bytes:
 
 
 def png_pixels(path: str | Path) -> Tensor:
-    """Return the pixels of a PNG file of 8 bits, (3, H, W), uint8: a quarter of the memory of a picture.
-
-    Raises:
-        PictureError: the file cannot be read.
-    """
+    """Return the pixels of a PNG file of 8 bits, (3, H, W), uint8: a quarter of the memory of a picture."""
     from PIL import Image
 
     try:
@@ -70,24 +54,7 @@ def png_pixels(path: str | Path) -> Tensor:
 
 
 def picture_bytes(image: Tensor, ending: str, *, bits: int = 8, quality: int | None = None) -> bytes:
-    """Return the file of an image.
-
-    Args:
-        image: (3, H, W) or (H, W), floating, [0, 1].
-        ending: names the format, such as ``".png"``.
-        bits: 8, or 16 in PNG and TIFF.
-        quality: of JPEG and WebP, 1 to 100; Pillow's own when not given.
-
-    Returns:
-        The bytes of the file.
-
-    Raises:
-        ValueError: no format that Pillow writes has this ending, or it has no such bits or quality.
-
-    Example:
-        >>> picture_bytes(torch.zeros(3, 4, 6), ".JPG")[:2].hex()
-        'ffd8'
-    """
+    """Return the file of an image in the format that an ending names, as :func:`spikekit.write_picture` takes it."""
     from PIL import Image
 
     formats = {name: kind for name, kind in Image.registered_extensions().items() if kind in Image.SAVE}
@@ -119,5 +86,8 @@ def _pillow_bytes(pixels: Tensor, kind: str, **how: Any) -> bytes:
 
     file = io.BytesIO()
     # of PNG: a fifth of the time of Pillow's own level 6, for files that are 15 % longer
-    Image.fromarray(pixels.numpy()).save(file, kind, compress_level=2, **how)
+    try:
+        Image.fromarray(pixels.numpy()).save(file, kind, compress_level=2, **how)
+    except OSError as error:
+        raise ValueError(f"expected a picture that fits into a {kind}, got {tuple(pixels.shape[:2])}") from error
     return file.getvalue()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import math
+import zlib
 from collections.abc import Sequence
 from contextlib import suppress
 from itertools import chain
@@ -24,16 +26,17 @@ from spikekit.io.whole_file import whole_file
 MOST_PIXELS = 1 << 27
 
 _ORIENTATION = 0x0112  # the tag of EXIF and TIFF
+_PNG = b"\x89PNG"
+_GREY_ALPHA_16 = (_PNG, 16, 4)
 _FARTHEST = 1e9  # the length of what is infinite
 
 
 def read_picture(path: str | Path) -> Tensor:
     """Read a picture file as a colour image, upright as its EXIF says.
 
-    Grey pictures get three equal channels, 16-bit files keep their depth (but for grey ones with alpha, CMYK, colour
-    PNMs, and colour TIFFs that only Pillow can unpack, which get 8 bits). Alpha is laid over white, as a page shows it;
-    dropping it would bring up colours that nobody was meant to see, and where it is opaque it changes nothing. Values
-    stay gamma-encoded as in the file.
+    Grey pictures get three equal channels, 16-bit files keep their depth (but for CMYK and colour PNMs, which get 8
+    bits). Alpha is laid over white, as a page shows it; dropping it would bring up colours that nobody was meant to
+    see, and where it is opaque it changes nothing. Values stay gamma-encoded as in the file.
 
     Args:
         path: a PNG, JPEG, TIFF (its first page), PNM or any other file that Pillow reads.
@@ -110,22 +113,32 @@ def _pixels(path: Path) -> tuple[np.ndarray, int]:
     By what the file says that it is, and by one library each: one that tries others would hand what no picture is to
     FFmpeg, for which some files are lists of others to open.
     """
+    from kornia_rs.io import read_image_png_u16, read_image_tiff_u16
     from PIL import Image
 
-    with open(path, "rb") as file:
-        head = file.read(26)
-    if head[:2] in (b"II", b"MM") and (plain := _plain_tiff(path)) is not None:
+    file: Path | io.BytesIO = path
+    with path.open("rb") as opened:
+        head = opened.read(26)
+    tiff = head[:2] in (b"II", b"MM")
+    if tiff and (plain := _plain_tiff(path)) is not None:
         return plain
-    with Image.open(path) as picture:
+    kind = (head[:4], *head[24:])  # of a PNG its bits and its kind of colour
+    if kind == _GREY_ALPHA_16:
+        file = io.BytesIO(_four_bytes(path.read_bytes()))
+    with Image.open(file) as picture:
         _check_pixels(picture.height * picture.width)
-        if head.startswith(b"\x89PNG") and head[24:] in (b"\x10\x02", b"\x10\x06"):
-            # 16 bits in colour, of which Pillow would keep 8
-            from kornia_rs.io import read_image_png_u16
-
-            pixels = _unit(read_image_png_u16(str(path), "rgb" if head[25] == 2 else "rgba"), 16)
+        tags = getattr(picture, "tag_v2", {})
+        bits = tags.get(258, (16,))
+        if kind == _GREY_ALPHA_16:
+            pixels = _unit(np.asarray(picture).view(">u2"), 16)
+        elif kind[:2] == (_PNG, 16) and kind[2] in (2, 6):  # 16 bits in colour, of which Pillow would keep 8
+            pixels = _unit(read_image_png_u16(str(path), "rgb" if kind[2] == 2 else "rgba"), 16)
+        elif tiff and max(bits) > 8 and tags.get(262) == 2:  # likewise
+            if len(bits) != 3 or tags.get(284, 1) != 1:
+                raise ValueError("expected the package imagecodecs for 16 bits in this packing and layout, got none")
+            pixels = _unit(read_image_tiff_u16(str(path), "rgb"), 16)
         elif picture.mode.startswith("I;16") or (picture.mode == "I" and picture.format in ("PNG", "PPM")):
-            tags = getattr(picture, "tag_v2", {})
-            pixels = _unit(np.asarray(picture), tags.get(258, (16,))[0])
+            pixels = _unit(np.asarray(picture), bits[0])
             pixels = 1 - pixels if tags.get(262) == 0 else pixels  # white is 0
         elif picture.mode == "F":
             pixels = np.asarray(picture)
@@ -135,6 +148,12 @@ def _pixels(path: Path) -> tuple[np.ndarray, int]:
             pixels = _unit(np.asarray(picture.convert("RGBA" if picture.has_transparency_data else "RGB")), 8)
         turned = _orientation(picture)  # a TIFF is upright once it is loaded
     return pixels.reshape(*pixels.shape[:2], -1), turned
+
+
+def _four_bytes(png: bytes) -> bytes:
+    """Call the two numbers of 16 bits of a pixel, grey and alpha, four of 8, of which Pillow keeps all."""
+    head = png[12:24] + b"\x08\x06" + png[26:29]
+    return png[:12] + head + zlib.crc32(head).to_bytes(4, "big") + png[33:]
 
 
 def _plain_tiff(path: Path) -> tuple[np.ndarray, int] | None:
@@ -207,9 +226,8 @@ def write_picture(path: str | Path, image: Tensor, *, bits: int = 8, quality: in
     """
     check_picture("image", image, "(3, H, W) or (H, W)", grey=True)
     path = home_path(path)
-    data = picture_bytes(image, path.suffix, bits=bits, quality=quality)
     with whole_file(path) as file:
-        file.write(data)
+        file.write(picture_bytes(image, path.suffix, bits=bits, quality=quality))
 
 
 def panel(rows: Sequence[Sequence[Tensor]], gap: int = 4) -> Tensor:

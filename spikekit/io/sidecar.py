@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import json
 import os
 import platform
@@ -20,7 +19,7 @@ import torch
 
 from spikekit.arguments import one_line
 from spikekit.color.cfa import PATTERNS
-from spikekit.io.failures import no_pipe, writing
+from spikekit.io.failures import no_pipe
 from spikekit.io.whole_file import flush_folder, hidden_name
 
 #: What the first line of a side-car says it is.
@@ -29,23 +28,14 @@ KIND = "spikekit simulation 1"
 
 @dataclass(frozen=True)
 class Sidecar:
-    """What is known about a simulated stream; the values are those of JSON.
+    """What is known about a simulated stream; the values are those of JSON."""
 
-    Args:
-        stream: ``file``, ``frames``, ``height``, ``width`` and ``sha256``, that of the frames as a ``.dat`` holds them.
-        truth: pictures of the scene, by their path from the side-car: the frame of the stream at which each was seen.
-        source: ``path``, from the side-car, and ``frames``: SHA-256 of the pixels of every frame that was looked at.
-        settings: all that was asked for, or left at its default.
-        plan: what was modelled.
-        versions: of what computed it.
-    """
-
-    stream: dict[str, Any]
-    truth: dict[str, float]
-    source: dict[str, Any]
-    settings: dict[str, Any]
-    plan: dict[str, Any]
-    versions: dict[str, str]
+    stream: dict[str, Any]  # file, frames, height, width and sha256, that of the frames as a .dat holds them
+    truth: dict[str, float]  # pictures, by their path from the side-car: the frame of the stream at which each was seen
+    source: dict[str, Any]  # path, from the side-car, and frames: SHA-256 of the pixels of each that was looked at
+    settings: dict[str, Any]  # all that was asked for, or left at its default
+    plan: dict[str, Any]  # what was modelled
+    versions: dict[str, str]  # of what computed it
 
     def dumps(self) -> str:
         """Return the text of the file."""
@@ -66,22 +56,9 @@ def versions() -> dict[str, str]:
 
 
 def read_sidecar(path: Path) -> Sidecar:
-    """Read a side-car.
-
-    Args:
-        path: the file.
-
-    Returns:
-        What it says.
-
-    Raises:
-        ValueError: it cannot be read, or is something else; the message names it.
-    """
+    """Read a side-car; raise ValueError, which names it, where it cannot be read or is something else."""
     try:
-        data = json.loads(no_pipe(path).read_text(encoding="utf-8"))
-        if not isinstance(data, dict) or data.pop("kind", None) != KIND:
-            raise ValueError(f"expected the side-car of a simulation ({KIND})")
-        sidecar = Sidecar(**data)
+        sidecar = Sidecar(**_data(path))
         _check(sidecar)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror or error})") from error
@@ -91,36 +68,29 @@ def read_sidecar(path: Path) -> Sidecar:
     return sidecar
 
 
+def _data(path: Path) -> dict[str, Any]:
+    data = json.loads(no_pipe(path).read_text(encoding="utf-8"))
+    if not isinstance(data, dict) or data.pop("kind", None) != KIND:
+        raise ValueError(f"expected the side-car of a simulation ({KIND})")
+    return data
+
+
 def _check(sidecar: Sidecar) -> None:
     """Raise unless the values are of the kinds that those who read them count on."""
-    for name, part in vars(sidecar).items():
-        if not isinstance(part, dict):
-            raise ValueError(f"{name}: expected names and values, got {part!r}")
-    stream, source, settings = sidecar.stream, sidecar.source, sidecar.settings
-    sizes = [stream[key] for key in ("frames", "height", "width")]
-    if not all(map(_is_whole, sizes)):
-        raise ValueError(f"expected frames, height and width above 0, got {sizes}")
-    texts = {"file": stream["file"], "sha256": stream["sha256"], "path": source["path"]}
-    for name, value in texts.items():
-        if not isinstance(value, str):
-            raise ValueError(f"{name}: expected a text, got {value!r}")
-    if not isinstance(source["frames"], dict) or not source["frames"]:
-        raise ValueError(f"frames of the source: expected names and values, got {source['frames']!r}")
-    for name, (expected, is_good) in _SETTINGS.items():
-        if name in settings and not is_good(settings[name]):
-            raise ValueError(f"{name}: expected {expected}, got {settings[name]!r}")
+    for part, values in vars(sidecar).items():
+        if not isinstance(values, dict):
+            raise ValueError(f"{part}: expected names and values, got {values!r}")
+        for name, (expected, is_good) in _VALUES.get(part, {}).items():
+            if (part != "settings" or name in values) and not is_good(values[name]):
+                raise ValueError(f"{part}.{name}: expected {expected}, got {values[name]!r}")
 
 
-def _is_whole(value: Any, least: int = 1) -> bool:
-    return type(value) is int and least <= value < 1 << 31  # True is an int, and JSON's have no end
+def _is_whole(value: Any, least: int = 1, most: int = (1 << 31) - 1) -> bool:
+    return type(value) is int and least <= value <= most  # True is an int, and JSON's have no end
 
 
 def _is_number(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) <= sys.float_info.max
-
-
-def _is_positive(value: Any) -> bool:
-    return _is_number(value) and value > 0
 
 
 def _is_noise(value: Any) -> bool:
@@ -128,62 +98,49 @@ def _is_noise(value: Any) -> bool:
     return known and all(one is None or _is_number(one) for one in value.values())
 
 
+_TEXT = ("a text", lambda value: isinstance(value, str))
 _WHOLE = ("a whole number, 1 or more", _is_whole)
 # a minute of a camera between two frames; a few bytes could ask for a stream that never ends
-_CLOCKS = (f"a whole number, 1 .. {1 << 20}", lambda value: _is_whole(value) and value <= 1 << 20)
-_POSITIVE = ("a finite number above 0", _is_positive)
+_CLOCKS = (f"a whole number, 1 .. {1 << 20}", lambda value: _is_whole(value, 1, 1 << 20))
+_POSITIVE = ("a finite number above 0", lambda value: _is_number(value) and value > 0)
 
-# Of the settings that something is computed from: what to expect, and whether a value is that.
-_SETTINGS: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "scale": _WHOLE,
-    "pattern": (f"one of {', '.join(PATTERNS)}", lambda value: value in PATTERNS),
-    "alpha": _POSITIVE,
-    "clocks": _CLOCKS,
-    "frame": ("a whole number, 0 or more, or null", lambda value: value is None or _is_whole(value, 0)),
-    "frames": ("a whole number, 1 or more, or null", lambda value: value is None or _is_whole(value)),
-    "readout": _CLOCKS,
-    "seed": ("a whole number, 0 or more", lambda value: type(value) is int and value >= 0),
-    "plan": ("a text or a number of latent frames", lambda value: isinstance(value, str) or _is_whole(value, 0)),
-    "tolerance": _POSITIVE,
-    "step": _POSITIVE,
-    "interpolation": ("a text", lambda value: isinstance(value, str)),
-    "noise": ("names and finite numbers", _is_noise),
-    "calibration": ("a text or null", lambda value: value is None or isinstance(value, str)),
+# What to expect, and whether a value is that; settings that are not there have their defaults.
+_VALUES: dict[str, dict[str, tuple[str, Callable[[Any], bool]]]] = {
+    "stream": {"file": _TEXT, "sha256": _TEXT, "frames": _WHOLE, "height": _WHOLE, "width": _WHOLE},
+    "source": {"path": _TEXT, "frames": ("names and values", lambda value: isinstance(value, dict) and bool(value))},
+    "settings": {
+        "scale": _WHOLE,
+        "pattern": (f"one of {', '.join(PATTERNS)}", lambda value: value in PATTERNS),
+        "alpha": _POSITIVE,
+        "clocks": _CLOCKS,
+        "frame": ("a whole number, 0 or more, or null", lambda value: value is None or _is_whole(value, 0)),
+        "frames": ("a whole number, 1 or more, or null", lambda value: value is None or _is_whole(value)),
+        "readout": _CLOCKS,
+        "seed": ("a whole number, 0 or more", lambda value: type(value) is int and value >= 0),
+        "plan": ("a text or a number of latent frames", lambda value: isinstance(value, str) or _is_whole(value, 0)),
+        "tolerance": _POSITIVE,
+        "step": _POSITIVE,
+        "interpolation": _TEXT,
+        "noise": ("names and finite numbers", _is_noise),
+        "calibration": ("a text or null", lambda value: value is None or isinstance(value, str)),
+    },
 }
 
 
 def find_sidecar(stream: Path) -> Sidecar | None:
     """Return the side-car of a stream: the JSON file of the same name, where it speaks of this file.
 
-    Args:
-        stream: a recording.
-
-    Returns:
-        The side-car; ``None`` where there is none, or that of another stream.
-
     Raises:
         ValueError: it speaks of this file, but not as a side-car does; the message names it.
     """
-    path = stream.with_suffix(".json")
-    try:
-        sidecar = read_sidecar(path)
-    except ValueError:
-        if _claims(path, stream):
-            raise
-        return None
-    return sidecar if sidecar.stream["file"] == stream.name else None
+    path, ours = stream.with_suffix(".json"), False
+    with suppress(OSError, ValueError, TypeError, LookupError, RecursionError):
+        ours = _data(path)["stream"]["file"] == stream.name
+    return read_sidecar(path) if ours else None
 
 
 def check_unclaimed(outputs: Iterable[Path], stream: Path) -> None:
-    """Refuse to write over what a side-car names: that of the stream, or one beside an output.
-
-    Args:
-        outputs: what is to be written.
-        stream: the recording that they show.
-
-    Raises:
-        ValueError: a side-car names an output as its stream or its ground truth; the message names both.
-    """
+    """Refuse to write over what a side-car names, that of the stream or one beside an output: a ValueError says so."""
     wanted = {output.resolve(): output for output in outputs}
     near = (place for output in wanted for place in (output, output.parent) if place.name)
     for path in dict.fromkeys(place.with_suffix(".json") for place in (stream.resolve(), *near)):
@@ -198,15 +155,6 @@ def check_unclaimed(outputs: Iterable[Path], stream: Path) -> None:
                 raise ValueError(f"{output}: the {kind} of {path.name} would be lost; choose another name")
 
 
-def _claims(path: Path, stream: Path) -> bool:
-    """Return whether a damaged side-car still says that it is that of a stream."""
-    try:
-        data = json.loads(no_pipe(path).read_text(encoding="utf-8"))
-        return data["kind"] == KIND and data["stream"]["file"] == stream.name
-    except (OSError, ValueError, TypeError, LookupError, RecursionError):
-        return False
-
-
 @contextmanager
 def published(output: Path) -> Iterator[Path]:
     """Give a folder to write to; when all is written, put everything under its final name, the side-car last.
@@ -215,42 +163,56 @@ def published(output: Path) -> Iterator[Path]:
         The folder lies beside ``output``, hidden. Its contents move to where ``output`` is, each by one renaming, and
         the side-car, ``output`` with the ending ``.json``, after all others. One that is there already and says
         something else goes first. So a stream beside its side-car is complete, whenever the process was killed. What
-        remains of one that was is a hidden folder that ends in ``.part``, which the next one removes.
-
-        Processes that write the same output publish one after the other.
-
-    Args:
-        output: the stream.
-
-    Returns:
-        A context that yields the folder.
+        remains of one that was is a hidden folder that ends in ``.part``, which the next one empties. Processes that
+        write the same output do so one after the other.
 
     Raises:
-        ValueError: the folder cannot be made, something cannot be moved, or the place of the side-car is taken by
-            something else.
+        ValueError: the place of the side-car or of a picture is taken by something else.
+        OSError: something cannot be written; it names the output.
     """
-    target, last, hidden = output.parent, output.with_suffix(".json"), hidden_name(output.name)
-    if last.exists():
-        stream = read_sidecar(last).stream["file"]  # raises where the file is something else
+    target, sidecar = output.parent, output.with_suffix(".json")
+    if sidecar.exists():
+        stream = read_sidecar(sidecar).stream["file"]  # raises where the file is something else
         if stream != output.name:
-            raise ValueError(f"{output}: its side-car, {last}, would replace that of {stream}; choose another name")
-    with ExitStack() as stack:
-        with writing(output):
-            target.mkdir(parents=True, exist_ok=True)
-            with _locked(target):
-                for other in target.glob(f"{glob.escape(hidden)}.*.part"):
-                    with _locked(other, wait=False) as dead:
-                        if dead:
-                            shutil.rmtree(other, ignore_errors=True)
-                part = Path(tempfile.mkdtemp(".part", f"{hidden}.", target))
-                stack.callback(shutil.rmtree, part, ignore_errors=True)
-                stack.enter_context(_locked(part))
-        yield part
+            raise ValueError(f"{output}: its side-car, {sidecar}, would replace that of {stream}; choose another name")
+    target.mkdir(parents=True, exist_ok=True)
+    with _owned(target / f"{hidden_name(sidecar.name)}.part") as part:
         try:
-            with _locked(target):
-                _publish(part, target, last.name)
+            yield part
+            _publish(part, target, sidecar.name)
         except OSError as error:
-            raise ValueError(f"{error.filename2 or output}: cannot be written ({error.strerror or error})") from error
+            name = error.filename2 or error.filename or output
+            error.filename = str(Path(str(name).replace(str(part), str(target))))
+            raise
+
+
+@contextmanager
+def _owned(place: Path) -> Iterator[Path]:
+    """Give an empty folder in one that nobody else has, as soon as whoever has it is done; remove both at the end."""
+    with ExitStack() as stack:
+        while True:
+            place.mkdir(exist_ok=True)
+            try:
+                import fcntl
+
+                handle = os.open(place, os.O_RDONLY | os.O_NOFOLLOW)
+                stack.callback(os.close, handle)
+                fcntl.flock(handle, fcntl.LOCK_EX)
+                if os.path.samestat(os.fstat(handle), os.stat(place)):
+                    for left in place.iterdir():  # by a process that was killed
+                        shutil.rmtree(left)
+                    break
+            except FileNotFoundError:  # somebody was done
+                pass
+            except (OSError, ImportError):  # not every system and not every file system has locks
+                break
+        folder = Path(tempfile.mkdtemp(dir=place))
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+            with suppress(OSError):  # others are waiting, or at work
+                place.rmdir()
 
 
 def _publish(part: Path, target: Path, last: str) -> None:
@@ -277,18 +239,3 @@ def _publish(part: Path, target: Path, last: str) -> None:
                 flush_folder(folder)
         os.replace(path, final)
     flush_folder(target)
-
-
-@contextmanager
-def _locked(folder: Path, *, wait: bool = True) -> Iterator[bool]:
-    """Hold the lock of a folder, which ends with the process; yields whether it is held."""
-    with ExitStack() as stack:
-        held = False
-        with suppress(OSError, ImportError):  # not every system and not every file system has locks
-            import fcntl
-
-            handle = os.open(folder, os.O_RDONLY)
-            stack.callback(os.close, handle)
-            fcntl.flock(handle, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
-            held = True
-        yield held

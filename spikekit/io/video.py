@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import operator
 import os
 import re
@@ -13,7 +12,6 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, overload
-from weakref import WeakSet
 
 import torch
 from torch import Tensor
@@ -44,7 +42,47 @@ _reading = partial(reading, kind=VideoError)
 
 
 class VideoFrames(Sequence[Tensor]):
-    """The frames of a folder of pictures or of a video file, each read when it is asked for.
+    """The frames of a folder of pictures or of a video file, each read when it is asked for; see :func:`read_video`.
+
+    Convention:
+        A slice is again a lazy sequence. Threads can share the object, which decodes for one after the other. It can be
+        pickled and used in other processes; each opens the files for itself.
+
+    Attributes:
+        height: rows of a frame.
+        width: columns of a frame.
+        fps: frames a second, of a video file that says so; ``None`` for a folder.
+        names: of the files in a folder, or the numbers of the frames in a video file.
+    """
+
+    def __init__(self, source: _Pictures | _Film, chosen: range) -> None:
+        self._source, self._chosen = source, chosen
+        self.height, self.width = source.size
+        self.fps: float | None = source.fps
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the frames."""
+        return list(map(self._source.name, self._chosen))
+
+    def __len__(self) -> int:
+        return len(self._chosen)
+
+    @overload
+    def __getitem__(self, index: int) -> Tensor: ...
+    @overload
+    def __getitem__(self, index: slice) -> VideoFrames: ...
+    def __getitem__(self, index: int | slice) -> Tensor | VideoFrames:
+        if isinstance(index, slice):
+            return VideoFrames(self._source, self._chosen[index])
+        return self._source.read(self._chosen[operator.index(index)])
+
+    def __repr__(self) -> str:
+        return f"VideoFrames({str(self._source.path)!r}, {len(self)} frames of {self.height} x {self.width})"
+
+
+def read_video(path: str | Path, *, start: int = 0, count: int | None = None) -> VideoFrames:
+    """Open a folder of pictures or a video file.
 
     Convention:
         A frame is ``rgb`` (3, H, W), float32, in [0, 1], gamma-encoded as it was stored and upright as the file says.
@@ -59,74 +97,6 @@ class VideoFrames(Sequence[Tensor]):
         is cheap, a few frames back too; further back the file is decoded from its start again, so that frame n is
         always the same one.
 
-        A slice is again a lazy sequence. Threads can share the object, which decodes for one after the other. It can be
-        pickled and used in other processes; each opens the files for itself.
-
-    Args:
-        path: a folder, a picture or a video file.
-        start: the first frame.
-        count: how many; up to the end when not given.
-
-    Raises:
-        VideoError: no such file, no pictures in it, pictures of several sizes, PyAV is missing, or there are fewer
-            frames. A frame that is damaged raises it when it is asked for.
-        TypeError: ``start`` is not a whole number.
-        ValueError: ``count`` is not a whole number, 1 or more.
-
-    Attributes:
-        height: rows of a frame.
-        width: columns of a frame.
-        fps: frames a second, of a video file that says so; ``None`` for a folder.
-
-    Example:
-        >>> import tempfile
-        >>> from spikekit import write_picture
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     for n in range(12):
-        ...         write_picture(f"{folder}/{n}.png", torch.full((3, 4, 6), n / 255))
-        ...     frames = VideoFrames(folder, start=1)
-        ...     len(frames), frames.height, frames.width, frames[3:9:4].names, round(frames[-1].max().item() * 255)
-        (11, 4, 6, ['4.png', '8.png'], 11)
-    """
-
-    def __init__(self, path: str | Path, *, start: int = 0, count: int | None = None) -> None:
-        start = operator.index(start)
-        self._source = _open(home_path(path))
-        total = self._source.count
-        stop = total if count is None else start + check_whole("count", count)
-        if start < 0 or start >= total or stop > total:
-            wanted = f"frame {start}" if count is None else f"{count} frames from frame {start} on"
-            raise VideoError(f"{path}: expected {wanted}, got {total} {'frame' if total == 1 else 'frames'}")
-        self._chosen = range(start, stop)
-        self.height, self.width = self._source.size
-        self.fps: float | None = self._source.fps
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the frames, of files in a folder, and numbers in a video file."""
-        return list(map(self._source.name, self._chosen))
-
-    def __len__(self) -> int:
-        return len(self._chosen)
-
-    @overload
-    def __getitem__(self, index: int) -> Tensor: ...
-    @overload
-    def __getitem__(self, index: slice) -> VideoFrames: ...
-    def __getitem__(self, index: int | slice) -> Tensor | VideoFrames:
-        if isinstance(index, slice):
-            part = copy.copy(self)
-            part._chosen = self._chosen[index]
-            return part
-        return self._source.read(self._chosen[operator.index(index)])
-
-    def __repr__(self) -> str:
-        return f"VideoFrames({str(self._source.path)!r}, {len(self)} frames of {self.height} x {self.width})"
-
-
-def read_video(path: str | Path, *, start: int = 0, count: int | None = None) -> VideoFrames:
-    """Open a folder of pictures or a video file; see :class:`VideoFrames`.
-
     Args:
         path: a folder, a picture or a video file.
         start: the first frame.
@@ -136,20 +106,28 @@ def read_video(path: str | Path, *, start: int = 0, count: int | None = None) ->
         The frames, none of which is read yet.
 
     Raises:
-        VideoError: as :class:`VideoFrames`.
-        TypeError: as :class:`VideoFrames`.
-        ValueError: as :class:`VideoFrames`.
+        VideoError: no such file, no pictures in it, pictures of several sizes, PyAV is missing, or there are fewer
+            frames. A frame that is damaged raises it when it is asked for.
+        TypeError: ``start`` is not a whole number.
+        ValueError: ``count`` is not a whole number, 1 or more.
 
     Example:
         >>> import tempfile
         >>> from spikekit import write_picture
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     for n in range(3):
-        ...         write_picture(f"{folder}/{n}.png", torch.full((3, 4, 6), n / 2))
-        ...     [frame.mean().round(decimals=1).item() for frame in read_video(folder)]
-        [0.0, 0.5, 1.0]
+        ...     for n in range(12):
+        ...         write_picture(f"{folder}/{n}.png", torch.full((3, 4, 6), n / 255))
+        ...     frames = read_video(folder, start=1)
+        ...     len(frames), frames.height, frames.width, frames[3:9:4].names, round(frames[-1].max().item() * 255)
+        (11, 4, 6, ['4.png', '8.png'], 11)
     """
-    return VideoFrames(path, start=start, count=count)
+    start = operator.index(start)
+    source = _open(home_path(path))
+    stop = source.count if count is None else start + check_whole("count", count)
+    if not 0 <= start < source.count or stop > source.count:
+        wanted = f"frame {start}" if count is None else f"{count} frames from frame {start} on"
+        raise VideoError(f"{path}: expected {wanted}, got {source.count} frame{'s' * (source.count != 1)}")
+    return VideoFrames(source, range(start, stop))
 
 
 def _open(path: Path) -> _Pictures | _Film:
@@ -230,19 +208,7 @@ def _load(file: Path) -> Tensor:
 # --- video files ------------------------------------------------------------------------------------------------------
 
 
-_films: WeakSet[_Film] = WeakSet()
-_parents: list[Any] = []
-
-
-def _leave_to_parent() -> None:
-    """A forked process neither moves its parent's place in a file nor closes a decoder whose threads it has not got."""
-    for film in list(_films):
-        _parents.append((film._decoder, film._kept))
-        film._rewind()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_leave_to_parent)
+_of_parents: list[Any] = []  # decoders whose threads a fork has not got: they are let be
 
 
 class _Film:
@@ -268,10 +234,10 @@ class _Film:
         if self.size[0] * self.size[1] > MOST_PIXELS:
             raise VideoError(f"{path}: expected at most {MOST_PIXELS} pixels, got {self.size[0]} x {self.size[1]}")
         self.count = total
-        self._rewind()
+        self._begin()
 
-    def _rewind(self) -> None:
-        _films.add(self)
+    def _begin(self) -> None:
+        self._process = os.getpid()
         self._lock = threading.Lock()  # of a decoder that two threads would crash, and that a fork may leave held
         self._forget()
 
@@ -285,12 +251,15 @@ class _Film:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        self._rewind()
+        self._begin()
 
     def name(self, index: int) -> str:
         return f"{index:0{len(str(self.count - 1))}}"
 
     def read(self, index: int) -> Tensor:
+        if self._process != os.getpid():
+            _of_parents.append((self._decoder, self._kept))
+            self._begin()
         with self._lock:
             return torch.rot90(self._decode(index), self.turns, (-2, -1)).contiguous()
 

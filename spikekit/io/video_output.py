@@ -15,7 +15,6 @@ from torch import Tensor
 
 from spikekit.arguments import home_path
 from spikekit.check import check_picture, check_positive
-from spikekit.io.failures import writing
 from spikekit.io.image_bytes import to_bytes
 from spikekit.io.video import VideoError
 from spikekit.io.whole_file import whole_file
@@ -29,14 +28,7 @@ _BT709, _NARROW, _WIDE = 1, 1, 2  # matrix and primaries of HD; levels 16 to 235
 
 
 def check_film(path: str | Path) -> None:
-    """Say at once what would keep a film from being written.
-
-    Args:
-        path: where to.
-
-    Raises:
-        VideoError: another ending than .mp4, .mov, .mkv and .gif, or PyAV is missing.
-    """
+    """Raise at once for what would keep a film from being written: another ending, or PyAV is missing."""
     if Path(path).suffix.lower() not in FILM_FORMATS:
         raise VideoError(f"{path}: expected a film that ends in {', '.join(FILM_FORMATS)}")
     try:
@@ -63,7 +55,8 @@ def write_video(path: str | Path, frames: Iterable[Tensor], fps: float = 25.0) -
         fps: frames shown in a second.
 
     Raises:
-        VideoError: another ending, no frames, frames of several sizes, PyAV is missing, or the file cannot be written.
+        VideoError: another ending, no frames, frames of several sizes, or PyAV is missing.
+        OSError: the file cannot be written; what was there before, or nothing, is then there.
         TypeError: a frame that is neither floating nor uint8, or an ``fps`` that is not a number.
         ValueError: a frame of another shape, or an ``fps`` that is not above 0.
 
@@ -84,7 +77,7 @@ def write_video(path: str | Path, frames: Iterable[Tensor], fps: float = 25.0) -
     if first is None:
         raise VideoError(f"{path}: expected at least one frame, got none")
     encode = _gif if _is_gif(path) else _h264
-    with writing(path, VideoError), whole_file(path) as file:  # FFmpeg's errors are the system's, too
+    with whole_file(path) as file:
         import av
 
         with av.open(file.name, "w", format=FILM_FORMATS[Path(path).suffix.lower()]) as container:

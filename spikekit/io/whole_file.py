@@ -5,10 +5,8 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
-import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from itertools import chain, count
 from pathlib import Path
 from typing import IO, Any
 
@@ -47,8 +45,7 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
         A context that yields the open file.
 
     Raises:
-        ValueError: another mode.
-        OSError: the file or its folder cannot be written.
+        OSError: the file or its folder cannot be written; it names the file.
 
     Example:
         >>> import tempfile
@@ -59,8 +56,6 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
         ...     early, Path(folder, "new", "a.txt").read_text()
         (False, 'all of it')
     """
-    if mode not in ("w", "wb"):
-        raise ValueError(f"mode: expected 'w' or 'wb', got {mode!r}")
     path = home_path(path)
     chosen = path.is_dir() or not path.is_symlink() or path.parent == Path("/dev")  # no stranger's way to a device
     if chosen and path.exists() and not path.is_file():
@@ -70,9 +65,10 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
     target = Path(os.path.realpath(path.parent), path.name)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-    except FileExistsError as error:
-        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(path)) from error
-    part, file = _open_part(target, mode, **how)
+        part, file = _open_part(target, mode, **how)
+    except OSError as error:
+        number = errno.ENOTDIR if isinstance(error, FileExistsError) else error.errno
+        raise OSError(number, os.strerror(number), str(path)) from error
     try:
         yield file
         file.flush()
@@ -84,7 +80,7 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
             file.close()
         os.replace(part, target)
     except BaseException as error:
-        if isinstance(error, OSError) and error.errno in FULL and error.filename is None:
+        if isinstance(error, OSError) and error.errno in FULL and error.filename in (None, str(part)):
             error.filename = str(path)
         with suppress(OSError):
             file.close()
@@ -107,22 +103,21 @@ def _open_part(target: Path, mode: str, **how: Any) -> tuple[Path, IO[Any]]:
     Names are counted, so that leftovers are found without a look at the whole folder.
     """
     hidden = hidden_name(target.name)
-    parts = [target.with_name(f"{hidden}.{n}.part") for n in range(_SIDE_BY_SIDE)]
-    for leftover in parts:
+    for n in range(_SIDE_BY_SIDE):
+        leftover = target.with_name(f"{hidden}.{n}.part")
         with suppress(OSError), open(leftover, "rb") as file:
             if _lock(file):
                 leftover.unlink()
-    more = (target.with_name(f"{hidden}.{secrets.token_hex(4)}.part") for _ in count())
-    for part in chain(parts, more):
-        try:
+    n = 0
+    while True:
+        part = target.with_name(f"{hidden}.{n}.part")
+        with suppress(FileExistsError):
             file = open(part, mode.replace("w", "x"), **how)  # noqa: SIM115 - closed when it is complete
-        except FileExistsError:
-            continue
-        with suppress(OSError):
-            if _lock(file) is not False and os.path.samestat(os.fstat(file.fileno()), os.stat(part)):
-                return part, file
-        file.close()  # another process took it for a leftover before it was locked
-    raise AssertionError("unreachable")
+            with suppress(OSError):
+                if _lock(file) is not False and os.path.samestat(os.fstat(file.fileno()), os.stat(part)):
+                    return part, file
+            file.close()  # another process took it for a leftover before it was locked
+        n += 1
 
 
 def _lock(file: IO[Any]) -> bool | None:

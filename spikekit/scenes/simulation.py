@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from spikekit.flow.interpolate import Blend, FlowInterpolation, Still
-from spikekit.io.failures import writing
 from spikekit.io.files import write_spikes
-from spikekit.io.formats import SpikeFileError, dat_bytes
+from spikekit.io.formats import dat_bytes
 from spikekit.io.image_bytes import png_bytes
 from spikekit.io.sidecar import Sidecar, published, versions
 from spikekit.io.video import VideoFrames, read_video
@@ -147,7 +146,7 @@ def simulate(source: Source, settings: Settings, output: Path, replayed: Sidecar
         raise ValueError(f"{source.path}: {error}") from error
     _check_calibration(settings, film, replayed)
     with _one_thread(), published(output) as part:
-        prints = _look(source, film, pictures, part, output, replayed)
+        prints = _look(source, film, pictures, part, replayed)
         noise, told = _needed_noise(source, settings, film)
         plans: list[Plan] = []
         shape, bits, digest = _expose(source, settings, film, noise, part, output, plans)
@@ -176,10 +175,7 @@ def simulate(source: Source, settings: Settings, output: Path, replayed: Sidecar
             },
             versions=versions(),
         )
-        with (
-            writing(output.with_suffix(".json"), wrong=Exception),
-            whole_file(part / f"{stem}.json", "w", encoding="utf-8") as file,
-        ):
+        with whole_file(part / f"{stem}.json", "w", encoding="utf-8") as file:
             file.write(sidecar.dumps())
     return _report(source, settings, film, sidecar, bits, [*_plan_lines(plans, source), *told], output)
 
@@ -208,7 +204,7 @@ def _calibration(settings: Settings, noise: SensorNoise, output: Path) -> str | 
 
 
 def _look(
-    source: Source, film: FrameSequence, pictures: dict[int, Path], part: Path, output: Path, replayed: Sidecar | None
+    source: Source, film: FrameSequence, pictures: dict[int, Path], part: Path, replayed: Sidecar | None
 ) -> dict[str, str]:
     """Read every frame once, so that a damaged one shows now; write the truth; return the hashes of the frames."""
     expected = None if replayed is None else replayed.source["frames"]
@@ -225,7 +221,7 @@ def _look(
             raise ValueError(f"{source.file(name)}: changed since the side-car was written{where}")
         index = next(iter(pictures)) if still else index
         if index in pictures:
-            with writing(output.parent / pictures[index], wrong=Exception), whole_file(part / pictures[index]) as file:
+            with whole_file(part / pictures[index]) as file:
                 file.write(png_bytes(frame[:, : film.height, : film.width]))
     return prints
 
@@ -277,11 +273,8 @@ def _expose(
             yield spikes
 
     frames = source.clocks // settings.readout
-    try:
-        with progress(what=f"frames of {output.name}", total=frames) as bar:
-            write_spikes(part / output.name, passing())
-    except SpikeFileError as error:
-        raise ValueError(str(error).replace(str(part / output.name), str(output))) from error
+    with progress(what=f"frames of {output.name}", total=frames) as bar:
+        write_spikes(part / output.name, passing())
     return shape, bits, digest.hexdigest()
 
 

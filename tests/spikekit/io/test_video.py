@@ -84,8 +84,8 @@ def test_a_folder_is_a_lazy_sequence(tmp_path, opened):
 
 def test_start_and_count(tmp_path):
     folder_of(tmp_path, [f"{n}.png" for n in range(5)])
-    assert [number(rgb) for rgb in VideoFrames(tmp_path, start=1, count=3)] == [1, 2, 3]
-    assert [number(rgb) for rgb in VideoFrames(tmp_path, start=3)] == [3, 4]
+    assert [number(rgb) for rgb in read_video(tmp_path, start=1, count=3)] == [1, 2, 3]
+    assert [number(rgb) for rgb in read_video(tmp_path, start=3)] == [3, 4]
     fails(tmp_path, "frame 5", "got 5 frames", start=5)
     fails(tmp_path, "3 frames from frame 3 on", "got 5 frames", start=3, count=3)
     fails(tmp_path, "frame -1", start=-1)
