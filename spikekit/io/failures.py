@@ -39,8 +39,7 @@ def reading(path: str | Path, kind: type[ValueError], what: str = "", otherwise:
         raise
     except MemoryError as error:  # also what PyAV says of damaged sizes
         raise kind(f"{path}: {what}takes more memory than there is") from error
-    except OSError as error:
-        raise kind(f"{path}: {what}cannot be read ({error.strerror or error})") from error
     except Exception as error:
         said = one_line(error).removeprefix(f"{path}: ")[:300]
-        raise kind(f"{path}: {what}{otherwise.format(said)}") from error
+        form = "cannot be read ({})" if isinstance(error, OSError) else otherwise
+        raise kind(f"{path}: {what}{form.format(said)}") from error

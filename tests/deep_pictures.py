@@ -1,0 +1,32 @@
+"""Pictures of 16 bits that no library writes alone: TIFFs packed by LZW, PNGs of grey with alpha."""
+
+import io
+import struct
+import zlib
+
+import tifffile
+from PIL import Image
+
+
+def write_lzw_tiff(path, pixels, **how):
+    """Write (H, W, C) uint16: Pillow packs the bytes, tifffile says what they are."""
+    packed = io.BytesIO()
+    Image.fromarray(pixels.astype("<u2").reshape(1, -1).view("u1")).save(packed, "TIFF", compression="tiff_lzw")
+    packed.seek(0)
+    with tifffile.TiffFile(packed) as file:
+        (start,), (length,) = file.pages.first.dataoffsets, file.pages.first.databytecounts
+    strip = packed.getvalue()[start : start + length]
+    how = {"photometric": "rgb", "compression": "zlib", "byteorder": "<"} | how
+    tifffile.imwrite(path, iter([strip]), shape=pixels.shape, dtype="uint16", **how)
+    with tifffile.TiffFile(path, mode="r+") as file:
+        file.pages.first.tags["Compression"].overwrite(5)
+
+
+def write_grey_alpha_png(path, pixels):
+    """Write (H, W, 2) uint16."""
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in pixels)
+    head = struct.pack(">IIBBBBB", *pixels.shape[1::-1], 16, 4, 0, 0, 0)
+    data = b"\x89PNG\r\n\x1a\n"
+    for kind, part in ((b"IHDR", head), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")):
+        data += struct.pack(">I", len(part)) + kind + part + struct.pack(">I", zlib.crc32(kind + part))
+    path.write_bytes(data)
