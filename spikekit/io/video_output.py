@@ -77,11 +77,14 @@ def write_video(path: str | Path, frames: Iterable[Tensor], fps: float = 25.0) -
     if first is None:
         raise VideoError(f"{path}: expected at least one frame, got none")
     encode = _gif if _is_gif(path) else _h264
-    with whole_file(path) as file:
-        import av
+    import av
 
-        with av.open(file.name, "w", format=FILM_FORMATS[Path(path).suffix.lower()]) as container:
-            encode(container, chain([first], pictures), first.shape, Fraction(float(fps)).limit_denominator(1001))
+    with whole_file(path) as file:
+        try:
+            with av.open(file.name, "w", format=FILM_FORMATS[path.suffix.lower()]) as container:
+                encode(container, chain([first], pictures), first.shape, Fraction(float(fps)).limit_denominator(1001))
+        except av.FFmpegError as error:
+            raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def _is_gif(path: str | Path) -> bool:

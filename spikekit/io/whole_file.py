@@ -80,7 +80,7 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
             file.close()
         os.replace(part, target)
     except BaseException as error:
-        if isinstance(error, OSError) and error.errno in FULL and error.filename in (None, str(part)):
+        if isinstance(error, OSError) and error.errno in FULL and error.filename is None:
             error.filename = str(path)
         with suppress(OSError):
             file.close()

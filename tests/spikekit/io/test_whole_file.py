@@ -1,5 +1,6 @@
 """Writing whole files: after an error, a full disk and kills, side by side, and what is no ordinary file."""
 
+import errno
 import os
 import random
 import signal
@@ -24,22 +25,6 @@ while True:
         for _ in range(50):
             file.write(letter.encode() * 4096)
 """
-LIMIT = """
-import resource, runpy, signal, sys
-whole_file = runpy.run_path(sys.argv[1])["whole_file"]
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
-try:
-    with whole_file(sys.argv[2]) as file:
-        file.write(b"x" * int(sys.argv[3]))
-except OSError as error:
-    print(error.strerror)
-"""
-
-
-def _half_of(file, error):
-    file.write(b"half")
-    raise error
 
 
 def files(folder):
@@ -57,39 +42,21 @@ def test_it_appears_when_it_is_complete(tmp_path):
     assert files(tmp_path / "deep" / "er") == {"a.bin": "é\r\n".encode()}
 
 
-@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])
-def test_an_error_leaves_what_was_there(tmp_path, error):
-    (tmp_path / "a.bin").write_bytes(b"old")
-    for name in ("a.bin", "b.bin"):
-        with pytest.raises(error), whole_file(tmp_path / name) as file:
-            _half_of(file, error)
-    assert files(tmp_path) == {"a.bin": b"old"}
-
-
-@pytest.mark.parametrize("name", ["fsync", "replace"])
-def test_a_disk_that_fails_at_the_end(tmp_path, monkeypatch, name):
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit, "fsync", "replace"])
+def test_an_error_or_a_full_disk_leaves_what_was_there(tmp_path, monkeypatch, error):
     def fail(*_):
-        raise OSError(28, "No space left on device")
+        raise OSError(errno.ENOSPC, "No space left on device")
 
     (tmp_path / "a.bin").write_bytes(b"old")
-    monkeypatch.setattr(os, name, fail)
-    with pytest.raises(OSError, match="No space"), whole_file(tmp_path / "a.bin") as file:
-        file.write(b"new")
+    if isinstance(error, str):
+        monkeypatch.setattr(os, error, fail)
+    for name in ("a.bin", "b.bin"):
+        raised = pytest.raises(OSError, match=name) if isinstance(error, str) else pytest.raises(error)
+        with raised, whole_file(tmp_path / name) as file:
+            file.write(b"half")
+            if not isinstance(error, str):
+                raise error
     assert files(tmp_path) == {"a.bin": b"old"}
-
-
-@pytest.mark.skipif(os.name != "posix", reason="limits of POSIX")
-def test_a_full_disk(tmp_path):
-    (tmp_path / "a.bin").write_bytes(b"old")
-    for size in (1001, 10**6):  # at the flush and in the middle
-        done = subprocess.run(
-            [sys.executable, "-c", LIMIT, MODULE, tmp_path / "a.bin", str(size)],
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        assert done.stdout == "File too large\n"
-        assert files(tmp_path) == {"a.bin": b"old"}
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
@@ -98,7 +65,7 @@ def test_two_writers_that_are_killed(tmp_path):
     target = tmp_path / "a.bin"
     chance = random.Random(24)
     whole = {letter.encode() * 4096 * 50 for letter in "ab"}
-    for _ in range(6):
+    for _ in range(3):
         writers = [
             subprocess.Popen([sys.executable, "-c", WRITER, MODULE, target, letter], stdout=subprocess.PIPE)
             for letter in "ab"
@@ -163,13 +130,10 @@ def test_modes_links_and_devices(tmp_path):
 
 
 def test_what_cannot_be_written(tmp_path):
-    with pytest.raises(OSError), whole_file(tmp_path):  # noqa: PT011 - another one on another system
-        pass
     (tmp_path / "file").touch()
-    with pytest.raises(OSError), whole_file(tmp_path / "file" / "a"):  # noqa: PT011
-        pass
-    with pytest.raises(ValueError, match="expected 'w' or 'wb', got 'a'"), whole_file(tmp_path / "a", "a"):
-        pass
+    for name in ("", "file/a"):
+        with pytest.raises(OSError, match=str(tmp_path / name)), whole_file(tmp_path / name):
+            pass
     assert files(tmp_path) == {"file": b""}
 
 
