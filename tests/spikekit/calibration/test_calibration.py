@@ -100,11 +100,6 @@ def test_a_flat_recording_of_the_wrong_brightness(light, said):
         calibrate(halves(flat), halves(torch.zeros(200, 4, 4)))
 
 
-def test_recordings_of_two_sensors():
-    with pytest.raises(ValueError, match=r"of one size, got sizes \[\(4, 4\), \(4, 6\)\]"):
-        calibrate(halves(torch.ones(200, 4, 4)), halves(torch.zeros(200, 4, 6)))
-
-
 # What is done with it
 
 
@@ -196,7 +191,7 @@ def test_corrected_pictures_are_nearly_those_of_an_ideal_sensor(truth):
         ({"dark": torch.full((2, 3), -1.0)}, "dark: expected 0 to 1, got -1"),
         ({"dark": torch.full((2, 3), float("nan"))}, "dark: expected 0 to 1, got nan"),
         ({"dark": torch.zeros(3, 2)}, "dark: expected .H, W."),
-        ({"defects": torch.full((2, 3), 3, dtype=torch.uint8)}, "defects: expected 0, 1 or 2, got 3"),
+        ({"defects": torch.full((2, 3), 3, dtype=torch.uint8)}, "defects: expected 0 to 2, got 3"),
     ],
 )
 def test_values_that_make_no_sense(changed, said):

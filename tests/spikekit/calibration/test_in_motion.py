@@ -7,7 +7,7 @@ from torch.testing import assert_close
 
 from spikekit import SensorNoise, SpikeSensor, bayer_mask, demosaic, psnr, tfp_at
 from spikekit.calibration.calibration import Calibration
-from spikekit.calibration.in_motion import Segments, calibrate_in_motion, count_segments, segment_length
+from spikekit.calibration.in_motion import calibrate_in_motion, count_segments, segment_length
 from spikekit.calibration.measure import find_defects
 from spikekit.calibration.pixel_rates import PixelRates
 from spikekit.sensor.noise import DEAD, HOT, WORKS
@@ -154,13 +154,3 @@ def test_where_nothing_can_be_seen_to_move(size, pattern, share):
 
 def test_segments_are_as_long_as_light_requires():
     assert [segment_length(rate) for rate in (0.5, 0.1, 0.05, 0.02, 0.0)] == [20, 20, 40, 100, 200]
-
-
-def test_what_is_refused():
-    ideal = Calibration(torch.ones(4, 4), torch.zeros(4, 4), torch.zeros(4, 4, dtype=torch.uint8))
-    with pytest.raises(ValueError, match=r"segments: expected at least 12 segments of 4 x 4 pixels, got \(11, 4, 4\)"):
-        calibrate_in_motion(Segments(torch.zeros(11, 4, 4, dtype=torch.uint8), 20), ideal)
-    with pytest.raises(ValueError, match="chunks: expected at least 20 frames, got 19"):
-        count_segments([torch.zeros(19, 4, 4)], 20)
-    with pytest.raises(ValueError, match="frames: expected 1 to 255, got 0"):
-        count_segments([torch.zeros(19, 4, 4)], 0)
