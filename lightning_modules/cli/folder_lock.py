@@ -9,7 +9,6 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from lightning_modules.cli.errors import InputError, UsageError
-from spikekit.io.failures import writing
 from spikekit.io.video import PICTURE_ENDINGS, VIDEO_ENDINGS
 
 # of what users may take the output for
@@ -42,20 +41,20 @@ def locked_folder(folder: str | Path, what: str, name: str = "lock") -> Iterator
         name: of the file that is locked, and stays; runs that lock different files are no trouble to each other.
 
     Raises:
-        InputError: another process, or another run of this one, is at work there; or it cannot be written to.
+        InputError: another process, or another run of this one, is at work there.
+        OSError: it cannot be written to.
     """
     path = Path(folder) / name
     if path.is_symlink() or (path.exists() and not path.is_file()):  # it would be emptied, or waited for
         raise InputError(f"-o: {path}: expected the file of a lock, got a link, a pipe or a folder")
     lock = FileLock(path, timeout=0)
-    with writing(f"-o: {path}", InputError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            lock.acquire()
-        except Timeout:
-            raise InputError(f"{folder}: another {what} is at work here; -o goes elsewhere") from None
-        except NotImplementedError:
-            pass
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise InputError(f"{folder}: another {what} is at work here; -o goes elsewhere") from None
+    except NotImplementedError:
+        pass
     try:
         yield
     finally:
