@@ -288,11 +288,7 @@ def bin_to_sensor(rgb: Tensor, pattern: str | CFA = "RGGB", *, scale: int) -> Te
         raise ValueError(f"rgb: expected {shape}{multiples}, got {tuple(rgb.shape)}")
     wide = torch.promote_types(rgb.dtype, torch.float32)
     dtype, rgb = rgb.dtype, rgb_to_grayscale(rgb.to(wide)) if luminance else rgb
-    if scale == 1 and side == 2:  # half of the pixels are green: copied at once
-        raw = rgb[..., 1, :, :].clone(memory_format=torch.contiguous_format)
-        sites = [site for site in sites if site[0] != 1]
-    else:
-        raw = rgb.new_empty(*rgb.shape[:-3], height // scale, width // scale, dtype=dtype)
+    raw = rgb.new_empty(*rgb.shape[:-3], height // scale, width // scale, dtype=dtype)
     for colour, row, column in sites:
         plane, step = rgb[..., colour, :, :], side * scale
         seen = _sum([plane[..., scale * row + a :: step, :] for a in range(scale)], wide)
@@ -357,9 +353,6 @@ def split_colors(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
     check_planes("raw", raw, 2, "(*, H, W)")
     if count_colors(pattern) == 1:
         return raw[None].clone()
-    if not raw.is_floating_point():  # of floats, a product would spread NaN
-        mask = bayer_mask(*raw.shape[-2:], pattern, device=raw.device, dtype=torch.bool)
-        return raw * mask.reshape(3, *[1] * (raw.ndim - 2), *raw.shape[-2:])
     colors = raw.new_zeros(3, *raw.shape)
     for colour, row, column in bayer_sites(pattern):
         colors[colour, ..., row::2, column::2] = raw[..., row::2, column::2]

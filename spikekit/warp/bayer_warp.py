@@ -20,21 +20,8 @@ def bayer_warp_idw(
     No operator of our own, no table that depends on the size: what ``torch.export`` makes of it takes any even height
     and width of the sensor, of 8 pixels or more. It takes several times the time.
 
-    Args:
-        features: (B, C, s H, s W), floating.
-        flow: (B, 2, s H, s W), in pixels of the features.
-        pattern: Bayer phase, or ``"grey"``.
-        color: 0, 1, 2 for R, G, B; 0 for grey.
-        scale: pixels s of the features that a sensor pixel is wide.
-        steps: positions per pixel and axis that flow is rounded to, even.
-        neighbors: how many known pixels to weigh, at most 4.
-
-    Returns:
-        As ``features``.
-
-    Example:
-        >>> bayer_warp_idw(torch.ones(1, 2, 16, 16), torch.zeros(1, 2, 16, 16), "RGGB", 0, 2, 16).shape
-        torch.Size([1, 2, 16, 16])
+    Features are (B, C, s H, s W), flow (B, 2, s H, s W); colours 0, 1, 2 are R, G, B, and 0 is grey. Flow is rounded to
+    one of ``steps`` positions per pixel and axis, an even number; at most 4 neighbours are weighed.
     """
     height, width = features.shape[-2:]
     x, y = (

@@ -86,17 +86,6 @@ def test_split_and_merge(pattern, lead, dtype):
     assert torch.equal(sk.split_bayer(sk.merge_bayer(planes, pattern), pattern), planes)
 
 
-@pytest.mark.parametrize("pattern", PATTERNS)
-@pytest.mark.parametrize("lead", [(), (2, 3)])
-def test_split_colors(pattern, lead):
-    raw = torch.rand(*lead, 3, 5) + 1
-    colors = sk.split_colors(raw, pattern)
-    assert colors.shape == (3, *lead, 3, 5)
-    assert torch.equal(colors.sum(0), raw)
-    assert torch.equal((colors != 0).reshape(3, -1, 3, 5)[:, 0], sk.bayer_mask(3, 5, pattern, dtype=torch.bool))
-    assert sk.split_colors(raw > 1.5).dtype == torch.bool
-
-
 @pytest.mark.parametrize(
     ("error", "call"),
     [

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from spikekit import LinearMotion, UpsampleFlow, joint_flow, linear_motion, upsample_flow
+from spikekit import LinearMotion, joint_flow, linear_motion, upsample_flow
 
 LEADS = pytest.mark.parametrize("lead", [(), (3, 2)])
 
@@ -103,17 +103,6 @@ FLOW = torch.zeros(1, 2, 3, 3)
 def test_errors(error, call):
     with pytest.raises(error):
         call()
-
-
-def test_numbers_of_numpy():
-    """The scale as a byte, which is not kept: what it is multiplied with would run over."""
-    flow = torch.randn(2, 100, 90)
-    assert torch.equal(upsample_flow(flow, np.uint8(3)), upsample_flow(flow, 3))
-    assert torch.equal(UpsampleFlow(np.uint8(3))(flow), upsample_flow(flow, 3))
-    expected = linear_motion(flow, -flow, [0, 1, 2], scale=3)
-    assert torch.equal(linear_motion(flow, -flow, np.arange(3), scale=np.uint8(3)), expected)
-    assert torch.equal(LinearMotion(np.arange(3), scale=np.uint8(3))(flow, -flow), expected)
-    assert type(UpsampleFlow(np.uint8(3)).scale) is type(LinearMotion([0, 2], scale=np.uint8(3)).scale) is int
 
 
 @pytest.mark.parametrize(

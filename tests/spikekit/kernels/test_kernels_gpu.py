@@ -206,14 +206,14 @@ def test_warp_on_the_gpu(dtype, layout, deterministic):
 def compile_calls():
     """Every kernel, every type of its arguments, and sizes that Triton specialises on."""
     stream = torch.zeros(2, 3, 4, 8)
-    for x, dtype in [*((stream, d) for d in FLOATS), (torch.zeros(1, 1, 1, 1), torch.float32)]:
+    for x, dtype in [*((stream, d) for d in FLOATS[:3]), (torch.zeros(1, 1, 1, 1), torch.float32)]:
         wide, x = torch.promote_types(dtype, torch.float32), x.to(dtype)
         yield "integrate_fire", x, 0.3, x[..., 0, :, :].to(wide), dtype
         yield "tfi", x > 0, 1.0, dtype
         yield "tfp", x > 0, 3, 1.0, dtype
         yield "tfp_grad", x, 3, 1.0, dtype
     yield "integrate_fire", stream, 0.3, stream[..., 0, :, :], torch.bool
-    for dtype in (torch.uint8, torch.int64, *FLOATS):
+    for dtype in (torch.uint8, torch.int64, torch.float16):
         yield "spike_interval", stream.to(dtype)
         yield "tfi", stream.to(dtype), 1.0, torch.uint8
         yield "tfp", stream.to(dtype), 3, 1.0, torch.uint8
@@ -221,12 +221,11 @@ def compile_calls():
     tables = [(torch.zeros(3, 8, dtype=torch.int32), torch.zeros(4, 16, dtype=torch.int32))] * 2
     for wide in FLOATS[:2]:
         yield "nearest_known", torch.zeros(1, 2, 4, 8, dtype=wide), tables, 4
-    for dtype in FLOATS:
-        for last in (False, True):
-            values, grad, index, weight = gathering((1, 64, 32, 4, 32), dtype, last)
-            yield "weighted_gather", values, index, weight
-            yield "weighted_scatter", grad, index, weight, 32
-            yield "weighted_dot", values, grad, index
+    for dtype, last in zip(FLOATS, (False, True, False, True), strict=True):
+        values, grad, index, weight = gathering((1, 64, 32, 4, 32), dtype, last)
+        yield "weighted_gather", values, index, weight
+        yield "weighted_scatter", grad, index, weight, 32
+        yield "weighted_dot", values, grad, index
 
 
 class Machine:
@@ -270,6 +269,6 @@ def test_compiles(target, monkeypatch, tmp_path):
     finally:
         vars(driver).clear()
         vars(driver).update(before)
-    assert len(texts) > 60
+    assert len(texts) > 40
     for text in texts:
         assert not re.search(r"\bfma\.rn\.f|\bdiv\.(full|approx)", text)

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from spikekit import PATTERNS, bin_to_sensor, demosaic, flow_warp, upsample_flow
+from spikekit import bin_to_sensor, upsample_flow
 from spikekit.scenes.analytic import Layer, Motion, Scene
-from spikekit.sensor.simulate import simulate_spikes
 
 
 def smooth_picture(height, width, dtype=torch.float64):
@@ -143,19 +142,6 @@ def test_rotation_is_clockwise_on_the_screen_and_zoom_grows():
     torch.testing.assert_close(scene.flow(0, scale=1)[:, 3, 6], torch.tensor([-1.0, 0.5]))
 
 
-@pytest.mark.parametrize("clock", [0, 5, 35, 40])
-def test_view_sampled_where_flow_points_is_the_middle(clock):
-    motion = Motion((0.31, -0.17), 0.002, 0.999, (30.0, 40.0))
-    scene = Scene([Layer(smooth_picture(120, 140), motion, (-20, -20))], 80, 100)
-    flow = scene.flow(clock, scale=1)
-    back = flow_warp(scene.rgb(clock)[None], flow[None])[0]
-    inside = (slice(None), slice(16, -16), slice(16, -16))
-    error = (back - scene.rgb(20))[inside].abs().max()
-    assert error < 0.02
-    for wrong in (-flow, flow.flip(0)):
-        assert (flow_warp(scene.rgb(clock)[None], wrong[None])[0] - scene.rgb(20))[inside].abs().max() > 10 * error
-
-
 @pytest.mark.parametrize("scale", [2, 3, 4])
 def test_flow_at_the_sensor_is_flow_at_the_centre_of_its_block(scale):
     motion = Motion((0.31, -0.17), 0.01, 0.99, (7.0, 5.0))
@@ -178,16 +164,6 @@ def test_flow_is_that_of_the_object_on_top():
     expected[:, 2:6, 2:6] = torch.tensor([0.0, 0.2])[:, None, None]
     expected[:, 2:4, 2:4] = torch.tensor([-0.3, 0.0])[:, None, None]
     torch.testing.assert_close(flow, expected)
-
-
-@pytest.mark.parametrize("pattern", PATTERNS)
-def test_the_bayer_phase_is_right(pattern):
-    """A plain orange scene comes back orange from spikes, in whatever phase: no channel swapped, no fringe."""
-    orange = torch.tensor([0.9, 0.5, 0.1])[:, None, None].expand(3, 48, 48)
-    light = Scene([Layer(orange, Motion((0.3, 0.2)))], 48, 48).light(pattern, scale=4, alpha=0.5)
-    spikes = simulate_spikes(light, generator=torch.Generator().manual_seed(0))
-    decoded = demosaic(spikes[:40].float().mean(0) / 0.5, pattern)
-    torch.testing.assert_close(decoded, orange[:, :12, :12], atol=1e-5, rtol=0)
 
 
 def test_errors_say_what_was_expected():

@@ -189,15 +189,6 @@ def test_a_film_gets_the_frames_that_its_motion_requires(pixels, latent):
     assert len([tau for tau in film.interpolation.taus if 0 < tau < 1]) == latent
 
 
-def test_settings_overrule_the_plan():
-    assert moving(2.4, cut=0.03, step=0.25).plan(0).latent == 9
-    assert (
-        moving(2.4, step=0.5, spike_tolerance=1e-3).plan(0).latent
-        > moving(2.4, step=0.5, spike_tolerance=1.0).plan(0).latent
-    )
-    assert moving(2.4, plan=Plan(1)).plan(0) == Plan(1)
-
-
 def test_every_interval_has_its_own_plan():
     exact = Shift(2.0)
     still, moved = smooth(64, 64), exact.shifted(smooth(64, 64), 1.0).clamp(0, 1)
