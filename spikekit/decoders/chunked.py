@@ -64,7 +64,9 @@ def _pieces(decode: Callable[[Tensor], Tensor], chunks: Iterable[Tensor], overla
     length = past = 0  # frames held, and how many of them are decoded already
     for chunk in chunks:
         check_planes("chunks", chunk, 3, "(*, T, H, W)")
-        _check_fits(held, chunk)
+        kinds = [((*part.shape[:-3], "T", *part.shape[-2:]), part.dtype, part.device) for part in (*held[:1], chunk)]
+        if kinds[0] != kinds[-1]:
+            raise ValueError(f"chunks: expected all of one size, type and device, got {kinds[0]} before {kinds[1]}")
         held.append(chunk)
         length += chunk.shape[-3]
         ready = length - past - overlap
@@ -88,15 +90,3 @@ def _decoded(decode: Callable[[Tensor], Tensor], span: Tensor, past: int, count:
     if result.ndim < 3 or result.shape[-3] != span.shape[-3]:
         raise ValueError(f"decode: expected {span.shape[-3]} frames as given, got a result of {tuple(result.shape)}")
     return result[..., past : past + count, :, :]
-
-
-def _check_fits(held: list[Tensor], chunk: Tensor) -> None:
-    def kind(part: Tensor) -> tuple[object, ...]:
-        return (*part.shape[:-3], "T", *part.shape[-2:]), part.dtype, part.device
-
-    if held and kind(held[0]) != kind(chunk):
-        shapes = tuple(held[0].shape), tuple(chunk.shape)
-        raise ValueError(
-            f"chunks: expected all of one size, type and device, got {shapes[0]} of {held[0].dtype} on "
-            f"{held[0].device} before {shapes[1]} of {chunk.dtype} on {chunk.device}"
-        )

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_map
 
 from spikekit.kernels import cpu
 
@@ -86,6 +87,6 @@ def batch_first(op: Any) -> None:
             return value.expand(info.batch_size, *value.shape) if dim is None else value.movedim(dim, 0)
 
         result = op(*map(with_axis, args, in_dims))
-        return result, (0,) * len(result) if isinstance(result, tuple) else 0
+        return result, tree_map(lambda _: 0, result)
 
     op.register_vmap(rule)

@@ -52,9 +52,7 @@ class Motion:
     acceleration: ArrayLike = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if isinstance(self.zoom, (int, float)):
-            check_positive("zoom", self.zoom)
-        elif not (np.asarray(self.zoom) > 0).all():
+        if not (np.asarray(self.zoom) > 0).all():
             raise ValueError(f"zoom: expected numbers above 0, got {np.min(self.zoom)}")
 
     def _turn_and_shift(self, tau: Tensor) -> tuple[Tensor, Tensor]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -246,23 +245,34 @@ class NoisyPixels:
                 f"light: expected {expected[0]} x {expected[1]} of the calibration, got {got[0]} x {got[1]}"
             )
         self.noise, self.size, self.seed = noise, size, seed
+        known, self._gain, self._dark, self._stuck = noise.calibration, None, None, []
+        if known is not None:
+            self._gain, self._dark = known.gain, known.dark
+            self._stuck = [(known.defects == kind, bit) for kind, bit in ((HOT, 1), (DEAD, 0))]
+            return
+        if noise.gain_spread:
+            self._gain = self._around_one("gain", noise.gain_spread)
+        if noise.dark_current:
+            self._dark = noise.dark_current * self._around_one("dark current", noise.dark_spread)
+        if noise.hot or noise.dead:
+            drawn = torch.from_numpy(random_numbers(seed, "defects").random(size))
+            self._stuck = [(drawn < noise.hot, 1), (drawn >= 1 - noise.dead, 0)]
 
     def charge(self, light: Tensor, threshold: float, clock: int) -> Tensor:
         """Return the charge that pixels integrate from light (*, T, H, W), whose first frame is that of ``clock``."""
-        noise = self.noise
-        known = noise.calibration
-        if noise.photons is None and known is None and not noise.dark_current and not noise.gain_spread:
+        photons = self.noise.photons
+        if photons is None and self._gain is None and self._dark is None:
             return light
         charge = light.detach().to(torch.promote_types(light.dtype, torch.float32), copy=True)
-        quantum = threshold / (noise.photons or math.inf)
-        gain = torch.from_numpy(self._gain).to(charge) if noise.gain_spread or known else None
-        dark = torch.from_numpy(self._dark * threshold) if noise.dark_current or known else None
+        quantum = threshold / (photons or math.inf)
+        gain = None if self._gain is None else self._gain.to(charge)
+        dark = None if self._dark is None else self._dark * threshold
         for t, now in enumerate(charge.unbind(-3), clock):
-            if noise.photons is not None:
+            if photons is not None:
                 now.copy_(_arrive(now, quantum, random_numbers(self.seed, "photons", t)))
             if gain is not None:
                 now.mul_(gain)
-            if dark is not None and noise.photons is not None:
+            if dark is not None and photons is not None:
                 now.add_(_arrive(dark, quantum, random_numbers(self.seed, "electrons", t)).to(now))
             elif dark is not None:
                 now.add_(dark.to(now))
@@ -270,36 +280,14 @@ class NoisyPixels:
 
     def spikes(self, spikes: Tensor) -> Tensor:
         """Set the bits (*, T, H, W) of hot and dead pixels, in place, and return all of them."""
-        for share, bit in ((self.noise.hot, 1), (self.noise.dead, 0)):
-            if share:
-                fails = self._defects < share if bit else self._defects >= 1 - share
-                spikes.masked_fill_(torch.from_numpy(fails).to(spikes.device).unsqueeze(-3), bit)
-        if self.noise.calibration is not None:
-            for kind, bit in ((HOT, 1), (DEAD, 0)):
-                fails = self.noise.calibration.defects == kind
-                spikes.masked_fill_(fails.to(spikes.device).unsqueeze(-3), bit)
+        for pixels, bit in self._stuck:
+            spikes.masked_fill_(pixels.to(spikes.device).unsqueeze(-3), bit)
         return spikes
 
-    @cached_property
-    def _gain(self) -> np.ndarray:
-        if self.noise.calibration is not None:
-            return self.noise.calibration.gain.numpy()
-        return self._around_one("gain", self.noise.gain_spread)
-
-    @cached_property
-    def _dark(self) -> np.ndarray:
-        if self.noise.calibration is not None:
-            return self.noise.calibration.dark.numpy()
-        return self.noise.dark_current * self._around_one("dark current", self.noise.dark_spread)
-
-    @cached_property
-    def _defects(self) -> np.ndarray:
-        return random_numbers(self.seed, "defects").random(self.size)
-
-    def _around_one(self, purpose: str, spread: float) -> np.ndarray:
+    def _around_one(self, purpose: str, spread: float) -> Tensor:
         variance = math.log1p(spread**2)  # of the logarithm
         normal = random_numbers(self.seed, purpose).standard_normal(self.size)
-        return np.exp(math.sqrt(variance) * normal - variance / 2)
+        return torch.from_numpy(np.exp(math.sqrt(variance) * normal - variance / 2))
 
 
 def _poisson_error(means: np.ndarray) -> np.ndarray:

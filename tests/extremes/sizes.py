@@ -134,8 +134,8 @@ before = torch.cuda.memory_allocated()
 result = call(stream)
 print((torch.cuda.max_memory_allocated() - before - result.nbytes) / result.numel())
 """
-_BITS = "(torch.arange(1000000).reshape(1000, 1000) % 3 == 0).to(torch.uint8).expand(400, 1000, 1000)"
-_LIGHT = "torch.linspace(0, 1, 1000000).reshape(1000, 1000).expand(400, 1000, 1000)"
+_BITS = "(torch.arange(1000000).reshape(1000, 1000) % 3 == 0).to(torch.uint8).expand(100, 1000, 1000)"
+_LIGHT = "torch.linspace(0, 1, 1000000).reshape(1000, 1000).expand(100, 1000, 1000)"
 
 
 def _memory(call: str, stream: str, on: On) -> Measured:
@@ -157,8 +157,8 @@ if Path("/proc/self/status").exists():
         "tfp": "sk.tfp(stream, 41, 255.0, dtype=torch.uint8)",
     }.items():
         _on_gpu = (2.1, "int16 a pixel: the next spike") if _name == "tfi" else None
-        CASES.add(_name, "1000 x 1000 x 400 stream", (torch.uint8,), on_gpu=_on_gpu, **_STREAM)(
+        CASES.add(_name, "1000 x 1000 x 100 stream", (torch.uint8,), on_gpu=_on_gpu, **_STREAM)(
             partial(_memory, _call, _BITS)
         )
     _call = "sk.spike_integrate_fire(stream, dtype=torch.uint8)[0]"
-    CASES.add("spike_integrate_fire", "1000 x 1000 x 400 stream", _FLOAT32, **_STREAM)(partial(_memory, _call, _LIGHT))
+    CASES.add("spike_integrate_fire", "1000 x 1000 x 100 stream", _FLOAT32, **_STREAM)(partial(_memory, _call, _LIGHT))
