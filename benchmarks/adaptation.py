@@ -22,7 +22,6 @@ from lightning_modules.cli.command import without_chatter
 from lightning_modules.data.pictures import folder_pictures
 from lightning_modules.data.stills import StillClips
 from lightning_modules.inference.clips import RecordingClips
-from lightning_modules.inference.export import load_network
 from lightning_modules.inference.predict import predict
 from lightning_modules.networks import Network
 from spikekit import SensorNoise, SpikeSensor, psnr, write_spikes
@@ -88,16 +87,16 @@ def main() -> None:
     args = parser.parse_args()
     without_chatter()
     noise = NOISE if args.noise is None else SensorNoise(**args.noise)
-    teacher, found = load_network(args.teacher).eval(), folder_pictures(args.pictures)
+    teacher, found = Network.from_pretrained(args.teacher).eval(), folder_pictures(args.pictures)
     chosen = [found[n * len(found) // args.count] for n in range(args.count)]
     rows = []
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        longest = max(teacher.frames, load_network(args.weights).frames)
+        longest = max(teacher.frames, Network.from_pretrained(args.weights).frames)
         shared = noise, args.alpha, teacher.scale, longest
         seen = [record(path, n, *shared, folder / f"{n}.npz") for n, path in enumerate(chosen)]
         for one, other in zip(seen, [*seen[1:], seen[0]], strict=True):
-            student = load_network(args.weights).eval()
+            student = Network.from_pretrained(args.weights).eval()
             before = one.psnr(student), other.psnr(student)
             lessons = make_lessons(student, teacher, one.clips(longest))
             alike = learn(student, lessons, args.steps)

@@ -19,8 +19,8 @@ from lightning_modules.inference.export import (
     example_inputs,
     export_network,
     exported,
-    load_network,
 )
+from lightning_modules.networks import Network
 from spikekit.arguments import whole
 from spikekit.tables import table
 from spikekit.timing import cpu_name, cpu_timer
@@ -44,7 +44,7 @@ def main(args: Sequence[str] | None = None) -> None:
 
 @torch.no_grad()
 def _rows(name: str, formats: Sequence[str], side: int, rounds: int) -> list[list[str]]:
-    network = load_network(name)
+    network = Network.from_pretrained(name)
     module, inputs = as_exported(network), list(example_inputs(network, (side, side)).values())
     runs, cells = {"network": lambda: module(*inputs)}, {}
     with tempfile.TemporaryDirectory() as folder:

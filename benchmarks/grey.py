@@ -26,7 +26,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lightning_modules.inference.export import load_network
 from lightning_modules.inference.predict import predict
 from lightning_modules.networks import Network, RecurrentCSCSR
 from spikekit import bin_to_sensor, psnr, read_picture, read_spikes, ssim, tfi_at, tfp_at
@@ -102,7 +101,7 @@ def methods(weights: list[str], every: int) -> dict[str, Method]:
     found: dict[str, Method] = {"TFI": tfi_at, "TFP 41": partial(tfp_at, window=41)}
     found |= {f"TFP {window}, order 3": partial(tfp_at, window=window, order=3) for window in (9, 13)}
     for name in weights:
-        network = load_network(name).eval()
+        network = Network.from_pretrained(name).eval()
         read = "" if network.pattern == GREY else f", as {network.pattern}"
         shown = name if "/" not in name else Path(name).stem
         found[f"{shown}{read}{', averaged down' if network.scale > 1 else ''}"] = partial(by_network, network, every)

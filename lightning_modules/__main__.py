@@ -29,39 +29,33 @@ def main(args: Sequence[str] | None = None) -> None:
     Args:
         args: what was typed after ``lightning``; ``sys.argv`` when not given.
     """
+    typed = sys.argv[1:] if args is None else list(args)
     with errors.as_one_line():
-        _main(args)
+        verb, *rest = typed or [""]
+        if verb in ("-h", "--help"):
+            print(overview())  # noqa: T201
+        elif verb == "--version":
+            from spikekit import __version__
 
+            print(f"lightning of spikekit {__version__}")  # noqa: T201
+        elif verb not in VERBS:
+            expected = f"expected a verb, one of {', '.join(VERBS)}, got {verb or 'none'}"
+            raise errors.Ended(f"lightning: {expected} (see lightning --help)", 2)
+        elif verb not in _OURS and {"-h", "--help"} & {*rest}:
+            print(usage(verb))  # noqa: T201
+        else:
+            # Threads of torch that spin while they wait hold up the workers that make clips: before it is imported.
+            os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+            if "" not in sys.path and os.getcwd() not in sys.path:
+                sys.path.append(os.getcwd())  # where users' own networks are; behind all else, so that it hides nothing
+            if verb in _OURS:
+                run = getattr(import_module(f"lightning_modules.{_OURS[verb]}"), verb)
+                with stopped_by_sigterm():  # Lightning's verbs have a way of their own, which leaves a checkpoint
+                    run(with_found_configs(rest))
+            else:
+                from lightning_modules.cli.command import run
 
-def _main(args: Sequence[str] | None) -> None:
-    verb, *rest = (sys.argv[1:] if args is None else list(args)) or [""]
-    if verb in ("-h", "--help"):
-        print(overview())  # noqa: T201
-    elif verb == "--version":
-        from spikekit import __version__
-
-        print(f"lightning of spikekit {__version__}")  # noqa: T201
-    elif verb not in VERBS and not verb.startswith("-"):
-        got = f"got {verb}" if verb else "got none"
-        raise errors.Ended(f"lightning: expected a verb, one of {', '.join(VERBS)}, {got} (see lightning --help)", 2)
-    elif verb not in _OURS and {"-h", "--help"} & {*rest}:
-        print(usage(verb))  # noqa: T201
-    else:
-        _run(verb, rest, args)
-
-
-def _run(verb: str, rest: Sequence[str], args: Sequence[str] | None) -> None:
-    # Threads of torch that spin while they wait hold up the workers that make clips: before torch is imported.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    if "" not in sys.path and os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # where users' own networks are; behind all else, so that it hides nothing
-    if verb in _OURS:
-        with stopped_by_sigterm():  # Lightning's verbs have a way of their own, which leaves a checkpoint
-            getattr(import_module(f"lightning_modules.{_OURS[verb]}"), verb)(with_found_configs(rest))
-    else:
-        from lightning_modules.cli.command import Command, run
-
-        run(args, Command)
+                run(typed)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ from lightning_modules.adaptation.lessons import ROOM, make_lessons
 from lightning_modules.cli.errors import InputError, UsageError, VerbParser, input_errors
 from lightning_modules.cli.folder_lock import check_folder, locked_folder
 from lightning_modules.inference.clips import RecordingClips
-from lightning_modules.inference.export import load_network
 from lightning_modules.inference.output import check_place
 from lightning_modules.inference.reconstruct import may_be_noisy, precision_of
 from lightning_modules.networks import Network, RecurrentCSCSR
@@ -73,9 +72,9 @@ def adapt(args: Sequence[str]) -> None:
         student = _student(weights).to(device)
         recording = recordings.opened(asked)
         noisy = asked.calibration != "none" and may_be_noisy(recording)
-        clips, name = clips_and_teacher(recording, student, asked.teacher, noisy)
+        clips, name, teacher = clips_and_teacher(recording, student, asked.teacher, noisy)
         with locked_folder(asked.output, "adaptation"):
-            lessons = make_lessons(student, load_network(name).to(device).eval(), clips)
+            lessons = make_lessons(student, teacher.to(device).eval(), clips)
             precision = precision_of(torch.device(device)) if device == "cuda" else "32-true"
             before, after = learn(student, lessons, asked.steps, precision)
             held_out = f"dB from the held-out pictures of {name}"
@@ -88,7 +87,7 @@ def adapt(args: Sequence[str]) -> None:
 
 
 def _student(weights: str) -> Network:
-    student = load_network(weights)
+    student = Network.from_pretrained(weights)
     learns = any(parameter.requires_grad for parameter in student.parameters())
     if isinstance(student, RecurrentCSCSR) or not learns or student.settings.get("motion_fusion", "joint") != "joint":
         raise UsageError(f"--weights: expected a network that learns from single clips and one flow, got {weights}")
@@ -97,8 +96,8 @@ def _student(weights: str) -> Network:
 
 def clips_and_teacher(
     recording: Recording, student: Network, teacher: str | None, noisy: bool = True
-) -> tuple[RecordingClips, str]:
-    """Return clips as long as the longer of both networks wants them, and the name of the teacher.
+) -> tuple[RecordingClips, str, Network]:
+    """Return clips as long as the longer of both networks wants them, the name of the teacher, and the teacher.
 
     Args:
         recording: what is learned from.
@@ -113,9 +112,7 @@ def clips_and_teacher(
     if min(clips.size) < _LEAST_SIDE:
         raise ValueError(f"{recording.path}: expected at least {_LEAST_SIDE} x {_LEAST_SIDE} pixels, got {clips.size}")
     name = teacher or _slowest(recording, student, noisy)
-    network = load_network(name)
-    if not any(True for _ in network.parameters()):
-        raise UsageError(f"--teacher: expected weights, got {name}, which has none")
+    network = Network.from_pretrained(name)
     for setting in ("scale", "pattern"):
         here, there = student.settings[setting], network.settings[setting]
         if here != there:
@@ -123,7 +120,7 @@ def clips_and_teacher(
     frames = max(student.frames, network.frames)
     if recording.frames < ROOM * frames:
         raise ValueError(_too_short(recording, frames))
-    return RecordingClips(recording, frames, crop_to=student.pattern), name
+    return RecordingClips(recording, frames, crop_to=student.pattern), name, network
 
 
 def _slowest(recording: Recording, student: Network, noisy: bool) -> str:

@@ -84,15 +84,23 @@ class Configuration(SaveConfigCallback):
 class Command(LightningCLI):
     """The ``lightning`` command.
 
-    Attributes:
+    Args:
         typed: verb and arguments.
     """
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        typed = kwargs.get("args")
-        typed = sys.argv[1:] if typed is None else typed
+    def __init__(self, typed: Sequence[str]) -> None:
         self.typed = with_found_configs("--help" if word == "--help=all" else word for word in typed)
-        super().__init__(*args, **kwargs)
+        super().__init__(
+            BaseTask,
+            LightningDataModule,
+            subclass_mode_model=True,
+            subclass_mode_data=True,
+            auto_configure_optimizers=False,
+            parser_class=Parser,
+            save_config_callback=Configuration,
+            save_config_kwargs={"save_to_log_dir": False},
+            args=self.typed,
+        )
 
     def subcommands(self) -> dict[str, set[str]]:
         """Return only the verb that was typed, because building the parser of every verb takes time."""
@@ -290,7 +298,7 @@ def _quiet_about_disks(failed: threading.ExceptHookArgs) -> None:
         threading.__excepthook__(failed)
 
 
-def run(args: Sequence[str] | None, command: type[Command]) -> Command:
+def run(typed: Sequence[str], command: type[Command] = Command) -> Command:
     """Run what was typed after ``lightning``, with one of Lightning's verbs; errors are raised."""
     without_chatter()
     threading.excepthook = _quiet_about_disks
@@ -298,14 +306,4 @@ def run(args: Sequence[str] | None, command: type[Command]) -> Command:
         os.environ[_FIRST] = str(os.getpid())
     elif os.environ.get(_FIRST) == str(os.getppid()):
         end_when_orphaned()
-    return command(
-        BaseTask,
-        LightningDataModule,
-        subclass_mode_model=True,
-        subclass_mode_data=True,
-        auto_configure_optimizers=False,
-        parser_class=Parser,
-        save_config_callback=Configuration,
-        save_config_kwargs={"save_to_log_dir": False},
-        args=None if args is None else list(args),
-    )
+    return command(typed)

@@ -51,25 +51,12 @@ def input_errors() -> Iterator[None]:
     """Take a file that cannot be used, or a value that cannot be, for a mistake of the user and not of the program."""
     try:
         yield
-    except InputError:
+    except (InputError, ModuleNotFoundError):
         raise
     except (OSError, ValueError, ImportError) as error:
-        raise (UsageError if isinstance(error, SpikekitUsageError) else InputError)(str(error)) from error
-
-
-def _of_users() -> tuple[type[BaseException], ...]:
-    """Return what is raised where a user made a mistake; importing it takes torch."""
-    from lightning_modules.storage.checkpoint import DivergedError
-    from lightning_modules.storage.pretrained import CheckpointMismatchError
-    from spikekit import SpikeFileError, VideoError
-    from spikekit.io import PictureError
-
-    known = [InputError, SpikeFileError, PictureError, VideoError, CheckpointMismatchError, DivergedError]
-    if "pytorch_lightning" in sys.modules:  # a verb that needs no Trainer does not import it
-        from pytorch_lightning.utilities.exceptions import MisconfigurationException
-
-        known.append(MisconfigurationException)  # such as a device that is not there
-    return tuple(known)
+        name = getattr(error, "filename", None)
+        said = str(error) if name is None else f"{name}: {one_line(error)}"
+        raise (UsageError if isinstance(error, SpikekitUsageError) else InputError)(said) from error
 
 
 @contextmanager
@@ -99,12 +86,13 @@ def as_one_line() -> Iterator[None]:
     except Exception as error:
         if isinstance(error, ModuleNotFoundError) and (line := remedy(error)):
             raise Ended(f"lightning: {line}", 1) from error
-        if not isinstance(error, _of_users()):
+        # errors of kinds that are defined here are users', such as a damaged file; Lightning's are of a bad Trainer
+        if not type(error).__module__.startswith(("lightning_modules.", "spikekit.", "lightning_fabric.")):
             raise
         # what a worker of a loader raises comes with its traceback, whose last line it is
         text = str(error).strip()
         said = text.splitlines()[-1].split("Error: ", 1)[-1] if "Traceback (" in text else text
-        raise Ended(f"lightning: {said}", 2 if isinstance(error, UsageError) else 1) from error
+        raise Ended(f"lightning: {said}", 2 if isinstance(error, SpikekitUsageError) else 1) from error
     except (Terminated, KeyboardInterrupt) as error:
         name, status = ("Ctrl-C", 130) if isinstance(error, KeyboardInterrupt) else ("SIGTERM", 143)
         raise Ended(f"lightning: stopped by {name}; what is whole has been written", status) from None

@@ -8,8 +8,8 @@ from pathlib import Path
 from time import perf_counter
 
 from lightning_modules.cli.configured import configured_network
-from lightning_modules.cli.errors import InputError, UsageError, VerbParser
-from lightning_modules.inference.export import FORMATS, WITHOUT_WEIGHTS, export_network, load_network
+from lightning_modules.cli.errors import InputError, VerbParser, input_errors
+from lightning_modules.inference.export import FORMATS, export_network
 from lightning_modules.motion import ESTIMATORS
 from lightning_modules.networks import NETWORKS
 from lightning_modules.storage.pretrained import (
@@ -33,10 +33,7 @@ def parser() -> argparse.ArgumentParser:
         "Both take a clip of any even height and width, and the motion as a second input where the network follows "
         "motion: an estimate of motion cannot be exported. They are compared with the network on three sizes.",
     )
-    names = " or ".join(WITHOUT_WEIGHTS)
-    made.add_argument(
-        "weights", help=f"a name that lightning models lists, a .safetensors, a checkpoint; or {names}, which have none"
-    )
+    made.add_argument("weights", help="a name that lightning models lists, a .safetensors, a checkpoint")
     made.add_argument(
         "-c", "--config", action="append", default=[], metavar="FILE", help="says what network, where it is your own"
     )
@@ -61,22 +58,17 @@ def export(args: Sequence[str]) -> None:
     if Path(asked.output).suffix != ending:
         raise InputError(f"-o: expected a name that ends in {ending} for {asked.format}, got {asked.output}")
     said = ""
-    try:
+    with input_errors():
         if asked.format in FORMATS:
-            own = bool(asked.config)
-            network = configured_network(asked.config, asked.weights) if own else load_network(asked.weights)
+            network = configured_network(asked.config, asked.weights)
             said = f", {export_network(network, asked.output, asked.format, still=asked.still)}"
         else:
             write_weights(_weights(asked), asked.output)
-    except (OSError, ValueError, ImportError) as error:
-        raise (UsageError if isinstance(error, UsageError) else InputError)(str(error)) from error
     size = Path(asked.output).stat().st_size / 2**20
     print(f"{asked.output}: {size:.1f} MiB{said}, in {duration(perf_counter() - begin)}")
 
 
 def _weights(asked: argparse.Namespace) -> Weights:
-    if asked.weights in WITHOUT_WEIGHTS:
-        raise ValueError(f"{asked.weights}: expected --format torch or onnx, as it has no weights of its own")
     if asked.config:
         network = configured_network(asked.config, asked.weights)
         return Weights(Path(asked.weights), settings_of(network), motion_of(network), network.state_dict())

@@ -11,13 +11,13 @@ from time import perf_counter
 from typing import Any
 
 from lightning_modules.cli.configured import checkpoint_of, configured_network
-from lightning_modules.cli.errors import InputError, UsageError, VerbParser
+from lightning_modules.cli.errors import InputError, UsageError, VerbParser, input_errors
 from lightning_modules.cli.folder_lock import check_folder, locked_folder
 from lightning_modules.cli.processes import calls_on_ray
 from lightning_modules.inference.output import LOCK, Output, is_film, is_picture
 from lightning_modules.inference.presets import SPEEDS
 from lightning_modules.inference.reconstruct import Reconstruction, reconstruct
-from spikekit.arguments import UsageError as SpikekitUsageError
+from lightning_modules.inference.tiles import TILE, TILE_ON_GPU
 from spikekit.arguments import positive, whole
 from spikekit.cli import recordings
 from spikekit.decoders.methods import DECODERS
@@ -65,7 +65,13 @@ def parser() -> argparse.ArgumentParser:
     add("-c", "--config", action="append", default=[], metavar="FILE", help="instead, the network of a configuration")
     add("--ckpt_path", metavar="FILE", help="its checkpoint; best and last are those of its output, or of -o")
     add = made.add_argument_group("how it is used").add_argument
-    add("--tile", type=whole(0), metavar="N", help="side of the tiles, in sensor pixels; 0 for none, 128 if not given")
+    sides = f"{TILE}, on a GPU {TILE_ON_GPU}"
+    add(
+        "--tile",
+        type=whole(0),
+        metavar="N",
+        help=f"side of the tiles in pixels, 0 for none; {sides} if not given",
+    )
     add(
         "--tolerance",
         type=float,
@@ -102,11 +108,9 @@ def predict(args: Sequence[str]) -> None:
     if not is_film(output) and not is_picture(output):
         check_folder(output)
     arguments = _arguments(asked, output)
-    try:
+    with input_errors():
         pictures = reconstruct(asked.file, **arguments)
         _check_output(output, pictures)
-    except (OSError, ValueError) as error:
-        raise (UsageError if isinstance(error, SpikekitUsageError) else InputError)(str(error)) from error
     for line in pictures.notes:
         print(line, flush=True)
     there = Output(output, pictures.clips.chosen, {**pictures.identity(), "beside": asked.beside})

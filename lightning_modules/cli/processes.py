@@ -17,20 +17,15 @@ from spikekit.arguments import one_line
 _A_MOMENT = 0.2  # seconds
 
 
-def run_commands_on_ray(
-    commands: Callable[[int], dict[Path, Sequence[str]]], jobs: int | None
-) -> Iterator[dict[Path, str | None]]:
+def run_commands_on_ray(commands: dict[Path, Sequence[str]], jobs: int | None) -> Iterator[dict[Path, str | None]]:
     """Run Python in processes of its own on a Ray cluster, as :func:`calls_on_ray` says.
 
     Args:
-        commands: given how many run at once, the arguments of Python by the file that a command's output goes to.
+        commands: arguments of Python by the file that a command's output goes to.
         jobs: commands at once; as many as there are GPUs, or else nodes, if ``None``.
     """
-
-    def calls(count: int) -> dict[Path, tuple[Any, ...]]:
-        return {log: (_run_to_end, log, words, os.getcwd()) for log, words in commands(count).items()}
-
-    return calls_on_ray(calls, jobs)
+    calls = {log: (_run_to_end, log, words, os.getcwd()) for log, words in commands.items()}
+    return calls_on_ray(lambda _: calls, jobs)
 
 
 def calls_on_ray(
@@ -70,7 +65,7 @@ def calls_on_ray(
 
 
 def _share(nodes: Sequence[dict[str, float]], jobs: int | None) -> dict[str, Any]:
-    """Return what a trial takes of a cluster.
+    """Return what a call takes of a cluster: of its GPUs, where it has any, or else of the cores of its nodes.
 
     Example:
         >>> _share([{"CPU": 16, "GPU": 2}, {"CPU": 8, "GPU": 2}], None)
@@ -78,14 +73,12 @@ def _share(nodes: Sequence[dict[str, float]], jobs: int | None) -> dict[str, Any
         >>> _share([{"CPU": 8}], 4)
         {'num_cpus': 2}
     """
-    gpus = sum(node.get("GPU", 0) for node in nodes)
-    if gpus:
-        gpu = gpus / max(jobs or gpus, 1)
-        gpu = min(1.0, gpu)
-        cpus = min(node.get("CPU", 0) / node["GPU"] for node in nodes if node.get("GPU")) * gpu
-        return {"num_cpus": int(cpus), "num_gpus": gpu}
-    a_node = -(-(jobs or len(nodes)) // len(nodes))
-    return {"num_cpus": max(1, int(min(node.get("CPU", 1) for node in nodes) // a_node))}
+    if gpus := sum(node.get("GPU", 0) for node in nodes):
+        gpu = min(1.0, gpus / (jobs or gpus))
+        cores = min(node["CPU"] / node["GPU"] for node in nodes if node.get("GPU"))
+        return {"num_cpus": int(gpu * cores), "num_gpus": gpu}
+    on_each = -(-(jobs or len(nodes)) // len(nodes))
+    return {"num_cpus": max(1, int(min(node["CPU"] for node in nodes) // on_each))}
 
 
 def _run_to_end(log: Path, words: Sequence[str], there: str) -> str | None:

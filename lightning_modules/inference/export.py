@@ -13,8 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from lightning_modules.inference.tiles import call
-from lightning_modules.networks import NETWORKS, ClassicalDecoder, Network, RecurrentCSCSR
-from lightning_modules.storage.pretrained import read_weights
+from lightning_modules.networks import Network, RecurrentCSCSR
 from spikekit.io.whole_file import whole_file
 
 #: formats, and how their files end
@@ -22,9 +21,6 @@ FORMATS = {"torch": ".pt2", "onnx": ".onnx"}
 
 #: of ONNX
 OPSET = 20
-
-#: networks that have no weights of their own, by name
-WITHOUT_WEIGHTS = {ClassicalDecoder.__name__: ClassicalDecoder}
 
 _TRACED = 32, 44  # sensor pixels, of the clip that the network is followed on
 _SIZES = (32, 44), (20, 16), (24, 48)
@@ -71,25 +67,6 @@ class _Film(_StillFilm):
 
     def forward(self, spikes: Tensor, flow: Tensor, state: Tensor, every: Tensor) -> tuple[Tensor, Tensor]:
         return self._meet(spikes, flow, state, self.network.flow_to(flow, -1) * every)
-
-
-def load_network(source: str) -> Network:
-    """Return the network that weights are of, or one that has none.
-
-    Args:
-        source: the name of weights that come with the package, a file of weights, or a name in ``WITHOUT_WEIGHTS``.
-
-    Raises:
-        FileNotFoundError: neither a file nor a name.
-        ValueError: a damaged file, or one of something else than a network.
-    """
-    if source in WITHOUT_WEIGHTS:
-        return WITHOUT_WEIGHTS[source]()
-    named = read_weights(source).settings.get("class")
-    if named not in NETWORKS:
-        expected = "expected weights of a network of this package; -c describes another"
-        raise ValueError(f"{source}: {expected}, got those of {named}")
-    return NETWORKS[named].from_pretrained(source)
 
 
 def export_network(network: Network, path: str | Path, kind: str, *, still: bool = False) -> str:

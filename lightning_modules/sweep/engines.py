@@ -53,7 +53,7 @@ def run_on_ray(folders: Sequence[Path], jobs: int | None, every: float) -> Itera
         every: seconds between two checkpoints.
     """
     logs = {folder.absolute() / LOG: folder for folder in folders}
-    for ended in run_commands_on_ray(lambda _: {log: _trial(log.parent, every) for log in logs}, jobs):
+    for ended in run_commands_on_ray({log: _trial(log.parent, every) for log in logs}, jobs):
         yield {logs[log]: reason for log, reason in ended.items()}
 
 

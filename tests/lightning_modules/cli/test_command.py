@@ -168,16 +168,6 @@ def test_test_prints_a_table_and_writes_it(trained, overlay, configs, capsys):
 
 
 @pytest.mark.slow
-def test_predict_takes_the_network_and_the_checkpoint_of_a_run(trained, overlay, configs, tmp_path):
-    write_spikes(tmp_path / "clip.dat", torch.rand(62, 10, 13) < 0.3)
-    args = ["-c", configs / "x4.yaml", "-c", overlay, "--ckpt_path", trained / "checkpoints/last.ckpt"]
-    args += [tmp_path / "clip.dat", "--height", 10, "--width", 13]
-    main(["predict", *map(str, args), "-o", str(tmp_path / "out")])
-    assert sorted(path.name for path in (tmp_path / "out").glob("*.png")) == ["frame_000020.png", "frame_000040.png"]
-    assert read_picture(tmp_path / "out" / "frame_000040.png").shape == (3, 40, 52)
-
-
-@pytest.mark.slow
 def test_a_finished_run_is_not_written_over(trained, overlay, configs):
     before = weights(trained)["state_dict"]
     with pytest.raises(SystemExit, match="holds a run already"):
@@ -206,16 +196,24 @@ def test_a_number_of_batches_is_no_share(configs, overlay, tmp_path):
     assert repr((trainer.limit_val_batches, trainer.limit_train_batches)) == "(1, 1.0)"
 
 
-def test_help_answers_without_lightning():
-    code = "import sys; from lightning_modules.__main__ import main; main(sys.argv[1:]); print(*sys.modules)"
-    for words in (["--help"], ["fit", "--help"], ["models"]):
-        done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
-        assert "pytorch_lightning" not in done.stdout.splitlines()[-1].split()
-
-
-def test_version(capsys):
-    main(["--version"])
-    assert capsys.readouterr().out == f"lightning of spikekit {spikekit.__version__}\n"
+def test_verbs_that_need_no_trainer_do_not_import_lightning(tmp_path):
+    write_spikes(tmp_path / "clip.npz", torch.rand(41, 8, 10) < 0.3)
+    code = f"""
+import sys, lightning_modules
+assert "CSCSR" in dir(lightning_modules) and "torch" not in sys.modules
+from lightning_modules.__main__ import main
+for words in (
+    ["--version"], ["--help"], ["fit", "--help"], ["models"],
+    ["predict", "{tmp_path}/clip.npz", "--speed", "fastest", "--calibration", "none", "-o", "{tmp_path}/out"],
+    ["export", "cscsr_tiny_x4", "-o", "{tmp_path}/tiny.safetensors"],
+):
+    main(words)
+import lightning_modules.adaptation.cli
+assert "pytorch_lightning" not in sys.modules
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(f"lightning of spikekit {spikekit.__version__}\n")
 
 
 def test_models_lists_the_weights_of_the_package(capsys):
@@ -226,13 +224,6 @@ def test_models_lists_the_weights_of_the_package(capsys):
     assert head == ["weights", "scale", "size", "parameters", "MMAC/px", "Kodak", "Vid4", "MB"]
     assert [row[0] for row in rows] == [weights.name for weights in list_models()]
     assert ["cscsr_tiny_x4", "x4", "tiny", "300,963", "0.36", "27.95", "23.51"] in [row[:-1] for row in rows]
-
-
-def test_the_package_offers_its_names_without_importing_torch():
-    seen = "import sys, lightning_modules as l; assert 'CSCSR' in dir(l) and 'torch' not in sys.modules; "
-    seen += "from lightning_modules import CSCSR, SuperResolution, list_models; CSCSR.from_pretrained"
-    done = subprocess.run([sys.executable, "-c", seen], capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.slow

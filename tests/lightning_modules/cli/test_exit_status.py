@@ -90,6 +90,7 @@ FAILED = {
     "predict odd.dat --height 7 --width 9 -o out -c bad.yaml": "bad.yaml",
     "adapt nowhere.dat -o out": "nowhere.dat",
     "export cut.ckpt -o a.safetensors": "cut.ckpt",
+    "export cscsr_tiny_x4 --format onnx -o a.pt2": "-o: expected a name that ends in .onnx for onnx, got a.pt2",
 }
 ROWS = [(words, 2, said) for words, said in WRONG.items()] + [(words, 1, said) for words, said in FAILED.items()]
 

@@ -1,8 +1,5 @@
 """From a recording to pictures, in Python: what is chosen, and what the pictures show."""
 
-import subprocess
-import sys
-
 import pytest
 import torch
 
@@ -176,9 +173,3 @@ def test_mistakes_are_said_in_one_line(recording, tmp_path):
         reconstruct(tmp_path / "none.npz")
     with pytest.raises(ValueError, match="scale: expected one that was measured"):
         reconstruct(recording, scale=7)
-
-
-def test_pictures_are_made_without_lightning(recording):
-    code = f"import sys, lightning_modules as l; list(l.reconstruct({str(recording)!r}, 'fastest', frame='40'))"
-    check = f"{code}; assert 'pytorch_lightning' not in sys.modules"
-    subprocess.run([sys.executable, "-c", check], check=True)

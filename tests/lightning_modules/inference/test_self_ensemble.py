@@ -58,9 +58,8 @@ def test_every_view_has_its_colours_where_the_network_has_them(pattern, size):
     assert kept == [(size[0] % 2, size[1] % 2), (size[1] % 2, size[0] % 2)] * 4  # so they end as they ended
 
 
-@pytest.mark.parametrize("pattern", PATTERNS)
-@pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("views", [2, 4, 8])
+@pytest.mark.parametrize(("pattern", "size"), zip(PATTERNS, SIZES, strict=True))
 def test_what_follows_the_flow_comes_back_the_same_from_every_view(pattern, size, views):
     """A run that samples along the flow: were a vector mirrored wrongly, its view would sample elsewhere."""
     generator = torch.Generator().manual_seed(0)
@@ -80,17 +79,7 @@ def test_what_follows_the_flow_comes_back_the_same_from_every_view(pattern, size
 
 
 @torch.no_grad()
-@pytest.mark.parametrize(("tile", "tolerance"), [(0, 0.0), (16, 0.0), (32, 0.1)])
-@pytest.mark.parametrize("pattern", ["RGGB", "BGGR"])
-def test_what_is_transposed_gives_the_transposed_picture(pattern, tile, tolerance):
-    network = CSCSR(3, **TINY, pattern=pattern)
-    module = partial(predict, network, tile=tile, psnr_tolerance=tolerance, self_ensemble=2)
-    spikes, _ = clip()
-    torch.testing.assert_close(module(spikes.mT), module(spikes).mT, rtol=0, atol=1e-5)
-
-
-@torch.no_grad()
-@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("pattern", ["RGGB", "GRBG"])
 def test_of_odd_sides_every_turn_of_the_clip_gives_that_of_the_picture(pattern):
     """Mirrors of an odd side leave nothing out: all eight views are those of the turned clip as well."""
     module = partial(predict, CSCSR(2, **TINY, pattern=pattern), self_ensemble=8)
@@ -100,15 +89,7 @@ def test_of_odd_sides_every_turn_of_the_clip_gives_that_of_the_picture(pattern):
         torch.testing.assert_close(module(spikes.flip(axes)).flip(axes), expected, rtol=0, atol=1e-5)
 
 
-@torch.no_grad()
-def test_a_decoder_has_it_as_well():
-    spikes, _ = clip()
-    decoder = ClassicalDecoder("tfp", 2)
-    expected = (decoder(spikes) + decoder(spikes.mT).mT) / 2
-    torch.testing.assert_close(predict(decoder, spikes, self_ensemble=2), expected.clamp(0, 1))
-
-
-@pytest.mark.parametrize("views", [True, False, 0, 3, 16])
+@pytest.mark.parametrize("views", [True, 0, 3])
 def test_other_numbers_of_views_are_refused(views):
     with pytest.raises(ValueError, match=rf"^self_ensemble: expected one of \(1, 2, 4, 8\), got {views}$"):
         predict(CSCSR(2, **TINY), torch.zeros(1, 41, 8, 8), self_ensemble=views)
