@@ -169,11 +169,3 @@ def test_the_picture_of_a_recording_by_onnxruntime_alone(tmp_path, capfd):
     with torch.no_grad():
         expected = network(spikes[None].float(), torch.full((1, 2, 2, 16, 24), 0.5))
     assert np.abs(np.load(tmp_path / "a.npy") - expected.numpy()).max() < 1e-4
-
-
-def test_a_program_of_torch_is_loaded_by_torch_alone(tmp_path):
-    said = export_network(ClassicalDecoder(), tmp_path / "a.pt2", "torch")
-    assert said.startswith("takes spikes (1, 41, H, W), H and W even")
-    run = torch.export.load(tmp_path / "a.pt2").module()
-    spikes = (torch.rand(1, 41, 38, 20) < 0.3).float()
-    torch.testing.assert_close(run(spikes), ClassicalDecoder()(spikes), rtol=0, atol=1e-4)
