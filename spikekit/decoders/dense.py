@@ -45,10 +45,14 @@ def interval_dtype(frames: int) -> torch.dtype:
 
 @operator(lambda spikes, max_range, dtype: torch.empty_like(spikes, dtype=dtype))
 def _tfi(spikes: Tensor, max_range: float, dtype: torch.dtype) -> Tensor:
-    wide = torch.promote_types(dtype, torch.float32)
-    interval = torch.ops.spikekit.spike_interval(spikes)
+    return rate_of(torch.ops.spikekit.spike_interval(spikes), max_range, dtype)
+
+
+def rate_of(interval: Tensor, max_range: float, dtype: torch.dtype) -> Tensor:
+    """Divide a range by intervals."""
     # a tensor over a tensor: torch divides a number by a tensor through the inverse, and 255 / 5 is not 51 then
-    return cast_light(torch.full_like(interval, max_range, dtype=wide) / interval, dtype)
+    most = torch.full_like(interval, max_range, dtype=torch.promote_types(dtype, torch.float32))
+    return cast_light(most / interval, dtype)
 
 
 def cast_light(value: Tensor, dtype: torch.dtype) -> Tensor:

@@ -11,7 +11,7 @@ from kornia.core.utils import is_exporting
 from torch import Tensor
 
 from spikekit.check import check_dtype, check_index, check_planes, check_positive, check_whole, default_float
-from spikekit.decoders.dense import cast_light, check_window, interval_dtype
+from spikekit.decoders.dense import cast_light, check_window, interval_dtype, rate_of
 from spikekit.kernels import operator, register_kernel
 
 
@@ -157,11 +157,7 @@ def tfi_at(spikes: Tensor, frame: int, max_range: float = 1.0, *, dtype: torch.d
     """
     check_dtype(dtype, torch.uint8)
     check_positive("max_range", max_range)
-    interval = _interval(spikes, frame)
-    dtype = dtype or default_float(spikes)
-    # a tensor over a tensor: torch divides a number by a tensor through the inverse, and 255 / 5 is not 51 then
-    rate = torch.full_like(interval, max_range, dtype=torch.promote_types(dtype, torch.float32)) / interval
-    return cast_light(rate, dtype)
+    return rate_of(_interval(spikes, frame), max_range, dtype or default_float(spikes))
 
 
 def tfp_at(

@@ -149,8 +149,10 @@ def simulate(source: Source, settings: Settings, output: Path, replayed: Sidecar
         prints = _look(source, film, pictures, part, replayed)
         noise, told = _needed_noise(source, settings, film)
         plans: list[Plan] = []
-        shape, bits, digest = _expose(source, settings, film, noise, part, output, plans)
-        stream = {"file": output.name, "frames": shape[0], "height": shape[1], "width": shape[2], "sha256": digest}
+        bits, digest = _expose(source, settings, film, noise, part / output.name, plans)
+        height, width = film.height // film.scale, film.width // film.scale
+        frames = source.clocks // settings.readout
+        stream = {"file": output.name, "frames": frames, "height": height, "width": width, "sha256": digest}
         if replayed is not None and any(replayed.stream[name] != stream[name] for name in stream if name != "file"):
             ours = versions()
             changed = [
@@ -239,32 +241,18 @@ def _needed_noise(source: Source, settings: Settings, film: FrameSequence) -> tu
 
 
 def _expose(
-    source: Source,
-    settings: Settings,
-    film: FrameSequence,
-    noise: SensorNoise,
-    part: Path,
-    output: Path,
-    plans: list[Plan],
-) -> tuple[tuple[int, int, int], int, str]:
-    """Write the stream; return its shape, how many bits are set, and its hash."""
+    source: Source, settings: Settings, film: FrameSequence, noise: SensorNoise, path: Path, plans: list[Plan]
+) -> tuple[int, str]:
+    """Write the stream, and collect the plans of its intervals; return how many bits are set, and its hash."""
     digest = hashlib.sha256()
-    shape, bits, clock = (0, 0, 0), 0, source.first
+    bits, clock = 0, source.first
 
     def passing() -> Iterator[Tensor]:
-        nonlocal shape, bits, clock
-        chunks = film.spikes(
-            source.first,
-            source.clocks,
-            noise=noise,
-            readout=settings.readout,
-            seed=settings.seed,
-            chunk=settings.clocks,
-        )
-        for spikes in chunks:
+        nonlocal bits, clock
+        how = {"noise": noise, "readout": settings.readout, "seed": settings.seed, "chunk": settings.clocks}
+        for spikes in film.spikes(source.first, source.clocks, **how):
             bar.update(len(spikes))
             digest.update(dat_bytes(spikes.numpy()))
-            shape = shape[0] + len(spikes), *spikes.shape[1:]
             bits += int(spikes.sum())
             begin, clock = clock, clock + len(spikes) * settings.readout
             for interval in range(begin // settings.clocks, -(-(clock - 1) // settings.clocks)):
@@ -272,10 +260,9 @@ def _expose(
                     plans.append(film.plan(interval))
             yield spikes
 
-    frames = source.clocks // settings.readout
-    with progress(what=f"frames of {output.name}", total=frames) as bar:
-        write_spikes(part / output.name, passing())
-    return shape, bits, digest.hexdigest()
+    with progress(what=f"frames of {path.name}", total=source.clocks // settings.readout) as bar:
+        write_spikes(path, passing())
+    return bits, digest.hexdigest()
 
 
 def _plan_lines(plans: list[Plan], source: Source) -> list[str]:
