@@ -41,6 +41,8 @@ def test_a_network_is_told_the_noise_of_every_clip(kind, pattern):
     quiet, loud = (network(spikes, static=True, noise=level) for level in (0.0, 1.0))
     torch.testing.assert_close(network(spikes, static=True), quiet)
     assert not torch.allclose(quiet, loud, atol=1e-3)
+    network.noise_level = 1.0
+    torch.testing.assert_close(network(spikes, static=True), loud)
     each = network(spikes, static=True, noise=torch.tensor([0.0, 1.0]))
     torch.testing.assert_close(each, torch.stack([quiet[0], loud[1]]))
 
@@ -71,5 +73,3 @@ def test_what_a_network_cannot_be_told():
         _network()(_spikes(1, 41, 8, 10), static=True, noise=0.5)
     with pytest.raises(ValueError, match=r"alpha: expected a number or \(2,\).*got \(3,\)"):
         _network()(_spikes(2, 41, 8, 10), static=True, alpha=torch.ones(3))
-    with pytest.raises(ValueError, match="noise: expected representation bssr"):
-        CSCSR(noise=True, representation="spikes")

@@ -44,35 +44,21 @@ def test_a_trace_keeps_no_motion_of_its_example():
     ],
 )
 def test_parameters_and_work_of_the_sizes(size, parameters, mmac):
-    for scale in (2, 4) if size.startswith("full") else (4,):  # the others see scale x scale pixels as channels
-        network = CSCSR(scale, size=size)
-        assert sum(p.numel() for p in network.parameters()) == parameters
+    network = CSCSR(4, size=size)
+    assert network.times == (5, 8, 11, 14, 17, 20, 23, 26, 29, 32, 35)[:: 2 if size == "tiny" else 1]
+    assert network.flow_times == (5, 20, 35)
+    assert sum(p.numel() for p in network.parameters()) == parameters
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
         network(torch.zeros(1, network.frames, 8, 8), torch.zeros(1, 2, 2, 8, 8))
     assert counter.get_total_flops() / 2 / 64 / 1e6 == pytest.approx(mmac, rel=0.005)
 
 
-@pytest.mark.parametrize("scale", [1, 2, 3, 4])
-@pytest.mark.parametrize("size", [(12, 16), (9, 7), (3, 4)])
+@pytest.mark.parametrize(("scale", "size"), [(1, (12, 16)), (2, (3, 4)), (3, (9, 7)), (4, (9, 8))])
 def test_any_size_and_scale(scale, size):
     spikes, flow = clip(2, *size)
     rgb = CSCSR(scale, **TINY)(spikes, flow)
     assert rgb.shape == (2, 3, scale * size[0], scale * size[1])
     assert rgb.isfinite().all()
-
-
-def test_time_points_are_those_of_the_paper():
-    network = CSCSR(**TINY)
-    assert network.times == (5, 8, 11, 14, 17, 20, 23, 26, 29, 32, 35)
-    assert network.flow_times == (5, 20, 35)
-
-
-def test_every_parameter_learns():
-    torch.manual_seed(0)
-    spikes, flow = clip()
-    network = CSCSR(2, **TINY)
-    network(spikes, flow).square().mean().backward()
-    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in network.parameters())
 
 
 def test_search_undoes_motion_of_whole_bayer_periods():
@@ -122,11 +108,19 @@ def test_result_moves_with_the_scene_by_whole_bayer_periods():
     torch.testing.assert_close(moved[..., 32:-32, 32:-32], network(spikes, still)[..., 32:-32, 32:-32])
 
 
-@pytest.mark.parametrize("reconstruction", ["correlated", "separate", "early"])
-@pytest.mark.parametrize("scale", [1, 2, 3])
-def test_features_at_sensor_resolution(scale, reconstruction):
+@pytest.mark.parametrize(
+    ("scale", "choice"),
+    [
+        (1, {}),
+        (2, {"end_width": 6}),
+        (2, {"reconstruction": "separate"}),
+        (3, {"reconstruction": "early"}),
+        (3, {"reconstruction": "early", "end_width": 6}),
+    ],
+)
+def test_features_at_sensor_resolution(scale, choice):
     torch.manual_seed(0)  # so few channels may all be silent otherwise
-    network = CSCSR(scale, **TINY, resolution="sensor", reconstruction=reconstruction)
+    network = CSCSR(scale, **TINY, resolution="sensor", **choice)
     spikes, flow = clip(2, 9, 7)
     rgb = network(spikes, flow)
     assert rgb.shape == (2, 3, scale * 9, scale * 7)
@@ -134,40 +128,18 @@ def test_features_at_sensor_resolution(scale, reconstruction):
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in network.parameters())
 
 
-@pytest.mark.parametrize("reconstruction", ["correlated", "early"])
-def test_width_after_the_last_fusion(reconstruction):
-    torch.manual_seed(0)
-    network = CSCSR(2, **TINY, end_width=6, reconstruction=reconstruction)
-    spikes, flow = clip()
-    network(spikes, flow).square().mean().backward()
-    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in network.parameters())
-    assert network.reconstruction.rgb.in_channels == 6
-    widths = {module.out_channels for module in network.reconstruction.modules() if isinstance(module, torch.nn.Conv2d)}
-    assert widths == ({4, 6, 3} if reconstruction == "correlated" else {6, 3})
-
-
 def test_features_at_sensor_resolution_are_where_the_sensor_has_them():
     """What a sensor pixel sees changes the picture around its own place."""
     network = CSCSR(3, **TINY, resolution="sensor").double()
-    still = torch.zeros(1, 2, 2, 64, 64, dtype=torch.float64)
-    spikes, _ = clip(1, 64, 64)
+    still = torch.zeros(1, 2, 2, 40, 44, dtype=torch.float64)
+    spikes, _ = clip(1, 40, 44)
     other = spikes.clone()
-    other[..., 30, 40] ^= 1
+    other[..., 18, 24] ^= 1
     change = (network(spikes, still) - network(other, still)).abs().sum(dim=1)[0].detach()
-    y, x = torch.meshgrid(torch.arange(192.0), torch.arange(192.0), indexing="ij")
+    y, x = torch.meshgrid(torch.arange(120.0), torch.arange(132.0), indexing="ij")
     centre = [(change * axis).sum() / change.sum() for axis in (y, x)]
-    assert centre[0] == pytest.approx(30 * 3 + 1, abs=1.5)
-    assert centre[1] == pytest.approx(40 * 3 + 1, abs=1.5)
-
-
-def test_features_at_sensor_resolution_cost_less():
-    def work(resolution):
-        network = CSCSR(4, width=32, representation_width=4, features=1, resolution=resolution)
-        with torch.no_grad(), FlopCounterMode(display=False) as counter:
-            network(torch.zeros(1, 41, 8, 8), torch.zeros(1, 2, 2, 8, 8))
-        return counter.get_total_flops()
-
-    assert work("sensor") < work("output") / 8
+    assert centre[0] == pytest.approx(18 * 3 + 1, abs=1.5)
+    assert centre[1] == pytest.approx(24 * 3 + 1, abs=1.5)
 
 
 @pytest.mark.parametrize("global_perception", [True, False])
@@ -202,11 +174,10 @@ def test_representation_starts_at_the_mean_of_the_window(global_perception):
         torch.testing.assert_close(represent(plane)[:, :, :1], WindowMeans(11, 3)(plane))
 
 
-@pytest.mark.parametrize("size", [1, 2, 3])
-def test_fold_is_pixel_unshuffle(size):
-    planes = torch.rand(1, 5, 2 * size, 4 * size)
-    folded = fold(planes, size)
-    assert torch.equal(folded, torch.nn.functional.pixel_unshuffle(planes, size))
+def test_fold_is_pixel_unshuffle():
+    planes = torch.rand(1, 5, 6, 12)
+    folded = fold(planes, 3)
+    assert torch.equal(folded, torch.nn.functional.pixel_unshuffle(planes, 3))
     assert folded.stride() == folded.contiguous(memory_format=torch.channels_last).stride()
 
 
@@ -241,19 +212,7 @@ def test_skip_starts_at_a_smooth_classical_picture():
     assert zipper.abs().max() < 0.1 * (raw[..., 1:-1, :] - (raw[..., :-2, :] + raw[..., 2:, :]) / 2).abs().max()
 
 
-def test_bfloat16_keeps_the_picture_in_float32():
-    spikes, flow = clip(1, 16, 16)
-    network = CSCSR(2, **TINY)
-    with torch.no_grad():
-        exact = network(spikes, flow)
-        with torch.autocast("cpu", torch.bfloat16):
-            half = network(spikes, flow)
-    assert half.dtype == torch.float32
-    assert not half.bfloat16().float().equal(half)
-    assert (half - exact).abs().max() < 0.05 * exact.abs().max()
-
-
-@pytest.mark.parametrize("motion", [0, 1, 15, torch.nan])
+@pytest.mark.parametrize("motion", [1, 15, torch.nan])
 def test_tiles_change_nothing(motion):
     """However far it moves: a tile sees what comes into it."""
     network = CSCSR(2, **TINY, skip=True)
@@ -266,8 +225,7 @@ def test_tiles_change_nothing(motion):
     torch.testing.assert_close(forward_in_tiles(network, spikes, 32), network(spikes, flow), rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("method", ["tfi", "tfp"])
-@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
+@pytest.mark.parametrize(("method", "pattern"), [("tfi", "RGGB"), ("tfp", "GBRG")])
 def test_classical_decoder_finds_the_colour_of_a_plain_scene(method, pattern):
     rgb = torch.tensor([1.0, 0.5, 0.25]).reshape(1, 3, 1, 1)
     light = 0.5 * mosaic(rgb.expand(1, 3, 12, 12), pattern).expand(41, 1, 12, 12).movedim(0, 1)
@@ -283,24 +241,6 @@ def test_classical_decoder_shows_the_middle_of_the_clip(method, settings):
     spikes, _ = clip(2)
     raw = {"tfi": tfi, "tfp": tfp}[method](spikes, **settings)[:, 20]
     torch.testing.assert_close(ClassicalDecoder(method, 1, **settings)(spikes), demosaic(raw / 0.4))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"frames": 40}, "odd frames"),
-        ({"stride": 7}, "divides frames - window"),
-        ({"scale": 0}, "scale"),
-        ({"pattern": "RGB"}, "pattern"),
-        ({"width": 0}, "width: expected a whole number >= 1, got 0"),
-        ({"width": 2.5}, "width: expected a whole number >= 1, got 2.5"),
-        ({"stride": 0}, "stride: expected a whole number >= 1, got 0"),
-        ({"alpha": float("nan")}, "alpha: expected a finite number above 0, got nan"),
-    ],
-)
-def test_wrong_arguments(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        CSCSR(**{**TINY, **arguments})
 
 
 def test_wrong_input():

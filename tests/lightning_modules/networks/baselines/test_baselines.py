@@ -1,0 +1,218 @@
+"""What all baselines have in common, in tables: sizes, gradients, the skip, phases, published sizes, bad arguments."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch.utils.flop_counter import FlopCounterMode
+
+from lightning_modules import networks
+from lightning_modules.motion import ZeroFlow
+from spikekit import demosaic_along_motion, demosaic_residual, linear_motion, tfi, tfp
+
+STAR = {"per_channel": True}
+CASES = [
+    ("BasicVSR", {"width": 4, "blocks": 1, "neighbors": 1}),
+    ("RealRawVSR", {"width": 8, "blocks": 2}),
+    ("SpikeSRNetLike", {"width": 8, "maps": 3, "corrections": 2}),
+    ("SpikeSRNetLike", {"width": 8, "maps": 3, "corrections": 2, **STAR}),
+    ("SwinIR", {"width": 12, "groups": 2, "layers": 2, "heads": 2, "drop_path": 0.0}),
+    ("SwinIR", {"width": 12, "groups": 1, "layers": 2, "heads": 2, "drop_path": 0.0, "upsampler": "steps"}),
+    ("TSCNN", {"width": 32, "blocks": 1, "low": 1, "high": 1}),
+    ("VidarSR", {"width": 6, "features": 3}),
+    ("VidarSR", {"width": 6, "features": 3, **STAR}),
+]
+EVERY = pytest.mark.parametrize(("name", "tiny"), CASES)
+
+
+def clip(batch=1, height=12, width=16):
+    generator = torch.Generator().manual_seed(0)
+    spikes = (torch.rand(batch, 41, height, width, generator=generator) < 0.3).to(torch.uint8)
+    return spikes, torch.randn(batch, 2, 2, height, width, generator=generator)
+
+
+def build(name, seed=0, **settings):
+    """A network in which what starts at zero does not stay there."""
+    torch.manual_seed(seed)
+    network = getattr(networks, name)(**{"scale": 2, **settings})
+    for module in network.modules():
+        if hasattr(module, "where"):
+            torch.nn.init.normal_(module.where.weight, std=0.1)
+        if hasattr(module, "gamma"):
+            torch.nn.init.ones_(module.gamma)
+    return network
+
+
+@EVERY
+@pytest.mark.parametrize(("scale", "size"), [(2, (3, 3)), (3, (9, 7)), (4, (4, 6))])
+def test_any_size_and_scale(name, tiny, scale, size):
+    spikes, flow = clip(2, *size)
+    rgb = build(name, scale=scale, **tiny)(spikes, flow)
+    assert rgb.shape == (2, 3, scale * size[0], scale * size[1])
+    assert rgb.isfinite().all()
+
+
+@EVERY
+def test_every_parameter_learns(name, tiny):
+    resting = None
+    for seed in range(4):  # few channels may all be silent by chance
+        network = build(name, seed, **tiny)
+        network(*clip(2, 9, 8)).square().mean().backward()
+        silent = {name for name, one in network.named_parameters() if one.grad is None or not one.grad.any()}
+        resting = silent if resting is None else resting & silent
+        if not resting:
+            break
+    assert not resting
+
+
+@EVERY
+def test_a_flow_changes_what_it_says_it_changes(name, tiny):
+    network, (spikes, flow) = build(name, **tiny).eval(), clip()
+    with torch.no_grad():
+        still, moved = network(spikes, static=True), network(spikes, flow)
+        assert network.takes_flow == (not moved.equal(still))
+        assert network(spikes, 0 * flow).equal(still)
+    assert network.halo is None
+    if network.takes_flow:
+        assert build(name, **tiny, motion=ZeroFlow()).eval()(spikes).equal(still)
+        with pytest.raises(ValueError, match=r"^flow: expected \(1, 2, 2, 12, 16\), got "):
+            network(spikes, flow[..., :8])
+
+
+@EVERY
+def test_bfloat16_keeps_the_picture_in_float32(name, tiny):
+    network, (spikes, flow) = build(name, **tiny).eval(), clip()
+    with torch.no_grad():
+        exact = network(spikes, flow)
+        with torch.autocast("cpu", torch.bfloat16):
+            half = network(spikes, flow)
+    assert half.dtype == torch.float32
+    assert 0 < (half - exact).abs().max() < 0.1 * exact.abs().max()
+
+
+# of the publications; BasicVSR without the 1,440,300 of SPyNet, VidarSR with 9,216 for three planes a picture
+@pytest.mark.parametrize(
+    ("name", "settings", "counts"),
+    [
+        ("BasicVSR", {"blocks": 30}, {4: 6_291_311 - 1_440_300}),
+        ("BasicVSR", {"blocks": 15}, {4: 4_075_631 - 1_440_300}),
+        ("RealRawVSR", {}, {2: 4_476_509, 3: 4_678_459, 4: 4_773_853}),
+        ("SpikeSRNetLike", {}, {2: 2_278_443, 3: 2_889_067, 4: 3_343_659}),
+        ("SwinIR", {}, {2: 910_152, 3: 918_267, 4: 929_628}),
+        (
+            "SwinIR",
+            {"width": 180, "groups": 6, "upsampler": "steps"},
+            {2: 11_752_487, 3: 11_937_127, 4: 11_900_199},
+        ),
+        ("TSCNN", {}, {2: 1_424_903, 3: 1_433_558, 4: 1_445_675}),
+        ("TSCNN", {"blocks": 4, "low": 4, "high": 6}, {2: 3_388_303, 3: 3_396_958, 4: 3_409_075}),
+        ("VidarSR", {"width": 256, "features": 64}, {2: 10_161_896, 3: 11_386_600, 4: 12_799_720}),
+        ("VidarSR", {"width": 256, "features": 64, **STAR}, {2: 12_785_894}),
+    ],
+)
+def test_parameters_are_those_of_the_publication(name, settings, counts):
+    for scale, expected in counts.items():
+        with torch.device("meta"):
+            network = getattr(networks, name)(scale=scale, **settings)
+        assert sum(p.numel() for p in network.parameters()) == expected
+
+
+# the first two as their docstrings or publications say, the others as the docstrings narrow them to CSCSR's size small
+@pytest.mark.parametrize(
+    ("name", "changed", "expected"),
+    [
+        ("RealRawVSR", {}, 9.11),
+        ("VidarSR", {}, 17.5),
+        ("BasicVSR", {"width": 24}, 1.5),
+        ("RealRawVSR", {"width": 24}, 1.7),
+        ("SpikeSRNetLike", {"width": 32, "maps": 12}, 1.5),
+        ("SpikeSRNetLike", {"width": 24, "maps": 8, **STAR}, 1.6),
+        ("VidarSR", {"width": 16, "features": 8}, 1.1),
+        ("VidarSR", {"width": 10, "features": 4, **STAR}, 0.9),
+    ],
+)
+def test_work_by_sensor_pixel(name, changed, expected):
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        getattr(networks, name)(scale=4, **changed)(torch.zeros(1, 41, 8, 8), static=True)
+    assert counter.get_total_flops() / 2 / 8**2 / 1e6 == pytest.approx(expected, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "decode"),
+    [
+        ("VidarSR", {"width": 4, "features": 2}, tfi),
+        ("SpikeSRNetLike", {"width": 8, "maps": 2, "corrections": 1}, tfi),
+        ("RealRawVSR", {"width": 8, "blocks": 2}, tfi),
+        ("RealRawVSR", {"width": 8, "blocks": 2, "decoder": "tfp"}, lambda spikes: tfp(spikes, 41)),
+        ("TSCNN", {"width": 8, "blocks": 1, "low": 1, "high": 1}, tfi),
+        (
+            "TSCNN",
+            {"width": 8, "blocks": 1, "low": 1, "high": 1, "decoder": "tfp", "tfp_window": 13},
+            lambda spikes: tfp(spikes, 13),
+        ),
+        ("SwinIR", {"width": 12, "groups": 1, "layers": 2, "heads": 2}, None),
+    ],
+)
+def test_with_a_skip_training_starts_where_a_decoder_ends(name, settings, decode):
+    network, (spikes, flow) = build(name, **settings, alpha=0.5, pattern="GBRG", skip=True), clip(2)
+    rgb = network(spikes, flow)
+    if decode:
+        picture = demosaic_residual(2 * decode(spikes)[:, 20], "GBRG")
+    else:
+        times = [10, 15, 20, 25, 30]
+        offsets = linear_motion(flow[:, 0], flow[:, 1], times, first=5, middle=20, last=35)
+        picture = demosaic_along_motion(2 * tfi(spikes)[:, times], offsets, "GBRG")
+    torch.testing.assert_close(rgb, F.interpolate(picture, scale_factor=2, mode="bicubic"), rtol=0, atol=1e-4)
+    (rgb - 1).square().mean().backward()  # and goes on from there
+    assert sum(p.grad is not None and p.grad.abs().sum() > 0 for p in network.parameters()) >= 2
+
+
+@pytest.mark.parametrize("name", ["VidarSR", "SpikeSRNetLike"])
+def test_with_the_star_every_colour_starts_from_its_own_pixels(name):
+    """Of a scene of one colour, the others see nothing."""
+    spikes, _ = clip(2)
+    spikes[..., 1::2, :] = 1
+    spikes[..., :, 1::2] = 1
+    rgb = build(name, width=8, **STAR, skip=True)(spikes, static=True)
+    torch.testing.assert_close(rgb[:, 1:], torch.full((2, 2, 24, 32), 2.5))
+    assert rgb[:, 0].std() > 0.1
+
+
+@pytest.mark.parametrize("case", [3, 7])  # those that split the colours themselves
+def test_a_mosaic_moved_by_a_pixel_is_one_of_another_phase(case):
+    name, tiny = CASES[case]
+    tiny = {**tiny, **({"corrections": 1} if "corrections" in tiny else {})}
+    network, moved, other = (build(name, **tiny, pattern=one).double() for one in ("RGGB", "GRBG", "RGGB"))
+    spikes, flow = clip(1, 40, 48)
+    inner = (..., slice(32, -32), slice(32, -32))
+    expected = network(spikes, flow.double())[inner]
+    rolled = spikes.roll(1, dims=-1), flow.double().roll(1, dims=-1)
+    deviation = [(net(*rolled).roll(-2, dims=-1)[inner] - expected).abs().max() for net in (moved, other)]
+    assert deviation[0] < 1e-3 * deviation[1]
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "message"),
+    [
+        ("BasicVSR", {"neighbors": 5}, "neighbors: expected 0 to 4, got 5"),
+        ("BasicVSR", {"frames": 11}, "frames: expected at least 13, got 11"),
+        ("BasicVSR", {"blocks": 0}, "blocks: expected a whole number >= 1, got 0"),
+        ("RealRawVSR", {"decoder": "tfx"}, "decoder: expected 'tfi' or 'tfp', got 'tfx'"),
+        ("RealRawVSR", {"width": 12}, "width: expected a multiple of 8, .*, got 12"),
+        ("SpikeSRNetLike", {"length": 12}, "length, every: expected .*, got 12 and 7 with 41 frames"),
+        ("SpikeSRNetLike", {"every": 28}, "length, every: expected .*, got 13 and 28 with 41 frames"),
+        ("SwinIR", {"width": 12, "heads": 5}, "heads: expected a divisor of width = 12, got 5"),
+        ("SwinIR", {"upsampler": "bicubic"}, "upsampler: expected 'direct' or 'steps', got 'bicubic'"),
+        ("SwinIR", {"upsampler": "steps", "scale": 6}, "scale: expected 1, 3 or a power of two .*, got 6"),
+        ("SwinIR", {"drop_path": 1.0}, r"drop_path: expected a share in \[0, 1\), got 1.0"),
+        ("TSCNN", {"tfp_window": 40}, "tfp_window: expected an odd number, got 40"),
+        ("TSCNN", {"width": 12}, "width: expected a multiple of 8, got 12"),
+        ("VidarSR", {"frames": 40}, "frames: expected an odd number, 9 or more, got 40"),
+        ("VidarSR", {"frames": 7}, "frames: expected an odd number, 9 or more, got 7"),
+        ("VidarSR", {"scale": 0}, "scale: expected a whole number >= 1, got 0"),
+        ("VidarSR", {"alpha": 0.0}, "alpha: expected a finite number above 0, got 0.0"),
+        ("VidarSR", {"pattern": "RGB"}, "pattern: expected one of"),
+    ],
+)
+def test_wrong_settings(name, settings, message):
+    with pytest.raises(ValueError, match=f"^{message}"):
+        getattr(networks, name)(**settings)
