@@ -34,12 +34,7 @@ class ResidualBlock(nn.Module):
 
 
 class GlobalAttention(nn.Module):
-    """Every position adds the features of all positions that resemble it; nothing at the beginning of training.
-
-    Args:
-        width: channels that come and go.
-        values: channels of what is found; it is looked for with four times as many.
-    """
+    """Every position adds the features of all positions that resemble it; nothing at the beginning of training."""
 
     def __init__(self, width: int, values: int) -> None:
         super().__init__()
@@ -60,15 +55,7 @@ class GlobalAttention(nn.Module):
 
 
 class Encoder(nn.Sequential):
-    """From a window of frames to features; every width halves the size once.
-
-    Args:
-        window: frames.
-        widths: channels of the stages.
-        blocks: residual blocks of each stage.
-        outputs: channels of the result.
-        attention: channels of the global attention, 0 for none.
-    """
+    """From a window of frames to features; every width halves the size once."""
 
     def __init__(self, window: int, widths: Sequence[int], blocks: int, outputs: int, attention: int) -> None:
         layers = _convolved(window, widths[0], 7, 2, norm=True)
@@ -171,18 +158,7 @@ class SeparableGRU(nn.Module):
 class RecurrentFlow(nn.Module):
     r"""Flows from one window of frames to three later ones at equal distances, all of them refined together.
 
-    Args:
-        window: frames of a window.
-        widths: channels of the encoders' stages; the flow is refined at a size that is halved once for each.
-        blocks: residual blocks of each stage.
-        features: channels that are correlated.
-        attention: channels of the encoders' global attention, 0 for none.
-        hidden: channels of the recurrent state, and as many of context.
-        correlation: channels that the correlations are encoded with.
-        motion: channels of a flow's motion features, even.
-        head: channels in front of the flow increments and of the upsampling weights.
-        levels: scales of the correlations.
-        radius: how far they are looked up, in pixels of each scale.
+    Its arguments are described in :class:`lightning_modules.motion.Spike2Flow`.
 
     Shape:
         - Input: windows :math:`(B, 4, window, h, w)`, any h and w

@@ -41,12 +41,7 @@ class ConvBlock(nn.Sequential):
 
 
 class ResBlock(nn.Module):
-    """Convolution, activation, convolution, plus the input: a residual block (He et al., 2016) without normalisation.
-
-    Args:
-        width: channels.
-        activation: ReLU when not given.
-    """
+    """Convolution, activation, convolution, plus the input: a residual block without normalisation."""
 
     def __init__(self, width: int, activation: nn.Module | None = None) -> None:
         super().__init__()
@@ -65,13 +60,6 @@ class NoiseLevel(nn.Module):
     """What the level of the sensor's noise changes: gain and shift of every channel, nothing at level 0.
 
     One layer of FiLM (Perez et al., AAAI 2018), linear in the level. Before it is trained it changes nothing.
-
-    Args:
-        width: channels.
-
-    Shape:
-        - Input: features :math:`(B, width, H, W)`, levels :math:`(B, 1, 1, 1)`, or None for 0
-        - Output: as the features
     """
 
     def __init__(self, width: int) -> None:

@@ -11,32 +11,12 @@ from spikekit import bayer_sites, merge_bayer
 
 
 def joint_motion(motion: MotionEstimator, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> Tensor:
-    """Ask an estimator for one motion of all colours.
-
-    Args:
-        motion: the estimator.
-        spikes: (B, N, H, W).
-        times: the first, the middle and the last time point, in spike frames.
-        pattern: Bayer phase.
-
-    Returns:
-        Flows from the middle to the first and to the last time point, (B, 2, 2, H, W), in sensor pixels.
-    """
+    """One motion of all colours: flows to the first and to the last time point, (B, 2, 2, H, W), in sensor pixels."""
     return torch.stack(motion(spikes, times, pattern), dim=1)
 
 
 def independent_motion(motion: MotionEstimator, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> Tensor:
-    """Ask an estimator for the motion of every colour by itself (ablation D); green is the mean of its two sites.
-
-    Args:
-        motion: the estimator.
-        spikes: (B, N, H, W).
-        times: the first, the middle and the last time point, in spike frames.
-        pattern: Bayer phase.
-
-    Returns:
-        Flows of R, G and B, (B, 3, 2, 2, H, W), in sensor pixels.
-    """
+    """The motion of every colour by itself (ablation D), (B, 3, 2, 2, H, W); green is the mean of its two sites."""
     height, width = spikes.shape[-2:]
     red, *greens, blue = (
         _to_sensor(flow, row, column, height, width)
@@ -48,17 +28,7 @@ def independent_motion(motion: MotionEstimator, spikes: Tensor, times: tuple[int
 
 
 def assembled_motion(motion: MotionEstimator, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> Tensor:
-    """Put the four sub-streams' flows side by side as their pixels are on the sensor (ablation E).
-
-    Args:
-        motion: the estimator.
-        spikes: (B, N, H, W).
-        times: the first, the middle and the last time point, in spike frames.
-        pattern: Bayer phase.
-
-    Returns:
-        Flows of all colours, (B, 2, 2, H, W), in sensor pixels.
-    """
+    """The sub-streams' flows side by side as their pixels are on the sensor (ablation E), (B, 2, 2, H, W)."""
     height, width = spikes.shape[-2:]
     return 2 * merge_bayer(_channel_flows(motion, spikes, times, pattern), pattern)[..., :height, :width]
 

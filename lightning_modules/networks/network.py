@@ -19,7 +19,7 @@ from lightning_modules.storage.settings import own_class
 from spikekit.check import check_planes
 
 #: settings of all networks
-_ALL_HAVE = "scale", "frames", "pattern", "alpha"
+_ALL_HAVE = {"scale": None, "frames": None, "pattern": None, "alpha": None}.keys()
 
 
 class Network(nn.Module):
@@ -117,11 +117,8 @@ class Network(nn.Module):
             raise ValueError(f"{weights}: expected weights of {cls.__name__}, got those of {named}")
         takes = signature(kind).parameters
         # a user's own constructor need not take all that every network has
-        settings = {
-            name: value
-            for name, value in found.settings.items()
-            if _ours(kind) or name in takes or name not in _ALL_HAVE
-        }
+        missing = set() if _ours(kind) else _ALL_HAVE - takes.keys()
+        settings = {name: value for name, value in found.settings.items() if name not in missing}
         check_weights(replace(found, settings=settings), {named: kind, **ESTIMATORS})
         settings.pop("class")
         own = motion is not None
@@ -164,11 +161,6 @@ class Network(nn.Module):
 
     def resolve_flow(self, spikes: Tensor, flow: Tensor | None, static: bool) -> Tensor | None:
         """Return the flow that is given, or the network's own estimate, or None where nothing moves.
-
-        Args:
-            spikes: (B, N, H, W).
-            flow: (B, 2, 2, H, W), or what else the network takes; None to ask the estimator.
-            static: nothing moves.
 
         Raises:
             ValueError: a flow of another size, or both a flow and ``static``.

@@ -10,14 +10,7 @@ from lightning_modules.networks.layers import NoiseLevel, conv, res_blocks
 
 
 class ToRgb(nn.Conv2d):
-    """3 x 3 convolution to the colours, never in half precision, which would round the picture itself.
-
-    Args:
-        inputs: channels of the features.
-        enlarge: sub-pixels that every pixel is divided into, along each side (Shi et al., CVPR 2016).
-        groups: 3 where every colour has features of its own.
-        colors: of the picture.
-    """
+    """Sub-pixel convolution to the colours, never in half precision, which would round the picture itself."""
 
     def __init__(self, inputs: int, enlarge: int = 1, groups: int = 1, colors: int = 3) -> None:
         super().__init__(inputs, colors * enlarge**2, 3, padding=1, groups=groups)
@@ -97,15 +90,7 @@ class ColorCorrelation(nn.Module):
 class SeparateColors(nn.Module):
     """No colour correlation (Fig. 6 b, ablation H): every colour makes its own channel of the picture.
 
-    Args:
-        width: channels of every colour.
-        stages: as of :class:`ColorCorrelation`, whose number of residual blocks is kept:
-        blocks: every colour has stages x blocks of them,
-        end_blocks: and its share of these at the end, rounded up.
-        enlarge: as of :class:`ColorCorrelation`.
-
-    Shape:
-        As :class:`ColorCorrelation`.
+    The number of residual blocks is that of :class:`ColorCorrelation`, the last ones shared out and rounded up.
     """
 
     def __init__(self, width: int, stages: int, blocks: int, end_blocks: int, enlarge: int = 1) -> None:
@@ -121,19 +106,7 @@ class SeparateColors(nn.Module):
 
 
 class EarlyFusion(nn.Module):
-    """Colours fused once, at the beginning (Fig. 6 c, ablation I).
-
-    Args:
-        width: channels of every colour.
-        stages: as of :class:`ColorCorrelation`, whose number of residual blocks is kept:
-        blocks: 3 x stages x blocks of them
-        end_blocks: and these, one after another.
-        enlarge: as of :class:`ColorCorrelation`.
-        end_width: as of :class:`ColorCorrelation`.
-
-    Shape:
-        As :class:`ColorCorrelation`.
-    """
+    """Colours fused once, at the beginning (Fig. 6 c, ablation I), and as many blocks as :class:`ColorCorrelation`."""
 
     def __init__(
         self, width: int, stages: int, blocks: int, end_blocks: int, enlarge: int = 1, end_width: int | None = None

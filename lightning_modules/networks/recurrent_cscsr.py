@@ -56,13 +56,6 @@ class StateFusion(nn.Module):
     Before it is trained it leaves the picture as it is. The weights are the same for both neighbours: a film may be
     read from either end.
 
-    Args:
-        features: channels of the clip's features.
-        picture: channels of a picture.
-        memory: channels of what is remembered beside it.
-        width: channels inside.
-        blocks: residual blocks.
-
     Shape:
         - Input: features :math:`(B, features, H, W)`, the clip's picture :math:`(B, picture, H, W)`, and the states of
           its neighbours, moved, :math:`(B, picture + memory, H, W)`, one or more

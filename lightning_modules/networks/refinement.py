@@ -12,14 +12,7 @@ from lightning_modules.networks.layers import ConvBlock, conv
 class FeatureRefinement(nn.Module):
     """FR (section 4.3, Fig. 5 c): what deviates from the mean over time is looked at by itself.
 
-    Args:
-        times: time points T.
-        features: channels of every time point.
-        width: channels of the result.
-
-    Shape:
-        - Input: temporal-pixel features, one time point after another, :math:`(B, T features, H, W)`
-        - Output: :math:`(B, width, H, W)`
+    From temporal-pixel features, one time point after another, (B, T features, H, W), to (B, width, H, W).
     """
 
     def __init__(self, times: int, features: int, width: int) -> None:
@@ -47,16 +40,7 @@ class FeatureRefinement(nn.Module):
 
 
 class TimeFusion(nn.Conv2d):
-    """No refinement (ablations F and G): one convolution over the features of all time points.
-
-    Args:
-        times: time points T.
-        features: channels of every time point.
-        width: channels of the result.
-
-    Shape:
-        As :class:`FeatureRefinement`.
-    """
+    """No refinement (ablations F and G): one convolution over the features of all time points."""
 
     def __init__(self, times: int, features: int, width: int) -> None:
         super().__init__(times * features, width, 3, padding=1)
@@ -75,10 +59,8 @@ class TimeFusion(nn.Conv2d):
         """Set weights, so that the first channels are the means over time of the first feature.
 
         A single linear layer with random weights would have to find them behind the noise of every time point: training
-        would then stay on a plateau, for a time that depends on the seed.
-
-        Args:
-            pixels: temporal pixels in which the first feature comes, the first channels of every time point.
+        would then stay on a plateau, for a time that depends on the seed. The first feature comes in so many temporal
+        ``pixels``, the first channels of every time point.
         """
         weight = self.weight.unflatten(1, (self.times, -1))
         means = min(pixels, len(weight))

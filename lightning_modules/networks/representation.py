@@ -18,15 +18,6 @@ _PIXELS = 1 << 16  # of all time points that a CPU takes at once
 class SpikeRepresentation(nn.Module):
     """BSSR of one colour (section 4.2, Fig. 4): features of every time point, from its window and the whole clip.
 
-    Args:
-        frames: spike frames N of a clip.
-        window: frames that a time point sees.
-        stride: frames between two time points.
-        width: channels inside.
-        features: channels of the result, for every time point.
-        global_perception: look at the whole clip, too (GP).
-        noise: be told the level of the sensor's noise.
-
     Shape:
         - Input: the spikes of one colour, zero elsewhere, :math:`(B, N, H, W)`, and perhaps the level of the noise,
           :math:`(B, 1, 1, 1)`
@@ -97,14 +88,6 @@ class SpikeRepresentation(nn.Module):
 class WindowMeans(nn.Module):
     """The spikes as they are, without weights (ablation A): the share of a window's frames in which a pixel fired.
 
-    Args:
-        window: frames that a time point sees.
-        stride: frames between two time points.
-
-    Shape:
-        - Input: the spikes of one colour, zero elsewhere, :math:`(B, N, H, W)`
-        - Output: :math:`(B, T, 1, H, W)` with :math:`T = (N - window) / stride + 1`
-
     Example:
         >>> spikes = torch.tensor([1.0, 0, 1, 1, 1]).reshape(1, 5, 1, 1)
         >>> WindowMeans(window=3, stride=2)(spikes).flatten().tolist()
@@ -126,13 +109,6 @@ class IntervalRepresentation(nn.Module):
     r"""Light from spike intervals, without weights (ablation C): :math:`1 / \Psi` of eq. (5) at every time point.
 
     A pixel that never fires gives 0, those of the other colours among them.
-
-    Args:
-        times: time points, in spike frames.
-
-    Shape:
-        - Input: the spikes of one colour, zero elsewhere, :math:`(B, N, H, W)`
-        - Output: :math:`(B, T, 1, H, W)`
 
     Example:
         >>> spikes = torch.tensor([[0.0, 0], [1, 0], [0, 0], [0, 0], [1, 0]]).reshape(1, 5, 1, 2)

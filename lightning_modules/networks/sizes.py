@@ -4,10 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
+
+def _widths(width: int, representation_width: int, **depths: int) -> dict[str, int]:
+    return {"width": width, "representation_width": representation_width, **depths}
+
+
 #: as the paper lays the network out: refinement and reconstruction work at the resolution of the picture
-_FULL = {"resolution": "output"}
+_FULL = {"resolution": "output", "blocks": 1}
 #: at the resolution of the sensor, with the temporal pixels of a site as channels: a fraction of the work
-_SENSOR = {"resolution": "sensor", "width": 32, "representation_width": 16, "features": 2, "stages": 3, "blocks": 1}
+_SENSOR = {"resolution": "sensor", "blocks": 1}
+_CLIP = {**_SENSOR, "width": 32, "representation_width": 16, "features": 2, "stages": 3}
 
 #: fields of :class:`lightning_modules.networks.CSCSRConfig` by the name of a size. Parameters and million
 #: multiplications by sensor pixel at x4: tiny 0.30 M and 0.36, small 1.08 M and 1.48, base 1.32 M and 1.72, large
@@ -15,67 +21,16 @@ _SENSOR = {"resolution": "sensor", "width": 32, "representation_width": 16, "fea
 #: and 42.7. Of those for x1, where a site is one temporal pixel and time points have more features, for a grey sensor:
 #: small_x1 0.53 M and 0.67, large_x1 1.72 M and 2.02
 SIZES: dict[str, dict[str, Any]] = {
-    "tiny": {
-        "resolution": "sensor",
-        "stride": 6,
-        "width": 24,
-        "representation_width": 8,
-        "features": 1,
-        "stages": 2,
-        "blocks": 1,
-        "end_blocks": 1,
-    },
-    "small": {**_SENSOR, "end_blocks": 3},
-    "base": {**_SENSOR, "end_blocks": 16},
-    "large": {**_SENSOR, "end_blocks": 16, "end_width": 64},
-    "huge": {**_SENSOR, "end_blocks": 16, "end_width": 96},
-    "small_x1": {
-        "resolution": "sensor",
-        "width": 32,
-        "representation_width": 16,
-        "features": 6,
-        "stages": 1,
-        "blocks": 1,
-        "end_blocks": 10,
-        "end_width": 48,
-    },
-    "large_x1": {
-        "resolution": "sensor",
-        "width": 48,
-        "representation_width": 24,
-        "features": 8,
-        "stages": 1,
-        "blocks": 1,
-        "end_blocks": 20,
-        "end_width": 64,
-    },
-    "full_small": {
-        **_FULL,
-        "width": 16,
-        "representation_width": 16,
-        "features": 2,
-        "stages": 2,
-        "blocks": 1,
-        "end_blocks": 2,
-    },
-    "full_base": {
-        **_FULL,
-        "width": 32,
-        "representation_width": 32,
-        "features": 4,
-        "stages": 3,
-        "blocks": 1,
-        "end_blocks": 3,
-    },
-    "full_large": {
-        **_FULL,
-        "width": 64,
-        "representation_width": 32,
-        "features": 8,
-        "stages": 3,
-        "blocks": 2,
-        "end_blocks": 4,
-    },
+    "tiny": {**_SENSOR, "stride": 6, **_widths(24, 8, features=1, stages=2, end_blocks=1)},
+    "small": {**_CLIP, "end_blocks": 3},
+    "base": {**_CLIP, "end_blocks": 16},
+    "large": {**_CLIP, "end_blocks": 16, "end_width": 64},
+    "huge": {**_CLIP, "end_blocks": 16, "end_width": 96},
+    "small_x1": {**_SENSOR, **_widths(32, 16, features=6, stages=1, end_blocks=10), "end_width": 48},
+    "large_x1": {**_SENSOR, **_widths(48, 24, features=8, stages=1, end_blocks=20), "end_width": 64},
+    "full_small": {**_FULL, **_widths(16, 16, features=2, stages=2, end_blocks=2)},
+    "full_base": {**_FULL, **_widths(32, 32, features=4, stages=3, end_blocks=3)},
+    "full_large": {**_FULL, **_widths(64, 32, features=8, stages=3, end_blocks=4), "blocks": 2},
 }
 
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from lightning_modules.storage.settings import check_plain
+from spikekit.arguments import one_line
 
 _NUMBERS = {torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.int64, torch.int32, torch.bool}
 #: what Lightning would build something from
@@ -53,7 +54,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
             check_plain(key, checkpoint[key])
         check_tensors(checkpoint["state_dict"])
     except Exception as error:  # what torch raises depends on the damage
-        reason = (str(error).splitlines() or [""])[0][:300]
+        reason = one_line(error)[:300]
         if isinstance(error, pickle.UnpicklingError):  # torch would advise to run what is there
             reason = "expected tensors and plain values, got something else, which is not run"
         raise ValueError(f"{path}: not a checkpoint of lightning fit ({type(error).__name__}: {reason})") from error

@@ -18,6 +18,7 @@ from lightning_modules.registry import FUSION, find_model, list_models
 from lightning_modules.storage.checkpoint import check_tensors, read_checkpoint
 from lightning_modules.storage.error_model import read_error_model
 from lightning_modules.storage.settings import check_plain, check_shapes
+from spikekit.arguments import one_line
 from spikekit.io.whole_file import whole_file
 
 _MOTION = "motion."
@@ -89,8 +90,7 @@ def check_weights(weights: Weights, kinds: Mapping[str, type[nn.Module]]) -> Non
         kinds: networks and estimators of this package, by name; weights of others are compared when they are loaded.
 
     Raises:
-        ValueError: settings that this package cannot have written, or that do not fit the weights; the message is one
-            line and names the file.
+        ValueError: as :func:`lightning_modules.storage.settings.check_shapes`.
     """
     inside = {name.removeprefix(_MOTION): value for name, value in weights.tensors.items() if name.startswith(_MOTION)}
     outside = {name: value for name, value in weights.tensors.items() if not name.startswith(_MOTION)}
@@ -106,7 +106,7 @@ def _read_safetensors(path: Path) -> Weights:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         check_tensors(tensors)
     except (SafetensorError, OSError, AttributeError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: not a file of safetensors, or a damaged one ({_first_line(error)})") from error
+        raise ValueError(f"{path}: not a file of safetensors, or a damaged one ({one_line(error)[:300]})") from error
     try:
         settings, motion = json.loads(said["network"]), json.loads(said["motion"])
         return Weights(path, {"class": settings["class"], **_named(settings)}, _named(motion), tensors)
@@ -150,16 +150,7 @@ def write_weights(weights: Weights, path: str | Path) -> None:
     }
     said = {"network": json.dumps(weights.settings), "motion": json.dumps(weights.motion)}
     with whole_file(path) as file:
-        file.write(_same_every_time(save(tensors, said)))
-
-
-def _same_every_time(data: bytes) -> bytes:
-    """Sort what the header of a safetensors file says: its own writer shuffles the metadata."""
-    length = int.from_bytes(data[:8], "little")
-    header = json.loads(data[8 : 8 + length])
-    header = {key: dict(sorted(value.items())) if key == "__metadata__" else value for key, value in header.items()}
-    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
-    return data[:8] + text.ljust(length) + data[8 + length :]
+        file.write(save(tensors, said))
 
 
 def settings_of(network: nn.Module) -> dict[str, Any]:
@@ -203,13 +194,8 @@ def with_own_motion(
 ) -> dict[str, Tensor]:
     """Replace the weights of another kind of estimator by an estimator's own.
 
-    Estimators are exchanged freely: a network is trained with one and used with all of them.
-
-    Args:
-        tensors: weights of a network, by name.
-        motion: the estimator of the network that they are meant for.
-        prefix: what the names begin with.
-        keep: replace those of the same kind as well.
+    Estimators are exchanged freely: a network is trained with one and used with all of them. Those of the same kind
+    are replaced as well where the network is to ``keep`` its own.
     """
     prefix += _MOTION
     ours = {f"{prefix}{name}": value for name, value in motion.state_dict().items()}
@@ -252,7 +238,3 @@ def load_weights(network: nn.Module, weights: Weights, keep_motion: bool = False
         network.error_model = read_error_model(weights.source)
     if weights.halo is not None:
         network.halo = weights.halo
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [""])[0]

@@ -18,11 +18,7 @@ class DeformableConv2d(nn.Module):
     r"""Modulated deformable convolution, 3 x 3, whose offsets and masks a convolution finds in other features.
 
     That convolution starts at zero: no offset, and every tap at one half. Positions are computed in the precision of
-    the weights, under autocast too.
-
-    Args:
-        width: channels, of the features that are sampled as well as of those that say where.
-        groups: parts of the channels that share their offsets.
+    the weights, under autocast too. So many groups of channels share their offsets.
 
     Shape:
         - Input: features and guide, each :math:`(B, C, H, W)`

@@ -24,11 +24,7 @@ def whole_sizes(**sizes: int) -> dict[str, int]:
 
 
 def check_decoder(decoder: str, window: int) -> None:
-    """Raise unless the decoder is TFI, or TFP with an odd window.
-
-    Raises:
-        ValueError: another decoder, or an even window.
-    """
+    """Raise unless the decoder is TFI, or TFP with an odd window."""
     if decoder not in ("tfi", "tfp"):
         raise ValueError(f"decoder: expected 'tfi' or 'tfp', got {decoder!r}")
     if window % 2 == 0:
@@ -39,34 +35,16 @@ def check_decoder(decoder: str, window: int) -> None:
 def decode_pictures(
     spikes: Tensor, times: Sequence[int], alpha: float, decoder: Decoder = "tfi", window: int = 41
 ) -> Tensor:
-    """Decode the mosaics of a clip at some of its frames, white being 1; nothing is learned through them.
-
-    Args:
-        spikes: (B, N, H, W), any real dtype.
-        times: the frames, T of them.
-        alpha: gain of the camera, what a white pixel receives per clock in thresholds; the pictures are divided by it.
-        decoder: ``"tfi"`` or ``"tfp"``.
-        window: frames that TFP averages, odd; fewer at the ends of the clip.
-
-    Returns:
-        Mosaics (B, T, H, W).
-    """
+    """Mosaics (B, T, H, W) of a clip at some of its frames, white being 1; nothing is learned through them."""
     decoded = [tfi_at(spikes, n) if decoder == "tfi" else tfp_at(spikes, n, window) for n in times]
     return torch.stack(decoded, dim=1) / alpha
 
 
 def mirror_to_multiple(planes: Tensor, multiple: int) -> Tensor:
-    """Continue planes at the bottom and at the right until their sides are multiples of a number.
+    """Continue planes (*, H, W) at the bottom and at the right until their sides are multiples of a number.
 
     They are mirrored without repeating the outermost pixel, and so again where they are shorter than what is missing:
     a mosaic keeps its Bayer phase.
-
-    Args:
-        planes: (*, H, W), H and W at least 2.
-        multiple: the number.
-
-    Returns:
-        (*, H', W').
     """
     for axis in (-2, -1):
         length = planes.shape[axis]
@@ -89,24 +67,9 @@ def cut_to(planes: Tensor, height: int, width: int) -> Tensor:
 
 
 class Baseline(Network):
-    r"""Base of the baselines that learn.
+    """Base of the baselines that learn: what they all are built with, and ``more`` that each has for itself.
 
-    Args:
-        scale: super-resolution factor.
-        frames: spike frames N of a clip, odd, 9 or more.
-        pattern: Bayer phase.
-        alpha: gain of the camera, what a white pixel receives per clock in thresholds; pictures are divided by it.
-        more: the other arguments of the constructor, as plain values.
-        motion: estimator that is asked where no flow is given; ``ZeroFlow`` for a network that takes no flow.
-
-    Attributes:
-        flow_times: with 41 frames 5, 20 and 35, between which CSCSR's flows run as well.
-
-    Shape:
-        - Input: spikes :math:`(B, N, H, W)`, any real dtype, any H and W of at least 3; optionally flow
-          :math:`(B, 2, 2, H, W)`, from the middle to the first and to the last time point, in sensor pixels, or
-          ``static=True``
-        - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
+    Their flows run between the frames 5, 20 and 35 of 41, as those of CSCSR.
     """
 
     def __init__(
@@ -127,11 +90,7 @@ class Baseline(Network):
         self.alpha = alpha
 
     def flow_or_estimate(self, spikes: Tensor, flow: Tensor | None, static: bool = False) -> Tensor:
-        """Return the flow that was given, what the network's estimator sees, or zeros, (B, 2, 2, H, W).
-
-        Raises:
-            ValueError: a flow of another size, or both a flow and ``static``.
-        """
+        """Return the flow that was given, what the network's estimator sees, or zeros, (B, 2, 2, H, W)."""
         flow = self.resolve_flow(spikes, flow, static)
         return torch.zeros(len(spikes), 2, 2, *spikes.shape[-2:], device=spikes.device) if flow is None else flow
 
@@ -143,16 +102,7 @@ class Baseline(Network):
 
 @torch.no_grad()
 def along_motion(network: Baseline, spikes: Tensor, flow: Tensor) -> Tensor:
-    """Make the 3DRI-like picture of the middle frame; nothing is learned through it.
-
-    Args:
-        network: says pattern, alpha, and between which frames the flow runs.
-        spikes: (B, N, H, W), any real dtype.
-        flow: (B, 2, 2, H, W), in sensor pixels.
-
-    Returns:
-        The picture (B, 3, H, W) of five TFI mosaics, of the frames 10, 15, ..., 30 of 41.
-    """
+    """The 3DRI-like picture (B, 3, H, W) of five TFI mosaics, of the frames 10, 15, ..., 30 of 41; without gradient."""
     times = [network.frames // 2 + n * (network.frames // 8) for n in range(-2, 3)]
     raw = decode_pictures(spikes, times, network.alpha)
     return demosaic_along_motion(raw, network.offsets(flow, times), network.pattern)

@@ -10,11 +10,6 @@ from lightning_modules.networks.layers import conv
 def sub_pixel_convolutions(width: int, scale: int, *after: nn.Module) -> nn.Sequential:
     """A convolution and a pixel shuffle for every prime factor of the scale: (B, width, H, W) to (B, width, s H, s W).
 
-    Args:
-        width: channels.
-        scale: enlargement s; 4 is two times 2.
-        after: what follows every pixel shuffle, without weights.
-
     Example:
         >>> [layer.upscale_factor for layer in sub_pixel_convolutions(8, 6)[1::2]]
         [2, 3]

@@ -17,7 +17,6 @@ from lightning_modules.cli.command import run
 from lightning_modules.cli.rehearsal import Rehearsal
 from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
 from lightning_modules.networks import CSCSR, ClassicalDecoder
-from lightning_modules.registry import find_model
 from lightning_modules.storage.pretrained import load_weights, read_weights, write_weights
 from lightning_modules.tasks.super_resolution import SuperResolution
 from spikekit import read_picture, write_picture, write_spikes
@@ -95,16 +94,6 @@ def test_weights_serve_with_any_way_of_joining_motion(fusion, file):
     torch.testing.assert_close(other(SPIKES), network(motion=ZeroFlow())(SPIKES))
 
 
-def test_a_file_names_no_class_from_outside_the_package(tmp_path):
-    outside = type("Foreign", (CSCSR,), {})
-    found = read_weights("cscsr_tiny_x4")
-    path = tmp_path / "foreign.safetensors"
-    write_weights(replace(found, settings={**found.settings, "class": "Foreign"}), path)
-    with pytest.raises(ValueError, match="expected weights of CSCSR, got those of Foreign"):
-        CSCSR.from_pretrained(path)
-    assert isinstance(outside.from_pretrained(path), outside)  # by its own name
-
-
 def test_weights_of_something_else(file, tmp_path):
     with pytest.raises(ValueError, match="expected weights of ClassicalDecoder, got those of CSCSR"):
         ClassicalDecoder.from_pretrained(file)
@@ -141,32 +130,6 @@ def test_damaged_files_say_so_in_one_line(file, suffix, length, capsys):
             main(args)
         assert str(stopped.value).startswith(f"lightning: {path}: not a ")
         assert str(stopped.value).count("\n") == 0
-
-
-def test_loading_runs_no_code(tmp_path):
-    class Harmful:
-        def __reduce__(self):
-            return os.mkdir, (str(tmp_path / "harmed"),)
-
-    for name in ("file.ckpt", "file.safetensors"):
-        torch.save({"network": {"class": "CSCSR"}, "state_dict": {}, "other": Harmful()}, tmp_path / name)
-        with pytest.raises(ValueError, match=name):
-            CSCSR.from_pretrained(tmp_path / name)
-    assert not (tmp_path / "harmed").exists()
-
-
-def test_classes_of_a_file_are_names_and_no_paths(tmp_path):
-    """A path would be imported where the network is built, and a module runs when it is imported."""
-    said = {"class": "this.That", **network().settings}
-    torch.save({"network": said, "state_dict": {}}, tmp_path / "file.ckpt")
-    save_file(
-        load_file(find_model("cscsr_tiny_x4").path),
-        tmp_path / "file.safetensors",
-        {"network": json.dumps(said), "motion": "{}"},
-    )
-    for name in ("file.ckpt", "file.safetensors"):
-        with pytest.raises(ValueError, match=name):
-            read_weights(tmp_path / name)
 
 
 @pytest.mark.parametrize(
