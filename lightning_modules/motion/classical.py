@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
@@ -13,7 +12,7 @@ from torch import Tensor
 from lightning_modules.motion.estimator import MotionEstimator, split_any_size
 from spikekit import flow_warp, tfp_at
 from spikekit.check import check_planes, check_positive, check_whole
-from spikekit.color.cfa import cfa_pattern, cfa_sites
+from spikekit.color.cfa import cfa_pattern
 from spikekit.flow.tvl1 import tvl1_flow
 from spikekit.kernels import compiler_kept_out
 from spikekit.sensor.quantization_noise import flicker
@@ -84,48 +83,30 @@ class ClassicalFlow(MotionEstimator):
             raise ValueError(f"spikes: expected {expected}, got {tuple(spikes.shape)}")
         pattern = cfa_pattern(pattern)
         alike = _clips_by_window(spikes)  # clips that need one window are seen at once
-        velocities = []
-        for window, clips in alike.items():
-            way = _Way(self.attachment, self.warps, middle, window, pattern, by_site)
-            noise = noise_by_rate(window, spikes.device)
-            velocities.append(_of_window(way, spikes if len(alike) == 1 else spikes[clips], noise))
+        with torch.autocast(spikes.device.type, enabled=False):
+            velocities = [
+                self._of_window(spikes if len(alike) == 1 else spikes[clips], middle, window, pattern, by_site)
+                for window, clips in alike.items()
+            ]
         order = torch.tensor([clip for clips in alike.values() for clip in clips], device=spikes.device).argsort()
         before, after = torch.cat(velocities, dim=-5).index_select(-5, order).unbind(dim=-4)
         return before * (first - middle), after * (last - middle)
 
-    def extra_repr(self) -> str:  # noqa: D102
-        return f"attachment={self.attachment}, warps={self.warps}"
-
-
-@dataclass(frozen=True)
-class _Way:
-    """How motion is estimated, besides the clips."""
-
-    attachment: float
-    warps: int
-    middle: int
-    window: int
-    pattern: str
-    by_site: bool
-
-
-def _of_window(way: _Way, spikes: Tensor, noise: Tensor) -> Tensor:
-    """Velocities before and after the middle, (*, B, 2, 2, h, w), by means of one window, whose noise is known."""
-    with torch.autocast(spikes.device.type, enabled=False):
-        seen, clock = _moments(spikes.shape[1], way.middle, way.window)
-        raw = torch.stack([tfp_at(spikes, n, way.window, order=_ORDER, dtype=torch.float32) for n in seen], dim=1)
-        variance = noise[(raw.mean(dim=1, keepdim=True) * _RATES).long().clamp(0, _RATES - 1)]
-        sites = 1
-        if way.by_site:
-            sites = len(cfa_sites(way.pattern)[0])
-            raw, variance = (split_any_size(part, way.pattern).flatten(0, 1) for part in (raw, variance))
-        kernel, border = (_BLUR, "replicate") if way.by_site else (_GREY, "reflect")
+    def _of_window(self, spikes: Tensor, middle: int, window: int, pattern: str, by_site: bool) -> Tensor:
+        """Velocities before and after the middle, (*, B, 2, 2, h, w), by means of one window."""
+        seen, clock = _moments(spikes.shape[1], middle, window)
+        raw = torch.stack([tfp_at(spikes, n, window, order=_ORDER, dtype=torch.float32) for n in seen], dim=1)
+        rates = (raw.mean(dim=1, keepdim=True) * _RATES).long().clamp(0, _RATES - 1)
+        variance = noise_by_rate(window, spikes.device)[rates]
+        kernel, border = (_BLUR, "replicate") if by_site else (_GREY, "reflect")
+        if by_site:
+            raw, variance = (split_any_size(part, pattern).flatten(0, 1) for part in (raw, variance))
         pictures, variance = (
             _filtered(part, weights, border) for part, weights in ((raw, kernel), (variance, [w**2 for w in kernel]))
         )
-        attachment = way.attachment / (1 + variance[:, 0] / _NOISE**2)
-        velocities = _velocities(pictures, clock, attachment, way.warps)
-    return velocities.unflatten(0, (sites, -1)) if way.by_site else velocities
+        attachment = self.attachment / (1 + variance[:, 0] / _NOISE**2)
+        velocities = _velocities(pictures, clock, attachment, self.warps)
+        return velocities.unflatten(0, (-1, len(spikes))) if by_site else velocities
 
 
 def _filtered(planes: Tensor, weights: Sequence[float], border: str) -> Tensor:

@@ -153,6 +153,3 @@ class Spike2Flow(MotionEstimator):
         centers = torch.tensor([round(middle + (last - middle) * k / 3) for k in range(4)])
         frames = centers[:, None] + torch.arange(self.window) - self.window // 2
         return intervals[:, :, frames.clamp(0, spikes.shape[1] - 1).to(spikes.device)]
-
-    def extra_repr(self) -> str:  # noqa: D102
-        return f"iterations={self.iterations}, frozen={self.frozen}"

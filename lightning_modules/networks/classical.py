@@ -64,24 +64,15 @@ class ClassicalDecoder(Network):
             "frames": frames,
         }
         super().__init__(settings, (frames // 2,) * 3, ZeroFlow())
-        self.method = method
-        self.alpha = alpha
-        self.window = window
-        self.order = order
+        self.method, self.window, self.order = method, window, order
 
     def forward(self, spikes: Tensor, flow: Tensor | None = None, static: bool = False) -> Tensor:
         """Return rgb; a flow changes nothing."""
         check_planes("spikes", spikes, 4, "(B, N, H, W)")
         n = spikes.shape[1] // 2
-        raw = DECODERS[self.method].frame(spikes, n, **self._options())
+        decoder = DECODERS[self.method]
+        raw = decoder.frame(spikes, n, **{name: getattr(self, name) for name in decoder.options})
         rgb = demosaic(raw / self.alpha, self.pattern)
         if self.scale > 1:
             rgb = F.interpolate(rgb, scale_factor=self.scale, mode="bicubic", align_corners=False)
         return rgb
-
-    def extra_repr(self) -> str:  # noqa: D102
-        text = f"method={self.method!r}, scale={self.scale}, alpha={self.alpha}"
-        return ", ".join([text, *(f"{name}={value}" for name, value in self._options().items())])
-
-    def _options(self) -> dict[str, int]:
-        return {name: getattr(self, name) for name in DECODERS[self.method].options}

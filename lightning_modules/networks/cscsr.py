@@ -206,8 +206,7 @@ class CSCSR(Network):
 
     def _colors(self, spikes: Tensor, flow: Tensor | None, **told: Tensor) -> list[Tensor]:
         """Features of R, G and B, refined over time, each (B, width, H, W) at the resolution of the reconstruction."""
-        height, width = spikes.shape[-2:]
-        planes, colors = split_colors(spikes, self.pattern), range(self.colors)
+        planes = split_colors(spikes, self.pattern)
         # one colour after the other: high resolution takes memory
         features = (encode(plane, **told) for encode, plane in zip(self.representation, planes, strict=True))
         if self._by_sites(spikes, flow):
@@ -215,13 +214,9 @@ class CSCSR(Network):
             return [refine(part) for refine, part in zip(self.refinement, pixels, strict=True)]
         if not self.config.search or (flow is None and self.colors == 1):  # at rest, all pixels of grey are known
             pixels = (enlarge(part, self.scale) for part in features)
-        elif is_exporting():
-            pixels = map(self._search_in_graph, features, self._offsets(flow, spikes), colors)
         else:
-            offsets = self._offsets(flow, spikes)
-            pixels = map(
-                self._search, features, offsets, _masks(height, width, self.pattern, self.scale, spikes.device)
-            )
+            search = self._search_in_graph if is_exporting() else self._search
+            pixels = map(search, features, self._offsets(flow, spikes), range(self.colors))
         pixels = (fold(part.flatten(1, 2), self.fold) for part in pixels)
         return [refine(part) for refine, part in zip(self.refinement, pixels, strict=True)]
 
@@ -269,7 +264,8 @@ class CSCSR(Network):
     def _offsets(self, flow: Tensor | None, spikes: Tensor) -> Sequence[Tensor]:
         """How far every colour has moved at every time point, each (B, T, 2, s H, s W), T being 1 at rest."""
         if flow is None:
-            return [self._no_offset(spikes)] * self.colors
+            size = [self.scale * length for length in spikes.shape[-2:]]
+            return [spikes.new_zeros(len(spikes), 1, 2, *size)] * self.colors
         flow = flow if flow.ndim == 6 else flow.unsqueeze(1)
         first, middle, last = self.flow_times
         offsets = linear_motion(
@@ -277,22 +273,18 @@ class CSCSR(Network):
         )
         return _kept_near(offsets).expand(-1, self.colors, -1, -1, -1, -1).unbind(1)
 
-    def _no_offset(self, planes: Tensor) -> Tensor:
-        height, width = planes.shape[-2:]
-        return planes.new_zeros(len(planes), 1, 2, self.scale * height, self.scale * width)
-
-    def _search(self, features: Tensor, offsets: Tensor, mask: Tensor) -> Tensor:
+    def _search(self, features: Tensor, offsets: Tensor, color: int) -> Tensor:
         """Temporal pixel search (section 4.3, Fig. 5 b): (B, T, C, H, W) to (B, T, C, s H, s W).
 
         Offsets of a single time point are those of all.
         """
-        on_cpu = features.device.type == "cpu"
         neighbors = self.config.neighbors
+        mask = _masks(*features.shape[-2:], self.pattern, self.scale, features.device)[color]
         if offsets.shape[1] == 1:
             pixels = self._enlarge(features, mask)
             return flow_warp_idw(pixels.flatten(1, 2), offsets[:, 0], mask, neighbors=neighbors).reshape(pixels.shape)
         # a few time points after the others: what the search needs on the way is many times its result
-        searched = _SEARCHED if on_cpu else _SEARCHED_ELSEWHERE
+        searched = _SEARCHED if features.device.type == "cpu" else _SEARCHED_ELSEWHERE
         few = max(1, searched // (offsets.shape[-2] * offsets.shape[-1]))
         pixels = [
             flow_warp_idw(self._enlarge(part, mask), offset, mask, neighbors=neighbors)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from lightning_modules.networks.configuration import check_fields
 from lightning_modules.networks.sizes import SIZES, default_stride
-from spikekit.color.cfa import GREY
+from spikekit.check import check_positive, check_whole
+from spikekit.color.cfa import GREY, cfa_pattern
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class CSCSRConfig:
         for name, value in SIZES[self.size].items():
             if getattr(self, name) is None:
                 object.__setattr__(self, name, value)  # frozen
-        check_fields(self)
+        _check_fields(self)
         if self.stride is None:
             object.__setattr__(self, "stride", default_stride(self.frames, self.window))
         frames, window, stride = self.frames, self.window, self.stride
@@ -136,3 +136,29 @@ class CSCSRConfig:
     def times(self) -> tuple[int, ...]:
         """Centres of the windows, in spike frames."""
         return tuple(range(self.window // 2, self.frames - self.window // 2, self.stride))
+
+
+def _check_fields(config: Any) -> None:
+    """Check every field of a dataclass by its type, and write whole numbers as Python's own.
+
+    ``int`` is a whole number, 1 or more; ``float`` a finite number above 0; a field called ``pattern`` a Bayer phase,
+    or ``"grey"``. A field that may be None is checked where it is not.
+    """
+    hints = get_type_hints(type(config))
+    for field in fields(config):
+        name, value, hint = field.name, getattr(config, field.name), hints[field.name]
+        if type(None) in get_args(hint):
+            if value is None:
+                continue
+            hint = next(kind for kind in get_args(hint) if kind is not type(None))
+        if hint is int:
+            value = check_whole(name, value)
+        elif hint is float:
+            check_positive(name, value)
+        elif hint is bool and not isinstance(value, bool):
+            raise ValueError(f"{name}: expected true or false, got {value!r}")
+        elif get_origin(hint) is Literal and value not in get_args(hint):
+            raise ValueError(f"{name}: expected one of {', '.join(get_args(hint))}, got {value!r}")
+        elif name == "pattern":
+            value = cfa_pattern(value)
+        object.__setattr__(config, name, value)  # frozen

@@ -64,9 +64,6 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
 def check_tensors(tensors: Mapping[str, Tensor]) -> None:
     """Refuse weights that are not finite: a network would return black pictures without any explanation.
 
-    Args:
-        tensors: weights by name.
-
     Raises:
         TypeError: something else than dense tensors of ordinary numbers.
         ValueError: NaN or Inf; the message names the weight.

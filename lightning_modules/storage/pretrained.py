@@ -169,10 +169,7 @@ def motion_of(network: nn.Module) -> dict[str, Any]:
 def check_settings(network: nn.Module, settings: dict[str, Any], source: str | Path) -> None:
     """Refuse weights of another network: a different scale, for example, changes no parameter and would go unnoticed.
 
-    Args:
-        network: what the weights are meant for.
-        settings: class and arguments of the network that they are of; empty where they are not known.
-        source: what the weights are called.
+    Empty settings are those of weights that do not say what they are of.
 
     Raises:
         CheckpointMismatchError: there are differences; the message names them.
@@ -211,11 +208,7 @@ def load_weights(network: nn.Module, weights: Weights, keep_motion: bool = False
 
     Weights belong to the gain alpha that they were trained with. If the network was built for another, its picture is
     multiplied by the ratio of the gains. How the motion of the colours is joined may differ as well: it has no weights.
-
-    Args:
-        network: what the weights are meant for.
-        weights: they.
-        keep_motion: leave its estimator of motion as it is, also where the weights have one of the same kind.
+    The network may keep its estimator of motion where the weights have one of the same kind.
 
     Raises:
         CheckpointMismatchError: they are of another network.

@@ -26,12 +26,7 @@ _NOT_STORED = ("weights",)  # would make one file read another
 def own_class(
     settings: Mapping[str, Any], source: str | Path, kinds: Mapping[str, type[nn.Module]]
 ) -> tuple[type[nn.Module], dict[str, Any]]:
-    """Return the class that stored settings name and the arguments to build it with.
-
-    Args:
-        settings: ``"class"``, the name of a network or an estimator of this package, and its arguments.
-        source: the file that they come from.
-        kinds: the classes that the file may name, by name.
+    """Return the class that settings out of a file name, one of ``kinds``, and the arguments to build it with.
 
     Raises:
         ValueError: another class, an argument that it does not take, or a value that is not of the argument's type or
@@ -61,12 +56,6 @@ def check_shapes(
     kinds: Mapping[str, type[nn.Module]],
 ) -> None:
     """Compare weights with the network that their settings describe, before it takes any memory.
-
-    Args:
-        settings: as for :func:`own_class`.
-        tensors: weights by name, without those of an estimator inside a network.
-        source: the file that they come from.
-        kinds: as for :func:`own_class`.
 
     Raises:
         ValueError: as :func:`own_class`, settings that contradict each other, or other names, shapes or kinds of

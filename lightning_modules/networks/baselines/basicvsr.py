@@ -8,8 +8,12 @@ import torch
 from torch import Tensor, nn
 
 from lightning_modules.motion import MotionEstimator
-from lightning_modules.networks.baselines.pictures import Baseline, decode_pictures, whole_sizes
-from lightning_modules.networks.baselines.sub_pixel import sub_pixel_convolutions
+from lightning_modules.networks.baselines.pictures import (
+    Baseline,
+    decode_pictures,
+    sub_pixel_convolutions,
+    whole_sizes,
+)
 from lightning_modules.networks.layers import conv, enlarge, res_blocks
 from spikekit import demosaic_along_motion, demosaic_residual, flow_warp
 

@@ -1,4 +1,4 @@
-"""Helpers of the baselines: decoded pictures of a clip, padding to any size, common settings."""
+"""What the baselines share: decoded pictures, padding to any size, settings, the skip, sub-pixel convolutions."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import Any, Literal
 import torch
 import torch.nn.functional as F
 from kornia.core.utils import is_exporting
-from torch import Tensor
+from torch import Tensor, nn
 
 from lightning_modules.motion import MotionEstimator
+from lightning_modules.networks.layers import conv
 from lightning_modules.networks.network import Network
-from spikekit import bayer_pattern, demosaic_along_motion, linear_motion, tfi_at, tfp_at
+from spikekit import bayer_pattern, demosaic_along_motion, demosaic_residual, linear_motion, tfi_at, tfp_at
 from spikekit.check import check_positive, check_whole
 
 Decoder = Literal["tfi", "tfp"]
@@ -111,3 +112,33 @@ def along_motion(network: Baseline, spikes: Tensor, flow: Tensor) -> Tensor:
 def enlarge_picture(picture: Tensor, scale: int) -> Tensor:
     """Bicubic: (B, C, H, W) to (B, C, s H, s W)."""
     return picture if scale == 1 else F.interpolate(picture, scale_factor=scale, mode="bicubic", align_corners=False)
+
+
+def begin_at_zero(*layers: nn.Conv2d) -> None:
+    """Initialise convolutions with zeros, so that training starts from what their result is added to."""
+    for layer in layers:
+        nn.init.zeros_(layer.weight)
+        nn.init.zeros_(layer.bias)
+
+
+@torch.no_grad()
+def enlarged_raw(raw: Tensor, pattern: str | None, scale: int) -> Tensor:
+    """Demosaic (B, H, W) by residual interpolation, unless all pixels see one colour, and enlarge bicubically."""
+    return enlarge_picture(raw.unsqueeze(1) if pattern is None else demosaic_residual(raw, pattern), scale)
+
+
+def sub_pixel_convolutions(width: int, scale: int, *after: nn.Module) -> nn.Sequential:
+    """A convolution and a pixel shuffle (Shi et al., CVPR 2016) for every prime factor of the scale.
+
+    Example:
+        >>> [layer.upscale_factor for layer in sub_pixel_convolutions(8, 6)[1::2]]
+        [2, 3]
+    """
+    layers: list[nn.Module] = []
+    factor = 2
+    while scale > 1:
+        while scale % factor == 0:
+            layers += [conv(width, factor**2 * width), nn.PixelShuffle(factor), *after]
+            scale //= factor
+        factor += 1
+    return nn.Sequential(*layers)

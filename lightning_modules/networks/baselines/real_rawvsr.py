@@ -11,13 +11,14 @@ from lightning_modules.networks.baselines.deformable import DeformableConv2d
 from lightning_modules.networks.baselines.pictures import (
     Baseline,
     Decoder,
+    begin_at_zero,
     check_decoder,
     cut_to,
     decode_pictures,
+    enlarged_raw,
     mirror_to_multiple,
     whole_sizes,
 )
-from lightning_modules.networks.baselines.skip import begin_at_zero, enlarged_raw
 from lightning_modules.networks.layers import ResBlock, conv, enlarge
 from spikekit import split_bayer
 

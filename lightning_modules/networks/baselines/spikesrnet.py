@@ -8,9 +8,14 @@ from torch import Tensor, nn
 from lightning_modules.motion import ZeroFlow
 from lightning_modules.networks.baselines.deformable import DeformableConv2d
 from lightning_modules.networks.baselines.per_channel import per_channel as run_per_channel
-from lightning_modules.networks.baselines.pictures import Baseline, decode_pictures, whole_sizes
-from lightning_modules.networks.baselines.skip import begin_at_zero, enlarged_raw
-from lightning_modules.networks.baselines.sub_pixel import sub_pixel_convolutions
+from lightning_modules.networks.baselines.pictures import (
+    Baseline,
+    begin_at_zero,
+    decode_pictures,
+    enlarged_raw,
+    sub_pixel_convolutions,
+    whole_sizes,
+)
 from lightning_modules.networks.layers import conv, res_blocks
 from spikekit import split_colors
 

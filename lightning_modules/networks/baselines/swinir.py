@@ -12,12 +12,12 @@ from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks.baselines.pictures import (
     Baseline,
     along_motion,
+    begin_at_zero,
     cut_to,
     enlarge_picture,
     mirror_to_multiple,
     whole_sizes,
 )
-from lightning_modules.networks.baselines.skip import begin_at_zero
 from lightning_modules.networks.layers import conv
 
 _MEAN = 0.4488, 0.4371, 0.4040  # of the DIV2K pictures that SwinIR was trained on

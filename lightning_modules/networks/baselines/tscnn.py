@@ -10,13 +10,13 @@ from lightning_modules.motion import ZeroFlow
 from lightning_modules.networks.baselines.pictures import (
     Baseline,
     Decoder,
+    begin_at_zero,
     check_decoder,
     decode_pictures,
     enlarge_picture,
     mirror_to_multiple,
     whole_sizes,
 )
-from lightning_modules.networks.baselines.skip import begin_at_zero
 from lightning_modules.networks.layers import ConvBlock, ResBlock, conv
 from spikekit import bayer_mask, demosaic_residual
 
@@ -111,10 +111,6 @@ class TSCNN(Baseline):
         if self.skip:
             rgb = rgb + enlarge_picture(picture, self.scale)
         return rgb[..., : self.scale * height, : self.scale * width]
-
-    def extra_repr(self) -> str:  # noqa: D102
-        window = f", tfp_window={self.tfp_window}" if self.decoder == "tfp" else ""
-        return f"decoder={self.decoder!r}, scale={self.scale}, alpha={self.alpha}{window}"
 
 
 class DemosaicingStage(nn.Module):

@@ -9,8 +9,13 @@ from torch import Tensor, nn
 
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks.baselines.per_channel import per_channel as run_per_channel
-from lightning_modules.networks.baselines.pictures import Baseline, decode_pictures, whole_sizes
-from lightning_modules.networks.baselines.skip import begin_at_zero, enlarged_raw
+from lightning_modules.networks.baselines.pictures import (
+    Baseline,
+    begin_at_zero,
+    decode_pictures,
+    enlarged_raw,
+    whole_sizes,
+)
 from lightning_modules.networks.layers import conv
 from spikekit import split_colors
 

@@ -3,7 +3,7 @@ import torch
 from scipy.ndimage import convolve1d
 
 from lightning_modules.motion import ClassicalFlow, MotionEstimator, ZeroFlow, classical
-from spikekit import mosaic, spike_integrate_fire, split_bayer, tfp_at
+from spikekit import mosaic, spike_integrate_fire, tfp_at
 from spikekit.flow import tvl1
 
 TIMES = (5, 20, 35)
@@ -24,8 +24,7 @@ def moving(velocity, height=48, width=64, pattern="RGGB", frames=41, alpha=0.4):
     return spike_integrate_fire(torch.stack(light).float(), charge=charge)[0][None]
 
 
-@pytest.mark.parametrize("velocity", [(0.2, 0.0), (0.0, -0.15), (-0.1, 0.1)])
-@pytest.mark.parametrize("pattern", ["RGGB", "GBRG"])
+@pytest.mark.parametrize(("velocity", "pattern"), [((0.2, 0.0), "RGGB"), ((-0.1, 0.1), "GBRG")])
 def test_classical_flow_finds_a_translation(velocity, pattern):
     to_first, to_last = ClassicalFlow()(moving(velocity, pattern=pattern), TIMES, pattern)
     truth = 15 * torch.tensor(velocity).reshape(1, 2, 1, 1)
@@ -51,29 +50,25 @@ def test_precision_of_a_network_is_not_that_of_motion():
     assert all(flow.isfinite().all() for flow in ClassicalFlow()(spikes.bfloat16(), TIMES, "RGGB"))
 
 
-@pytest.mark.parametrize("estimate", ["forward", "channel_flows"])
-def test_a_compiler_keeps_out(estimate):
-    spikes = moving((0.2, -0.1))
-    flow = ClassicalFlow()
+def test_a_compiler_keeps_out():
+    spikes, flow = moving((0.2, -0.1)), ClassicalFlow()
 
     def mean(spikes):
-        return sum(part.mean() for part in getattr(flow, estimate)(spikes, TIMES, "RGGB"))
+        return sum(part.mean() for part in flow(spikes, TIMES, "RGGB"))
 
     assert torch.compile(mean, backend="eager")(spikes) == mean(spikes)
 
 
-@pytest.mark.parametrize("size", [(33, 35), (5, 4), (3, 3)])
+@pytest.mark.parametrize("size", [(33, 35), (3, 3)])
 def test_any_size(size):
+    spikes = (torch.rand(2, 41, *size) < 0.4).to(torch.uint8)
     for estimator in (ClassicalFlow(), ZeroFlow()):
-        for flow in estimator((torch.rand(2, 41, *size) < 0.4).to(torch.uint8), TIMES, "RGGB"):
+        for flow in estimator(spikes, TIMES, "RGGB"):
             assert flow.shape == (2, 2, *size)
             assert flow.isfinite().all()
-
-
-def test_zero_flow_has_a_plane_for_every_site():
-    for flow in ZeroFlow().channel_flows(torch.zeros(3, 41, 5, 8, dtype=torch.uint8), TIMES, "RGGB"):
-        assert flow.shape == (4, 3, 2, 3, 4)
-        assert flow.dtype == torch.float32
+        for flow in estimator.channel_flows(spikes, TIMES, "RGGB"):
+            assert flow.shape == (4, 2, 2, *((side + 1) // 2 for side in size))
+            assert flow.dtype == torch.float32
 
 
 @pytest.mark.parametrize(
@@ -118,21 +113,12 @@ def test_scene_without_contrast_is_still():
         assert all(not flow.any() for flow in ClassicalFlow()(torch.full((1, 41, 16, 16), level), TIMES, "RGGB"))
 
 
-def test_few_frames():
-    for frames, times in ((5, (0, 2, 4)), (3, (0, 1, 2))):
-        spikes = moving((0.2, 0.0))[:, 20 - frames // 2 : 21 + frames // 2]
-        assert all(flow.isfinite().all() for flow in ClassicalFlow()(spikes, times, "RGGB"))
-
-
 @pytest.mark.parametrize(
     ("frames", "rate", "window"),
     [
         (41, 0.01, 13),
-        (41, 0.5, 13),
         (101, 0.0, 33),
-        (101, 0.01, 33),
         (101, 0.05, 25),
-        (101, 0.5, 17),
         (401, 0.5, 17),
         (401, 0.011, 51),
     ],
@@ -187,32 +173,8 @@ def expected_flows(pictures, raw, clock, squared, border):
     return tvl1.tvl1_flow(pictures[None, ::2], times, attachment[None])[0] / (clock[2] - clock[0]) * 15
 
 
-@pytest.mark.parametrize("size", [(32, 40), (33, 35)])
-def test_flows_of_the_sites_are_in_bayer_cells_and_in_the_order_of_split_bayer(size):
-    spikes = moving((0.2, -0.1), *size, "GRBG").repeat(2, 1, 1, 1)
-    flows = ClassicalFlow().channel_flows(spikes, TIMES, "GRBG")
-    sites = spike_sites(spikes, "GRBG")
-    for flow in flows:
-        assert flow.shape == (4, 2, 2, (size[0] + 1) // 2, (size[1] + 1) // 2)
-    weights = torch.eye(41)
-    for _ in range(3):
-        weights = torch.stack([weights[max(n - 6, 0) : n + 7].mean(dim=0) for n in range(41)])
-    clock, seen = (weights @ torch.arange(41.0)).tolist(), [10, 20, 30]
-    raw = torch.einsum("kn,sbnhw->sbkhw", weights[seen], sites.float())
-    blur = torch.exp(-(torch.arange(-2.0, 3) ** 2) / (2 * 0.5**2))
-    blur = (blur / blur.sum()).numpy()
-    pictures = torch.from_numpy(convolve1d(convolve1d(raw.numpy(), blur, -1, mode="nearest"), blur, -2, mode="nearest"))
-    for site in range(4):
-        expected = expected_flows(pictures[site, 1], raw[site, 1], [clock[n] for n in seen], blur**2, "nearest")
-        to_first, to_last = (flow[site, 1] for flow in flows)
-        straight = (to_first + to_last).abs() < 1e-5
-        assert straight.float().mean() > 0.9
-        torch.testing.assert_close(to_last[straight], expected[straight], rtol=1e-2, atol=2e-2)
-
-
-@pytest.mark.parametrize("pattern", ["RGGB", "GBRG"])
-def test_joint_flow_is_that_of_grey_pictures(pattern):
-    spikes, clock = moving((0.2, -0.1), pattern=pattern), torch.arange(41.0).reshape(41, 1, 1)
+def test_joint_flow_is_that_of_grey_pictures():
+    spikes, clock = moving((0.2, -0.1), pattern="GBRG"), torch.arange(41.0).reshape(41, 1, 1)
     binomial, raw, when = [0.25, 0.5, 0.25], [], []
     for n in (10, 20, 30):
         raw.append(tfp_at(spikes[0].float(), n, 13, order=3))
@@ -220,11 +182,11 @@ def test_joint_flow_is_that_of_grey_pictures(pattern):
     raw = torch.stack(raw)
     grey = torch.from_numpy(convolve1d(convolve1d(raw.numpy(), binomial, 1, mode="mirror"), binomial, 2, mode="mirror"))
     expected = expected_flows(grey, raw, when, [0.0625, 0.25, 0.0625], "mirror")
-    to_first, to_last = ClassicalFlow()(spikes, TIMES, pattern)
+    to_first, to_last = ClassicalFlow()(spikes, TIMES, "GBRG")
     torch.testing.assert_close((to_last - to_first)[0] / 2, expected, rtol=1e-2, atol=2e-2)
 
 
-@pytest.mark.parametrize("step", [3, 20, 46, 63, 102, 320, 512, 788])
+@pytest.mark.parametrize("step", [3, 63, 512])
 def test_noise_of_a_mean_is_that_of_an_ideal_pixel(step):
     charge = (torch.arange(100_000, dtype=torch.float64) + 0.5) / 100_000
     light = torch.full((41, 1, len(charge)), (step + 0.5) / 1024, dtype=torch.float64)
@@ -248,13 +210,6 @@ def test_mosaic_without_motion_is_no_motion():
     assert all(flow.abs().max() < 0.3 for flow in grey)
 
 
-def spike_sites(spikes, pattern):
-    """Sub-streams of a clip of any size, an odd side continued by the pixel of the same site."""
-    spikes = torch.cat([spikes, spikes[..., -2:-1, :]], -2) if spikes.shape[-2] % 2 else spikes
-    spikes = torch.cat([spikes, spikes[..., -2:-1]], -1) if spikes.shape[-1] % 2 else spikes
-    return split_bayer(spikes, pattern)
-
-
 class Constant(MotionEstimator):
     """Every site has a flow of its own."""
 
@@ -265,10 +220,9 @@ class Constant(MotionEstimator):
         return -flow, flow
 
 
-@pytest.mark.parametrize("size", [(8, 10), (7, 9)])
-def test_joint_flow_is_the_mean_of_the_sites_in_sensor_pixels(size):
-    to_first, to_last = Constant()(torch.zeros(3, 41, *size), TIMES, "RGGB")
-    expected = torch.tensor([8.0, 12]).reshape(1, 2, 1, 1).expand(3, 2, *size)
+def test_joint_flow_is_the_mean_of_the_sites_in_sensor_pixels():
+    to_first, to_last = Constant()(torch.zeros(3, 41, 8, 9), TIMES, "RGGB")
+    expected = torch.tensor([8.0, 12]).reshape(1, 2, 1, 1).expand(3, 2, 8, 9)
     assert to_last.equal(expected)
     assert to_first.equal(-expected)
 
@@ -286,7 +240,6 @@ def test_more_warps_are_more_exact():
     ("size", "times", "pattern", "message"),
     [
         ((1, 8, 8), (0, 0, 0), "RGGB", "with frames before and after the middle, 0"),
-        ((41, 8, 8), (0, 0, 10), "RGGB", "with frames before and after the middle, 0"),
         ((41, 8, 8), (0, 40, 40), "RGGB", "with frames before and after the middle, 40"),
         ((41, 1, 8), TIMES, "RGGB", "at least 2 x 2 pixels"),
         ((41, 8, 8), TIMES, "XYZ", "pattern"),

@@ -1,38 +1,16 @@
-import os
-
 import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from lightning_modules.motion import Spike2Flow
-from lightning_modules.motion.recurrent import Correlation, GlobalAttention, SeparableGRU, upsample_convex
+from lightning_modules.motion.recurrent import Correlation, GlobalAttention, upsample_convex
 from lightning_modules.networks import CSCSR
-from spikekit import spike_interval, split_bayer, upsample_flow
+from spikekit import spike_interval, split_bayer
 
 TIMES = (5, 20, 35)
-TINY = {
-    "widths": (4, 6),
-    "features": 4,
-    "hidden": 4,
-    "correlation": (4, 4),
-    "motion": 4,
-    "head": 4,
-    "iterations": 2,
-}
-PAPER = {
-    "window": 21,
-    "widths": (64, 96, 128),
-    "blocks": 2,
-    "features": 216,
-    "attention": 128,
-    "hidden": 128,
-    "correlation": (196, 160),
-    "motion": 96,
-    "head": 196,
-    "levels": 3,
-    "radius": 3,
-    "iterations": 8,
-}
+TINY = {"features": 4, "hidden": 4, "motion": 4, "head": 4, "widths": (4, 6), "correlation": (4, 4), "iterations": 2}
+PAPER = {"window": 21, "widths": (64, 96, 128), "blocks": 2, "features": 216, "attention": 128, "hidden": 128}
+PAPER |= {"correlation": (196, 160), "motion": 96, "head": 196, "levels": 3, "radius": 3, "iterations": 8}
 
 
 @pytest.fixture(autouse=True)
@@ -45,22 +23,16 @@ def clip(batch=1, height=16, width=20, seed=0):
     return (torch.rand(batch, 41, height, width, generator=generator) < 0.3).to(torch.uint8)
 
 
-def test_size_of_the_paper():
+def test_size_of_the_paper_and_work_of_the_default_size():
     with torch.device("meta"):
         network = Spike2Flow(**PAPER)
     assert sum(p.numel() for p in network.parameters()) == 6_603_718 - 101_888
-    assert Spike2Flow.__doc__.count("6,501,830") == 1
-
-
-def test_work_of_the_default_size():
-    network = Spike2Flow()
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
-        network(clip(1, 48, 48), TIMES, "RGGB")
+        Spike2Flow()(clip(1, 48, 48), TIMES, "RGGB")
     assert counter.get_total_flops() / 2 / 48**2 < 0.3e6
 
 
-@pytest.mark.parametrize("size", [(6, 6), (7, 13), (9, 6), (23, 24), (40, 40), (2, 3)])
-@pytest.mark.parametrize("value", [None, 0, 1])
+@pytest.mark.parametrize(("size", "value"), [((2, 3), 0), ((7, 13), None), ((9, 6), 1), ((40, 40), None)])
 def test_any_size_and_any_spikes_without_nan(size, value):
     network = Spike2Flow(**{**TINY, "levels": 4, "attention": 4})
     with torch.no_grad():
@@ -102,9 +74,8 @@ def test_flow_is_that_of_the_last_iteration_and_of_the_farthest_window_in_sensor
     assert to_first.equal(-expected)
 
 
-@pytest.mark.parametrize("window", [11, 21])
-def test_windows_are_those_of_intervals_around_the_times(window):
-    estimator = Spike2Flow(**{**TINY, "window": window})
+def test_windows_are_those_of_intervals_around_the_times():
+    estimator = Spike2Flow(**{**TINY, "window": 21})
     estimator.network = Known()
     estimator.register_parameter("dtype", torch.nn.Parameter(torch.zeros(1)))
     spikes = clip(2, 8, 6)
@@ -113,16 +84,8 @@ def test_windows_are_those_of_intervals_around_the_times(window):
     for direction, stream in enumerate((spikes.flip(1), spikes)):
         sites = spike_interval(split_bayer(stream, "GBRG"))
         for number, center in enumerate((20, 25, 30, 35)):
-            frames = [min(center + offset, 40) for offset in range(-(window // 2), window // 2 + 1)]
+            frames = [min(center + offset, 40) for offset in range(-10, 11)]
             assert seen[:, :, direction, number].equal(sites[:, :, frames].float())
-
-
-def test_context_is_that_of_the_window_where_all_flows_begin():
-    network, seen = Spike2Flow(**TINY).network, []
-    network.context.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
-    windows = torch.rand(2, 4, 11, 8, 12)
-    network(windows, 1)
-    assert seen[0].equal(windows[:, 0])
 
 
 def test_time_reversed_swaps_the_flows():
@@ -135,30 +98,13 @@ def test_time_reversed_swaps_the_flows():
     assert not torch.allclose(to_first, to_last)
 
 
-def test_flow_of_a_clip_is_the_same_alone_and_among_others():
+def test_every_clip_by_itself_and_large_ones_bit_by_bit(monkeypatch):
     estimator = Spike2Flow(**TINY)
     spikes = clip(3)
-    together = estimator(spikes, TIMES, "RGGB")
-    alone = estimator(spikes[1:2], TIMES, "RGGB")
-    for flows, flow in zip(together, alone, strict=True):
-        torch.testing.assert_close(flows[1:2], flow, rtol=1e-4, atol=1e-5)
-
-
-def test_large_clips_bit_by_bit(monkeypatch):
-    estimator = Spike2Flow(**TINY)
-    spikes = clip(2)
     whole = estimator(spikes, TIMES, "RGGB")
     monkeypatch.setattr("lightning_modules.motion.spike2flow._PIXELS", 1)
-    for flow, expected in zip(estimator(spikes, TIMES, "RGGB"), whole, strict=True):
-        torch.testing.assert_close(flow, expected, rtol=1e-4, atol=1e-5)
-
-
-def test_correlations_of_all_pairs_and_of_those_looked_up_are_the_same(monkeypatch):
-    estimator = Spike2Flow(**{**TINY, "levels": 3})
-    all_pairs = estimator(clip(1, 18, 22), TIMES, "RGGB")
-    monkeypatch.setattr("lightning_modules.motion.recurrent._ALL_PAIRS", 0)
-    for flow, expected in zip(estimator(clip(1, 18, 22), TIMES, "RGGB"), all_pairs, strict=True):
-        torch.testing.assert_close(flow, expected, rtol=1e-4, atol=1e-5)
+    for flow, expected in zip(estimator(spikes[1:2], TIMES, "RGGB"), whole, strict=True):
+        torch.testing.assert_close(flow, expected[1:2], rtol=1e-4, atol=1e-5)
 
 
 def test_every_parameter_learns():
@@ -237,18 +183,6 @@ def test_convex_upsampling():
     torch.testing.assert_close(moved[..., :-1], 2 * flow[..., 1:])
 
 
-def test_recurrent_unit_keeps_its_state_where_the_gate_is_shut():
-    unit = SeparableGRU(3, 2)
-    hidden, inputs = torch.randn(1, 3, 4, 5), torch.randn(1, 2, 4, 5)
-    for gates in unit.gates:
-        torch.nn.init.zeros_(gates.weight)
-        torch.nn.init.constant_(gates.bias, -100.0)
-    torch.testing.assert_close(unit(hidden, inputs), hidden)
-    for gates in unit.gates:
-        torch.nn.init.constant_(gates.bias, 100.0)
-    assert not torch.allclose(unit(hidden, inputs), hidden)
-
-
 def test_attention_against_brute_force():
     attention = GlobalAttention(3, 2).double()
     x = torch.randn(1, 3, 2, 4, dtype=torch.float64)
@@ -302,29 +236,12 @@ def test_weights_plug_into_cscsr(frozen, tmp_path):
 def test_files_that_hold_no_weights_for_it(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"nowhere.ckpt: neither a file of weights nor the name"):
         Spike2Flow(weights=tmp_path / "nowhere.ckpt")
-    damaged = checkpoint(tmp_path / "damaged.ckpt", Spike2Flow(**TINY))
-    damaged.write_bytes(damaged.read_bytes()[:-2000])
-    with pytest.raises(ValueError, match=r"damaged.ckpt: not a checkpoint"):
-        Spike2Flow(**TINY, weights=damaged)
     other = checkpoint(tmp_path / "other.ckpt", Spike2Flow(**TINY))
     with pytest.raises(ValueError, match=r"other.ckpt was trained with hidden=4; this run asks for hidden=6"):
         Spike2Flow(**{**TINY, "hidden": 6}, weights=other)
     short = checkpoint(tmp_path / "short.ckpt", Spike2Flow(**TINY), state_dict={})
     with pytest.raises(ValueError, match=r"short.ckpt: weights that do not fit"):
         Spike2Flow(**TINY, weights=short)
-
-    class Harmful:
-        def __reduce__(self):
-            return os.mkdir, (str(tmp_path / "harmed"),)
-
-    checkpoint(tmp_path / "harmful.ckpt", Spike2Flow(**TINY), epoch=Harmful())
-    with pytest.raises(ValueError, match=r"harmful.ckpt: not a checkpoint") as raised:
-        Spike2Flow(**TINY, weights=tmp_path / "harmful.ckpt")
-    assert "\n" not in str(raised.value)
-    assert not (tmp_path / "harmed").exists()
-    torch.save({"network": 1, "state_dict": 2}, tmp_path / "strange.ckpt")
-    with pytest.raises(ValueError, match=r"strange.ckpt: not a checkpoint"):
-        Spike2Flow(weights=tmp_path / "strange.ckpt")
 
 
 @pytest.mark.parametrize(
@@ -342,35 +259,11 @@ def test_wrong_arguments(arguments, message):
         Spike2Flow(**{**TINY, **arguments})
 
 
-def test_wrong_input():
-    with pytest.raises(ValueError, match=r"spikes: expected a non-empty tensor of shape \(B, N, H, W\)"):
-        Spike2Flow(**TINY)(torch.zeros(41, 8, 8), TIMES, "RGGB")
-
-
-def test_bfloat16_is_close_and_gives_float32():
-    estimator, spikes = Spike2Flow(**TINY), clip(1, 24, 24)
-    with torch.no_grad():
-        exact = estimator(spikes, TIMES, "RGGB")[1]
-        with torch.autocast("cpu", torch.bfloat16):
-            half = estimator(spikes, TIMES, "RGGB")[1]
-    assert half.dtype == torch.float32
-    assert (half - exact).abs().max() < 0.2 * exact.abs().max()
-
-
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-def test_a_network_in_half_precision_asks_it_for_motion(dtype):
-    torch.manual_seed(0)
+def test_a_network_in_half_precision_asks_it_for_motion():
+    dtype = torch.bfloat16
     network = CSCSR(2, width=4, representation_width=4, features=1, stages=1, end_blocks=1, motion=Spike2Flow(**TINY))
     expected = network.estimate_flow(clip(1, 24, 24))
     flow = network.to(dtype).estimate_flow(clip(1, 24, 24).to(dtype))
     assert flow.dtype == dtype
     torch.testing.assert_close(flow.float(), expected, rtol=0, atol=0.05 * expected.abs().max().item())
     assert network(clip(1, 24, 24)).isfinite().all()
-
-
-def test_phase_of_the_joint_flow():
-    """Flow that the sites see at their own places, and that grows across the sensor, comes out where it was."""
-    x = torch.arange(16.0).expand(1, 1, 16, 16)
-    sites = split_bayer(torch.cat([x, 0 * x], dim=1), "GRBG") / 2
-    joint = upsample_flow(sites.mean(dim=0), 2)
-    torch.testing.assert_close(joint[0, 0, :, 2:-2], x[0, 0, :, 2:-2])

@@ -29,8 +29,9 @@ def steady(pictures, value=60.0):
     return torch.full_like(pictures[:, 0], value)
 
 
-@pytest.mark.parametrize("times", [(0.0, 1.0), (-0.5, 0.5), (-0.4, 0.6), (1.0, 0.0)])
-@pytest.mark.parametrize("velocity", [(0.3, 0.0), (-1.5, 2.0), (3.0, -2.0)])
+@pytest.mark.parametrize(
+    ("times", "velocity"), [((0.0, 1.0), (0.3, 0.0)), ((-0.4, 0.6), (-1.5, 2.0)), ((1.0, 0.0), (3.0, -2.0))]
+)
 def test_a_translation_is_found(times, velocity):
     pictures = moved(velocity, times=times)
     flow = tvl1_flow(pictures, torch.tensor([times]), steady(pictures))
@@ -39,8 +40,9 @@ def test_a_translation_is_found(times, velocity):
 
 
 @needs_numba
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("size", [(48, 64), (33, 35), (17, 5), (2, 3), (2, 2)])
+@pytest.mark.parametrize(
+    ("dtype", "size"), [(torch.float64, (33, 35)), (torch.float32, (17, 5)), (torch.float64, (2, 2))]
+)
 def test_compiled_loops_do_what_the_tensors_do(dtype, size):
     """In a batch of different motion, with weights and times of their own, and from a flow to begin with."""
     still, far = moved((0.0, 0.0), *size), moved((1.5, -0.7), *size)
@@ -128,11 +130,10 @@ def energy(pictures, flow, attachment):
     return attachment * np.abs(differs).sum() + variation
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.02])
-def test_energy_is_as_low_as_that_of_scikit_image(noise):
+def test_energy_is_as_low_as_that_of_scikit_image():
     pictures = moved((1.4, -0.8))
     pictures[..., 20:30, 20:40] = moved((-1.0, 0.5), seed=2)[..., 20:30, 20:40]
-    pictures = pictures + noise * torch.randn(pictures.shape, generator=torch.Generator().manual_seed(0))
+    pictures = pictures + 0.02 * torch.randn(pictures.shape, generator=torch.Generator().manual_seed(0))
     ours = tvl1_flow(pictures, FORWARD, steady(pictures, 30.0))[0].numpy()
     first, second = pictures[0].numpy()
     down, right = optical_flow_tvl1(first, second, attachment=30, num_warp=20, num_iter=50, tol=0)

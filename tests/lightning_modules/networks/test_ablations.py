@@ -1,6 +1,5 @@
 """The ten variants of Table 3: what every one leaves out or puts in another's place."""
 
-import itertools
 import sys
 
 import pytest
@@ -159,7 +158,7 @@ def test_any_size_and_every_parameter_learns(letter, configs):
     assert network(spikes[:, :, :3, :3], flow[..., :3, :3]).shape == (2, 3, 9, 9)
 
 
-@pytest.mark.parametrize("letter", "cehij")
+@pytest.mark.parametrize("letter", "ceh")
 def test_precisions(letter, configs):
     spikes, _ = clip(1, 12, 12)
     network = variant(letter, configs, motion=Motions((0.93, 0.41, 0.57, 0.13)), skip=True)
@@ -176,11 +175,10 @@ def test_precisions(letter, configs):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("letter", ["c", "d"])
-def test_compiles_in_one_piece(letter, configs):
+def test_compiles_in_one_piece(configs):
     spikes, flow = clip()
-    flow = flow[:, None].expand(-1, 3, -1, -1, -1, -1) if letter == "d" else flow
-    network = variant(letter, configs)
+    flow = flow[:, None].expand(-1, 3, -1, -1, -1, -1)
+    network = variant("d", configs, representation="interval")
     compiled = torch.compile(network, fullgraph=True, backend="eager")
     with torch.no_grad():
         torch.testing.assert_close(compiled(spikes, flow), network(spikes, flow))
@@ -214,10 +212,10 @@ def test_features_without_weights_of_a_flat_scene_are_flat_whatever_moves(letter
     network = variant(letter, configs, scale=scale)
     spikes = torch.ones(1, 41, 12, 16)
     flow = torch.rand(1, 2, 2, 12, 16, generator=torch.Generator().manual_seed(0)) * 6 - 3
-    for color, mask in enumerate(bayer_mask(12, 16, scale=scale, dtype=torch.bool)):
-        features = network.representation[color](spikes * bayer_mask(12, 16)[color])
+    for color, mask in enumerate(bayer_mask(12, 16)):
+        features = network.representation[color](spikes * mask)
         for offsets in (network._offsets(flow, spikes)[color], network._offsets(None, spikes)[color]):
-            pixels = network._search(features, offsets, mask)
+            pixels = network._search(features, offsets, color)
             torch.testing.assert_close(pixels, torch.ones_like(pixels))
 
 
@@ -323,24 +321,6 @@ def test_f_neither_estimates_motion_nor_warps(configs, monkeypatch):
     assert type(variant("f", configs, refinement=True).refinement[0]) is FeatureRefinement
 
 
-def test_f_shows_every_feature_enlarged_bilinearly(configs):
-    spikes, _ = clip()
-    network = variant("f", configs, 3)
-    seen = []
-    network.refinement[1].register_forward_hook(lambda _, inputs, output: seen.append(inputs[0]))
-    network(spikes)
-    features = network.representation[1](spikes * bayer_mask(12, 16)[1])
-    expected = torch.nn.functional.interpolate(features[0], scale_factor=3, mode="bilinear", align_corners=False)
-    torch.testing.assert_close(seen[0][0], expected.flatten(0, 1))
-
-
-def test_g_merges_the_time_points_linearly(configs):
-    refine = variant("g", configs).refinement[0].double()
-    assert sum(p.numel() for p in refine.parameters()) == 11 * 2 * 4 * 9 + 4
-    one, other = torch.randn(2, 1, 11 * 2, 6, 6, dtype=torch.float64)
-    torch.testing.assert_close(refine(one) + refine(other), refine(one + other) + refine(0 * one))
-
-
 # H, I: reconstruction
 
 
@@ -356,16 +336,6 @@ def test_colours_help_each_other_except_in_h(letter, apart, configs):
 
 
 # checkpoints
-
-
-def test_variants_combine(configs):
-    spikes, _ = clip(1, 9, 7)
-    choices = ("bssr", "spikes", "interval"), ("correlated", "separate", "early"), (True, False), (True, False)
-    for values in itertools.product(*choices):
-        arguments = dict(zip(("representation", "reconstruction", "search", "refinement"), values, strict=True))
-        motion_fusion = "independent" if arguments["search"] else "joint"
-        network = CSCSR(1, **TINY, **arguments, motion_fusion=motion_fusion, motion=Motions())
-        assert network(spikes).isfinite().all()
 
 
 @pytest.mark.parametrize("letter", "cej")

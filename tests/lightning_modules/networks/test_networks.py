@@ -8,7 +8,7 @@ from lightning_modules.networks import CSCSR, ClassicalDecoder
 from lightning_modules.networks.layers import fold
 from lightning_modules.networks.refinement import FeatureRefinement
 from lightning_modules.networks.representation import SpikeRepresentation, WindowMeans
-from spikekit import bayer_mask, demosaic, linear_motion, mosaic, psnr, spike_integrate_fire, split_colors, tfi, tfp
+from spikekit import demosaic, linear_motion, mosaic, psnr, spike_integrate_fire, split_colors, tfi, tfp
 
 TINY = {"width": 4, "representation_width": 4, "features": 2, "stages": 2, "blocks": 1, "end_blocks": 1}
 
@@ -70,10 +70,10 @@ def test_search_undoes_motion_of_whole_bayer_periods():
     flow = torch.zeros(1, 2, 24, 60)
     flow[:, 0] = 2 * (times // 2)  # to the right, in sensor pixels, from the middle to the last time point
     offsets = linear_motion(-flow, flow, network.times, scale=3)
-    for mask in bayer_mask(24, 60, scale=3):
-        pixels = network._search(moving, offsets, mask)[..., 36:-36]
+    for color in range(3):
+        pixels = network._search(moving, offsets, color)[..., 36:-36]
         torch.testing.assert_close(pixels, pixels[:, times // 2 :][:, :1].expand_as(pixels), rtol=0, atol=1e-5)
-        wrong = network._search(moving, -offsets, mask)[..., 36:-36]
+        wrong = network._search(moving, -offsets, color)[..., 36:-36]
         assert (wrong - wrong[:, times // 2 :][:, :1]).abs().max() > 0.1
 
 
@@ -88,7 +88,7 @@ def test_flows_reach_their_time_points(given):
     network = CSCSR(3, **TINY, motion=Estimator())
     seen = []
     search = network._search
-    network._search = lambda features, offsets, mask: seen.append(offsets) or search(features, offsets, mask)
+    network._search = lambda features, offsets, color: seen.append(offsets) or search(features, offsets, color)
     spikes, flow = clip()
     flow[:, 0], flow[:, 1] = -1, 2
     network(spikes, flow) if given else network(spikes)

@@ -118,33 +118,13 @@ def test_weights_of_something_else(file, tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".ckpt", ".safetensors"])
-@pytest.mark.parametrize("length", [0, 5, 1000, -1])
-def test_damaged_files_say_so_in_one_line(file, suffix, length, capsys):
+def test_damaged_files_say_so_in_one_line(file, suffix):
     path = file.with_suffix(suffix)
-    path.write_bytes(path.read_bytes()[:length])
-    for args in (
-        ["predict", "clip.dat", "--weights", str(path), "-o", "out"],
-        ["export", str(path), "-o", "other.safetensors"],
-    ):
-        with pytest.raises(SystemExit) as stopped:
-            main(args)
-        assert str(stopped.value).startswith(f"lightning: {path}: not a ")
-        assert str(stopped.value).count("\n") == 0
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"motion": None},
-        {"state_dict": {1: torch.zeros(1)}},
-        {"state_dict": {"a": "b"}},
-        {"network": {"scale": torch.ones(1)}},
-    ],
-)
-def test_odd_checkpoints_say_so(tmp_path, changes):
-    torch.save({"network": {"class": "CSCSR"}, "state_dict": {}, **changes}, tmp_path / "odd.ckpt")
-    with pytest.raises(ValueError, match=r"odd.ckpt: not a checkpoint of lightning fit"):
-        read_weights(tmp_path / "odd.ckpt")
+    for length in (-1, 1000, 0):
+        path.write_bytes(path.read_bytes()[:length])
+        for args in (["predict", "clip.dat", "--weights", str(path)], ["export", str(path)]):
+            with pytest.raises(SystemExit, match=rf"^lightning: {path}: not a .*$"):
+                main([*args, "-o", "other.safetensors"])
 
 
 def test_motion_of_no_class_is_refused(file, tmp_path):
@@ -184,9 +164,7 @@ def test_predict_needs_nothing_but_weights(file, tmp_path, monkeypatch):
     ("named", "expected"),
     [
         ([], Spike2Flow),
-        (["-c", "{still}"], ZeroFlow),
         (["-c{still}"], ZeroFlow),
-        (["--model.network.motion", "ZeroFlow"], ZeroFlow),
         (["--model.network.motion", "ZeroFlow", "-c", "{configs}/x2.yaml"], ZeroFlow),
         (["--model.network.motion.iterations", "1"], Spike2Flow),
     ],
@@ -206,11 +184,9 @@ def test_motion_is_that_of_the_weights_unless_another_is_named(named, expected, 
 @pytest.mark.parametrize(
     ("named", "expected"),
     [
-        ([], 0.3),
         (["-c", "{configs}/data/films.yaml"], 0.3),
         (["-c", "{configs}/data/paper.yaml"], 0.6),
         (["-c", "{configs}/data/paper.yaml", "--model.network.alpha", "0.5"], 0.5),
-        (["--model.network.alpha", "0.4"], 0.4),
     ],
 )
 def test_gain_is_that_of_the_weights_unless_another_is_named(named, expected, tmp_path, configs, monkeypatch):
