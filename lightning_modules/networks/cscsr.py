@@ -209,11 +209,11 @@ class CSCSR(Network):
         planes = split_colors(spikes, self.pattern)
         # one colour after the other: high resolution takes memory
         features = (encode(plane, **told) for encode, plane in zip(self.representation, planes, strict=True))
-        if self._by_sites(spikes, flow):
-            pixels = self._search_sites(features, flow, spikes)
-            return [refine(part) for refine, part in zip(self.refinement, pixels, strict=True)]
         if not self.config.search or (flow is None and self.colors == 1):  # at rest, all pixels of grey are known
             pixels = (enlarge(part, self.scale) for part in features)
+        elif self._by_sites(spikes, flow):
+            pixels = self._search_sites(features, flow, spikes)
+            return [refine(part) for refine, part in zip(self.refinement, pixels, strict=True)]
         else:
             search = self._search_in_graph if is_exporting() else self._search
             pixels = map(search, features, self._offsets(flow, spikes), range(self.colors))
@@ -223,12 +223,10 @@ class CSCSR(Network):
     def _by_sites(self, spikes: Tensor, flow: Tensor | None) -> bool:
         """Whether the temporal pixels of a site can be looked up together, without a derivative in the flow."""
         config = self.config
-        if flow is None and self.colors == 1:  # all pixels are known, and nothing is searched
-            return False
         learned = flow is not None and flow.requires_grad and torch.is_grad_enabled()
         if learned or not self.by_sites or is_exporting() or torch.jit.is_tracing():
             return False
-        known = config.search and config.representation == "bssr" and config.neighbors <= 4
+        known = config.representation == "bssr" and config.neighbors <= 4
         return known and self.fold == self.scale and min(spikes.shape[-2:]) >= SMALLEST
 
     def _search_sites(self, features: Iterable[Tensor], flow: Tensor | None, spikes: Tensor) -> Iterator[Tensor]:

@@ -226,30 +226,16 @@ class RecurrentCSCSR(CSCSR):
         self.fusion.rest.bias[:picture] *= factor
 
     def features(self, spikes: Tensor, flow: Tensor | None, noise: float | Tensor | None = None) -> Tensor:
-        """Return the features of a clip's key frame, from this clip alone.
-
-        Args:
-            spikes: (B, N, H, W).
-            flow: (B, 2, 2, H, W), or None where nothing moves.
-            noise: see :class:`CSCSR`.
-
-        Returns:
-            What the picture is made of, (B, width, H, W).
-        """
+        """Return what a picture is made of, (B, width, H, W), from a clip alone; without flow nothing moves."""
         spikes = spikes.to(self.reconstruction.rgb.weight.dtype)
         told = self._told(noise, spikes)
         return self.reconstruction.features(self._colors(spikes, flow, **told), **told)
 
     def advance(self, features: Tensor, spikes: Tensor, *neighbors: Tensor) -> Tensor:
-        """Return the state of a key frame: its picture, as channels, and a memory.
-
-        Args:
-            features: see :meth:`features`.
-            spikes: (B, N, H, W), its clip.
-            neighbors: states of its neighbours, moved to where they are in it.
+        """Return the state of a key frame, given its features, its clip, and the states of its neighbours, moved to it.
 
         Returns:
-            (B, 3 s^2 + memory, H, W), or (B, s^2 + memory, H, W) of a grey sensor
+            Its picture, as channels, and a memory, (B, 3 s^2 + memory, H, W), or (B, s^2 + memory, H, W) of grey.
         """
         rgb = self.reconstruction.rgb(features)
         if self.config.skip:
@@ -268,14 +254,9 @@ class RecurrentCSCSR(CSCSR):
         return F.pixel_shuffle(self._parted(state)[0], self.scale)
 
     def flow_to(self, flow: Tensor, clocks: int) -> Tensor:
-        """Return the flow to what is so many clocks later, or earlier where they are negative.
+        """Return the flow, (B, 2, H, W), to what is so many clocks later, or earlier where they are negative.
 
-        Args:
-            flow: (B, 2, 2, H, W), to the first and to the last time point of the clip.
-            clocks: later.
-
-        Returns:
-            The motion, taken to go on as it is, (B, 2, H, W).
+        That of the clip, (B, 2, 2, H, W), is taken to go on as it is.
         """
         first, middle, last = self.flow_times
         return flow[:, 1] * (clocks / (last - middle)) if clocks > 0 else flow[:, 0] * (-clocks / (middle - first))

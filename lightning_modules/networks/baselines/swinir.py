@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Literal
 
 import torch
@@ -16,6 +15,7 @@ from lightning_modules.networks.baselines.pictures import (
     cut_to,
     enlarge_picture,
     mirror_to_multiple,
+    sub_pixel_convolutions,
     whole_sizes,
 )
 from lightning_modules.networks.layers import conv
@@ -35,7 +35,7 @@ class SwinIR(Baseline):
     betas of 0.9 and 0.99, 500,000 steps, halved at 250, 400, 450 and 475 thousand.
 
     Args:
-        scale: super-resolution factor; 1, 3 or a power of two where ``upsampler`` is ``"steps"``.
+        scale: super-resolution factor.
         frames: spike frames N of a clip, odd.
         pattern: Bayer phase of the streams.
         alpha: gain of the camera, what a white pixel receives per clock in thresholds; pictures are divided by it.
@@ -44,7 +44,7 @@ class SwinIR(Baseline):
         layers: attention layers of a group; windows are shifted by half their side in every other one.
         heads: attention heads, which divide ``width``.
         upsampler: ``"direct"``, one sub-pixel convolution, is the light network; ``"steps"``, 64 channels that are
-            enlarged by 2 or 3 at a time, the full one.
+            enlarged by a prime factor at a time, the full one.
         drop_path: in training, the share of clips that skip the last layer, rising from 0 at the first.
         skip: learn what to add to the bicubically enlarged picture. The publication has no such skip; with it
             training starts where demosaicing ends.
@@ -57,8 +57,8 @@ class SwinIR(Baseline):
         - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
 
     Raises:
-        ValueError: a size below 1, heads that do not divide the width, an unknown upsampler or a scale that it does
-            not have, a ``drop_path`` outside [0, 1).
+        ValueError: a size below 1, heads that do not divide the width, an unknown upsampler, a ``drop_path`` outside
+            [0, 1).
 
     Example:
         >>> network = SwinIR(scale=2, width=12, groups=1, layers=2, heads=2)
@@ -217,8 +217,4 @@ def _direct(width: int, scale: int) -> nn.Sequential:
 
 
 def _in_steps(width: int, scale: int) -> nn.Sequential:
-    steps = [3] if scale == 3 else [2] * round(math.log2(scale))
-    if math.prod(steps) != scale:
-        raise ValueError(f"scale: expected 1, 3 or a power of two with upsampler 'steps', got {scale}")
-    enlarge = [layer for step in steps for layer in (conv(64, 64 * step**2), nn.PixelShuffle(step))]
-    return nn.Sequential(conv(width, 64), nn.LeakyReLU(), *enlarge, conv(64, 3))
+    return nn.Sequential(conv(width, 64), nn.LeakyReLU(), *sub_pixel_convolutions(64, scale), conv(64, 3))

@@ -1,10 +1,8 @@
 import pytest
 import torch
-from scipy.ndimage import convolve1d
 
 from lightning_modules.motion import ClassicalFlow, MotionEstimator, ZeroFlow, classical
 from spikekit import mosaic, spike_integrate_fire, tfp_at
-from spikekit.flow import tvl1
 
 TIMES = (5, 20, 35)
 
@@ -113,30 +111,10 @@ def test_scene_without_contrast_is_still():
         assert all(not flow.any() for flow in ClassicalFlow()(torch.full((1, 41, 16, 16), level), TIMES, "RGGB"))
 
 
-@pytest.mark.parametrize(
-    ("frames", "rate", "window"),
-    [
-        (41, 0.01, 13),
-        (101, 0.0, 33),
-        (101, 0.05, 25),
-        (401, 0.5, 17),
-        (401, 0.011, 51),
-    ],
-)
-def test_the_less_light_the_longer_are_the_means(frames, rate, window):
-    clip = torch.zeros(frames, 20, 20)
-    clip.flatten()[: round(rate * clip.numel())] = 1
-    for dtype in (torch.uint8, torch.bool, torch.bfloat16, torch.float64):
-        assert classical._clips_by_window(clip.to(dtype)[None]) == {window: [0]}
-
-
 def test_every_clip_of_a_batch_is_seen_by_its_own_light():
     dark = moving((0.2, 0.1), frames=101, alpha=0.05)
     bright = moving((0.2, 0.1), frames=101, alpha=0.8)
     both = torch.cat([dark, bright, moving((-0.2, 0.1), frames=101, alpha=0.05)])
-    (longer, first), (shorter, second) = classical._clips_by_window(both).items()
-    assert longer > shorter
-    assert (first, second) == ([0, 2], [1])
     for estimate in (ClassicalFlow(), ClassicalFlow().channel_flows):
         together = estimate(both, (5, 50, 95), "RGGB")
         for n in range(3):
@@ -155,35 +133,6 @@ def test_motion_in_dim_light_is_seen_by_longer_means(monkeypatch):
     longer = error()
     monkeypatch.setattr(classical, "_LIGHT", 0)
     assert longer < 0.7 * error()
-
-
-def expected_flows(pictures, raw, clock, squared, border):
-    """Flows between decoded pictures (3, H, W), each half of the clip by itself where motion bends; here it does not.
-
-    ``squared`` are the weights of the raw pixels in a picture, along an axis, squared: noise adds up by them.
-    """
-    steps = torch.linspace(0, 1, 1025)[:-1]
-    noise = torch.from_numpy(
-        classical.noise_by_rate(13).numpy()[torch.searchsorted(steps, raw.mean(0), right=True) - 1]
-    )
-    for axis in range(2):
-        noise = torch.from_numpy(convolve1d(noise.numpy(), squared, axis, mode=border))
-    attachment = 120 / (1 + noise / 0.002**2)
-    times = torch.tensor([[clock[0] - clock[1], clock[2] - clock[1]]]) / (clock[2] - clock[0])
-    return tvl1.tvl1_flow(pictures[None, ::2], times, attachment[None])[0] / (clock[2] - clock[0]) * 15
-
-
-def test_joint_flow_is_that_of_grey_pictures():
-    spikes, clock = moving((0.2, -0.1), pattern="GBRG"), torch.arange(41.0).reshape(41, 1, 1)
-    binomial, raw, when = [0.25, 0.5, 0.25], [], []
-    for n in (10, 20, 30):
-        raw.append(tfp_at(spikes[0].float(), n, 13, order=3))
-        when.append(tfp_at(clock, n, 13, order=3).item())
-    raw = torch.stack(raw)
-    grey = torch.from_numpy(convolve1d(convolve1d(raw.numpy(), binomial, 1, mode="mirror"), binomial, 2, mode="mirror"))
-    expected = expected_flows(grey, raw, when, [0.0625, 0.25, 0.0625], "mirror")
-    to_first, to_last = ClassicalFlow()(spikes, TIMES, "GBRG")
-    torch.testing.assert_close((to_last - to_first)[0] / 2, expected, rtol=1e-2, atol=2e-2)
 
 
 @pytest.mark.parametrize("step", [3, 63, 512])

@@ -1,9 +1,7 @@
 """Weights in files, from Python and as they are typed."""
 
 import json
-import os
 import pickle
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +17,7 @@ from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
 from lightning_modules.networks import CSCSR, ClassicalDecoder
 from lightning_modules.storage.pretrained import load_weights, read_weights, write_weights
 from lightning_modules.tasks.super_resolution import SuperResolution
-from spikekit import read_picture, write_picture, write_spikes
+from spikekit import write_picture
 
 TINY = {"scale": 2, "width": 4, "representation_width": 4, "features": 1, "stages": 1, "end_blocks": 1, "skip": True}
 FLOW_TINY = {"window": 5, "widths": (4,), "features": 4, "hidden": 4, "correlation": (4, 4), "motion": 4, "head": 4}
@@ -61,12 +59,6 @@ def test_weights_serve_cameras_of_another_gain(file):
     own, other = CSCSR.from_pretrained(file), CSCSR.from_pretrained(file, alpha=0.6)
     assert [own.settings["alpha"], other.settings["alpha"]] == [0.4, 0.6]
     torch.testing.assert_close(other(SPIKES), own(SPIKES) * (0.4 / 0.6))
-
-
-@pytest.mark.skipif(os.name != "posix", reason="modes of files are those of POSIX")
-def test_others_may_read_what_was_exported(file):
-    (file.parent / "any").touch()
-    assert file.stat().st_mode == (file.parent / "any").stat().st_mode
 
 
 @pytest.mark.parametrize("suffix", [".ckpt", ".safetensors"])
@@ -145,19 +137,6 @@ def test_a_module_can_be_pickled():
     module = SuperResolution(CSCSR.from_pretrained("cscsr_tiny_x4"))
     spikes = torch.ones(1, 41, 8, 8)
     assert torch.equal(pickle.loads(pickle.dumps(module))(spikes), module(spikes))
-
-
-@pytest.mark.slow
-def test_predict_needs_nothing_but_weights(file, tmp_path, monkeypatch):
-    """In a process of its own, from a folder that holds the weights and the recording alone."""
-    write_spikes(tmp_path / "clip.dat", SPIKES[0])
-    recording = ["clip.dat", "--height", "8", "--width", "10", "--white", "0.4", "--precision", "32-true"]
-    command = [sys.executable, "-m", "lightning_modules", "predict", *recording, "--weights", file.name, "-o", "out"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    expected = network()(SPIKES)[0].clamp(0, 1)
-    [picture] = (tmp_path / "out").glob("*.png")
-    assert (read_picture(picture) - expected).abs().max() < 0.51 / 255
 
 
 @pytest.mark.parametrize(

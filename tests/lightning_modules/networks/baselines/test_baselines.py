@@ -202,7 +202,6 @@ def test_a_mosaic_moved_by_a_pixel_is_one_of_another_phase(case):
         ("SpikeSRNetLike", {"every": 28}, "length, every: expected .*, got 13 and 28 with 41 frames"),
         ("SwinIR", {"width": 12, "heads": 5}, "heads: expected a divisor of width = 12, got 5"),
         ("SwinIR", {"upsampler": "bicubic"}, "upsampler: expected 'direct' or 'steps', got 'bicubic'"),
-        ("SwinIR", {"upsampler": "steps", "scale": 6}, "scale: expected 1, 3 or a power of two .*, got 6"),
         ("SwinIR", {"drop_path": 1.0}, r"drop_path: expected a share in \[0, 1\), got 1.0"),
         ("TSCNN", {"tfp_window": 40}, "tfp_window: expected an odd number, got 40"),
         ("TSCNN", {"width": 12}, "width: expected a multiple of 8, got 12"),
