@@ -114,9 +114,10 @@ def test_damaged_files_say_so_in_one_line(file, suffix):
     path = file.with_suffix(suffix)
     for length in (-1, 1000, 0):
         path.write_bytes(path.read_bytes()[:length])
-        for args in (["predict", "clip.dat", "--weights", str(path)], ["export", str(path)]):
+        export = ["export", str(path), "-o", "other.safetensors"]
+        for args in (["predict", "clip.dat", "--weights", str(path), "-o", "out"], export):
             with pytest.raises(SystemExit, match=rf"^lightning: {path}: not a .*$"):
-                main([*args, "-o", "other.safetensors"])
+                main(args)
 
 
 def test_motion_of_no_class_is_refused(file, tmp_path):
