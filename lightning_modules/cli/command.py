@@ -104,8 +104,7 @@ class Command(LightningCLI):
 
     def subcommands(self) -> dict[str, set[str]]:
         """Return only the verb that was typed, because building the parser of every verb takes time."""
-        verbs = {verb: LightningCLI.subcommands()[verb] for verb in ("fit", "validate", "test")}
-        return {verb: verbs[verb] for verb in self.typed[:1] if verb in verbs} or verbs
+        return {verb: LightningCLI.subcommands()[verb] for verb in self.typed[:1]}
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:  # noqa: D102
         parser.add_argument(

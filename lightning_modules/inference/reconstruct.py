@@ -25,7 +25,6 @@ from spikekit import __version__
 from spikekit.color.cfa import GREY, PATTERNS
 from spikekit.io.image_bytes import to_bytes
 from spikekit.recording import Recording, open_recording
-from spikekit.timing import duration
 
 # how many times as long as its clips a recording is whose first and last pictures a longer clip may cost
 _MANY = 10
@@ -34,8 +33,6 @@ _WORTH_ROOM = 0.3
 # clocks between two pictures of the network up to which those between, interpolated, lose nothing: in fast scenes, and
 # in slower ones
 _APART, _FARTHER_APART = 6, 12
-# milliseconds a pixel of a picture, written as PNG by one core
-_WRITING = 7e-5
 # white pixels between two pictures
 _GAP = 4
 
@@ -326,20 +323,12 @@ def _chosen(
     room = max(FRAMES, recording.frames // _MANY if frame is None else around)
     asked = {"scale": scale, "size": clips.size, "film": film, "white": white, "noisy": noisy}
     choice = choose(speed=speed, budget=budget, frames=room, **asked)
-    clips = RecordingClips(recording, choice.preset.clip, frame)
     interpolated = _interpolated(choice.preset, every, speed)
-
-    def took(one: Choice, speed: str | None) -> str:
-        network = one.ms / (_interpolated(one.preset, every, speed) + 1)
-        return duration(len(clips) * (network + _WRITING * scale**2 * clips.size[0] * clips.size[1]) / 1e3)
-
-    speeds = list(SPEEDS)
-    sooner = speeds[max(speeds.index(speed) - 1, 0)] if speed else None
-    other = choose(speed=sooner, frames=room, **asked) if sooner else choice
-    below = f"{other.below:.2f} dB below the best"
-    instead = "" if other == choice else f"; --speed {sooner}: {took(other, sooner)}, {below}"
-    count = "1 picture" if len(clips) == 1 else f"{len(clips)} pictures"
-    said = [str(choice), f"{count}, written as PNG: about {took(choice, speed)}{instead}"]
+    said = [str(choice)]
+    if speed not in (None, "fastest"):
+        sooner = list(SPEEDS)[list(SPEEDS).index(speed) - 1]
+        other = choose(speed=sooner, frames=room, **asked)
+        said += [f"sooner, --speed {sooner}: {other}"] if other != choice else []
     if interpolated:
         said.append(
             f"{interpolated} of {interpolated + 1} pictures are interpolated, being {every} frames apart; "

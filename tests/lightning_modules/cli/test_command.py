@@ -45,17 +45,10 @@ def overlay(tmp_path_factory):
     return path
 
 
-@pytest.fixture(autouse=True)
-def _argv(monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["lightning"])
-
-
 @pytest.fixture(scope="module")
 def trained(overlay, tmp_path_factory):
     output = tmp_path_factory.mktemp("run")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["lightning"])
-        main(["fit", "-c", str(X4), "-c", str(overlay), "-o", str(output)])
+    main(["fit", "-c", str(X4), "-c", str(overlay), "-o", str(output)])
     return output
 
 
@@ -239,9 +232,7 @@ def test_config_yaml_stays_the_record_of_the_training(trained, overlay, configs)
 def begun(overlay, tmp_path_factory):
     """What a checkpoint holds before the first step."""
     words = ["fit", "-c", str(X4), "-c", str(overlay), "-o", str(tmp_path_factory.mktemp("begun"))]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["lightning"])
-        run = run_command(words, Fit)
+    run = run_command(words, Fit)
     model, parts = run.model, run.model.configure_optimizers()
     content = {"state_dict": model.state_dict(), "epoch": 0, "global_step": 0}
     content |= {"optimizer_states": [parts["optimizer"].state_dict()]}

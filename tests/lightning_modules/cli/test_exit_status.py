@@ -100,7 +100,6 @@ def test_one_line(words, status, named, tmp_path, monkeypatch, capfd):
     for name, content in FILES.items():
         (tmp_path / name).write_bytes(content)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["lightning"])
     with pytest.raises(SystemExit) as end:
         main(words.split())
     said = capfd.readouterr().err
@@ -130,7 +129,6 @@ SOON = "predict a.npz --speed fastest --calibration none -o"
 def test_two_runs_of_a_verb_in_one_folder(words, folder, name, tmp_path, monkeypatch):
     """One of them would go on with what the other writes; said before anything is computed."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["lightning"])
     (tmp_path / "tiny.yaml").write_bytes(FILES["tiny.yaml"])
     write_spikes("a.npz", torch.zeros(41, 4, 4))
     with locked_folder(folder, "run", name), pytest.raises(SystemExit, match=f"{folder}: another .* is at work here"):

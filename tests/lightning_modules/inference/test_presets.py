@@ -1,7 +1,6 @@
 """Settings by what they may cost, from Python and as they are typed."""
 
 import csv
-import sys
 from itertools import pairwise
 
 import pytest
@@ -30,11 +29,6 @@ ROWS = [
     ("what no column says", 31.0, 1, 90, {}, ""),
     ("broken", "", "", "", {"weights": "nowhere"}, "there is none"),
 ]
-
-
-@pytest.fixture(autouse=True)
-def _argv(monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["lightning"])
 
 
 @pytest.fixture(name="table")
