@@ -28,7 +28,6 @@ from spikekit.timing import duration
 LEAST_GAIN = 0.1
 
 _WRITTEN = "adapted.safetensors"
-_LEAST_SIDE = 4  # pixels of a recording
 
 
 def parser() -> argparse.ArgumentParser:
@@ -88,8 +87,7 @@ def adapt(args: Sequence[str]) -> None:
 
 def _student(weights: str) -> Network:
     student = Network.from_pretrained(weights)
-    learns = any(parameter.requires_grad for parameter in student.parameters())
-    if isinstance(student, RecurrentCSCSR) or not learns or student.settings.get("motion_fusion", "joint") != "joint":
+    if isinstance(student, RecurrentCSCSR) or student.settings.get("motion_fusion", "joint") != "joint":
         raise UsageError(f"--weights: expected a network that learns from single clips and one flow, got {weights}")
     return student.eval()
 
@@ -108,9 +106,6 @@ def clips_and_teacher(
     Raises:
         ValueError: the recording is too short or too small, or the teacher does not fit.
     """
-    clips = RecordingClips(recording, student.frames, crop_to=student.pattern)
-    if min(clips.size) < _LEAST_SIDE:
-        raise ValueError(f"{recording.path}: expected at least {_LEAST_SIDE} x {_LEAST_SIDE} pixels, got {clips.size}")
     name = teacher or _slowest(recording, student, noisy)
     network = Network.from_pretrained(name)
     for setting in ("scale", "pattern"):

@@ -2,12 +2,10 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-import yaml
 
 from lightning_modules.inference import export
 from lightning_modules.inference.export import as_exported, difference, example_inputs, export_network
@@ -15,27 +13,28 @@ from lightning_modules.motion import ClassicalFlow, ZeroFlow
 from lightning_modules.networks import CSCSR, NETWORKS, ClassicalDecoder, RecurrentCSCSR
 from spikekit import write_spikes
 
-CONFIGS = Path(__file__).parents[3] / "configs"
 TINY = {"width": 4, "representation_width": 4, "features": 1, "stages": 1, "blocks": 1, "end_blocks": 1}
 
-ABLATIONS = {
-    path.stem: yaml.safe_load(path.read_text())["model"]["network"]["init_args"]
-    for path in sorted((CONFIGS / "ablation").glob("*.yaml"))
-}
+ABLATIONS = [
+    {"representation": "spikes", "reconstruction": "separate"},
+    {"representation": "interval", "reconstruction": "early"},
+    {"global_perception": False, "refinement": False},
+    {"motion_fusion": "independent"},
+    {"motion_fusion": "assembled", "resolution": "sensor"},
+    {"search": False, "refinement": False},
+]
 BASELINES = {
     "TSCNN": {"width": 8, "blocks": 1, "low": 1, "high": 1},
     "RealRawVSR": {"width": 8, "blocks": 2},
     "SwinIR": {"width": 12, "groups": 1, "layers": 2, "heads": 2},
     "BasicVSR": {"width": 8, "blocks": 1},
     "VidarSR": {"width": 8, "features": 4},
-    "SpikeSRNetLike": {"width": 8, "maps": 4, "corrections": 1},
+    "SpikeSRNetLike": {"width": 8, "maps": 4, "corrections": 1, "per_channel": True},
 }
-STARS = {f"{name}*": {**BASELINES[name], "per_channel": True} for name in ("VidarSR", "SpikeSRNetLike")}
 MADE = {
-    **{f"CSCSR {name}": (CSCSR, {**TINY, **settings}) for name, settings in ABLATIONS.items()},
-    "CSCSR sensor": (CSCSR, {**TINY, "resolution": "sensor"}),
+    **{f"CSCSR {', '.join(map(str, changes.values()))}": (CSCSR, {**TINY, **changes}) for changes in ABLATIONS},
     "RecurrentCSCSR": (RecurrentCSCSR, {**TINY, "fusion_width": 4, "fusion_blocks": 1, "memory": 2}),
-    **{name: (NETWORKS[name.removesuffix("*")], settings) for name, settings in {**BASELINES, **STARS}.items()},
+    **{name: (NETWORKS[name], settings) for name, settings in BASELINES.items()},
     **{method: (ClassicalDecoder, {"method": method}) for method in ("tfi", "tfp")},
 }
 
@@ -112,14 +111,14 @@ def test_every_network_as_onnx(name, tmp_path, program):
 def test_what_an_export_takes(tmp_path):
     film = RecurrentCSCSR(scale=2, **MADE["RecurrentCSCSR"][1])
     cases = {
-        "spikes": CSCSR(scale=2, **TINY, **ABLATIONS["f"]),  # searches nothing, so no motion
+        "spikes": CSCSR(scale=2, **TINY, search=False, refinement=False),  # searches nothing, so no motion
         "spikes flow": CSCSR(scale=2, **TINY),
         "spikes flow state every": film,
     }
     for names, network in cases.items():
         assert " ".join(example_inputs(network, (16, 20))) == names
     assert [*example_inputs(film, (16, 20), still=True)] == ["spikes", "state"]
-    independent = CSCSR(scale=2, **TINY, **ABLATIONS["d"])
+    independent = CSCSR(scale=2, **TINY, motion_fusion="independent")
     assert example_inputs(independent, (16, 20))["flow"].shape == (1, 3, 2, 2, 16, 20)
 
 
