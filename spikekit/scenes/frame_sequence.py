@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypeVar
 
 import torch
@@ -14,8 +15,7 @@ from torch import Tensor
 from spikekit.check import check_picture, check_positive, check_whole
 from spikekit.color.cfa import bin_to_sensor, cfa_pattern
 from spikekit.flow.interpolate import Blend, FlowInterpolation, Still
-from spikekit.scenes.adaptive_sampling import Plan, SceneProfile, profile_interval
-from spikekit.scenes.frame_interval import Interval
+from spikekit.scenes.adaptive_sampling import Plan, Region, SceneProfile, profile_interval
 from spikekit.sensor.noise import SensorNoise
 from spikekit.sensor.simulate import SpikeSensor
 from spikekit.warp.warp import flow_warp
@@ -106,7 +106,7 @@ class FrameSequence:
         if plan is None and isinstance(self.interpolation, (Blend, Still)):  # these know no motion
             self.fixed = Plan() if isinstance(self.interpolation, Blend) else Plan.everything(self.clocks)
         self._views: dict[int, Tensor] = {}
-        self._intervals: dict[int, Interval] = {}
+        self._intervals: dict[int, _Interval] = {}
         self._size = tuple(self._read(0).shape[1:])
         cell = 2 * scale
         self.height, self.width = (side // cell * cell for side in self._size)
@@ -306,10 +306,66 @@ class FrameSequence:
         names = "scale", "pattern", "alpha", "clocks", "spike_tolerance", "motion"
         return profile_interval(first, second, **{name: getattr(self, name) for name in names})
 
-    def _interval(self, index: int) -> Interval:
+    def _interval(self, index: int) -> _Interval:
         if not 0 <= index < len(self.frames) - 1:
             raise ValueError(f"interval: expected 0 to {len(self.frames) - 2}, got {index}")
-        return _kept(self._intervals, index, lambda: Interval(self, self._view(index), self._view(index + 1)))
+        return _kept(self._intervals, index, lambda: _Interval(self, self._view(index), self._view(index + 1)))
+
+
+class _Interval:
+    """Two neighbouring frames and the light between them, computed on demand, by the settings of their film."""
+
+    def __init__(self, film: FrameSequence, first: Tensor, second: Tensor) -> None:
+        self.film, self.frames = film, (first, second)
+        self._betweens: dict[Region | None, Any] = {}
+        self._latent: dict[int, Tensor] = {}
+
+    @cached_property
+    def profile(self) -> SceneProfile:
+        """Change within the interval."""
+        return self.film._profile(*self.frames)
+
+    @cached_property
+    def plan(self) -> Plan:
+        """Moments that are modelled."""
+        film = self.film
+        return film.fixed or self.profile.plan(spike_tolerance=film.spike_tolerance, step=film.step)
+
+    @cached_property
+    def _ends(self) -> tuple[Tensor, ...]:
+        return tuple(map(self.film._seen, self.frames))
+
+    def between(self, region: Region | None = None) -> Any:
+        """Return the interpolation for a region of the sensor, or for all of it when not given."""
+        if region not in self._betweens:
+            ends = self.frames
+            if region is not None:
+                top, left, height, width = (self.film.scale * pixels for pixels in region)
+                ends = tuple(frame[:, top : top + height, left : left + width].contiguous() for frame in ends)
+            self._betweens[region] = self.film.interpolation(*ends)
+        return self._betweens[region]
+
+    def light(self, phase: int) -> Tensor:
+        """Return the light at a clock of the interval, 1 to ``clocks - 1``."""
+        steps, region, clocks = self.plan.latent + 1, self.plan.region, self.film.clocks
+        blended = torch.lerp(*self._ends, phase / clocks)
+        if steps == 1:
+            return blended
+        before, rest = divmod(phase * steps, clocks)
+        part = self._at(before, steps)
+        if rest:
+            part = torch.lerp(part, self._at(before + 1, steps), rest / clocks)
+        if region is None:
+            return part
+        top, left, height, width = region
+        blended[top : top + height, left : left + width] = part
+        return blended
+
+    def _at(self, number: int, steps: int) -> Tensor:
+        """Return the light of latent frame ``number`` in the plan's region; 0 and ``steps`` are the ends."""
+        if number not in self._latent:
+            self._latent[number] = self.film._seen(self.between(self.plan.region).at(number / steps))
+        return self._latent[number]
 
 
 def _kept(kept: dict[int, T], index: int, make: Callable[[], T]) -> T:

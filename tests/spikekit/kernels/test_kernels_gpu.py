@@ -161,7 +161,7 @@ def same_on_both(function, *tensors, eps, absolute):
     """Results, and gradients of their squares, on CPU and GPU."""
     found = {}
     for device in ("cpu", "cuda"):
-        leaves = [tensor.to(device).requires_grad_() for tensor in tensors]
+        leaves = [tensor.detach().to(device).requires_grad_() for tensor in tensors]
         results = function(*leaves)
         loss = sum(result.square().sum() for result in results if result.requires_grad)
         found[device] = [r.detach().cpu() for r in (*results, *torch.autograd.grad(loss, leaves))]
