@@ -52,7 +52,6 @@ class VideoFrames(Sequence[Tensor]):
         height: rows of a frame.
         width: columns of a frame.
         fps: frames a second, of a video file that says so; ``None`` for a folder.
-        names: of the files in a folder, or the numbers of the frames in a video file.
     """
 
     def __init__(self, source: _Pictures | _Film, chosen: range) -> None:
@@ -62,7 +61,7 @@ class VideoFrames(Sequence[Tensor]):
 
     @property
     def names(self) -> list[str]:
-        """Names of the frames."""
+        """Names of the files in a folder, or numbers of the frames in a video file."""
         return list(map(self._source.name, self._chosen))
 
     def __len__(self) -> int:
