@@ -85,30 +85,22 @@ class Spike2Flow(MotionEstimator):
         frozen: bool = False,
     ) -> None:
         super().__init__()
-        sizes = [*widths, blocks, features, hidden, *correlation, head, levels, radius, iterations]
+        one_each = {"blocks": blocks, "features": features, "hidden": hidden, "head": head}
+        one_each |= {"levels": levels, "radius": radius}
+        several = {"widths": list(widths), "correlation": list(correlation)}
+        for name, sizes in [*several.items(), *((name, [size]) for name, size in one_each.items())]:
+            if not sizes or min(sizes) < 1:
+                raise ValueError(f"{name}: expected 1 or more, got {sizes}")
+        if iterations < 1 or attention < 0:
+            raise ValueError(f"iterations, attention: expected 1 or more and 0 or more, got {iterations}, {attention}")
         if window < 1 or window % 2 == 0:
             raise ValueError(f"window: expected an odd number of frames, got {window}")
-        if attention < 0:
-            raise ValueError(f"attention: expected 0 or more channels, got {attention}")
-        if not widths or min(sizes) < 1:
-            raise ValueError(
-                "widths, blocks, features, hidden, correlation, head, levels, radius, iterations: expected 1 or more "
-                f"of each, got {', '.join(map(str, sizes))}"
-            )
         if motion < 4 or motion % 2:
             raise ValueError(f"motion: expected an even number of at least 4 channels, got {motion}")
         self.settings: dict[str, Any] = {
-            "window": window,
-            "widths": list(widths),
-            "blocks": blocks,
-            "features": features,
-            "attention": attention,
-            "hidden": hidden,
-            "correlation": list(correlation),
-            "motion": motion,
-            "head": head,
-            "levels": levels,
-            "radius": radius,
+            **{"window": window, "attention": attention, "motion": motion},
+            **one_each,
+            **several,
         }
         self.window, self.iterations, self.frozen = window, iterations, frozen
         self.network = RecurrentFlow(**self.settings)

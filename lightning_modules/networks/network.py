@@ -19,7 +19,7 @@ from lightning_modules.storage.settings import own_class
 from spikekit.check import check_planes
 
 #: settings of all networks
-_ALL_HAVE = {"scale": None, "frames": None, "pattern": None, "alpha": None}.keys()
+_ALL_HAVE = "scale", "frames", "pattern", "alpha"
 
 
 class Network(nn.Module):
@@ -117,7 +117,7 @@ class Network(nn.Module):
             raise ValueError(f"{weights}: expected weights of {cls.__name__}, got those of {named}")
         takes = signature(kind).parameters
         # a user's own constructor need not take all that every network has
-        missing = set() if _ours(kind) else _ALL_HAVE - takes.keys()
+        missing = set() if _ours(kind) else {*_ALL_HAVE} - takes.keys()
         settings = {name: value for name, value in found.settings.items() if name not in missing}
         check_weights(replace(found, settings=settings), {named: kind, **ESTIMATORS})
         settings.pop("class")

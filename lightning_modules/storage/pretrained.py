@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from lightning_modules.registry import FUSION, find_model, list_models
 from lightning_modules.storage.checkpoint import check_tensors, read_checkpoint
 from lightning_modules.storage.error_model import read_error_model
-from lightning_modules.storage.settings import check_plain, check_shapes
+from lightning_modules.storage.settings import check_plain, check_shapes, load_state
 from spikekit.arguments import one_line
 from spikekit.io.whole_file import whole_file
 
@@ -220,11 +220,7 @@ def load_weights(network: nn.Module, weights: Weights, keep_motion: bool = False
     check_settings(network, weights.settings and {**weights.settings, **exchanged}, weights.source)
     motion = getattr(network, "motion", None)
     tensors = weights.tensors if motion is None else with_own_motion(weights.tensors, motion, keep=keep_motion)
-    try:
-        network.load_state_dict(tensors)
-    except RuntimeError as error:
-        reason = str(error).splitlines()[-1].strip()
-        raise ValueError(f"{weights.source}: weights that do not fit ({reason})") from error
+    load_state(network, tensors, weights.source)
     if ratio != 1:
         network.scale_picture(ratio)
     if hasattr(network, "error_model"):

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
-from spikekit.arguments import one_line
+from spikekit.arguments import one_line, printable
 
 _LONGEST = 1000  # characters of a text
 _LARGEST = 4096  # of numbers
@@ -64,20 +64,19 @@ def check_shapes(
     kind, arguments = own_class(settings, source, kinds)
     try:
         with torch.device("meta"), _at_most(2 * len(tensors) + 1000):
-            expected = kind(**arguments).state_dict()
+            network = kind(**arguments)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{source}: settings that do not make a {kind.__name__} ({one_line(error)[:300]})") from error
-    for name in sorted(expected.keys() | tensors.keys()):
-        wanted, got = expected.get(name), tensors.get(name)
-        if wanted is None or got is None:
-            trouble = "missing" if got is None else "unknown"
-        elif wanted.shape != got.shape:
-            trouble = f"expected {tuple(wanted.shape)}, got {tuple(got.shape)}"
-        elif wanted.is_floating_point() != got.is_floating_point():
-            trouble = f"expected {wanted.dtype}, got {got.dtype}"
-        else:
-            continue
-        raise ValueError(f"{source}: weights that do not fit ({_short(name)[1:-1]}: {trouble})")
+    load_state(network, tensors, source, assign=True)
+
+
+def load_state(network: nn.Module, tensors: Mapping[str, Tensor], source: str | Path, assign: bool = False) -> None:
+    """Load weights, or say in one line that those of the file do not fit."""
+    try:
+        network.load_state_dict(tensors, assign=assign)
+    except RuntimeError as error:
+        _, *reasons = str(error).splitlines()
+        raise ValueError(f"{source}: weights that do not fit ({printable(' '.join(reasons).strip())[:200]})") from error
 
 
 @contextmanager

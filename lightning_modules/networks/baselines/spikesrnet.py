@@ -16,7 +16,7 @@ from lightning_modules.networks.baselines.pictures import (
     sub_pixel_convolutions,
     whole_sizes,
 )
-from lightning_modules.networks.layers import conv, res_blocks
+from lightning_modules.networks.layers import ConvBlock, conv, res_blocks
 from spikekit import split_colors
 
 
@@ -87,16 +87,10 @@ class SpikeSRNetLike(Baseline):
         planes, enlarged = (1, 2 * self.scale) if per_channel else (3, self.scale)
         self.enlarged = enlarged
         self.kernels = nn.Sequential(
-            conv(length, width),
-            nn.ReLU(inplace=True),
-            conv(width, width),
-            nn.ReLU(inplace=True),
-            nn.Conv2d(width, maps * length, 1),
+            *ConvBlock(length, width), *ConvBlock(width, width), nn.Conv2d(width, maps * length, 1)
         )
         self.represent = conv(maps * planes, width)
-        self.guide = nn.Sequential(
-            conv(2 * width, width), nn.ReLU(inplace=True), conv(width, width), nn.ReLU(inplace=True)
-        )
+        self.guide = nn.Sequential(*ConvBlock(2 * width, width), *ConvBlock(width, width))
         self.align = DeformableConv2d(width)
         self.start = sub_pixel_convolutions(width, enlarged)
         self.corrections = nn.ModuleList(_Correction(width, enlarged) for _ in range(corrections))

@@ -145,7 +145,7 @@ def test_a_module_can_be_pickled():
     [
         ([], Spike2Flow),
         (["-c{still}"], ZeroFlow),
-        (["--model.network.motion", "ZeroFlow", "-c", "{configs}/x2.yaml"], ZeroFlow),
+        (["--model.network.motion", "ZeroFlow"], ZeroFlow),
         (["--model.network.motion.iterations", "1"], Spike2Flow),
     ],
 )
