@@ -72,13 +72,8 @@ class Correlation:
     """How much the features of every pixel resemble those around where its flow points, on several scales.
 
     Small pictures are correlated once, all pixels with all pixels; in large ones only what is looked up is. Both give
-    the same, because pooling and interpolation are linear.
-
-    Args:
-        features: of the window where the flow begins, (B, C, h, w).
-        others: of the windows where it ends, (B, K, C, h, w).
-        levels: scales, each half as fine as the one before.
-        radius: positions to each side that are looked at.
+    the same, because pooling and interpolation are linear. The flow begins in ``features``, (B, C, h, w), and ends in
+    ``others``, (B, K, C, h, w).
     """
 
     def __init__(self, features: Tensor, others: Tensor, levels: int, radius: int) -> None:
@@ -222,15 +217,9 @@ def _head(inputs: int, width: int, outputs: int, size: int) -> nn.Sequential:
 
 
 def upsample_convex(flow: Tensor, weights: Tensor, scale: int) -> Tensor:
-    """Bring flow to a finer grid, every fine pixel a weighted mean of the nine coarse ones around it.
+    """Bring flow, (B, K, 2, h, w), to a finer grid, every fine pixel a weighted mean of the nine coarse ones around it.
 
-    Args:
-        flow: (B, K, 2, h, w), in coarse pixels.
-        weights: (B, 9 scale scale, h, w), before the softmax over the nine.
-        scale: how much finer.
-
-    Returns:
-        (B, K, 2, scale h, scale w), in fine pixels.
+    The weights are (B, 9 scale scale, h, w), before the softmax over the nine.
     """
     batch, count, _, height, width = flow.shape
     around = F.unfold(F.pad(flow.flatten(1, 2), (1, 1, 1, 1), "replicate"), 3)

@@ -44,10 +44,7 @@ class ErrorModel:
 
 
 def read_error_model(weights: str | Path) -> ErrorModel:
-    """Return the constants of a file of weights, or the defaults where it has none.
-
-    Args:
-        weights: the file. That of a checkpoint, which training writes over, has none.
+    """Return the constants of a file of weights, or the defaults where it has none, as a checkpoint has none.
 
     Raises:
         ValueError: a damaged file of constants; the message is one line and names it.
@@ -57,14 +54,7 @@ def read_error_model(weights: str | Path) -> ErrorModel:
 
 
 def write_error_model(weights: str | Path, model: ErrorModel) -> Path:
-    """Write the constants of a file of weights beside it.
-
-    Args:
-        weights: the file, of safetensors.
-        model: the constants.
-
-    Returns:
-        The file that they are in, which holds those of all weights of the folder.
+    """Write the constants of a file of safetensors beside it, and return the file, which holds those of the folder.
 
     Raises:
         ValueError: no file of safetensors, or a damaged file of constants.

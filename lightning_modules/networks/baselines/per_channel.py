@@ -21,16 +21,8 @@ def per_channel(
     ours: the four sub-streams, each half as large as the sensor, are enlarged by 2 s, moved by the half pixel of the
     sensor that their sites are off the middle of the Bayer cell, bilinearly, and the two greens are averaged.
 
-    Args:
-        reconstruct: maps the spikes of sub-streams, (4 B, N, h, w), and their flows, (4 B, 2, 2, h, w), in pixels of
-            the sub-streams, to pictures of one channel, (4 B, 1, 2 s h, 2 s w).
-        spikes: (B, N, H, W), floating; an odd side is mirrored.
-        flow: (B, 2, 2, H, W), in sensor pixels.
-        pattern: Bayer phase.
-        scale: super-resolution factor s.
-
-    Returns:
-        rgb (B, 3, s H, s W).
+    ``reconstruct`` maps the spikes of sub-streams, (4 B, N, h, w), and their flows, (4 B, 2, 2, h, w), in pixels of the
+    sub-streams, to pictures of one channel, (4 B, 1, 2 s h, 2 s w); what is returned is rgb, (B, 3, s H, s W).
     """
     batch, (height, width) = len(spikes), spikes.shape[-2:]
     planes = split_any_size(spikes, pattern)
