@@ -64,7 +64,7 @@ def _recording(truth):
     """Record a scene in motion, by the phase of the sensor."""
     rgb = pictures((0.05, -0.03), range(FRAMES))
     sensor = SpikeSensor(SensorNoise(photons=3000, calibration=truth), seed=4)
-    return rgb, {pattern: sensor.expose(0.25 * raw(rgb, pattern)) for pattern in (None, "BGGR", "GRBG")}
+    return rgb, {pattern: sensor.expose(0.25 * raw(rgb, pattern)) for pattern in (None, "BGGR")}
 
 
 def measured(spikes, pattern, known=None):
@@ -76,7 +76,7 @@ def alike(found, expected, works):
     return torch.corrcoef(torch.stack([found[works], expected[works]]))[0, 1].item()
 
 
-@pytest.mark.parametrize("pattern", [None, "BGGR", "GRBG"])
+@pytest.mark.parametrize("pattern", [None, "BGGR"])
 def test_gains_are_found(truth, recording, pattern):
     found = measured(recording[1][pattern], pattern)
     known, works = found.calibration, truth.defects == WORKS
@@ -104,17 +104,11 @@ def test_pictures_get_better(recording):
     assert quality(measured(spikes, "BGGR").calibration) > quality(defects) + 1
 
 
-def test_an_ideal_sensor_stays_one():
-    spikes = SpikeSensor(SensorNoise(photons=3000), seed=5).expose(
-        0.25 * raw(pictures((0.05, -0.03), range(FRAMES)), "BGGR")
-    )
-    assert measured(spikes, "BGGR") is None
-
-
-@pytest.mark.parametrize("motion", [(0.0, 0.0), (0.006, 0.004)], ids=["rest", "slow"])
-def test_texture_at_rest_is_no_gain(truth, motion):
+@pytest.mark.parametrize(("motion", "ideal"), [((0.05, -0.03), True), ((0.0, 0.0), False), ((0.006, 0.004), False)])
+def test_an_ideal_sensor_stays_one_and_texture_at_rest_is_no_gain(truth, motion, ideal):
+    noise = SensorNoise(photons=3000) if ideal else SensorNoise(calibration=truth)
     light = 0.25 * raw(pictures(motion, range(FRAMES)), "BGGR")
-    assert measured(SpikeSensor(SensorNoise(calibration=truth), seed=6).expose(light), "BGGR") is None
+    assert measured(SpikeSensor(noise, seed=6).expose(light), "BGGR") is None
 
 
 def test_light_that_flickers(truth, recording):
@@ -143,8 +137,7 @@ def test_counts_do_not_depend_on_the_chunks(chunk):
     assert found.counts.equal(spikes[:90].reshape(3, 30, 3, 4).sum(1).byte())
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 40), (5, 40)])
-@pytest.mark.parametrize("pattern", [None, "BGGR"])
+@pytest.mark.parametrize(("size", "pattern"), [((1, 1), None), ((1, 40), "BGGR"), ((5, 40), "BGGR")])
 @pytest.mark.parametrize("share", [0.0, 0.3])
 def test_where_nothing_can_be_seen_to_move(size, pattern, share):
     spikes = torch.rand(260, *size, generator=chance(10)) < share

@@ -90,6 +90,8 @@ def test_a_sheet_by_its_sidecar(still, capsys):
     assert red.sum() > 10_000
     assert blue.sum() == pytest.approx(int(red.sum()), rel=0.1)
     assert red.nonzero()[:, 1].max() < blue.nonzero()[:, 1].min()
+    assert main(["decode", "a.dat", "--method", "tfp", "-o", "d.png"]) == 0
+    assert read_picture("d.png")[:, 16, 8].tolist() == pytest.approx([1, 0, 0], abs=0.1)
 
 
 def test_a_longer_window_is_proposed_where_pixels_hardly_fire(tmp_path, monkeypatch, capsys):
@@ -155,15 +157,6 @@ def test_a_camera_is_known(own_camera, capsys, header):
     for n, plane in enumerate(shown.packed(7, 3), 7):
         assert (shown.unpack(plane) == known.prepare(spikes[n]).numpy()).all()
         assert shown.read(n, 1)[0].equal(known.prepare(spikes[n]))
-
-
-def test_decode_by_its_sidecar(still, capsys):
-    capsys.readouterr()
-    assert main(["decode", "a.dat", "--method", "tfp", "-o", "d.png"]) == 0
-    assert capsys.readouterr().out.endswith("divided by alpha 0.5\n")
-    assert read_picture("d.png")[:, 16, 8].tolist() == pytest.approx([1, 0, 0], abs=0.1)
-    assert main(["info", "a.dat"]) == 0
-    assert "size         32 x 48 (H x W)" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
