@@ -85,17 +85,22 @@ class Recording:
         """What is corrected, in words that follow others."""
         return "" if self.calibration is None else ", pixels corrected by its calibration"
 
+    def chunks(self, start: int, frames: int, what: str) -> Iterator[Tensor]:
+        """Read some frames in chunks (T_i, H, W), uint8, of up to 255 frames; show how far the work is."""
+        height, width = self.stored
+        chunk = min(max(_BLOCK // (height * width), 1), 255)
+        parts = iter_spikes(self.path, height, width, flip=self.flip, start=start, frames=frames, chunk=chunk)
+        with progress(what=what, total=frames) as bar:
+            for part in parts:
+                yield self.prepare(part)
+                bar.update(len(part))
+
     def counts(self, start: int, frames: int) -> Tensor:
         """Count the spikes of every pixel (H, W) in some frames."""
-        height, width = self.stored
-        counts = torch.zeros(height, width, dtype=torch.int64)
-        chunk = min(max(_BLOCK // (height * width), 1), 255)  # whose sum fits into a byte
-        parts = iter_spikes(self.path, height, width, flip=self.flip, start=start, frames=frames, chunk=chunk)
-        with progress(what="frames counted", total=frames) as bar:
-            for part in parts:
-                counts += torch.from_numpy(part.numpy().sum(axis=0, dtype=np.uint8))
-                bar.update(len(part))
-        return self.prepare(counts)
+        counts = torch.zeros(self.size, dtype=torch.int64)
+        for part in self.chunks(start, frames, "frames counted"):
+            counts += torch.from_numpy(part.numpy().sum(axis=0, dtype=np.uint8))  # a chunk's sum fits into a byte
+        return counts
 
     def show(self, picture: Tensor, *, known: bool) -> Tensor:
         """Return light as it is shown; the gain of the camera is for light whose white is known, not guessed."""

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
-from typing import Any
-
-from torch import Tensor
 
 from spikekit.arguments import UsageError, home_path
 from spikekit.calibration.calibration import Calibration
@@ -21,14 +17,11 @@ from spikekit.calibration.in_motion import (
 from spikekit.calibration.measure import Measured, calibrate, find_defects
 from spikekit.calibration.pixel_rates import PixelRates
 from spikekit.cli import recordings
-from spikekit.io.files import iter_spikes
-from spikekit.progress import progress
 from spikekit.recording import Recording, open_recording, own_calibration
 from spikekit.sensor.noise import DEAD, HOT, WORKS
 from spikekit.standard_output import say
 
 _LEAST_FRAMES = 100
-_CHUNK = 1 << 24  # pixels that are counted at a time
 
 
 def run(args: argparse.Namespace) -> None:
@@ -87,22 +80,8 @@ def _halves(recording: Recording) -> tuple[PixelRates, PixelRates]:
     frames, half = recording.frames, recording.frames // 2
     if frames < _LEAST_FRAMES:
         raise ValueError(f"{recording.path}: expected at least {_LEAST_FRAMES} frames to count, got {frames}")
-    with progress(what=recording.path.name, total=frames) as bar:
-        first, second = (
-            PixelRates.of(_parts(recording, start, count, bar)) for start, count in ((0, half), (half, frames - half))
-        )
-    return first, second
-
-
-def _parts(recording: Recording, start: int, frames: int, bar: Any) -> Iterator[Tensor]:
-    """Read some frames in chunks (T_i, H, W)."""
-    height, width = recording.stored
-    chunk = max(1, min(_CHUNK // (height * width), 500))
-    for part in iter_spikes(
-        recording.path, height, width, flip=recording.flip, start=start, frames=frames, chunk=chunk
-    ):
-        bar.update(len(part))
-        yield recording.prepare(part)
+    parts = recording.chunks(0, half, recording.path.name), recording.chunks(half, frames - half, recording.path.name)
+    return PixelRates.of(parts[0]), PixelRates.of(parts[1])
 
 
 def _in_motion(recording: Recording, rates: PixelRates, known: Calibration) -> tuple[Measured | None, str | None]:
@@ -111,8 +90,7 @@ def _in_motion(recording: Recording, rates: PixelRates, known: Calibration) -> t
     least, frames = LEAST_SEGMENTS * length, min(recording.frames, MOST_SEGMENTS * length)
     if frames < least:
         return None, f"not measured: that takes {least} frames of a scene that moves, got {frames}"
-    with progress(what="segments counted", total=frames) as bar:
-        segments = count_segments(_parts(recording, 0, frames, bar), length)
+    segments = count_segments(recording.chunks(0, frames, "segments counted"), length)
     found = calibrate_in_motion(segments, known, recording.bayer)
     return found, None if found else f"not measured in {frames} frames: too little moves, or gains are all but equal"
 

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from spikekit._version import __version__
 from spikekit.arguments import UsageError, one_line, printable
@@ -45,51 +45,35 @@ def main(argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")
     try:
         with stopped_by_sigterm():
-            return _run(argv)
+            with suppress(SystemExit):  # --help
+                words = sys.argv[1:] if argv is None else list(argv)
+                args = _parser(*words[:1]).parse_args(words)
+                args.run(args)
+            print(end="", flush=True)
+        return 0
     except KeyboardInterrupt:
-        print("spikekit: interrupted", file=sys.stderr)
-        return 128 + signal.SIGINT
+        said, status = "interrupted", 128 + signal.SIGINT
     except Terminated:
-        print("spikekit: terminated", file=sys.stderr)
-        return 128 + signal.SIGTERM
-
-
-def _run(argv: Sequence[str] | None) -> int:
-    try:
-        with suppress(SystemExit):  # --help
-            words = sys.argv[1:] if argv is None else list(argv)
-            args = _parser(*words[:1]).parse_args(words)
-            args.run(args)
-        print(end="", flush=True)
+        said, status = "terminated", 128 + signal.SIGTERM
     except (ValueError, MemoryError) as error:
-        print(f"spikekit: {one_line(error)}", file=sys.stderr)
-        return 2 if isinstance(error, UsageError) else 1
+        said, status = one_line(error), 2 if isinstance(error, UsageError) else 1
     except OSError as error:
-        if error.filename is not None:
-            print(f"spikekit: {printable(str(error.filename))}: {one_line(error)}", file=sys.stderr)
-            return 1
-        stop_printing()  # nobody reads it, or it finds no room
+        said, status = f"{printable(str(error.filename or 'standard output'))}: {one_line(error)}", 1
+        if error.filename is None:
+            stop_printing()  # nobody reads it, or it finds no room
         if isinstance(error, BrokenPipeError):
             return BROKEN_PIPE
-        print(f"spikekit: standard output: {one_line(error)}", file=sys.stderr)
-        return 1
     except ModuleNotFoundError as error:
-        if not (line := remedy(error)):
+        if (said := remedy(error)) is None:
             raise
-        print(f"spikekit: {line}", file=sys.stderr)
-        return 1
-    return 0
+        status = 1
+    print(f"spikekit: {said}", file=sys.stderr)
+    return status
 
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message} (see {self.prog} --help)")
-
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
-        namespace, unknown = super().parse_known_args(args, namespace)
-        if unknown:  # said by the parser of the verb: that of all verbs would point to its own --help
-            self.error(f"unrecognized arguments: {' '.join(unknown)}")
-        return namespace, unknown
 
 
 def _parser(*asked: str) -> argparse.ArgumentParser:

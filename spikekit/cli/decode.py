@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -13,7 +14,6 @@ from spikekit.arguments import UsageError, ending_in, frames_of, positive, whole
 from spikekit.cli import recordings
 from spikekit.color.demosaic import demosaic
 from spikekit.decoders.methods import DECODERS, TFI_REACH
-from spikekit.io.files import iter_spikes
 from spikekit.io.images import write_picture
 from spikekit.io.sidecar import check_unclaimed
 from spikekit.io.video import PICTURE_ENDINGS
@@ -154,19 +154,18 @@ def _span(frame: int, reach: int, frames: int) -> tuple[int, int]:
 
 def _windows(recording: Recording, chosen: range, reach: int) -> Iterator[tuple[int, _Plane]]:
     """Read forwards; yield every chosen frame and what unpacks it and its neighbours."""
-    path, frames, (height, width) = recording.path, recording.frames, recording.stored
-    held = np.empty((min(2 * reach + 1, frames), height, -(-width // 8)), np.uint8)  # frame n at n modulo the length
+    frames, stop = recording.frames, 0
+    held: deque[np.ndarray] = deque(maxlen=min(2 * reach + 1, frames))  # packed, of which the last is frame stop - 1
+    stream = recording.packed(0, frames)
 
     def plane(n: int) -> np.ndarray:
-        return recording.unpack(held[n % len(held)])
+        return recording.unpack(held[n - stop])
 
-    stream, stop = None, 0
     for n in chosen:
         first, last = _span(n, reach, frames)
-        if stream is None or (stop < first and path.suffix.lower() == ".dat"):  # an .npz has no short cut
-            stream = iter_spikes(path, height, width, flip=recording.flip, start=first, packed=True)
-            stop = first
-        for k in range(stop, last + 1):
-            held[k % len(held)] = next(stream).numpy()
-        stop = last + 1
+        if stop < first and recording.path.suffix.lower() == ".dat":  # an .npz has no short cut
+            stream, stop = recording.packed(first, frames - first), first
+        while stop <= last:
+            held.append(next(stream))
+            stop += 1
         yield n, plane

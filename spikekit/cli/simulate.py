@@ -44,7 +44,8 @@ def run(args: argparse.Namespace) -> None:
     """
     if args.output.is_dir():
         raise ValueError(f"{args.output}: expected a stream to write, got a folder")
-    given = {name: value for name, value in vars(args).items() if name in _names(Settings) | _names(SensorNoise)}
+    known = {field.name for field in (*fields(Settings), *fields(SensorNoise))}
+    given = {name: value for name, value in vars(args).items() if name in known}
     replayed = None
     if args.input.suffix.lower() == ".json":
         replayed = read_sidecar(args.input)
@@ -73,19 +74,12 @@ def _options() -> Iterator[None]:
         raise UsageError(f"--{str(error).replace('_', '-', 1)}") from error
 
 
-def _names(kind: Any) -> set[str]:
-    return {field.name for field in fields(kind)}
-
-
 def _settings(given: dict[str, Any]) -> Settings:
     noise = {name: value for name, value in given.items() if name in _NOISE}
-    calibration = given.get("calibration")
-    known = calibration and read_calibration(calibration)
+    known = read_calibration(given["calibration"]) if "calibration" in given else None
     with _options():
-        return Settings(
-            **{name: value for name, value in given.items() if name not in noise},
-            noise=SensorNoise(**noise, calibration=known),
-        )
+        others = {name: value for name, value in given.items() if name not in noise}
+        return Settings(**others, noise=SensorNoise(**noise, calibration=known))
 
 
 def _settings_of(path: Path, sidecar: Sidecar, given: dict[str, Any]) -> Settings:

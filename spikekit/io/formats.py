@@ -168,35 +168,42 @@ def write_array(file: IO[bytes], ending: str, shape: tuple[int, int, int], block
 @contextmanager
 def _array(path: Path) -> Iterator[tuple[IO[bytes], tuple[int, int, int], np.dtype, bool]]:
     """Open the array of a recording at its first number: the stream, shape, dtype, and whether in Fortran order."""
-    if path.suffix.lower() == ".npy":
-        with reading(path), open(path, "rb") as stream:
-            shape, fortran, dtype = _npy_header(stream)
-            _check_array(path, "the array", shape, dtype, path.stat().st_size - stream.tell())
-            yield stream, shape, dtype, fortran
-        return
-    with reading(path), zipfile.ZipFile(path) as archive:
-        headers = {}
-        for member in archive.infolist():
-            if not member.filename.endswith(".npy"):
-                continue
-            with archive.open(member) as stream:
-                headers[member.filename.removesuffix(".npy")] = member, *_npy_header(stream)
-        named = [name for name in _ARRAY_NAMES if name in headers]
-        solid = [name for name, (_, shape, _, _) in headers.items() if len(shape) == 3]
-        name = (named or solid or [""])[0]
-        if name not in solid or (not named and len(solid) > 1):
-            found = ", ".join(f"{name} {shape}" for name, (_, shape, _, _) in headers.items())
-            raise SpikeFileError(
-                f"{path}: expected one array (T, H, W) of zeros and ones, named {' or '.join(_ARRAY_NAMES)} or the "
-                f"only one of three dimensions, got {found or 'no array'}"
-            )
-        member, shape, fortran, dtype = headers[name]
-        if member.file_size > _MOST_DEFLATED * min(member.compress_size, path.stat().st_size):
-            raise SpikeFileError(f"{path}: damaged, {name} claims {member.file_size} bytes of {member.compress_size}")
-        with archive.open(member) as stream:
-            _npy_header(stream)
-            _check_array(path, name, shape, dtype, member.file_size - stream.tell())
-            yield stream, shape, dtype, fortran
+    with reading(path), ExitStack() as stack:
+        size, name = path.stat().st_size, "the array"
+        if path.suffix.lower() == ".npy":
+            stream = stack.enter_context(open(path, "rb"))
+        else:
+            archive = stack.enter_context(zipfile.ZipFile(path))
+            member = _member(path, archive)
+            name = member.filename.removesuffix(".npy")
+            if member.file_size > _MOST_DEFLATED * min(member.compress_size, size):
+                said = f"{name} claims {member.file_size} bytes of {member.compress_size}"
+                raise SpikeFileError(f"{path}: damaged, {said}")
+            stream, size = stack.enter_context(archive.open(member)), member.file_size
+        shape, fortran, dtype = _npy_header(stream)
+        _check_array(path, name, shape, dtype, size - stream.tell())
+        yield stream, shape, dtype, fortran
+
+
+def _member(path: Path, archive: zipfile.ZipFile) -> zipfile.ZipInfo:
+    """Return the file of an archive that is the recording."""
+    members = {
+        info.filename.removesuffix(".npy"): info for info in archive.infolist() if info.filename.endswith(".npy")
+    }
+    shapes = {}
+    for name, info in members.items():
+        with archive.open(info) as stream:
+            shapes[name] = _npy_header(stream)[0]
+    named = [name for name in _ARRAY_NAMES if name in shapes]
+    solid = [name for name, shape in shapes.items() if len(shape) == 3]
+    name = (named or solid or [""])[0]
+    if name not in solid or (not named and len(solid) > 1):
+        found = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+        raise SpikeFileError(
+            f"{path}: expected one array (T, H, W) of zeros and ones, named {' or '.join(_ARRAY_NAMES)} or the only "
+            f"one of three dimensions, got {found or 'no array'}"
+        )
+    return members[name]
 
 
 def _check_array(path: Path, name: str, shape: tuple[int, ...], dtype: np.dtype, present: int) -> None:

@@ -226,7 +226,8 @@ class _Film:
             total = sum(packet.size > 0 and not packet.is_discard for packet in container.demux(stream))
             total = max(total, stream.frames)  # what the header promises and the file lacks is told when it is reached
             self.turns = _turns(path)
-            self.size = (stream.height, stream.width)[:: -1 if self.turns % 2 else 1]
+            self.stored = stream.height, stream.width
+            self.size = self.stored[:: -1 if self.turns % 2 else 1]
             self.fps = float(stream.average_rate) if stream.average_rate else None
         if not total or 0 in self.size:
             raise VideoError(f"{path}: expected frames, got none")
@@ -246,7 +247,7 @@ class _Film:
         self._kept: deque[Any] = deque(maxlen=_KEPT)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name in ("path", "size", "fps", "count", "turns")}
+        return {name: value for name, value in vars(self).items() if not name.startswith("_")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -275,12 +276,9 @@ class _Film:
                         raise VideoError(f"{self.path}: ends after {self._next} of {self.count} frames")
                     if frame.is_corrupt:
                         raise VideoError(f"{self.path}: frame {self._next}: damaged")
-                    height, width = self.size[:: -1 if self.turns % 2 else 1]
-                    if (frame.height, frame.width) != (height, width):
-                        raise VideoError(
-                            f"{self.path}: frame {self._next}: expected {height} x {width} (H x W) as before, got "
-                            f"{frame.height} x {frame.width}"
-                        )
+                    if (frame.height, frame.width) != self.stored:
+                        sizes = " x ".join(map(str, self.stored)), f"{frame.height} x {frame.width}"
+                        raise VideoError(f"{self.path}: frame {self._next}: expected {sizes[0]}, got {sizes[1]}")
             except VideoError:
                 self._forget()  # whoever asks for an earlier frame again gets it
                 raise

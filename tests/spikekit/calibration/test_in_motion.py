@@ -5,7 +5,7 @@ import torch
 import torch.nn.functional as F
 from torch.testing import assert_close
 
-from spikekit import SensorNoise, SpikeSensor, bayer_mask, demosaic, psnr, tfp_at
+from spikekit import SensorNoise, SpikeSensor, bayer_mask
 from spikekit.calibration.calibration import Calibration
 from spikekit.calibration.in_motion import calibrate_in_motion, count_segments, segment_length
 from spikekit.calibration.measure import find_defects
@@ -91,17 +91,6 @@ def test_gains_are_found(truth, recording, pattern):
     assert_close(
         torch.stack([known.gain[c & works].mean() for c in colours]), torch.ones(len(colours)), atol=1e-4, rtol=0
     )
-
-
-def test_pictures_get_better(recording):
-    rgb, spikes = recording[0], recording[1]["BGGR"]
-
-    def quality(known):
-        light = known.correct(tfp_at(spikes.float(), 240, 13, order=3), "BGGR")
-        return psnr((demosaic(light, "BGGR") / 0.25).clamp(0, 1), rgb[240]).item()
-
-    defects = find_defects(PixelRates.of([spikes]), "BGGR").calibration
-    assert quality(measured(spikes, "BGGR").calibration) > quality(defects) + 1
 
 
 @pytest.mark.parametrize(("motion", "ideal"), [((0.05, -0.03), True), ((0.0, 0.0), False), ((0.006, 0.004), False)])
