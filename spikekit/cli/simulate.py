@@ -140,21 +140,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     noise = parser.add_argument_group("noise of the sensor, none if not given")
     for name, said in _NOISE.items():
-        noise.add_argument(f"--{name.replace('_', '-')}", type=_number, metavar="X", help=said)
+        noise.add_argument(f"--{name.replace('_', '-')}", type=float, metavar="X", help=said)
     said = "instead of dark current, spreads and shares, the pixels of a sensor that spikekit calibrate has measured, "
     noise.add_argument("--calibration", metavar="FILE", help=f"{said}their rows as the stream has them")
 
 
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected a number, got {text}") from None
-
-
 def _plan(text: str) -> str | int:
-    if text in ("scene", "everything"):
-        return text
-    if text.isascii() and text.isdigit():
-        return int(text)
-    raise argparse.ArgumentTypeError(f"expected scene, everything or a number of latent frames, got {text}")
+    return int(text) if text.isascii() and text.isdigit() else text

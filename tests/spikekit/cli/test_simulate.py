@@ -318,7 +318,7 @@ def test_nothing_of_others_is_replaced(film, fails, capsys):
         (["film"], 2, "--scale: needed"),
         (["film", "--scale", "2", "--plan", "20"], 2, "0 to 19 latent frames in 20 clocks, got 20"),
         (["film", "--scale", "2", "--dark-current", "-1"], 2, "--dark-current: expected 0 to 1, got -1.0"),
-        (["film", "--scale", "2", "--hot", "much"], 2, "argument --hot: expected a number, got much"),
+        (["film", "--scale", "2", "--hot", "much"], 2, "argument --hot: invalid float value: 'much'"),
         (["film/f0.png", "--scale", "2", "--all"], 2, "one picture without an end"),
         (["damaged", "--scale", "2"], 1, "damaged/0.png: not a picture that can be read"),
         (["nothing", "--scale", "2"], 1, "nothing: no such file or folder"),
