@@ -1,4 +1,4 @@
-"""Options of device and dtype; one thread each where tests run side by side (pytest -n); what damages files."""
+"""The option of the device; one thread each where tests run side by side (pytest -n); what damages files."""
 
 import copy
 import gc
@@ -19,7 +19,6 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 def pytest_addoption(parser):
     parser.addoption("--device", default="cpu", help="where operators are tested: cpu, cuda; default cpu")
-    parser.addoption("--dtype", default="all", help="the only dtype in which they are tested, such as float32")
     parser.addoption("--table", metavar="FILE", help="CSV file for the rows of tests/extremes")
 
 
@@ -39,14 +38,8 @@ def pytest_sessionfinish():
     gc.unfreeze()
 
 
-def pytest_collection_modifyitems(config, items):
-    """Only one dtype where it is asked for; fuzzing at length takes as long as it takes."""
-    dtype = config.getoption("dtype")
-    if dtype != "all":
-        only = getattr(torch, dtype)
-        kept = [item for item in items if getattr(item, "callspec", None) and item.callspec.params.get("dtype") == only]
-        config.hook.pytest_deselected(items=[item for item in items if item not in kept])
-        items[:] = kept
+def pytest_collection_modifyitems(items):
+    """Fuzzing at length takes as long as it takes."""
     if "SPIKEKIT_FUZZ" in os.environ:
         for item in items:
             item.add_marker(pytest.mark.timeout(0))

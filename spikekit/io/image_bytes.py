@@ -78,7 +78,7 @@ def picture_bytes(image: Tensor, ending: str, *, bits: int = 8, quality: int | N
         file = io.BytesIO()
         imwrite(file, pixels.numpy(), photometric="rgb" if pixels.ndim == 3 else "minisblack")
         return file.getvalue()
-    return _pillow_bytes(pixels, kind, **({} if quality is None else {"quality": quality}))
+    return _pillow_bytes(pixels, kind, **({} if quality is None else {"quality": int(quality)}))
 
 
 def _pillow_bytes(pixels: Tensor, kind: str, **how: Any) -> bytes:
