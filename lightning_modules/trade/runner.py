@@ -42,7 +42,7 @@ class Runner:
 
     Args:
         args: of ``lightning test``, in the order in which they are typed; and how pictures are made, as of ``predict``:
-            ``--tile``, ``--psnr_tolerance``, ``--self_ensemble``, ``--interpolated`` and ``--future``.
+            ``--tile``, ``--tolerance``, ``--self_ensemble``, ``--interpolated`` and ``--future``.
 
     Attributes:
         network: with its weights.
@@ -117,7 +117,7 @@ def _how() -> VerbParser:
     parser = VerbParser(prog="lightning trade", add_help=False, allow_abbrev=False)
     for name in ("tile", "self_ensemble", "interpolated", "future"):
         parser.add_argument(f"--{name}", type=whole(0))
-    parser.add_argument("--psnr_tolerance", type=float)
+    parser.add_argument("--tolerance", type=float, dest="psnr_tolerance")
     return parser
 
 

@@ -34,7 +34,7 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
 
         The file keeps the mode of the one that it replaces. A link of that name is replaced, and what it points at
         stays as it is: a folder from a stranger may have links in it. A device, such as ``/dev/stdout``, is written
-        directly, and so is a pipe.
+        directly, and so is a pipe that somebody reads.
 
     Args:
         path: the file; its folder is made when it is missing.
@@ -59,7 +59,7 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
     path = home_path(path)
     chosen = path.is_dir() or not path.is_symlink() or path.parent == Path("/dev")  # no stranger's way to a device
     if chosen and path.exists() and not path.is_file():
-        with open(path, mode, **how) as file:  # a folder says so
+        with open(path, mode, opener=_to_a_reader if path.is_fifo() else None, **how) as file:  # a folder says so
             yield file
         return
     target = Path(os.path.realpath(path.parent), path.name)
@@ -89,6 +89,13 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
         raise
     file.close()  # so late, because the lock that says that somebody is at work ends here
     flush_folder(target.parent)
+
+
+def _to_a_reader(path: str, flags: int) -> int:
+    """Open a pipe; one that nobody reads, which would be waited for without end, is an error."""
+    file = os.open(path, flags | os.O_NONBLOCK)
+    os.set_blocking(file, True)
+    return file
 
 
 def hidden_name(name: str) -> str:

@@ -121,6 +121,8 @@ def test_modes_links_and_devices(tmp_path):
         file.write(b"4")
     assert not (tmp_path / "device").is_symlink()
     os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OSError, match="pipe"), whole_file(tmp_path / "pipe"):  # nobody reads it: no waiting
+        pass
     reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
     with whole_file(tmp_path / "pipe") as file:
         file.write(b"through")
