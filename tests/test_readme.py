@@ -19,7 +19,7 @@ QUICKSTART = (ROOT / "docs" / "quickstart.rst").read_text()
 PROGRAMS = {"lightning": lightning, "spikekit": spikekit}
 
 # What makes a command small; everything else is as it is written.
-SMALL = {"250": "24", "400": "32", "cscsr_small_x4": "ClassicalDecoder"}
+SMALL = {"250": "24", "400": "32", "cscsr_small_x4": "ClassicalDecoder", "ablation/*": "ablation/c"}
 FEW = """
 model: {network: {init_args: {size: tiny}}}
 data: {init_args: {patch: 8, val_patch: 16, train_clips: 2, val_clips: 2, batch_size: 1, workers: 0}}
@@ -53,14 +53,12 @@ def light(frames, height, width):
 
 @pytest.fixture(name="folder")
 def _folder(tmp_path):
-    """A folder with what the commands name: a recording, a film's frames, pictures; and one overlay to sweep over."""
+    """A folder with what the commands name: a recording, a film's frames, pictures."""
     write_spikes(tmp_path / "FILE.dat", simulate_spikes(light(221, 24, 32), generator=torch.Generator().manual_seed(0)))
     for n, frame in enumerate(light(3, 96, 128)[:, None].expand(-1, 3, -1, -1)):
         write_picture(tmp_path / "FRAMES" / f"{n}.png", frame)
         write_picture(tmp_path / "PICTURES" / f"{n}.png", frame)
     (tmp_path / "few.yaml").write_text(FEW)
-    (tmp_path / "ablation").mkdir()
-    (tmp_path / "ablation" / "one.yaml").write_text((ROOT / "configs" / "ablation" / "c.yaml").read_text())
     return tmp_path
 
 

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from spikekit.check import wide_dtype
 from spikekit.color.cfa import bayer_mask
-from spikekit.kernels import custom_operator, gpu_kernel, register_kernel, register_on_gpu
+from spikekit.kernels import compiler_kept_out, custom_operator, gpu_kernel, register_kernel, register_on_gpu
 from spikekit.kernels.loops import import_loops
 from spikekit.warp.neighbors import finite, products_of, search_and_weigh
 
@@ -109,6 +109,7 @@ def _steps_to(moved: Tensor, length: int, axis: int) -> Tensor:
     return ((moved * STEPS).round().long() + at).clamp(-STEPS, STEPS * length)
 
 
+@compiler_kept_out  # which would make the table anew, and cannot
 @lru_cache(maxsize=24)
 def site_table(
     pattern: str, color: int, scale: int, odd: tuple[bool, bool], device: torch.device, neighbors: int = 4
