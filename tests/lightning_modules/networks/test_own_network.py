@@ -81,6 +81,17 @@ def test_a_compiled_network_is_stored_as_the_network_that_it_is(tmp_path):
         SuperResolution(torch.compile(CSCSR(2, **TINY), backend="eager"), weights=str(path))
 
 
+def test_a_compiled_network_makes_the_same_pictures_whatever_comes_first():
+    """As in a training: it is validated with its own motion, then learns smaller clips with theirs."""
+    network = CSCSR(2, **TINY).eval()
+    compiled = torch.compile(network, backend="eager")
+    for side, own in ((16, True), (8, False)):
+        spikes = (torch.rand(1, 41, side, side) < 0.3).float()
+        flow = None if own else torch.rand(1, 2, 2, side, side)
+        with torch.set_grad_enabled(not own):
+            torch.testing.assert_close(compiled(spikes, flow), network(spikes, flow))
+
+
 def test_a_checkpoint_alone_is_enough(tmp_path):
     network = CSCSR(2, **TINY, motion=ZeroFlow())
     path, _ = saved(tmp_path / "alone", network)
