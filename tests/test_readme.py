@@ -37,12 +37,12 @@ ADDED = {
 
 def commands(text):
     """The commands in blocks of a page, without what installs; CI asks the package index and runs all tests."""
-    blocks = re.findall(r"```(?:ba)?sh\n(.*?)```|\.\. code-block:: sh\n\n((?:   .*\n)+)", text, flags=re.DOTALL)
+    blocks = re.findall(r"```(?:ba)?sh\n(.*?)```|\.\. code-block:: sh\n\n((?:   [^\n]*\n)+)", text, flags=re.DOTALL)
     for line in "".join(a or b for a, b in blocks).splitlines():
         for command in line.split(" && "):
-            program, *words = shlex.split(command, comments=True)
-            if Path(program).name in PROGRAMS:
-                yield Path(program).name, words
+            words = shlex.split(command, comments=True)
+            if words and Path(words[0]).name in PROGRAMS:
+                yield Path(words[0]).name, words[1:]
 
 
 def light(frames, height, width):
