@@ -293,8 +293,8 @@ def _digest(values: Any) -> str:
     return total.hexdigest()
 
 
-def grey_model(models: Sequence[Model], speed: str, film: bool) -> Model | None:
-    """Return those of the weights for grey cameras that a speed stands for, from the smallest to the largest."""
+def by_size(models: Sequence[Model], speed: str, film: bool) -> Model | None:
+    """Return the weights that a speed stands for where no table was measured, from the smallest to the largest."""
     if speed not in SPEEDS:
         raise ValueError(f"speed: expected one of {', '.join(SPEEDS)}, got {speed!r}")
     able = [model for model in models if model.film == film] or [model for model in models if not model.film]
@@ -316,9 +316,12 @@ def _chosen(
     clips = RecordingClips(recording, frame=frame)
     every = min((later - clock for clock, later in pairwise(clips.chosen)), default=clips.frames + 1)
     film = every <= clips.frames  # one picture knows the other
-    grey = grey_model(list_models(scale, GREY), speed or "balanced", film) if recording.pattern == GREY else None
-    if grey is not None:
-        return Preset(grey.name), [f"{grey.name}, for grey cameras"]
+    if recording.pattern == GREY or scale == 1:
+        kind = GREY if recording.pattern == GREY else "RGGB"  # serves every phase
+        model = by_size(list_models(scale, kind), speed or "balanced", film)
+        if model is not None:
+            said = "grey cameras" if kind == GREY else "colour at the resolution of the sensor"
+            return Preset(model.name), [f"{model.name}, for {said}"]
     around = 2 * min(clips.chosen[0], recording.frames - 1 - clips.chosen[-1]) + 1
     room = max(FRAMES, recording.frames // _MANY if frame is None else around)
     asked = {"scale": scale, "size": clips.size, "film": film, "white": white, "noisy": noisy}

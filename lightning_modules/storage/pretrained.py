@@ -150,7 +150,15 @@ def write_weights(weights: Weights, path: str | Path) -> None:
     }
     said = {"network": json.dumps(weights.settings), "motion": json.dumps(weights.motion)}
     with whole_file(path) as file:
-        file.write(save(tensors, said))
+        file.write(_same_every_time(save(tensors, said)))
+
+
+def _same_every_time(data: bytes) -> bytes:
+    """Sort the metadata of a safetensors file, which its writer shuffles."""
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + length])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    return data[:8] + json.dumps(header, separators=(",", ":")).encode().ljust(length) + data[8 + length :]
 
 
 def settings_of(network: nn.Module) -> dict[str, Any]:

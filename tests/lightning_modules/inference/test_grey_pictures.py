@@ -8,7 +8,7 @@ import torch
 from lightning_modules import reconstruct
 from lightning_modules.inference.predict import predict
 from lightning_modules.inference.presets import SPEEDS
-from lightning_modules.inference.reconstruct import grey_model
+from lightning_modules.inference.reconstruct import by_size
 from lightning_modules.networks import CSCSR, RecurrentCSCSR
 from lightning_modules.registry import Model
 from spikekit import write_spikes
@@ -70,10 +70,17 @@ def test_speeds_stand_for_sizes_of_grey_weights():
         return Model(name, macs=macs, film=film, kodak=None, vid4=None, **known)
 
     models = [model("large", 2000), model("small", 700), model("large_film", 2100, film=True)]
-    chosen = {speed: grey_model(models, speed, film=False).name for speed in SPEEDS}
+    chosen = {speed: by_size(models, speed, film=False).name for speed in SPEEDS}
     assert chosen == {"fastest": "small", "fast": "small", "balanced": "large", "best": "large"}
-    assert grey_model(models, "fastest", film=True).name == "large_film"
-    assert grey_model(models[:2], "best", film=True).name == "large"
-    assert grey_model([], "best", film=False) is None
+    assert by_size(models, "fastest", film=True).name == "large_film"
+    assert by_size(models[:2], "best", film=True).name == "large"
+    assert by_size([], "best", film=False) is None
     with pytest.raises(ValueError, match="speed"):
-        grey_model(models, "soon", film=False)
+        by_size(models, "soon", film=False)
+
+
+@pytest.mark.parametrize(("pattern", "weights"), [("grey", "cscsr_small_grey_x1"), ("BGGR", "cscsr_small_x1")])
+def test_the_resolution_of_the_sensor_has_weights_for_grey_and_colour(recording, pattern, weights):
+    made = reconstruct(**recording, speed="best", scale=1, pattern=pattern)
+    assert made.array().shape == (3, 16, 24, 3)
+    assert [note.split(",")[0] for note in made.notes] == [weights]

@@ -195,3 +195,11 @@ def test_fit_goes_on_from_weights_and_data_follow_them(file, tmp_path):
     after = CSCSR.from_pretrained(tmp_path / "run" / "checkpoints" / "last.ckpt")
     assert after.scale == 2
     torch.testing.assert_close(after(SPIKES), network()(SPIKES))
+
+
+def test_the_same_weights_are_the_same_bytes(tmp_path):
+    weights, written = read_weights("cscsr_tiny_x4"), set()
+    for _ in range(8):
+        write_weights(weights, tmp_path / "weights.safetensors")
+        written.add((tmp_path / "weights.safetensors").read_bytes())
+    assert len(written) == 1
