@@ -79,7 +79,7 @@ def test_speeds_stand_for_sizes_of_grey_weights():
         by_size(models, "soon", film=False)
 
 
-@pytest.mark.parametrize(("pattern", "weights"), [("grey", "cscsr_small_grey_x1"), ("BGGR", "cscsr_small_x1")])
+@pytest.mark.parametrize(("pattern", "weights"), [("grey", "cscsr_small_grey_x1"), ("RGGB", "cscsr_small_x1")])
 def test_the_resolution_of_the_sensor_has_weights_for_grey_and_colour(recording, pattern, weights):
     made = reconstruct(**recording, speed="best", scale=1, pattern=pattern)
     assert made.array().shape == (3, 16, 24, 3)
