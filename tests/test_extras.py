@@ -13,7 +13,7 @@ from spikekit.extras import LEARN
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-IMPORTED_AS = {"pillow": "PIL", "scikit-image": "skimage", "pyyaml": "yaml", "nvidia-ml-py": "pynvml"}
+IMPORTED_AS = {"pillow": "PIL", "scikit-image": "skimage", "pyyaml": "yaml"}
 
 
 def declared(requirements):

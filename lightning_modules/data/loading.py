@@ -25,14 +25,6 @@ class FreshClips(DistributedSampler[int]):
 
     Where several processes train, each takes its batch of every step, so that every clip is seen once: two processes
     see in a step what one of twice the batch size would.
-
-    Args:
-        data: whose training says where it stands.
-        batch_size: clips in a batch.
-        length: clips in an epoch.
-
-    Raises:
-        ValueError: less than a batch for every process.
     """
 
     def __init__(self, data: LightningDataModule, batch_size: int, length: int) -> None:
@@ -57,15 +49,7 @@ class FreshClips(DistributedSampler[int]):
 
 
 class OwnPart(DistributedSampler[int]):
-    """The indices of one process: all of them, or a part, one part behind the other, where several share them.
-
-    Args:
-        data: whose trainer says how many processes there are.
-        length: how many indices there are in all.
-
-    Raises:
-        ValueError: fewer than there are processes.
-    """
+    """Indices of one process: all of them, or one part behind the other, where several processes share them."""
 
     def __init__(self, data: LightningDataModule, length: int) -> None:
         super().__init__(range(length), 1, 0, shuffle=False)
@@ -88,16 +72,7 @@ def process(data: LightningDataModule) -> tuple[int, int]:
 
 
 class ClipScenes(LightningDataModule):
-    """Loads clips that are made while training runs: ``train_set``, ``val_set`` and ``test_set`` of ``setup``.
-
-    Args:
-        batch_size: training clips in a batch.
-        val_batch_size: clips in a batch of validation and test.
-        workers: processes that make clips; None for :func:`default_workers`.
-
-    Attributes:
-        train_clips: training clips in an epoch.
-    """
+    """Loads clips that are made while training runs: ``train_set``, ``val_set`` and ``test_set`` of ``setup``."""
 
     train_clips: int
 
@@ -129,14 +104,7 @@ def cut_key_frames(clip: dict[str, Tensor], key_frames: int, frames: int, every:
 
 
 def load_clips(clips: Dataset, batch_size: int, workers: int, **options: object) -> DataLoader:
-    """Return a loader of clips, which are dictionaries of tensors.
-
-    Args:
-        clips: a data set of them.
-        batch_size: clips in a batch.
-        workers: processes that make clips, at most; of one thread each.
-        options: others of :class:`torch.utils.data.DataLoader`.
-    """
+    """Return a loader of clips, which are dictionaries of tensors; its workers have one thread each."""
     workers = min(workers, math.ceil(len(clips) / batch_size))
     return _ClipLoader(
         clips,

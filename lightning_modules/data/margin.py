@@ -6,14 +6,7 @@ from torch import Tensor
 
 
 def flow_margin(patch: int, flow_patch: int) -> int:
-    """Return how far spikes reach beyond a patch so that motion is estimated on enough of the scene.
-
-    Args:
-        patch: side of the patch in sensor pixels.
-        flow_patch: smallest side of what motion is estimated on.
-
-    Returns:
-        An even number, which keeps the Bayer phase.
+    """Return how far spikes reach beyond a patch for motion to be estimated on ``flow_patch``; it is even.
 
     Example:
         >>> flow_margin(24, 48), flow_margin(26, 48), flow_margin(96, 48)
@@ -23,12 +16,6 @@ def flow_margin(patch: int, flow_patch: int) -> int:
 
 
 def trim(planes: Tensor, margin: int) -> Tensor:
-    """Cut off a margin: (*, H, W) to (*, H - 2 margin, W - 2 margin).
-
-    Example:
-        >>> import torch
-        >>> trim(torch.arange(16).reshape(4, 4), 1).tolist()
-        [[5, 6], [9, 10]]
-    """
+    """Cut off a margin: (*, H, W) to (*, H - 2 margin, W - 2 margin)."""
     height, width = planes.shape[-2:]
     return planes[..., margin : height - margin, margin : width - margin]

@@ -31,12 +31,7 @@ _HELD_OUT = ["coffee.png", "chelsea.png", "motorcycle_left.png", "gravel.png"]
 
 
 def existing_folder(root: str | Path, what: str) -> Path:
-    """Return the path of a folder of ``what``.
-
-    Raises:
-        FileNotFoundError: there is no such folder.
-        NotADirectoryError: it is a file.
-    """
+    """Return the path of a folder of ``what``, or raise ``FileNotFoundError`` or ``NotADirectoryError``."""
     root = Path(root).expanduser()
     if not root.exists():
         raise FileNotFoundError(f"{root}: no such folder of {what}")
@@ -47,12 +42,6 @@ def existing_folder(root: str | Path, what: str) -> Path:
 
 def folder_pictures(root: str | Path) -> list[Path]:
     """List the pictures of a folder and of all folders in it, linked ones too, sorted; hidden ones are left out.
-
-    Args:
-        root: the folder.
-
-    Returns:
-        Paths of PNG, JPEG, TIFF, BMP, WebP and PNM files, at least one.
 
     Raises:
         FileNotFoundError: there is no such folder, or no picture in it.
@@ -74,13 +63,7 @@ def folder_pictures(root: str | Path) -> list[Path]:
 
 
 def embedded_pictures(held_out: bool = False) -> list[Path]:
-    """List the photographs that lie inside scikit-image's wheel; nothing is ever downloaded.
-
-    Args:
-        held_out: the four that are kept for validation, instead of those for training.
-
-    Returns:
-        Paths, at least one.
+    """List the photographs inside scikit-image's wheel, for training or the four held out; nothing is ever downloaded.
 
     Raises:
         FileNotFoundError: this build of scikit-image came without any of them.
@@ -97,12 +80,7 @@ def embedded_pictures(held_out: bool = False) -> list[Path]:
 def split_pictures(pictures: list[Path], seed: int) -> tuple[list[Path], list[Path]]:
     """Hold out one picture in twenty at random, but four where there are eight or more, and half of fewer.
 
-    Args:
-        pictures: what to split.
-        seed: the same seed gives the same split.
-
-    Returns:
-        What stays, and what is held out, each in the order given. One picture alone is in both.
+    Returns what stays, and what is held out, each in the order given. One picture alone is in both.
     """
     if len(pictures) == 1:
         return pictures, pictures
@@ -116,20 +94,10 @@ def split_pictures(pictures: list[Path], seed: int) -> tuple[list[Path], list[Pa
 
 @lru_cache(maxsize=64)
 def read_shades(path: Path) -> Tensor:
-    """Read a picture as numbers of 8 bits, (3, h, w), or give the one in memory; not to be written to.
-
-    Raises:
-        ValueError: the file is not a picture; the message names it.
-    """
+    """Read a picture as numbers of 8 bits, (3, h, w), or give the one in memory; not to be written to."""
     return to_shades(read_picture(path))
 
 
 def to_shades(rgb: Tensor) -> Tensor:
-    """Turn values of [0, 1] into numbers of 8 bits.
-
-    Example:
-        >>> import torch
-        >>> to_shades(torch.tensor([0.0, 0.5, 1.0])).tolist()
-        [0, 128, 255]
-    """
+    """Turn values of [0, 1] into numbers of 8 bits."""
     return (rgb * 255).round().byte()

@@ -24,12 +24,7 @@ _TAPS = 4  # of a cubic
 
 
 class Pictures:
-    """Pictures of 8 bits, (3, h, w), by number: files, then procedural textures.
-
-    Args:
-        paths: the files.
-        textures: have textures, too.
-    """
+    """Pictures of 8 bits, (3, h, w), by number: files, then, if asked for, procedural textures."""
 
     def __init__(self, paths: Sequence[Path], textures: bool) -> None:
         self.paths, self.textures = list(paths), _TEXTURES if textures else 0
@@ -100,8 +95,7 @@ def draw_cut(
         side: of the square, in pixels.
         size: of the picture.
         rng: where chance comes from.
-        mirror: the square is at most so many times as long as the picture, as far as that is to be had without
-            enlarging.
+        mirror: the square is at most so many times as long as the picture, where that needs no enlarging.
         least: how far the picture is shrunk at most.
 
     Returns:
@@ -124,7 +118,7 @@ def draw_cut(
 def cut_pictures(
     gallery: Gallery, which: Tensor, cuts: Tensor, sides: Tensor, side: int, taken: tuple[int, int], turn: Tensor
 ) -> Tensor:
-    """Cut squares out of pictures, bicubic, with antialiasing: two matrix products for each.
+    """Cut squares out of pictures, (B, 3, side, side) in [0, 1]: bicubic, antialiased, two matrix products for each.
 
     Args:
         gallery: the pictures.
@@ -134,9 +128,6 @@ def cut_pictures(
         side: of all squares, at least as long: they go on beyond what was drawn.
         taken: most lines that any cut takes, of rows and of columns.
         turn: (B, 3) bool: turn rows around, columns, swap rows and columns.
-
-    Returns:
-        (B, 3, side, side), in [0, 1].
     """
     if len(cuts) == 1 and cuts.device.type == "cpu":  # a view serves
         (top, height, *_), (left, width, *_) = cuts[0].tolist()
@@ -184,7 +175,7 @@ def _cubic(x: Tensor) -> Tensor:
 
 
 def outline_masks(radius: Tensor, sides: Tensor, side: int) -> Tensor:
-    """Masks of outlines, (B, side, side), 1 inside, 0 outside; the edge is as wide as a pixel.
+    """Masks (B, side, side) of outlines, 1 inside, 0 outside; the edge is as wide as a pixel.
 
     Args:
         radius: (B, A), at A angles from -pi on, at most 1; all of them 0 for no object.
@@ -206,16 +197,7 @@ def outline_masks(radius: Tensor, sides: Tensor, side: int) -> Tensor:
 def render_scene(
     drawn: dict[str, np.ndarray], gallery: Gallery, pattern: str, side: int, margin: int, clocks: int
 ) -> Scene:
-    """Build scenes of drawn numbers, a batch of them.
-
-    Args:
-        drawn: of :meth:`lightning_modules.data.stills.StillClips.draw`, each with a leading dimension B.
-        gallery: what its numbers of pictures count.
-        pattern: of the sensor; a grey one needs one channel.
-        side: of the view, in its pixels.
-        margin: how far the background reaches beyond it.
-        clocks: of the clips.
-    """
+    """Build a batch of scenes of what :meth:`StillClips.draw` drew; in the margin is what comes into view."""
     device = gallery.shades.device
 
     def there(name: str, n: int) -> Tensor:
@@ -243,7 +225,7 @@ def render_scene(
     return Scene(layers, side, side, clocks)
 
 
-def see(light: Tensor, drawn: dict[str, np.ndarray], noise: SensorNoise) -> Tensor:
+def see(light: Tensor, drawn: dict[str, np.ndarray], noise: SensorNoise | None) -> Tensor:
     """Return the spikes of light (B, T, H, W), uint8, that sensors see, each with its share of the noise.
 
     Photons come out of the device's own random numbers, all else is drawn; so is the same on every device.
@@ -253,8 +235,10 @@ def see(light: Tensor, drawn: dict[str, np.ndarray], noise: SensorNoise) -> Tens
     def there(name: str) -> Tensor:
         return torch.from_numpy(drawn[name]).to(device, non_blocking=True)
 
-    share = there("noise")[:, None, None] if "noise" in drawn else 1.0
     light = light * there("alpha")[:, None, None, None]
+    if noise is None:
+        return spike_integrate_fire(light, 1.0, there("charge"), dtype=torch.uint8)[0]
+    share = there("noise")[:, None, None]
     if noise.photons is not None:
         light = _arrive(light, drawn, noise.photons, "photons")
     if noise.gain_spread:
@@ -279,9 +263,8 @@ def _around_one(normal: Tensor, spread: Tensor | float) -> Tensor:
 def _arrive(light: Tensor, drawn: dict[str, np.ndarray], photons: float, purpose: str) -> Tensor:
     """Let charge (B, T, H, W) arrive in whole electrons, every clip by its own seed."""
     generator = torch.Generator(light.device)
-    shares = drawn["noise"].tolist() if "noise" in drawn else [1.0] * len(light)
     arrived = []
-    for clip, seed, share in zip(light, drawn[purpose].tolist(), shares, strict=True):
+    for clip, seed, share in zip(light, drawn[purpose].tolist(), drawn["noise"].tolist(), strict=True):
         in_threshold = photons / max(share, 1e-6)
         arrived.append(torch.poisson(clip * in_threshold, generator.manual_seed(seed)) / in_threshold)
     return torch.stack(arrived)

@@ -109,10 +109,6 @@ class ClipRecipe:
     def clip(self, sequence: SequenceFiles, middle: int) -> dict[str, Tensor]:
         """Simulate a clip around a source frame.
 
-        Args:
-            sequence: the frames, as files.
-            middle: which of its frames is in the middle.
-
         Returns:
             ``spikes`` uint8 (N, H, W), ``rgb`` (3, s H, s W), the truth, and ``flow`` (times, 2, H, W), in sensor
             pixels, all of the whole view. Where the sequence is cut, nothing can be followed, and flow is 0. Of several
@@ -122,19 +118,15 @@ class ClipRecipe:
             spikekit.io.video.VideoError: a file that cannot be read; the message names it.
             ValueError: frames too small for the sensor, or a truth of another size than theirs.
         """
-        paths, pictures = self.files(sequence, middle), self._pictures(sequence, middle)
-        clip = self._view(sequence, pictures)
-        chance = self._chance(paths)
-        spikes = torch.cat(list(clip.sequence.spikes(clip.first, clip.frames, noise=self.noise, seed=chance)))
+        clip, paths = self.view(sequence, middle), self.files(sequence, middle)
+        spikes = torch.cat(
+            list(clip.sequence.spikes(clip.first, clip.frames, noise=self.noise, seed=self._chance(paths)))
+        )
         if self.key_frames > 1:
-            key_frames = (
-                clip.middle + n * self.clocks for n in range(-(self.key_frames // 2), self.key_frames // 2 + 1)
-            )
-            return {"spikes": spikes, "rgb": self._seen(torch.stack([clip.rgb(clock) for clock in key_frames]))}
-        if sequence.truth is None:
-            rgb = clip.rgb(clip.middle)
-        else:
-            rgb = _truth(paths[-1], tuple(pictures[0].shape[1:]), self.scale, spikes)
+            around = range(-(self.key_frames // 2), self.key_frames // 2 + 1)
+            rgb = torch.stack([clip.rgb(clip.middle + n * self.clocks) for n in around])
+            return {"spikes": spikes, "rgb": self._seen(rgb)}
+        rgb = clip.rgb(clip.middle) if sequence.truth is None else _truth(paths[-1], self.scale, spikes)
         made = {"spikes": spikes, "rgb": self._seen(rgb)}
         if self.flow_times:
             made["flow"] = torch.stack([self._flow(clip, time) for time in self.flow_times])
@@ -145,25 +137,10 @@ class ClipRecipe:
         return bin_to_sensor(rgb, GREY, scale=1).unsqueeze(-3) if self.pattern == GREY else rgb
 
     def view(self, sequence: SequenceFiles, middle: int) -> SequenceClip:
-        """Return what the camera sees around a source frame.
-
-        Args:
-            sequence: the frames, as files.
-            middle: which of its frames is in the middle.
-
-        Raises:
-            spikekit.io.video.VideoError: a file that cannot be read; the message names it.
-            ValueError: frames too small for the sensor.
-        """
-        return self._view(sequence, self._pictures(sequence, middle))
-
-    def _pictures(self, sequence: SequenceFiles, middle: int) -> list[Tensor]:
+        """Return what the camera sees around a source frame; errors are those of :meth:`clip`."""
         paths = self.files(sequence, middle)[: sum(self.reach) + 1]
-        return [_shrunk(read_video(path)[0], sequence.shrink) for path in paths]
-
-    def _view(self, sequence: SequenceFiles, pictures: list[Tensor]) -> SequenceClip:
         seen = FrameSequence(
-            pictures,
+            [_shrunk(read_video(path)[0], sequence.shrink) for path in paths],
             scale=self.scale if sequence.truth is None else 1,
             pattern=self.pattern,
             alpha=self.alpha,
@@ -209,13 +186,13 @@ def _shrunk(rgb: Tensor, factor: int) -> Tensor:
     return small.mul(255).round().clamp(0, 255).div(255)
 
 
-def _truth(path: Path, size: tuple[int, int], scale: int, spikes: Tensor) -> Tensor:
-    rgb = read_video(path)[0]
-    wanted = tuple(scale * length for length in size)
-    if tuple(length // scale * scale for length in rgb.shape[1:]) != wanted:
+def _truth(path: Path, scale: int, spikes: Tensor) -> Tensor:
+    rgb, wanted = read_video(path)[0], [scale * length for length in spikes.shape[1:]]
+    # the view is cut to whole Bayer cells
+    if not all(0 <= length - side < 2 * scale for length, side in zip(rgb.shape[1:], wanted, strict=True)):
         expected, got = (f"{height} x {width}" for height, width in (wanted, rgb.shape[1:]))
         raise ValueError(f"{path}: expected {expected}, {scale} times the frames that the sensor sees, got {got}")
-    return rgb[:, : scale * spikes.shape[1], : scale * spikes.shape[2]]
+    return rgb[:, : wanted[0], : wanted[1]]
 
 
 class SequenceClips(Dataset):

@@ -56,10 +56,9 @@ class StillClips(Dataset):
         zoom: largest growth or shrinkage of the background and of each object in that time; 0.01 is one per cent.
         objects: most objects that move in front of the background.
         brightness: darkest and brightest exposure. Truth and light of a clip are both multiplied by one number between.
-        photons: photons that make one threshold, for photon noise; null for none.
-        noise: instead, what a sensor adds, such as ``{photons: 3000, gain_spread: 0.06}``; a clip with ``augment``, as
-            training clips are, has a random share of it: a network learns sensors from the ideal to this one. The
-            share is the clip's ``noise``.
+        noise: what a sensor adds, such as ``{photons: 3000, gain_spread: 0.06}``; a clip with ``augment``, as training
+            clips are, has a random share of it: a network learns sensors from the ideal to this one. The share is the
+            clip's ``noise``.
         gains: lowest and highest alpha of clips with ``augment``, all orders of magnitude between alike; it is the
             clip's ``alpha``. Null for one alpha.
         flow_times: frames to which the flow from the middle frame is given; with 41 frames and a window of 11, 5 and 35
@@ -91,7 +90,6 @@ class StillClips(Dataset):
     zoom: float = 0.01
     objects: int = 2
     brightness: tuple[float, float] = (0.5, 1.0)
-    photons: float | None = None
     noise: SensorNoise | None = None
     gains: tuple[float, float] | None = None
     flow_times: tuple[int, int] = (5, 35)
@@ -163,15 +161,11 @@ class StillClips(Dataset):
         light = scene.light(self.pattern, scale=self.scale, alpha=1.0)
         middles = [self.frames // 2 + n * self.every for n in range(self.key_frames)]
         rgb = torch.stack([trim(scene.rgb(middle), self.scale * self.margin) for middle in middles], dim=1)
-        clips = {"spikes": see(light, drawn, self._noise), "rgb": rgb if self.key_frames > 1 else rgb[:, 0]}
+        clips = {"spikes": see(light, drawn, self.noise), "rgb": rgb if self.key_frames > 1 else rgb[:, 0]}
         if self.key_frames == 1:
             flow = torch.stack([scene.flow(clock, scale=self.scale) for clock in self.flow_times], dim=1)
             clips["flow"] = trim(flow, self.margin)
         return clips | {name: torch.from_numpy(drawn[name]).to(rgb.device) for name in self._told}
-
-    @property
-    def _noise(self) -> SensorNoise:
-        return self.noise or SensorNoise(photons=self.photons)
 
     @property
     def _told(self) -> list[str]:
@@ -188,7 +182,7 @@ class StillClips(Dataset):
     def spikes(self, index: int, scene: Scene) -> Tensor:
         """Return what the sensor of a clip makes of a scene, uint8 (clocks, H, W)."""
         drawn = {name: np.asarray(part)[None] for name, part in self._sensor(index).items()}
-        return see(scene.light(self.pattern, scale=self.scale, alpha=1.0)[None], drawn, self._noise)[0]
+        return see(scene.light(self.pattern, scale=self.scale, alpha=1.0)[None], drawn, self.noise)[0]
 
     def scene(self, index: int) -> Scene:
         """Return the scene of a clip, to look at other clocks or sizes than the clip has."""
@@ -271,15 +265,14 @@ class StillClips(Dataset):
         drawn = {"charge": rng.random((side, side), "float32"), "alpha": np.float32(self.alpha)}
         if self.gains and self.augment:
             drawn["alpha"] = np.float32(np.exp(rng.uniform(*np.log(self.gains))))
-        if self.photons is None and self.noise is None:
+        if self.noise is None:
             return drawn
         drawn["photons"], drawn["electrons"] = rng.integers(2**62, size=2)
-        noise = self.noise or SensorNoise()
-        drawn["noise"] = np.float32(1 - rng.uniform() if self.noise and self.augment else 1)
-        for name, wanted in (("gain", noise.gain_spread), ("dark", noise.dark_current)):
+        drawn["noise"] = np.float32(1 - rng.uniform() if self.augment else 1)
+        for name, wanted in (("gain", self.noise.gain_spread), ("dark", self.noise.dark_current)):
             if wanted:
                 drawn[name] = rng.standard_normal((side, side), "float32")
-        if noise.hot or noise.dead:
+        if self.noise.hot or self.noise.dead:
             drawn["defects"] = rng.random((side, side), "float32")
         return drawn
 
@@ -323,8 +316,6 @@ def _check(clips: StillClips) -> None:
         ("key_frames", clips.key_frames >= 1, "at least 1"),
         ("every", clips.every >= 1, "at least 1 clock"),
         ("flow_times", all(0 <= t < clips.frames for t in clips.flow_times), f"clocks in [0, {clips.frames})"),
-        ("photons", clips.photons is None or 1 <= clips.photons < math.inf, "1 or more, or null for no noise"),
-        ("photons", None in (clips.photons, clips.noise), "those of the noise instead"),
         (
             "gains",
             clips.gains is None or (len(clips.gains) == 2 and 0 < clips.gains[0] <= clips.gains[1] < math.inf),

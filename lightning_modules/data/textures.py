@@ -8,14 +8,9 @@ from torch import Tensor
 
 
 def outline_mask(size: int, rng: np.random.Generator) -> Tensor:
-    """Draw an ellipse, a polygon or a blob that fills a square.
+    """Draw an ellipse, a polygon or a blob that fills a square of so many pixels.
 
-    Args:
-        size: side of the square in pixels.
-        rng: where chance comes from.
-
-    Returns:
-        (size, size), 1 inside, 0 outside; the edge is as wide as a pixel.
+    (size, size), 1 inside, 0 outside; the edge is as wide as a pixel.
     """
     middle = (size - 1) / 2
     y, x = np.mgrid[:size, :size] - middle
@@ -56,16 +51,7 @@ def _blob(angle: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def texture(height: int, width: int, rng: np.random.Generator) -> Tensor:
-    """Draw a picture: coloured noise, gratings, checkers, or patches that lie over each other.
-
-    Args:
-        height: rows.
-        width: columns.
-        rng: where chance comes from.
-
-    Returns:
-        ``rgb`` of shape (3, height, width), [0, 1].
-    """
+    """Draw ``rgb`` (3, height, width): coloured noise, gratings, checkers, or patches that lie over each other."""
     draw = [_noise, _gratings, _checkers, _patches, _patches][rng.integers(5)]
     return torch.from_numpy(draw(height, width, rng).clip(0, 1).astype("float32"))
 

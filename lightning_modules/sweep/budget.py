@@ -15,10 +15,6 @@ def seconds(text: str) -> float:
 
     Raises:
         ValueError: it is not one, or no time at all.
-
-    Example:
-        >>> seconds("00:05:00"), seconds("1:00:00:00")
-        (300, 86400)
     """
     if not re.fullmatch(r"(\d+:)?\d+:[0-5]?\d:[0-5]?\d", text):
         raise ValueError(f"expected HH:MM:SS or DD:HH:MM:SS, got {text}")
@@ -31,22 +27,9 @@ def seconds(text: str) -> float:
 def with_budget(config: dict[str, Any], budget: dict[str, float]) -> dict[str, Any]:
     """Return a configuration of ``lightning fit`` that trains as long as a budget says.
 
-    Args:
-        config: the configuration, resolved.
-        budget: nothing, for what the configuration says; or ``steps``; or ``seconds``, in which training stops,
-            validation included; or ``flops``, of which :mod:`lightning_modules.sweep.worker` makes steps once it has
-            counted those of one. Steps are also those at which a schedule ends that has an end, such as that of
-            ``CosineAnnealingLR``.
-
-    Returns:
-        A new configuration.
-
-    Example:
-        >>> cosine = {"class_path": "torch.optim.lr_scheduler.CosineAnnealingLR", "init_args": {"T_max": 1000}}
-        >>> config = {"trainer": {"max_steps": 1000}, "model": {"init_args": {"lr_scheduler": cosine}}}
-        >>> short = with_budget(config, {"steps": 300})
-        >>> short["trainer"]["max_steps"], short["model"]["init_args"]["lr_scheduler"]["init_args"]["T_max"]
-        (300, 300)
+    The budget is nothing, for what the configuration says; or ``steps``; or ``seconds``, in which training stops,
+    validation included; or ``flops``, of which :mod:`lightning_modules.sweep.worker` makes steps once it has counted
+    those of one. Steps are also those at which a schedule ends that has an end, such as ``CosineAnnealingLR``.
     """
     if not budget:
         return config

@@ -125,10 +125,7 @@ examples:
 
 
 def sweep(args: Sequence[str]) -> None:
-    """Run the verb.
-
-    Args:
-        args: what was typed after ``lightning sweep``.
+    """Run the verb with what was typed after it.
 
     Raises:
         InputError: what was asked for cannot be; or trials failed.

@@ -17,13 +17,7 @@ Ended = dict[Path, str | None]
 
 
 def run_locally(folders: Sequence[Path], jobs: int | None, every: float) -> Iterator[Ended]:
-    """Run trials on this machine, and repeatedly yield those that ended.
-
-    Args:
-        folders: of the trials.
-        jobs: trials at once, which share the cores; one if ``None``.
-        every: seconds between two checkpoints.
-    """
+    """Run trials on this machine, ``jobs`` at once, which share the cores, and repeatedly yield those that ended."""
     jobs = jobs or 1
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     threads = {"OMP_NUM_THREADS": str(max(1, cores // jobs))} if jobs > 1 else {}
@@ -46,11 +40,6 @@ def run_on_ray(folders: Sequence[Path], jobs: int | None, every: float) -> Itera
 
     A trial takes a GPU where the cluster has any, else the cores of a node; with ``jobs``, such a share of all that as
     many run at once. All nodes need this package, the working directory and the folders, under the same paths.
-
-    Args:
-        folders: of the trials.
-        jobs: trials at once; as many as there are GPUs, or else nodes, if ``None``.
-        every: seconds between two checkpoints.
     """
     logs = {folder.absolute() / LOG: folder for folder in folders}
     for ended in run_commands_on_ray({log: _trial(log.parent, every) for log in logs}, jobs):

@@ -183,12 +183,7 @@ def _resolve(args: Sequence[str], trial: str) -> dict[str, Any]:
 
 def _difference(there: dict[str, Any], asked: dict[str, Any]) -> str:
     there, asked = dict(flatten(there)), dict(flatten(asked))
-    keys = sorted(key for key in {**there, **asked} if there.get(key) != asked.get(key))
-    if not keys:
-        return "holds a trial of another form than this sweep asks for"
-    shown = [" ".join(key.replace(".init_args", "").split())[:80] for key in keys[:3]]
-    more = f" and {len(keys) - 3} more" if len(keys) > 3 else ""
-    holds, wanted = (" ".join(str(values.get(keys[0], "none")).split())[:80] for values in (there, asked))
-    first = f"{shown[0]}={holds}" if keys[0] in there else f"no {shown[0]}"
-    others = f" (also {', '.join(shown[1:])}{more})" if shown[1:] else ""
-    return f"holds a trial with {first}, and this sweep asks for {wanted}{others}"
+    key = next((key for key in {**there, **asked} if there.get(key) != asked.get(key)), "its form")
+    holds, wanted = (" ".join(str(values.get(key, "none")).split())[:80] for values in (there, asked))
+    shown = " ".join(key.replace(".init_args", "").split())[:80]
+    return f"holds a trial with {shown}={holds}, and this sweep asks for {wanted}"

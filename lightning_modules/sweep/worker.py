@@ -33,11 +33,7 @@ _TIMED, _WARM_UP = 12, 4
 
 
 class Report(Callback):
-    """Say in a file where training stands, and stop it where the loss is no number any more.
-
-    Args:
-        folder: of the trial.
-    """
+    """Say in a file where training stands, and stop it where the loss is no number any more."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -160,12 +156,7 @@ def plan(folder: Path) -> Path:
 
 
 def train_and_test(folder: Path, every: float) -> None:
-    """Train a trial, from where it was stopped if it was, and test the weights that it ends with.
-
-    Args:
-        folder: the trial's, with ``trial.yaml`` and ``budget.json``.
-        every: seconds between two checkpoints, besides those at the end of each epoch.
-    """
+    """Train a trial, from where it was stopped if it was, and test the weights that it ends with."""
     config = plan(folder)
     report = Report(folder)
     checkpoints = folder / "checkpoints"

@@ -19,8 +19,6 @@ from spikekit import panel, write_picture
 from spikekit.io.whole_file import whole_file
 from spikekit.tables import table
 
-_MOST_TABLES = 20
-
 
 def middle_clip(batch: dict[str, Tensor]) -> dict[str, Tensor]:
     """Return the clip of a batch, of a film that around the key frame in its middle, with its truth."""
@@ -72,8 +70,8 @@ class TestReport(Callback):
     """Print one table of a test, every method on the same clips, and write ``test.csv`` and ``test.png``.
 
     PSNR and SSIM as :func:`spikekit.psnr` and :func:`spikekit.ssim`, averaged over clips, and LPIPS where it is to be
-    had, see :mod:`lightning_modules.metrics.image`. Data that name their clips, in ``test_names``, get a table for each
-    of them, too, where they are no more than 20.
+    had, see :mod:`lightning_modules.metrics.image`. In ``test.csv`` every clip has a row, too, with its name where the
+    data have ``test_names``.
 
     Args:
         output: the folder that they are written to.
@@ -126,10 +124,6 @@ class TestReport(Callback):
             method: torch.tensor(scores, dtype=torch.float64).mean(dim=0).tolist()
             for method, scores in self._scores.items()
         }
-        tables = [self._table(f"mean of {clips} clips", means)]
-        if named and clips <= _MOST_TABLES:
-            for clip, name in enumerate(names):
-                tables.append(self._table(name, {method: scores[clip] for method, scores in self._scores.items()}))
         with whole_file(self.output / "test.csv", "w", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(["method", "clip", *(column for column, _, _ in self.columns())])
@@ -138,7 +132,7 @@ class TestReport(Callback):
                 writer.writerow([method, "mean", *map(_rounded, means[method])])
         write_picture(self.output / "test.png", panel(self._rows))
         missing = self.missing()
-        print("\n" + "\n\n".join([*tables, missing or ""]))  # noqa: T201
+        print(f"\n{self._table(f'mean of {clips} clips', means)}\n\n{missing or ''}")  # noqa: T201
         print(f"{self.output / 'test.csv'}, {self.output / 'test.png'} (columns: {', '.join(self._scores)}, truth)")  # noqa: T201
 
     def _gather(self, processes: int) -> None:

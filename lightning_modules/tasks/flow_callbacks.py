@@ -15,9 +15,6 @@ class FlowPictures(ValidationPictures):
     """Show the first clips of every validation in TensorBoard: the estimated flow to the last time point, and the true.
 
     The direction is the hue and the length the saturation; both pictures of a clip have one scale.
-
-    Args:
-        clips: how many.
     """
 
     title = "flow, truth"
@@ -32,10 +29,6 @@ class FlowReport(TestReport):
     The end-point error and the share of pixels where it is above one pixel are in sensor pixels, and so are KITTI's
     outliers, :func:`lightning_modules.metrics.flow.outliers`; both flows of a clip count. The time is that of a batch,
     shared by its clips.
-
-    Args:
-        output: the folder that they are written to.
-        clips: how many clips the picture shows.
     """
 
     def columns(self) -> list[tuple[str, str, int]]:  # noqa: D102
@@ -55,11 +48,6 @@ class FlowReport(TestReport):
 
 
 def flow_row(flows: list[Tensor], truth: Tensor) -> list[Tensor]:
-    """Return pictures of estimated flows (2, H, W) and of the true one, all of one scale: the longest true one.
-
-    Args:
-        flows: the estimates.
-        truth: the true flow.
-    """
+    """Return pictures of estimated flows (2, H, W) and of the true one, all of one scale: the longest true one."""
     longest = max(truth.norm(dim=0).max().item(), 1.0)
     return [flow_to_rgb(flow.float().cpu(), longest) for flow in (*flows, truth)]

@@ -22,14 +22,6 @@ _LARGEST = (1 << 63) - 1  # of the whole numbers that tensors hold
 def check_resume(path: str | Path, module: BaseTask, trainer: Trainer) -> dict[str, Any]:
     """Read a checkpoint that training is to resume from, and compare all parts of it with a training that begins.
 
-    Args:
-        path: the file.
-        module: what is trained.
-        trainer: what trains it.
-
-    Returns:
-        The checkpoint.
-
     Raises:
         FileNotFoundError: no such file.
         ValueError: no checkpoint, or one that this training cannot resume from; the message is one line and names it.

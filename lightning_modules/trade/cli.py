@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import re
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -38,11 +37,10 @@ arguments give the clips takes those in the middle. All settings are parsed and 
 that cannot run here, for want of a file, say, is reported as a row, and the others go on. Time is taken in one process
 and in turns: every setting once in every round, on the same clip.
 
-With --film EVERY, the test scenes are films of {PICTURES} pictures, EVERY clocks apart, and time, work and energy are
+With --film EVERY, the test scenes are films of {PICTURES} pictures, EVERY clocks apart, and time and work are
 those of a picture in a film; PSNR, SSIM and LPIPS are of the pictures between the first and the last.
 
-The result is trade.md and trade.csv, with the Pareto front of time and PSNR, and for every row the command that
-measures it alone.
+The result is trade.md and trade.csv, with the Pareto front of time and PSNR.
 
 columns:
 {COLUMNS}
@@ -71,10 +69,7 @@ examples:
 
 
 def trade(args: Sequence[str]) -> None:
-    """Run the verb.
-
-    Args:
-        args: what was typed after ``lightning trade``.
+    """Run the verb with what was typed after it.
 
     Raises:
         InputError: what was asked for cannot be; or nothing of it can run.
@@ -96,10 +91,10 @@ def trade(args: Sequence[str]) -> None:
     rows = [_row(setting, shared, base) for setting in progress(settings, "settings built")]
     _check_any(rows)
     with locked_folder(asked.output, "lightning trade"):
-        _measured(rows, base, asked, [_command(setting, shared, asked) for setting in settings])
+        _measured(rows, base, asked, shlex.join(["lightning", "trade", *args]))
 
 
-def _measured(rows: Sequence[Measurement], base: Runner, asked: argparse.Namespace, commands: Sequence[str]) -> None:
+def _measured(rows: Sequence[Measurement], base: Runner, asked: argparse.Namespace, command: str) -> None:
     """Measure the rows, and write them in three ways."""
     for row in rows:
         if row.reason is not None:
@@ -114,10 +109,10 @@ def _measured(rows: Sequence[Measurement], base: Runner, asked: argparse.Namespa
         except ValueError as error:
             raise InputError(f"trade: {error}") from error
     _check_any(rows)
-    text = markdown(rows, commands, timed)
+    text = markdown(rows, command, timed)
     with whole_file(asked.output / "trade.md", "w") as file:
         file.write(text)
-    write_csv(rows, commands, timed, asked.output / "trade.csv")
+    write_csv(rows, timed, asked.output / "trade.csv")
     print(f"\n{text}")
     print(", ".join(str(path) for path in (asked.output / "trade.csv", asked.output / "trade.md")))
 
@@ -143,11 +138,3 @@ def _row(setting: Setting, shared: Sequence[str], base: Runner) -> Measurement:
 def _check_any(rows: Sequence[Measurement]) -> None:
     if not running(rows):
         raise InputError(f"trade: nothing can run; {rows[0].setting.name}: {rows[0].reason}")
-
-
-def _command(setting: Setting, shared: Sequence[str], asked: argparse.Namespace) -> str:
-    """The command that measures a setting alone, into a folder of its own."""
-    folder = asked.output / re.sub(r"[^\w.=+-]+", "_", setting.name).strip("_")
-    rounds = [] if asked.rounds == _ROUNDS else ["--rounds", str(asked.rounds)]
-    filmed = [] if asked.film is None else ["--film", str(asked.film)]
-    return shlex.join(["lightning", "trade", *shared, *filmed, *rounds, "-o", str(folder), "--setting", setting.text])

@@ -30,14 +30,9 @@ _COUNTED = slice(1, PICTURES - 1)
 
 
 class FilmRunner:
-    """A setting that makes films.
+    """A setting that makes films, with a picture ``every`` so many clocks.
 
-    Args:
-        runner: it.
-        every: clocks between two pictures.
-
-    Attributes:
-        latency: clocks that had come after a picture's own when it was made, in the last film at most.
+    ``latency`` is how many clocks had come after a picture's own when it was made, in the last film at most.
     """
 
     def __init__(self, runner: Runner, every: int) -> None:
@@ -48,8 +43,7 @@ class FilmRunner:
     def __call__(self, spikes: Tensor) -> Tensor:
         """Return the pictures of a film, (PICTURES, 3, s H, s W), in [0, 1].
 
-        Args:
-            spikes: (1, T, H, W), on the device; of more clocks than the network needs, those in the middle.
+        Of more spikes (1, T, H, W) than the network needs, those in the middle.
         """
         length = film_length(self.network.frames, self.every)
         first = (spikes.shape[1] - length) // 2
@@ -84,22 +78,12 @@ class FilmScene(NamedTuple):
 
 
 def film_length(frames: int, every: int) -> int:
-    """Return how many clocks a film takes.
-
-    Args:
-        frames: those of a clip.
-        every: clocks between two pictures.
-    """
+    """Return how many clocks a film takes."""
     return frames + (PICTURES - 1) * every
 
 
 def film_scenes(data: LightningDataModule, frames: int, every: int) -> Iterator[FilmScene]:
     """Yield the test scenes of data as films, moving as fast as the clips do.
-
-    Args:
-        data: scenes that are set up for a test.
-        frames: those of a clip.
-        every: clocks between two pictures.
 
     Raises:
         UsageError: data of another kind, or without truth at so many clocks.
@@ -138,13 +122,6 @@ def measure_films(
 ) -> Timed:
     """Measure settings as :func:`lightning_modules.trade.measure.measure` does, on films.
 
-    Args:
-        rows: of settings that can run; their runners become those of films.
-        data: scenes that are set up for a test.
-        frames: those of the longest clip.
-        every: clocks between two pictures.
-        rounds: how often a setting is timed.
-
     Raises:
         UsageError: data that make no such films.
         ValueError: likewise.
@@ -161,7 +138,6 @@ def measure_films(
     for row in running(rows):
         row.seconds = [seconds / PICTURES for seconds in row.seconds]
         row.macs /= PICTURES
-        row.joules = row.joules and row.joules / PICTURES
     return replace(timed, every=every)
 
 

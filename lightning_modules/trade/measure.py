@@ -13,7 +13,6 @@ from torch.utils.data import DataLoader
 from torch.utils.flop_counter import FlopCounterMode
 
 from lightning_modules.metrics.image import measures
-from lightning_modules.trade.energy import energy_meter, energy_per_call
 from lightning_modules.trade.runner import Runner
 from lightning_modules.trade.settings import Setting
 from spikekit.arguments import one_line
@@ -35,7 +34,6 @@ class Measurement:
         seconds: of one clip, which is one frame, round by round.
         memory: MiB, by how much a clip raises the memory in use; None where that is not to be had.
         macs: multiplications of convolutions and matrices, by sensor pixel.
-        joules: by frame; None where that is not to be had.
         flicker: of pairs of pictures in films, see :func:`lightning_modules.metrics.flicker.film_flicker`.
         latency: clocks that a film is late; None where it is no film.
     """
@@ -49,7 +47,6 @@ class Measurement:
     seconds: list[float] = field(default_factory=list)
     memory: float | None = None
     macs: float | None = None
-    joules: float | None = None
     flicker: list[float] = field(default_factory=list)
     latency: int | None = None
 
@@ -79,16 +76,10 @@ class Timed:
 
 
 def measure(rows: Sequence[Measurement], scenes: DataLoader, rounds: int) -> Timed:
-    """Measure the settings that can run; if one fails, its row gets the reason, and the others continue.
+    """Score and time the settings that can run; if one fails, its row gets the reason, and the others continue.
 
-    All settings see a clip before the next one is made. That also warms them up. Then they are timed, see
-    :func:`time_in_turns`, on the clips that are of one size with the first. Times do not include moving the spikes to
-    the device.
-
-    Args:
-        rows: of settings that can run.
-        scenes: clips with their truth.
-        rounds: how often a setting is timed.
+    All settings see a clip before the next one is made. That also warms them up. Then they are timed on the clips that
+    are of one size with the first. Times do not include moving the spikes to the device.
     """
     kept: list[Tensor] = []
     with progress(what="pictures scored", total=len(scenes.dataset) * len(running(rows))) as bar:
@@ -104,10 +95,7 @@ def measure(rows: Sequence[Measurement], scenes: DataLoader, rounds: int) -> Tim
 def measure_costs(rows: Sequence[Measurement], clips: Sequence[Tensor], rounds: int) -> Timed:
     """Measure the cost of settings that can run; one that fails on the way gets a reason, and the others go on.
 
-    Args:
-        rows: of settings that can run.
-        clips: spikes (1, N, H, W), of one size, which take turns at being timed; the first of them is also weighed.
-        rounds: how often a setting is timed.
+    The clips, spikes (1, N, H, W) of one size, take turns at being timed; the first of them is also weighed.
     """
     for row in progress(running(rows), "settings weighed"):
         attempt(row, lambda row=row: _weigh(row, clips[0]))
@@ -125,13 +113,7 @@ def running(rows: Sequence[Measurement]) -> list[Measurement]:
 def time_in_turns(rows: Sequence[Measurement], clips: Sequence[Tensor], rounds: int) -> None:
     """Time all rows once in every round, on the round's clip, each round beginning with the next row.
 
-    Other work on the machine and the demands of a clip then affect all rows alike, and no row is always the first of
-    its round.
-
-    Args:
-        rows: their ``seconds`` are added to.
-        clips: spikes (1, N, H, W), which take turns.
-        rounds: how many.
+    Other work on the machine and the demands of a clip then affect all rows alike, and no row is always the first.
     """
     turns = [(turn, row) for turn in range(rounds) for row in _from(rows, turn)]
     for turn, row in progress(turns, "timings"):
@@ -173,7 +155,7 @@ def _score(row: Measurement, clip: dict[str, Tensor]) -> None:
 
 
 def _weigh(row: Measurement, spikes: Tensor) -> None:
-    """Memory, work and energy of one clip."""
+    """Memory and work of one clip."""
     device = row.runner.device
     spikes = spikes.to(device)
     with FlopCounterMode(display=False) as counter:
@@ -181,16 +163,8 @@ def _weigh(row: Measurement, spikes: Tensor) -> None:
     row.macs = counter.get_total_flops() / 2 / (spikes.shape[-2] * spikes.shape[-1])
     gc.collect()
     row.memory = peak_memory(lambda: row.runner(spikes), device)
-    meter = energy_meter(device)
-    if meter is not None:
-        row.joules = energy_per_call(lambda: row.runner(spikes).cpu(), meter)
 
 
 def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
-    """Return the first quartile, the median, and the third.
-
-    Example:
-        >>> quartiles([4.0, 1.0, 2.0, 3.0, 5.0])
-        (2.0, 3.0, 4.0)
-    """
+    """Return the first quartile, the median, and the third."""
     return tuple(float(value) for value in np.quantile(values, [0.25, 0.5, 0.75]))

@@ -89,8 +89,7 @@ class Runner:
     def __call__(self, spikes: Tensor) -> Tensor:
         """Return what ``lightning predict`` makes of a clip: rgb (1, 3, s H, s W), in [0, 1].
 
-        Args:
-            spikes: (1, N, H, W), on the device; of more frames than the network takes, those in the middle.
+        Of more frames in spikes (1, N, H, W), on the device, than the network takes, those in the middle.
         """
         first = (spikes.shape[1] - self.network.frames) // 2
         clip = spikes[:, first : first + self.network.frames]
@@ -101,12 +100,7 @@ class Runner:
         return FilmMaker(self.network, **self.how)
 
     def film(self, chunks: Iterable[Tensor], every: int) -> Iterator[FilmFrame]:
-        """Yield the pictures of a film, see :func:`lightning_modules.inference.film.film`.
-
-        Args:
-            chunks: spikes (T, H, W), on the device.
-            every: clocks between two pictures.
-        """
+        """Yield the pictures of a film of spikes (T, H, W), see :func:`lightning_modules.inference.film.film`."""
         chunks, white = map(self.precision.convert_input, chunks), self.network.settings["alpha"]
         with torch.inference_mode(), self.precision.predict_step_context():
             yield from film(self.network, chunks, every, white=white, **self.how)
@@ -122,12 +116,7 @@ def _how() -> VerbParser:
 
 
 def make_runner(shared: Sequence[str], args: Sequence[str], base: Runner) -> Runner:
-    """Build a setting and check that it runs on the scenes of all the others.
-
-    Args:
-        shared: arguments of all settings.
-        args: its own.
-        base: what the shared arguments make by themselves.
+    """Build a setting, and check that it runs on the scenes of all the others, which ``base`` has.
 
     Raises:
         InputError: arguments that make no sense, or that ask for other scenes.

@@ -59,17 +59,6 @@ class Setting(NamedTuple):
         except ValueError:
             return None
 
-    @property
-    def text(self) -> str:
-        """As :func:`read_setting` takes it.
-
-        Example:
-            >>> Setting("small tiles", ["--tile", "32"]).text
-            'small tiles: --tile 32'
-        """
-        typed = shlex.join(self.args)
-        return typed if typed == self.name else f"{self.name}: {typed}".rstrip()
-
 
 def read_setting(text: str) -> Setting:
     """Read a setting as it is typed: ``ARGS``, or ``NAME: ARGS``.

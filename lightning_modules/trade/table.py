@@ -1,4 +1,4 @@
-"""Tables of a trade as CSV and Markdown, with the machine and the command of every row."""
+"""Tables of a trade as CSV and Markdown."""
 
 from __future__ import annotations
 
@@ -28,42 +28,32 @@ MiB         by how much a clip raises the memory in use at its worst moment
 parameters  weights, with those of a learned estimator of motion
 MAC a pixel multiplications of convolutions and matrices by sensor pixel, those of a learned estimator included; not
             counted: the search along the motion, classical motion, decoding, whatever is done element by element
-J a frame   energy of the whole device, whoever uses it: NVML on GPUs (with nvidia-ml-py)
 flicker     of films: error of the difference of two neighbouring pictures, the one warped onto the other by the true
             motion, in steps of 8 bits; what moves with the scene is none
 latency     of films: clocks that have to come behind a picture before it is made
 front       nothing else here is as fast and, to 0.01 dB, as good"""
 
-_FIGURES = [
-    "psnr", "ssim", "lpips", "ms", "ms_q1", "ms_q3", "ratio", "ratio_q1", "ratio_q3",
-    "mib", "parameters", "macs", "joules", "flicker", "latency",
-]  # fmt: skip
-
 _OF_FILMS = "flicker", "latency"
 
 #: columns that are left out where no setting has anything in them
-_PERHAPS = ("LPIPS", "J a frame", *_OF_FILMS)
+_PERHAPS = ("LPIPS", *_OF_FILMS)
 
 
 def figures(rows: Sequence[Measurement]) -> list[dict[str, float | None]]:
     """Return what was measured, a dictionary a row; an empty one where a setting could not run."""
-    measured = running(rows)
+    reference = running(rows)[0].seconds
     found = []
     for row in rows:
         if row.reason is not None:
             found.append({})
             continue
-        ratios = [ours / max(first, 1e-9) for ours, first in zip(row.seconds, measured[0].seconds, strict=True)]
-        (ms_q1, ms, ms_q3), (ratio_q1, ratio, ratio_q3) = (
-            quartiles([1e3 * seconds for seconds in row.seconds]),
-            quartiles(ratios),
-        )
-        values = [
-            mean(row.psnr), mean(row.ssim), mean(row.lpips) if row.lpips else None,
-            ms, ms_q1, ms_q3, ratio, ratio_q1, ratio_q3, row.memory, row.parameters, row.macs, row.joules,
-            mean(row.flicker) if row.flicker else None, row.latency,
-        ]  # fmt: skip
-        found.append(dict(zip(_FIGURES, values, strict=True)))
+        ratios = [ours / max(first, 1e-9) for ours, first in zip(row.seconds, reference, strict=True)]
+        scores = {name: getattr(row, name) for name in ("psnr", "ssim", "lpips", "flicker")}
+        values = {name: mean(score) if score else None for name, score in scores.items()}
+        for name, measured in (("ms", [1e3 * seconds for seconds in row.seconds]), ("ratio", ratios)):
+            values[f"{name}_q1"], values[name], values[f"{name}_q3"] = quartiles(measured)
+        cost = {"mib": row.memory, "parameters": row.parameters, "macs": row.macs, "latency": row.latency}
+        found.append(values | cost)
     return found
 
 
@@ -97,14 +87,8 @@ def machine(rows: Sequence[Measurement], timed: Timed) -> str:
     )
 
 
-def markdown(rows: Sequence[Measurement], commands: Sequence[str], timed: Timed) -> str:
-    """Return the table as Markdown.
-
-    Args:
-        rows: measured ones, and those that could not run.
-        commands: what a user types for each of them.
-        timed: how time was taken.
-    """
+def markdown(rows: Sequence[Measurement], command: str, timed: Timed) -> str:
+    """Return the table as Markdown, with the command that was typed."""
     best = front(rows)
     cells = [_cells(values, n in best) if values else {} for n, values in enumerate(figures(rows))]
     header = [name for name in cells[best[0]] if name not in _PERHAPS or any(own.get(name) for own in cells)]
@@ -113,8 +97,7 @@ def markdown(rows: Sequence[Measurement], commands: Sequence[str], timed: Timed)
     ]
     missing = why_no_lpips()
     failed = [f"{row.setting.name} cannot run: {row.reason}" for row in rows if row.reason is not None]
-    typed = "\n".join(f"# {n + 1}\n{command}" for n, command in enumerate(commands))
-    notes = [*([missing] if missing else []), *failed, f"```text\n{COLUMNS}\n```", f"```sh\n{typed}\n```"]
+    notes = [*([missing] if missing else []), *failed, f"```text\n{COLUMNS}\n```", f"```sh\n{command}\n```"]
     parts = [f"```text\n{machine(rows, timed)}\n```", table(["", "setting", *header], lines), *notes]
     return "\n\n".join(parts) + "\n"
 
@@ -129,40 +112,39 @@ def _cells(values: dict[str, float | None], best: bool) -> dict[str, str]:
         "MiB": _text(values["mib"], ".1f"),
         "parameters": f"{values['parameters']:,}",
         "MAC a pixel": f"{values['macs']:,.0f}",
-        "J a frame": _text(values["joules"], ".3g"),
         "flicker": _text(values["flicker"], ".3f"),
         "latency": _text(values["latency"], "d"),
         "front": "x" if best else "",
     }
 
 
-def write_csv(rows: Sequence[Measurement], commands: Sequence[str], timed: Timed, path: Path) -> None:
-    """Write a row a setting: the preset that it is, its figures, and the command that measures it alone.
+def write_csv(rows: Sequence[Measurement], timed: Timed, path: Path) -> None:
+    """Write a row a setting: the preset that it is, and its figures.
 
     ``reference`` is the setting that the ratios refer to. The columns of a preset are empty where a setting says what
-    a preset cannot; its command has it all. A table in this form comes with the weights, for
-    :mod:`lightning_modules.inference.presets` to choose from.
+    a preset cannot. A table in this form comes with the weights, for :mod:`lightning_modules.inference.presets` to
+    choose from.
     """
     height, width = timed.size
     best, reference = front(rows), running(rows)[0].setting.name
-    figured = _FIGURES if timed.every is not None else [name for name in _FIGURES if name not in _OF_FILMS]
     lines = [
         {
             "setting": row.setting.name,
             **(row.setting.preset or Preset()).write(),
-            **{name: _text(values.get(name), ".10g") for name in figured},
-            **({} if timed.every is None else {"every": timed.every}),
+            **{name: _text(value, ".10g") for name, value in values.items()},
+            "every": timed.every,
             "reference": reference,
             "height": height,
             "width": width,
             "front": int(n in best) if values else "",
-            "command": command,
             "failed": row.reason,
         }
-        for n, (row, values, command) in enumerate(zip(rows, figures(rows), commands, strict=True))
+        for n, (row, values) in enumerate(zip(rows, figures(rows), strict=True))
     ]
+    left_out = () if timed.every is not None else (*_OF_FILMS, "every")
+    columns = [name for name in lines[best[0]] if name not in left_out]
     with whole_file(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, list(lines[0]))
+        writer = csv.DictWriter(file, columns, extrasaction="ignore")
         writer.writeheader()
         writer.writerows(lines)
 

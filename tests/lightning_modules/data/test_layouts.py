@@ -31,9 +31,7 @@ def found(root):
     [
         ("train/train_orig", "val/val_orig"),
         ("train_orig", "val_orig"),
-        ("train_orig_part3/train/train_orig", "val_orig_part0/val/val_orig"),
         ("train_orig_part15/train_orig", "val_orig_part1/val_orig"),
-        ("train", "val"),
     ],
 )
 def test_reds(tmp_path, train, val, reds):

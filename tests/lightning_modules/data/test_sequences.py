@@ -4,7 +4,6 @@ import functools
 import importlib
 import shutil
 import types
-import warnings
 
 import numpy as np
 import pytest
@@ -186,39 +185,6 @@ class First:
         return between
 
 
-# --- data module ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.filterwarnings("ignore:This DataLoader will create")
-def test_same_clips_whatever_the_workers(tmp_path, reds):
-    reds(tmp_path)
-    alone = scenes(tmp_path, clips=2)
-    expected = list(alone.train_dataloader())
-    assert [len(batch["spikes"]) for batch in expected] == [2, 2]
-    assert torch.equal(expected[1]["rgb"][0], alone.train_set[2]["rgb"])
-    for workers in (1, 2):
-        data = scenes(tmp_path, clips=2, workers=workers, cache=str(tmp_path / "cache"))
-        loader = data.train_dataloader()
-        assert loader.num_workers == workers
-        for _ in range(2):
-            assert all(equal(*pair) for pair in zip(loader, expected, strict=True))
-        val = zip(data.val_dataloader(), alone.val_dataloader(), strict=True)
-        assert all(equal(*pair) for pair in val)
-    assert len(list((tmp_path / "cache").glob("*/*.clip"))) == 6
-
-
-def test_training_goes_on_where_it_stands(tmp_path, reds):
-    reds(tmp_path)
-    data = scenes(tmp_path, "fit", clips=2)
-    sampler = data.train_dataloader().sampler
-    assert list(sampler) == [0, 1, 2, 3]
-    data.trainer = types.SimpleNamespace(global_step=3, accumulate_grad_batches=1, world_size=1, global_rank=0)
-    assert list(sampler) == [6, 7, 8, 9]
-
-
-# --- cache ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def film(tmp_path, write_film):
     write_film(tmp_path / "films" / "film", 5)
@@ -254,31 +220,25 @@ def test_cached_clips_equal_fresh_ones(film, tmp_path, simulated):
     assert simulated.clips == 0
 
 
-@pytest.mark.parametrize(
-    "changed",
-    [
+def test_another_setting_is_another_clip(film):
+    (one,) = find_sequences(film, lambda found: (found, found)).test
+    changes = [
+        {},
         {"scale": 1},
         {"frames": 39},
         {"pattern": "BGGR"},
         {"alpha": 0.41},
         {"clocks": 21},
         {"flow_times": (5, 34)},
-        {"flow": False},
+        {"flow_times": ()},
         {"noise": SensorNoise(photons=100)},
         {"interpolation": FlowInterpolation(shrink=1)},
         {"seed": 1},
-    ],
-    ids=lambda changed: next(iter(changed)),
-)
-def test_another_setting_is_another_clip(film, tmp_path, simulated, changed):
-    cache = str(tmp_path / "cache")
-    scenes(film, cache=cache, clips=1).test_set[0]
-    clip = scenes(film, cache=cache, clips=1, **changed).test_set[0]
-    assert simulated.clips == 2
-    assert equal(clip, scenes(film, cache=cache, clips=1, **changed).test_set[0])
-    assert simulated.clips == 2
-    scenes(film, cache=cache, clips=1).test_set[0]
-    assert simulated.clips == 2
+        {"key_frames": 3},
+    ]
+    keys = {ClipRecipe(**change).key(one, 2) for change in changes}
+    assert len(keys) == len(changes)
+    assert ClipRecipe().key(one, 2) in keys
 
 
 def test_an_interpolation_of_ones_own_that_changes_makes_another_clip(film, tmp_path, monkeypatch):
@@ -307,25 +267,9 @@ def test_other_frames_are_another_clip(film, tmp_path, simulated, write_film):
     assert simulated.clips == 2
 
 
-def test_a_damaged_clip_is_made_again(film, tmp_path, simulated):
-    cache = tmp_path / "cache"
-    clips = scenes(film, cache=str(cache), clips=1).test_set
-    fresh = clips[0]
-    (path,) = cache.glob("*/*.clip")
-    path.write_bytes(path.read_bytes()[:-1])
-    with pytest.warns(UserWarning, match="damaged, made again"):
-        assert equal(clips[0], fresh)
-    assert simulated.clips == 2
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert equal(clips[0], fresh)
-    assert simulated.clips == 2
-
-
-@pytest.mark.parametrize("key_frames", [1, 3])
-def test_films_of_a_grey_sensor_show_the_luminance(tmp_path, write_film, key_frames):
+def test_films_of_a_grey_sensor_show_the_luminance(tmp_path, write_film):
     write_film(tmp_path / "film", 11, (36, 48))
-    options = {"clips": 1, "key_frames": key_frames, "cache": str(tmp_path / "cache")}
+    options = {"clips": 1, "key_frames": 3, "cache": str(tmp_path / "cache")}
     grey, colour = (scenes(tmp_path, pattern=pattern, **options) for pattern in ("grey", "RGGB"))
     for _ in ("fresh", "cached"):
         clip = grey.test_set[0]

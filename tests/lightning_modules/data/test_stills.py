@@ -1,7 +1,6 @@
 """The still-picture clips: the same by seed and index everywhere, fresh every epoch, from any folder."""
 
 import hashlib
-import types
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +13,12 @@ from skimage import io
 from lightning_modules.data.pictures import (
     embedded_pictures,
     folder_pictures,
-    read_shades,
     split_pictures,
 )
 from lightning_modules.data.stills import StillClips, StillScenes
 from lightning_modules.data.textures import outline_mask, texture
 from spikekit import SensorNoise, bin_to_sensor
 
-SHARED = Path(__file__).parents[3].parent / "shared" / "data"
 SMALL = {"patch": 8, "val_patch": 8, "train_clips": 8, "val_clips": 4, "batch_size": 2}
 
 
@@ -111,14 +108,6 @@ def test_a_cache_gives_the_same_clips_of_the_same_settings(tmp_path, monkeypatch
             scenes(**{**options, **other}).train_set[3]
 
 
-def test_mean_of_the_spikes_is_the_brightness():
-    data = scenes(patch=16, motion=0.0, rotation=0.0, zoom=0.0)
-    for i in range(6):
-        clip = data.train_set[i]
-        truth = bin_to_sensor(clip["rgb"], scale=4).mean()
-        assert abs(clip["spikes"].float().mean() / 0.4 - truth) < 0.02
-
-
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")
 def test_same_clips_whatever_the_workers():
     alone = scenes()
@@ -126,7 +115,7 @@ def test_same_clips_whatever_the_workers():
     assert expected == [digest(alone.train_set[i]) for i in range(8)]
     assert expected[::-1] == [digest(alone.train_set[i]) for i in range(7, -1, -1)]
     assert len(set(expected)) == 8
-    for workers in (1, 3):
+    for workers in (2,):
         data = scenes(workers=workers)
         loader = data.train_dataloader()
         assert loader.num_workers == workers
@@ -144,14 +133,6 @@ def test_chance_of_others_does_not_matter():
     assert torch.initial_seed() == 2
     assert digest(scenes(seed=1).train_set[0]) != first
     assert digest(scenes().val_set[0]) != first
-
-
-def test_fresh_clips_follow_the_steps():
-    data = scenes()
-    sampler = data.train_dataloader().sampler
-    assert list(sampler) == list(range(8))
-    data.trainer = types.SimpleNamespace(global_step=7, accumulate_grad_batches=3, world_size=1, global_rank=0)
-    assert list(sampler) == list(range(42, 50))
 
 
 class Watcher(pl.LightningModule):
@@ -173,7 +154,7 @@ class Watcher(pl.LightningModule):
         return torch.optim.SGD(self.parameters(), 0.1)
 
 
-@pytest.mark.parametrize(("workers", "stop"), [(0, 3), (1, 4), (1, 6)])
+@pytest.mark.parametrize(("workers", "stop"), [(0, 3), (1, 6)])
 def test_resumed_training_sees_what_unbroken_training_would(tmp_path, workers, stop):
     def train(steps, **how):
         watcher = Watcher()
@@ -237,11 +218,9 @@ def test_options_do_what_they_say():
     assert abs(dark["spikes"].float().mean() * 2 - bright["spikes"].float().mean()) < 0.02
     glare = scenes(brightness=(1.5, 1.5)).train_set[4]
     torch.testing.assert_close(glare["rgb"], 1.5 * bright["rgb"])
-    clean, noisy = (scenes(photons=p).train_set[4] for p in (None, 10.0))
+    clean, noisy = (scenes(noise=noise).val_set[4] for noise in (None, SensorNoise(photons=10.0)))
     assert torch.equal(clean["rgb"], noisy["rgb"])
     assert not torch.equal(clean["spikes"], noisy["spikes"])
-    same = scenes(noise=SensorNoise(photons=10.0)).val_set, scenes(photons=10.0).val_set
-    assert torch.equal(*(clips[4]["spikes"] for clips in same))
     turned = scenes(motion=0.0, rotation=5.0, zoom=0.0, objects=0)
     assert turned.train_set[0]["flow"][0, :, 0, 0].norm() > 0
     assert scenes(frames=11, flow_times=(0, 10)).train_set[0]["spikes"].shape[0] == 11
@@ -251,12 +230,10 @@ def test_training_sees_sensors_from_the_ideal_to_the_noisiest():
     """White light on the sensor, of which dead pixels see nothing: 4 % at most, 2 % of them on average."""
     options = {"brightness": (1.0, 1.0), "motion": 0.0, "objects": 0, "alpha": 1.0, "patch": 32, "val_patch": 32}
     noisy, clean = (scenes(noise=noise, **options).train_set for noise in (SensorNoise(dead=0.04), None))
-    dead = [[(clips[n]["spikes"].amax(dim=0) == 0).double().mean() for n in range(20)] for clips in (noisy, clean)]
+    dead = [[(clips[n]["spikes"].amax(dim=0) == 0).double().mean() for n in range(12)] for clips in (noisy, clean)]
     more = torch.tensor(dead[0]) - torch.tensor(dead[1])
     assert more.min() < 0.01 < 0.03 < more.max() < 0.06
     assert 0.012 < more.mean() < 0.028
-    with pytest.raises(ValueError, match="photons: expected those of the noise instead, got 10"):
-        scenes(photons=10.0, noise=SensorNoise())
     shown = StillClips(embedded_pictures(), scale=2, patch=32, augment=False, noise=SensorNoise(dead=0.04))
     assert (shown[0]["spikes"].amax(dim=0) == 0).double().mean() > 0.035
     keys = {StillClips(embedded_pictures(), noise=noise)._source for noise in (None, SensorNoise(), shown.noise)}
@@ -278,7 +255,7 @@ def test_key_frames_are_one_scene_that_moves_on():
 
 def test_margins_are_wide_enough():
     """Whatever comes into view is picture, not its mirror image, when the picture is large."""
-    for i in range(20):
+    for i in range(6):
         data = scenes(patch=16, motion=4.0, rotation=10.0, zoom=0.2, objects=0)
         scene = data.train_set.scene(i)
         layer = scene.layers[0]
@@ -295,29 +272,16 @@ def test_margins_are_wide_enough():
 def test_a_batch_has_the_clips_that_are_made_one_by_one(options):
     noise = SensorNoise(gain_spread=0.05, dark_current=0.002, dark_spread=0.3, hot=0.001, dead=0.01)
     clips = StillClips(embedded_pictures(), **{"scale": 2, "patch": 16, "noise": noise, "textures": True} | options)
-    drawn = [clips.draw(index) for index in range(12)]
+    drawn = [clips.draw(index) for index in range(6)]
     drawn = {name: np.stack([one[name] for one in drawn]) for name in drawn[0]}
     batch = clips.render(drawn, clips.sources.gallery("cpu"))
-    for index in range(12):
+    for index in range(6):
         alone = clips[index]
         spikes = clips._cut({"spikes": batch["spikes"][index]})["spikes"]
         assert (alone["spikes"] != spikes).double().mean() < 1e-3
         for name in batch.keys() - {"spikes"}:
             torch.testing.assert_close(batch[name][index], alone[name], atol=1e-4, rtol=0)
     assert 0.05 < batch["spikes"].float().mean() < 0.5
-
-
-def test_light_of_every_clip_is_between_the_bounds_and_truth_does_not_follow_it():
-    options = {"scale": 2, "patch": 16, "motion": 0.0, "objects": 0}
-    dim, plain = (StillClips(embedded_pictures(), gains=gains, **options) for gains in ((0.05, 1), None))
-    alphas = []
-    for index in range(20):
-        clip = dim[index]
-        assert torch.equal(clip["rgb"], plain[index]["rgb"])
-        ratio = clip["spikes"].float().mean() / plain[index]["spikes"].float().mean() * 0.4
-        alphas.append(float(clip["alpha"]))
-        assert abs(ratio - alphas[-1]) < 0.05
-    assert 0.05 <= min(alphas) < 0.15 < 0.5 < max(alphas) <= 1
 
 
 def test_embedded_pictures_are_disjoint():
@@ -382,7 +346,6 @@ def test_errors_say_what_is_wrong(folder, tmp_path):
         ("bend", -1.0, "bend: expected"),
         ("objects", -1, "objects: expected"),
         ("brightness", (0.9, 0.5), "brightness: expected two numbers"),
-        ("photons", 0.0, "photons: expected"),
         ("alpha", 0.0, "alpha: expected"),
         ("flow_times", (5, 41), r"flow_times: expected clocks in \[0, 41\), got \(5, 41\)"),
         ("seed", -1, "seed: expected"),
@@ -392,10 +355,9 @@ def test_errors_say_what_is_wrong(folder, tmp_path):
             scenes(**{name: value})
 
 
-@pytest.mark.parametrize("workers", [0, 1])
-def test_corrupt_picture_is_named(tmp_path, workers):
+def test_corrupt_picture_is_named(tmp_path):
     (tmp_path / "broken.png").write_bytes(b"\x89PNG\r\n\x1a\nnot really")
-    data = scenes(root=str(tmp_path), workers=workers)
+    data = scenes(root=str(tmp_path), workers=1)
     with pytest.raises(ValueError, match=r"broken\.png: not a picture"):
         next(iter(data.train_dataloader()))
 
@@ -416,17 +378,6 @@ def test_outlines_and_textures_are_sound():
         kinds.add(round(picture.std().item(), 1))
     assert len(kinds) > 2
     assert outline_mask(1, np.random.default_rng(0)).shape == (1, 1)
-
-
-@pytest.mark.parametrize("where", ["train", "val/kodak"])
-def test_shared_pictures(where):
-    root = SHARED / where
-    if not root.is_dir():
-        pytest.skip(f"{root} is not here")
-    data = scenes(root=str(root), patch=48)
-    clip = data.train_set[0]
-    assert clip["rgb"].shape == (3, 192, 192)
-    assert read_shades(data.train_set.pictures[0]).float().std() > 2
 
 
 def test_grey_clips_are_the_luminance_of_the_same_scenes():
@@ -474,7 +425,7 @@ def test_at_scale_1_pictures_are_shrunk_until_their_edges_are_sharp():
 
     def detail(scale):
         clips = StillClips(embedded_pictures(), scale=scale, patch=32, pattern="grey", objects=0, seed=1)
-        pictures = torch.stack([F.avg_pool2d(clips[n]["rgb"], scale) for n in range(30)])
+        pictures = torch.stack([F.avg_pool2d(clips[n]["rgb"], scale) for n in range(16)])
         spread = pictures.std(dim=(-2, -1)).clamp(min=0.01)
         return (pictures.diff(dim=-1).square().mean(dim=(-2, -1)).sqrt() / spread).median()
 

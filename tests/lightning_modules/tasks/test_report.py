@@ -9,7 +9,6 @@ from pytorch_lightning import Trainer
 
 from lightning_modules.data import StillScenes
 from lightning_modules.networks import CSCSR
-from lightning_modules.tasks import callbacks
 from lightning_modules.tasks.callbacks import TestReport
 from lightning_modules.tasks.super_resolution import SuperResolution
 from spikekit import psnr, read_picture
@@ -44,10 +43,7 @@ def test_clips_have_their_names(tmp_path, capsys):
         ("TFI", "city"): 1.0,
         ("TFI", "mean"): 0.5,
     }
-    said = capsys.readouterr().out
-    assert "mean of 2 clips" in said
-    assert "walk" in said
-    assert "foliage" not in said
+    assert "mean of 2 clips" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("clips", "expected"), [(2, {"0", "1", "mean"}), (3, {"walk", "city", "foliage", "mean"})])
@@ -55,13 +51,6 @@ def test_first_clips_of_several_processes_have_no_names(clips, expected, tmp_pat
     """With --trainer.limit_test_batches each process has seen the first of its own."""
     found = report_of(tmp_path, clips, ["walk", "city", "foliage"], processes=2)
     assert {clip for _, clip in found} == expected
-
-
-@pytest.mark.parametrize("more", [0, 1])
-def test_of_many_clips_the_mean_alone_is_printed(more, tmp_path, capsys):
-    clips = callbacks._MOST_TABLES + more
-    report_of(tmp_path, clips, [f"clip{n}" for n in range(clips)])
-    assert ("clip0" in capsys.readouterr().out) == (not more)
 
 
 def test_as_many_pictures_as_asked_for(tmp_path):

@@ -12,7 +12,7 @@ def test_pictures_made_in_and_by_several_threads_are_those_of_one():
     network = choose(4, "fast").preset.build()
     generator = torch.Generator().manual_seed(0)
     clips = [
-        (torch.rand(1, 41, 24 + 2 * n, 40, generator=generator) < 0.1 * (1 + n % 5)).to(torch.uint8) for n in range(8)
+        (torch.rand(1, 41, 24 + 2 * n, 40, generator=generator) < 0.1 * (1 + n % 5)).to(torch.uint8) for n in range(4)
     ]
 
     def picture(spikes):
@@ -28,6 +28,6 @@ def test_pictures_made_in_and_by_several_threads_are_those_of_one():
     finally:
         torch.set_num_threads(before)
     with ThreadPoolExecutor(4) as pool:
-        for _ in range(3):
+        for _ in range(2):
             for found, alone in zip(pool.map(picture, clips), expected, strict=True):
                 torch.testing.assert_close(found, alone, rtol=0, atol=1e-5)
