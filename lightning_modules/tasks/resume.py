@@ -89,43 +89,35 @@ def _check_optimizer(checkpoint: Mapping[str, Any], module: BaseTask) -> None:
 
 def _compare(fresh: Any, value: Any, name: str) -> None:
     """Raise unless a value is of the kind that a training begins with; where that is empty, any plain value will do."""
-    nothing = fresh is None or (isinstance(fresh, (dict, list)) and not fresh)
+    nothing = fresh is None or (isinstance(fresh, (dict, list, tuple)) and not fresh)
+    number = type(value) in (int, float) and abs(value) <= _LARGEST
     if isinstance(value, Tensor):
         if not (value.numel() == 1 and nothing) and not (isinstance(fresh, Tensor) and value.shape == fresh.shape):
             raise TypeError(f"{name}: expected {_kind(fresh)}, got {_kind(value)}")
         begins_finite = isinstance(fresh, Tensor) and fresh.isfinite().all()  # the score of ModelCheckpoint does not
         if value.is_complex() or (begins_finite and not value.isfinite().all()):
             raise ValueError(f"{name}: expected finite numbers, got NaN, Inf or complex ones")
-    elif nothing:
-        _check_plain(value, name)
-    elif isinstance(fresh, dict) and isinstance(value, dict):
+    elif isinstance(value, dict) and (nothing or isinstance(fresh, dict)):
         for key, inner in value.items():
-            _compare(fresh.get(key), inner, f"{name}.{key!s:.80}")
-    elif isinstance(fresh, (list, tuple)) and isinstance(value, (list, tuple)) and len(fresh) == len(value):
-        for mine, theirs in zip(fresh, value, strict=True):
+            _compare((fresh or {}).get(key), inner, f"{name}.{key!s:.80}")
+    elif isinstance(value, (list, tuple)) and (nothing or isinstance(fresh, (list, tuple))):
+        for mine, theirs in zip(fresh or [None] * len(value), value, strict=True):
             _compare(mine, theirs, name)
-    elif type(fresh) is int and type(value) is int:
+    elif type(fresh) is int:
         least = min(fresh, 1)  # a count may begin at 0; a period, such as StepLR's, is never 0
-        if not least <= value <= _LARGEST:
+        if not (type(value) is int and number and value >= least):
             raise ValueError(f"{name}: expected a whole number, {least} or more, got {value!s:.80}")
-    elif type(fresh) is float and type(value) in (int, float):
-        if abs(value) > _LARGEST or (math.isfinite(fresh) and not math.isfinite(value)):
+    elif type(fresh) is float:
+        if not (number or (type(value) is float and not math.isfinite(fresh))):
             raise ValueError(f"{name}: expected a finite number, got {value!s:.80}")
-    elif type(fresh) is not type(value) or not isinstance(fresh, (bool, str)):
+    elif not (number or type(value) in (float, bool, str, type(None)) if nothing else type(fresh) is type(value)):
         raise TypeError(f"{name}: expected {_kind(fresh)}, got {_kind(value)}")
-
-
-def _check_plain(value: Any, name: str) -> None:
-    """Raise unless a value is a number, a text or nothing, or holds such values."""
-    if isinstance(value, (dict, list, tuple)):
-        for inner in value.values() if isinstance(value, dict) else value:
-            _compare(None, inner, name)
-    elif not (value is None or isinstance(value, (float, str)) or (isinstance(value, int) and abs(value) <= _LARGEST)):
-        raise TypeError(f"{name}: expected a plain value, got {_kind(value)}")
 
 
 def _kind(value: Any) -> str:
     """What a message calls a value."""
-    if isinstance(value, Tensor):
-        return f"a tensor of shape {tuple(value.shape)}"
-    return f"{type(value).__name__} {value!s:.80}"
+    return (
+        f"a tensor of shape {tuple(value.shape)}"
+        if isinstance(value, Tensor)
+        else f"{type(value).__name__} {value!s:.80}"
+    )

@@ -126,17 +126,6 @@ def clip_of(recipe, film, middle):
     return original_clip(recipe, film, middle)
 
 
-def test_chance_is_that_of_the_content_and_the_seed(tmp_path, write_film):
-    write_film(tmp_path / "one" / "film", 3)
-    shutil.copytree(tmp_path / "one" / "film", tmp_path / "two" / "elsewhere")
-    first = scenes(tmp_path / "one").test_set[0]
-    torch.manual_seed(3)
-    assert equal(scenes(tmp_path / "two").test_set[0], first)
-    assert not torch.equal(scenes(tmp_path / "one", seed=1).test_set[0]["spikes"], first["spikes"])
-    write_film(tmp_path / "two" / "elsewhere", 1, first=2, seed=5)
-    assert not torch.equal(scenes(tmp_path / "two").test_set[0]["spikes"], first["spikes"])
-
-
 def test_without_flow(tmp_path, reds):
     reds(tmp_path)
     data = scenes(tmp_path, flow=False)

@@ -19,7 +19,6 @@ from lightning_modules.cli.command import run
 from lightning_modules.cli.errors import InputError
 from lightning_modules.storage.checkpoint import DivergedError
 from lightning_modules.sweep import cli, engines, worker
-from lightning_modules.sweep.budget import seconds
 from lightning_modules.sweep.state import say_progress
 from lightning_modules.sweep.table import collect, markdown, reference
 from lightning_modules.sweep.trials import Trial, _Resolver, make_trials
@@ -286,21 +285,17 @@ def test_steps_are_timed_whole(batches, monkeypatch, tmp_path):
 
 
 @pytest.mark.slow
-def test_time_ends_training(typed, overlays, tmp_path):
-    main([*typed, "--time", "00:00:01", "--set", "data.val_clips=1", "-o", str(tmp_path / "constant")])
-    assert not (tmp_path / "constant" / "tiny" / "plan.yaml").exists()
-    checkpoint = weights(tmp_path / "constant" / "tiny")
-    elapsed = checkpoint["callbacks"]["Timer"]["time_elapsed"]["train"]
-    assert checkpoint["global_step"] >= 1
-    assert elapsed >= 1
-
-    cosine = [typed[1], typed[3], overlays / "cosine.yaml"]
-    [trial] = make_trials(cosine, [], [], [], {"seconds": 3600}, tmp_path)
-    trial.write()
-    planned = yaml.safe_load(worker.plan(trial.folder).read_text())
-    steps = planned["trainer"]["max_steps"]
-    assert planned["model"]["init_args"]["lr_scheduler"]["init_args"]["T_max"] == steps > 1
-    assert planned["trainer"]["max_time"] == "00:01:00:00"
+def test_time_ends_training_and_a_schedule_that_has_an_end(overlays, tmp_path):
+    configs = [CONFIGS / "x4.yaml", overlays / "tiny.yaml", overlays / "cosine.yaml"]
+    for files, planned in ((configs[:2], "trial.yaml"), (configs, "plan.yaml")):
+        [trial] = make_trials(files, [], [], [], {"seconds": 3600}, tmp_path)
+        trial.write()
+        path = worker.plan(trial.folder)
+        assert path.name == planned
+        trainer = yaml.safe_load(path.read_text())["trainer"]
+        assert trainer["max_time"] == "00:01:00:00"
+    steps = yaml.safe_load(path.read_text())["model"]["init_args"]["lr_scheduler"]["init_args"]["T_max"]
+    assert steps == trainer["max_steps"] > 1
 
 
 @pytest.mark.parametrize(
@@ -308,6 +303,8 @@ def test_time_ends_training(typed, overlays, tmp_path):
     [
         ([], "expected a configuration, such as configs/x4.yaml"),
         (["X", "--steps", "3", "--time", "00:00:01"], "--time: not allowed with argument --steps"),
+        (["X", "--time", "1:60:00"], "--time: expected HH:MM:SS or DD:HH:MM:SS, got 1:60:00"),
+        (["X", "--time", "00:00:00"], "--time: expected more than no time, got 00:00:00"),
         (["X", "--set", "width"], "--set: expected KEY=VALUE"),
         (["X", "--set", "model.network.widht=8,16"], "widht=8: model.network: Option 'widht' is not accepted"),
         (["X", "--set", "data.motion=1,-1"], "motion=-1: motion: expected 0 or more, got -1.0"),
@@ -430,12 +427,6 @@ def test_what_is_shown(typed, tmp_path, capsys, monkeypatch):
         f"tiny-seed0  FAILED: it ended without a result ({first / 'log.txt'})",
     ]
     assert "tiny, seed 0, failed: it ended without a result" in (tmp_path / "sweep.md").read_text()
-
-
-@pytest.mark.parametrize("text", ["", "5", "00:00:00", "1:60:00", "a:b:c", "1:2:3:4:5"])
-def test_times_that_are_none(text):
-    with pytest.raises(ValueError, match="expected"):
-        seconds(text)
 
 
 def test_ray_that_is_missing_is_said(typed, tmp_path, monkeypatch):

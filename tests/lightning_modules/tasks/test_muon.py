@@ -98,21 +98,6 @@ def test_it_goes_on_where_it_stopped():
     assert all(map(torch.equal, whole, halves))
 
 
-def test_a_closure_is_asked_and_parameters_without_a_gradient_rest():
-    used, unused = nn.Parameter(torch.ones(4, 4)), nn.Parameter(torch.ones(4, 4))
-    optimizer = MuonWithAdam([used, unused])
-
-    def closure():
-        optimizer.zero_grad()
-        loss = used.square().sum()
-        loss.backward()
-        return loss
-
-    assert optimizer.step(closure) == 16
-    assert used.ne(1).any()
-    assert unused.eq(1).all()
-
-
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
