@@ -119,7 +119,7 @@ def test_processes_that_lightning_spawns_itself(tmp_path, configs):
     (tmp_path / "tiny.yaml").write_text(TINY)
     words = ["fit", "-c", str(configs / "x4.yaml"), "-c", "tiny.yaml", "--trainer.max_steps=2", "--trainer.devices=1"]
     words = [sys.executable, "-m", "lightning_modules", *words, "--trainer.strategy=ddp_spawn", "-o", "run"]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr
     assert torch.load(tmp_path / "run/checkpoints/last.ckpt", weights_only=True)["global_step"] == 2
 
