@@ -183,7 +183,7 @@ def _resolve(args: Sequence[str], trial: str) -> dict[str, Any]:
 
 def _difference(there: dict[str, Any], asked: dict[str, Any]) -> str:
     there, asked = dict(flatten(there)), dict(flatten(asked))
-    key = next((key for key in {**there, **asked} if there.get(key) != asked.get(key)), "its form")
+    key = min((key for key in {**there, **asked} if there.get(key) != asked.get(key)), default="its form")
     holds, wanted = (" ".join(str(values.get(key, "none")).split())[:80] for values in (there, asked))
     shown = " ".join(key.replace(".init_args", "").split())[:80]
     return f"holds a trial with {shown}={holds}, and this sweep asks for {wanted}"

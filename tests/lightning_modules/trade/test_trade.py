@@ -256,14 +256,6 @@ def test_usual_settings_of_films_have_networks_for_films_and_no_variants():
     assert not any(find_model(name).film for name in single)
 
 
-def test_usual_settings_of_longer_scenes_have_networks_and_decoders_of_longer_clips():
-    usual, longer = ({one.name: one for one in usual_settings(4, frames=frames)} for frames in (100, 101))
-    assert {find_model(name).frames for name in networks_of(usual.values())} == {41}
-    assert {find_model(name).frames for name in networks_of(longer.values())} == {41, 101}
-    assert longer["TFI"].preset == replace(usual["TFI"].preset, frames=41)
-    assert longer["TFP 33, order 3"].preset == replace(longer["TFP 13, order 3"].preset, window=33, frames=101)
-
-
 @pytest.mark.parametrize(
     ("typed", "preset"),
     [
