@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks.cscsr import CSCSR
 from lightning_modules.networks.cscsr_config import CSCSRConfig
-from lightning_modules.networks.layers import conv, res_blocks, start_pixel_by_pixel
+from lightning_modules.networks.layers import channels_last, conv, res_blocks, start_pixel_by_pixel
 from lightning_modules.signatures import inherit_signature
 from spikekit import flow_warp, upsample_flow
 from spikekit.check import check_whole
@@ -237,6 +237,7 @@ class RecurrentCSCSR(CSCSR):
         Returns:
             Its picture, as channels, and a memory, (B, 3 s^2 + memory, H, W), or (B, s^2 + memory, H, W) of grey.
         """
+        features = channels_last(features)
         rgb = self.reconstruction.rgb(features)
         if self.config.skip:
             rgb = rgb + self._base(spikes.to(rgb.dtype))
