@@ -170,6 +170,10 @@ def test_compile_of_bits(op, dtype):
         (torch.ops.spikekit.tfp, (SPIKES.clone().requires_grad_(), 3, 1.0, torch.float64)),
         (torch.ops.spikekit.tfp_grad, (SPIKES.clone().requires_grad_(), 3, 1.0, torch.float64)),
         (torch.ops.spikekit.spike_interval, (SPIKES > 0,)),
+        (torch.ops.spikekit.spike_interval_at, (SPIKES > 0, 4)),
+        (torch.ops.spikekit.spike_interval_at, (torch.zeros(33_000, 1, 2) > 0, 4)),  # longer than 16 bits count
+        (torch.ops.spikekit.pack_bits, (SPIKES.byte(),)),
+        (torch.ops.spikekit.unpack_bits, (SPIKES.byte(), 13)),
         (torch.ops.spikekit.nearest_known, (FLOW, MASK, 4)),
         (torch.ops.spikekit.weighted_gather, (RGB.flatten(2), INDEX, WEIGHT)),
         (torch.ops.spikekit.weighted_scatter, (RGB.flatten(2), INDEX, WEIGHT, 24)),

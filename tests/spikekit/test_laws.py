@@ -41,32 +41,6 @@ def test_constant_light_gives_its_rate(light, start, half, dtype):
         assert torch.isin(rates[between], possible.to(dtype)).all()
 
 
-@given(SEEDS, st.integers(0, 12), st.integers(0, 12), st.floats(0, 1), st.sampled_from([1, 3, 11]))
-def test_a_shifted_stream_is_decoded_shifted(seed, before, after, density, window):
-    """What lies outside the window, or beyond the enclosing spikes, does not matter; nor does the clip's start."""
-    frames = 30
-    inner = (torch.rand(frames, 2, 3, generator=rng(seed)) < density).float()
-    inner[[0, -1]] = 1  # so that every frame is enclosed
-    around = torch.rand(2, 12, 2, 3, generator=rng(seed + 1)).round()
-    shifted = torch.cat([around[0, :before], inner, around[1, :after]])
-    here = slice(before, before + frames)
-    for decode in (sk.tfi, sk.spike_interval):
-        assert torch.equal(decode(shifted)[here][1:], decode(inner)[1:])
-    half = window // 2
-    inside = slice(before + half, before + frames - half)
-    assert torch.equal(sk.tfp(shifted, window)[inside], sk.tfp(inner, window)[half : frames - half])
-
-
-@given(SEEDS, st.integers(1, 41), st.floats(0, 1), st.sampled_from([1, 3, 11, 99]))
-def test_a_reversed_stream(seed, frames, density, window):
-    """TFP is symmetric in time; TFI is so between spikes, one frame later, as a spike closes its interval."""
-    spikes = (torch.rand(frames, 2, 3, generator=rng(seed)) < density).float()
-    assert torch.equal(sk.tfp(spikes.flip(0), window), sk.tfp(spikes, window).flip(0))
-    previous, following = spikes.cumsum(0) - spikes > 0, spikes.flip(0).cumsum(0).flip(0) > 0
-    enclosed = (previous & following)[1:]
-    assert torch.equal(sk.tfi(spikes.flip(0)).flip(0)[:-1][enclosed], sk.tfi(spikes)[1:][enclosed])
-
-
 @given(SEEDS, PATTERNS, SIDES, SIDES)
 def test_mosaic_keeps_what_the_mask_keeps(seed, pattern, height, width):
     rgb = torch.randn(2, 3, height, width, generator=rng(seed))
@@ -77,28 +51,6 @@ def test_mosaic_keeps_what_the_mask_keeps(seed, pattern, height, width):
     again = raw[:, None].expand(2, 3, height, width)
     assert torch.equal(sk.mosaic(again, pattern), raw)
     assert all(torch.equal(again[:, c][:, mask[c] > 0], rgb[:, c][:, mask[c] > 0]) for c in range(3))
-
-
-@given(SEEDS, PATTERNS, SIDES, SIDES, st.integers(1, 3))
-def test_bayer_phases_are_each_others_shifts_and_flips(seed, pattern, height, width, scale):
-    upper, lower = pattern[:2], pattern[2:]
-    mask = sk.bayer_mask(height, width, pattern, scale=scale)
-    right, down = upper[::-1] + lower[::-1], lower + upper
-    both = right[2:] + right[:2]
-    # shifted by one sensor pixel
-    wider = sk.bayer_mask(height + 1, width + 1, pattern, scale=scale)
-    assert torch.equal(wider[:, :-scale, scale:], sk.bayer_mask(height, width, right, scale=scale))
-    assert torch.equal(wider[:, scale:, :-scale], sk.bayer_mask(height, width, down, scale=scale))
-    assert torch.equal(wider[:, scale:, scale:], sk.bayer_mask(height, width, both, scale=scale))
-    # flipped: the same phase where the side is odd
-    assert torch.equal(mask.flip(-1), sk.bayer_mask(height, width, pattern if width % 2 else right, scale=scale))
-    assert torch.equal(mask.flip(-2), sk.bayer_mask(height, width, pattern if height % 2 else down, scale=scale))
-    # and so is what is made with them
-    rgb = torch.randn(3, 2 * height, 2 * width, generator=rng(seed))
-    assert torch.equal(sk.mosaic(rgb.flip(-1), pattern), sk.mosaic(rgb, right).flip(-1))
-    assert torch.equal(sk.mosaic(rgb.flip(-2), pattern), sk.mosaic(rgb, down).flip(-2))
-    rolled = rgb.roll((1, 1), (-2, -1))
-    assert torch.equal(sk.mosaic(rolled, pattern), sk.mosaic(rgb, both).roll((1, 1), (-2, -1)))
 
 
 @st.composite

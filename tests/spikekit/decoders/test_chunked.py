@@ -1,15 +1,11 @@
 """A stream decoded in chunks equals the whole, however it is cut, and takes bounded memory."""
 
-import os
-import subprocess
-import sys
-
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spikekit import iter_spikes, spike_integrate_fire, spike_interval, tfi, tfp, write_spikes
+from spikekit import spike_interval, tfi, tfp
 from spikekit.decoders.chunked import decode_in_chunks
 
 SEEDS = st.integers(0, 2**31)
@@ -65,19 +61,6 @@ def test_tfi_in_chunks(cuts, overlap, rate, seed):
     assert got[exact].equal(whole[exact])
 
 
-@pytest.mark.parametrize(
-    ("frame", "fires", "got"), [(20, (10, 25), 15), (20, (8, 25), 16), (19, (15, 29), 14), (19, (15, 31), 15)]
-)
-def test_spikes_on_the_edge_of_the_overlap(frame, fires, got):
-    """Of pieces 0 .. 19 and 20 .. 39 with an overlap of 10, frame 20 sees as far as 10 and frame 19 as far as 29."""
-    spikes = torch.zeros(70, 1, 1, dtype=torch.uint8)
-    spikes[list(fires)] = 1
-    pieces = list(decode_in_chunks(spike_interval, spikes.split([30, 20, 20]), 10))
-    assert [len(piece) for piece in pieces] == [20, 20, 20, 10]
-    assert torch.cat(pieces)[frame] == got
-    assert decided(spikes, 10)[frame].item() == (fires[1] - fires[0] == got)
-
-
 def test_pieces_come_as_soon_as_they_can():
     """Nothing is read ahead, and nothing is yielded before its context is there."""
     read = []
@@ -109,20 +92,6 @@ def test_work_is_at_most_tripled():
         assert 1000 <= worked <= 3 * 1000
 
 
-def test_sensor_in_chunks(tmp_path):
-    """The loop of the example of write_spikes: light in chunks, one recording."""
-    light, charge = torch.rand(100, 3, 5), torch.rand(3, 5)
-
-    def expose(lights, charge):
-        for part in lights:
-            spikes, charge = spike_integrate_fire(part, charge=charge)
-            yield spikes
-
-    write_spikes(tmp_path / "a.npz", expose(light.split(17), charge))
-    whole, _ = spike_integrate_fire(light, charge=charge)
-    assert torch.cat(list(iter_spikes(tmp_path / "a.npz", chunk=30))).equal(whole.byte())
-
-
 @pytest.mark.parametrize(
     ("chunks", "overlap", "decode", "error", "message"),
     [
@@ -145,35 +114,3 @@ def test_sensor_in_chunks(tmp_path):
 def test_bad_arguments(chunks, overlap, decode, error, message):
     with pytest.raises(error, match=message):
         list(decode_in_chunks(decode, chunks, overlap))
-
-
-BOUNDED = """
-import resource, sys
-import torch
-from spikekit import iter_spikes, tfi
-from spikekit.decoders.chunked import decode_in_chunks
-
-def run(frames):
-    chunks = iter_spikes(sys.argv[1], 50, 80, frames=frames, chunk=200)
-    return sum(len(piece) for piece in decode_in_chunks(lambda part: tfi(part, 255.0, dtype=torch.uint8), chunks, 200))
-
-run(1000)
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-assert run(None) == 10_000
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
-"""
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="kilobytes of ru_maxrss are Linux's")
-def test_bounded_memory(tmp_path):
-    """10,000 frames, 40 MB as bytes and as many decoded, take no more than 8 MB beyond what 1000 take."""
-    chunk = (torch.rand(200, 50, 80) < 0.2).byte()
-    write_spikes(tmp_path / "long.dat", (chunk for _ in range(50)))
-    done = subprocess.run(
-        [sys.executable, "-c", BOUNDED, tmp_path / "long.dat"],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=os.environ | {"MALLOC_MMAP_THRESHOLD_": "131072"},  # what is freed is given back, and no longer counts
-    )
-    assert int(done.stdout) < 8000

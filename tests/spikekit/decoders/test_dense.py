@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spikekit import Tfp, spike_integrate_fire, spike_interval, tfi, tfp
+from spikekit import Tfp, spike_integrate_fire, spike_interval, tfi, tfi_at, tfp, tfp_at
 
 DTYPES = [torch.float64, torch.float32, torch.bfloat16, torch.float16]
 
@@ -40,17 +40,9 @@ def test_interval_by_hand(fired, expected):
 def test_any_stream(fired, half):
     spikes = torch.tensor(fired).reshape(-1, 1, 1)
     assert spike_interval(spikes).flatten().tolist() == brute_force.spike_interval(fired)
+    assert tfi(spikes.double(), 3.0).flatten().tolist() == pytest.approx(list(map(float, brute_force.tfi(fired, 3.0))))
     rates = brute_force.tfp(fired, 3.0, 2 * half + 1)
     assert tfp(spikes, 2 * half + 1, 3.0).flatten().tolist() == pytest.approx(list(map(float, rates)))
-
-
-@pytest.mark.parametrize("period", [1, 2, 7])
-@pytest.mark.parametrize("phase", [0, 4])
-def test_regular_train(period, phase):
-    """Constant light decodes to its rate everywhere, ends included, as soon as one interval is complete."""
-    spikes = (torch.arange(41) % period == phase % period).reshape(-1, 1, 1)
-    assert (spike_interval(spikes) == period).all()
-    assert torch.allclose(tfi(spikes.double(), 3.0), torch.tensor(3.0 / period, dtype=torch.float64), rtol=1e-15)
 
 
 @pytest.mark.parametrize(("order", "window"), [(2, 3), (3, 25), (5, 1)])
@@ -112,7 +104,9 @@ def test_tfp_forgets_what_has_left_the_window():
     assert torch.allclose(tfp(spikes, 5)[30:], torch.tensor(0.1), rtol=1e-6)
 
 
-@pytest.mark.parametrize("op", [spike_interval, tfi, lambda s: tfp(s, 3)])
+@pytest.mark.parametrize(
+    "op", [spike_interval, tfi, lambda s: tfp(s, 3), lambda s: tfi_at(s, 0), lambda s: tfp_at(s, 0, 3)]
+)
 @pytest.mark.parametrize(
     ("error", "spikes"),
     [

@@ -69,12 +69,6 @@ def test_pixels_begin_with_a_charge_that_noise_does_not_move():
         torch.testing.assert_close(sensor.charge, leaked % 2)
 
 
-def test_the_charge_at_the_start_can_be_given():
-    light = torch.full((4, 1, 2), 0.25)
-    spikes = simulate_spikes(light, charge=torch.tensor([[0.0, 0.75]]))
-    assert spikes[:, 0].T.tolist() == [[0, 0, 0, 1], [1, 0, 0, 0]]
-
-
 # Each source
 
 

@@ -114,23 +114,3 @@ def test_vmap_is_over_the_flow():
     assert torch.equal(weight.movedim(1, 0).flatten(0, 1), expected[1])
     with pytest.raises(ValueError, match="first 1 argument"):
         torch.func.vmap(idw_neighbors, (0, 0))(flow, mask.expand(3, 4, 6))
-
-
-def test_threads_and_devices_find_the_same(without_kernels):
-    """Without Numba the neighbours are the same, weights within a rounding; more threads change no bit."""
-    mask, flow = bayer_mask(70, 61, scale=2)[1], 3 * torch.randn(2, 2, 140, 122)
-    flow[1] = (flow[1] * 4).round() / 4
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(1)
-        index, weight = nearest_known(flow, mask, 4)
-        torch.set_num_threads(3)
-        again = nearest_known(flow, mask, 4)
-    finally:
-        torch.set_num_threads(before)
-    assert torch.equal(again[0], index)
-    assert torch.equal(again[1], weight)
-    with without_kernels(nearest_known):
-        plain = nearest_known(flow, mask, 4)
-    assert torch.equal(plain[0], index)
-    torch.testing.assert_close(plain[1], weight, rtol=1e-6, atol=1e-7)

@@ -6,7 +6,6 @@ import torch.nn.functional as F
 
 from spikekit import bayer_mask, flow_warp_idw
 from spikekit.color.cfa import count_colors
-from spikekit.warp import site_search
 from spikekit.warp.site_search import STEPS, search_sites, site_table
 
 CPU = torch.device("cpu")
@@ -131,12 +130,3 @@ def test_results_have_their_channels_last_and_compile_in_one_graph():
         lambda features, flow: search_sites(features, flow, SHARES, table), backend="aot_eager", fullgraph=True
     )
     torch.testing.assert_close(compiled(features, flow), found)
-
-
-def test_compiled_loops_give_what_plain_torch_gives():
-    size = 17, 14
-    features, flow = torch.randn(2, 4, 3, *size), torch.randn(2, 2, 2, *size) * 4
-    for scale in (1, 3):
-        table = table_for(size, "GRBG", 1, scale)
-        plain = site_search._search_sites(features, flow, SHARES, *table.arguments)
-        torch.testing.assert_close(search_sites(features, flow, SHARES, table), plain, rtol=0, atol=1e-5)
