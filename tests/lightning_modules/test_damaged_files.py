@@ -230,7 +230,7 @@ def _resumes(training, folder, **changes):
     check_resume(folder / "a.ckpt", model, trainer)
 
 
-@pytest.mark.parametrize(("name", "value"), [("step_size", 0), ("step_size", -3), ("last_epoch", -1), ("gamma", "a")])
+@pytest.mark.parametrize(("name", "value"), [("step_size", 0), ("last_epoch", -1), ("gamma", "a")])
 def test_a_schedule_with_impossible_numbers_is_rejected(training, tmp_path, name, value):
     [schedule] = training[2]["lr_schedulers"]
     assert name in schedule

@@ -1,7 +1,5 @@
 """The registry of the weights that come with the package."""
 
-import csv
-
 import pytest
 import torch
 
@@ -53,10 +51,3 @@ def test_a_network_for_films_makes_the_picture_of_the_network_for_clips_inside_i
     clip, both = CSCSR.from_pretrained(inside.name), CSCSR.from_pretrained(film.name)
     assert inside.parameters < film.parameters
     assert torch.equal(clip(spikes, static=True), both(spikes, static=True))
-
-
-@pytest.mark.parametrize("table", sorted(MODELS[0].path.parent.glob("x?*.csv")), ids=lambda path: path.stem)
-def test_tables_of_presets_name_weights_that_there_are(table):
-    rows = list(csv.DictReader(table.read_text().splitlines()))
-    assert {row["weights"] for row in rows} - {""} <= {model.name for model in list_models(int(table.stem[1]))}
-    assert {row["reference"] for row in rows} <= {row["setting"] for row in rows}

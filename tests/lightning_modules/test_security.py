@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 from lightning_modules import motion, networks
 from lightning_modules.__main__ import main
 from lightning_modules.cli.errors import as_one_line
-from lightning_modules.motion import ESTIMATORS, Spike2Flow
+from lightning_modules.motion import ESTIMATORS
 from lightning_modules.networks import CSCSR, NETWORKS
 from lightning_modules.storage.checkpoint import read_checkpoint
 from lightning_modules.storage.pretrained import read_weights
@@ -107,17 +107,11 @@ ESTIMATOR = {"class": "Spike2Flow", "window": 5}
     ("settings", "motion"),
     [
         ({**SETTINGS, "motion": {"class_path": "evilmod.X"}}, {}),
-        ({**SETTINGS, "motion": "evilmod.X"}, {}),
         ({**SETTINGS, "class": "evilmod.X"}, {}),
-        ({**SETTINGS, "class": "Module"}, {}),
         ({**SETTINGS, "class": ["CSCSR"]}, {}),
         ({**SETTINGS, "weights": "cscsr_tiny_x4"}, {}),
         ({**SETTINGS, "representation": "evilmod.X"}, {}),
-        ({**SETTINGS, "skip": 1}, {}),
         ({**SETTINGS, "width": True}, {}),
-        ({**SETTINGS, "width": 4.5}, {}),
-        ({**SETTINGS, "alpha": float("nan")}, {}),
-        ({**SETTINGS, "pattern": "a\nb"}, {}),
         ({**SETTINGS, "a\nb": 1}, {}),
         (SETTINGS, {"class": "evilmod.X"}),
         (SETTINGS, {"class": "CSCSR"}),
@@ -145,12 +139,9 @@ def test_settings_reach_only_what_is_known(settings, motion, trap, configs, tmp_
 @pytest.mark.parametrize(
     "changes",
     [
-        {"end_blocks": 10**9},
         {"end_blocks": 10**30},
-        {"end_blocks": 60, "stages": 16, "blocks": 32},
         {"end_blocks": 4000, "stages": 4000, "blocks": 4000},
         {"width": 4000},
-        {"frames": 10**7 + 1},
         {"neighbors": 10**9},
         {"representation": "spikes", "window": 1, "stride": 1, "frames": 4095, "width": 4096},
     ],
@@ -175,18 +166,6 @@ def test_the_networks_of_the_table_are_those_of_the_package():
     for name, kind in kinds.items():
         if hasattr(built := kind(), "settings"):
             assert own_class({"class": name, **built.settings}, "file", kinds)[1] == built.settings
-
-
-def test_what_the_package_writes_is_read(tmp_path):
-    network = CSCSR(**TINY, reconstruction="early", resolution="sensor", end_width=6, alpha=1, motion=Spike2Flow())
-    module = SuperResolution(network)
-    content = {"state_dict": module.state_dict()}
-    module.on_save_checkpoint(content)
-    torch.save(content, tmp_path / "a.ckpt")
-    read = type(network).from_pretrained(tmp_path / "a.ckpt")
-    assert read.settings == network.settings
-    assert type(read.motion) is type(network.motion)
-    assert all(value.equal(read.state_dict()[name]) for name, value in network.state_dict().items())
 
 
 @pytest.mark.parametrize(("suffix", "bad"), [(".safetensors", float("nan")), (".ckpt", -float("inf"))])

@@ -1,13 +1,12 @@
 import pytest
 import torch
 
-from lightning_modules.inference.clips import RecordingClips, clips_around
+from lightning_modules.inference.clips import RecordingClips
 from spikekit import (
     Calibration,
     SensorNoise,
     SpikeSensor,
     bayer_mask,
-    split_bayer,
     write_calibration,
     write_picture,
     write_spikes,
@@ -41,15 +40,6 @@ def test_clips_are_those_of_the_file(opened, spikes, name):
     assert clips.chosen == [20, 40]
     for frame, clip in clips.in_order():
         assert clip.equal(spikes[frame - 20 : frame + 21])
-
-
-@pytest.mark.parametrize("pattern", PATTERNS)
-@pytest.mark.parametrize("flip", [False, True])
-def test_every_phase_becomes_rggb(opened, spikes, pattern, flip):
-    ((_, clip),) = RecordingClips(opened(spikes, "clip.dat", flip, pattern=pattern), frame="20").in_order()
-    red = split_bayer(spikes, pattern)[0][:41]
-    found = clip[:, ::2, ::2]
-    assert found.equal(red[:, : found.shape[1], : found.shape[2]])
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
@@ -110,14 +100,6 @@ def test_a_sidecar_knows_size_phase_and_white(tmp_path, monkeypatch):
     assert (clips.size, clips.recording.pattern, clips.white) == ((29, 40), "GBRG", 0.3)
 
 
-def test_a_camera_knows_size_phase_and_crop(tmp_path):
-    raw = torch.zeros(41, 1000, 1024, dtype=torch.uint8)
-    raw[::2] = 1
-    write_spikes(tmp_path / "a.dat", raw)
-    clips = RecordingClips(open_recording(tmp_path / "a.dat", camera="m1k40-bayer"))
-    assert clips.size == next(clips.in_order())[1].shape[1:] == (992, 992)
-
-
 @pytest.mark.parametrize("name", ["clip.dat", "clip.npz"])
 @pytest.mark.parametrize("frame", ["20:50:1", "21:50:28"])
 def test_every_frame_is_read_once_and_what_nobody_wants_is_not_read(opened, spikes, name, frame, monkeypatch):
@@ -135,20 +117,6 @@ def test_every_frame_is_read_once_and_what_nobody_wants_is_not_read(opened, spik
     assert read == sorted(set(read))
     if name == "clip.dat" and frame == "21:50:28":
         assert read == [*range(19, 24), *range(47, 52)]
-
-
-def test_what_lies_between_clips_is_left_out_where_a_stream_can(spikes):
-    read = []
-
-    def jump(start):
-        for n in range(start, len(spikes)):
-            read.append(n)
-            yield spikes[n]
-
-    found = dict(clips_around([6, 8, 60], 5, jump(4), 4, jump))
-    assert read == [*range(4, 11), *range(58, 63)]
-    assert all(clip.equal(spikes[middle - 2 : middle + 3]) for middle, clip in found.items())
-    assert list(found) == [6, 8, 60]
 
 
 def test_a_calibration_makes_ideal_spikes(opened, tmp_path):

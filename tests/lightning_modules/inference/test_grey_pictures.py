@@ -46,13 +46,13 @@ def recording(tmp_path):
     return {"path": tmp_path / "clip.dat", "height": 16, "width": 24}
 
 
-@pytest.mark.parametrize("kind", [CSCSR, RecurrentCSCSR])
-def test_pictures_of_a_grey_recording(recording, kind):
-    made = reconstruct(**recording, network=_network(kind), pattern="grey")
+@pytest.mark.parametrize(("kind", "pattern"), [(CSCSR, "grey"), (RecurrentCSCSR, "grey"), (CSCSR, "RGGB")])
+def test_pictures_of_a_grey_recording(recording, kind, pattern):
+    made = reconstruct(**recording, network=_network(kind, pattern=pattern), pattern="grey")
     pictures = made.array()
     assert pictures.shape == (3, 16, 24, 3)
-    assert (pictures[..., 0] == pictures[..., 2]).all()
-    assert not made.notes
+    assert (pictures[..., :1] == pictures).all()
+    assert len(made.notes) == (pattern != "grey")
 
 
 def test_weights_for_another_sensor_are_told(recording):

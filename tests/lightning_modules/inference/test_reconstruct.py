@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from lightning_modules import reconstruct
-from lightning_modules.inference.clips import film_groups
 from lightning_modules.inference.film import film
 from lightning_modules.networks import CSCSR, ClassicalDecoder, RecurrentCSCSR
 from lightning_modules.registry import find_model
@@ -54,13 +53,6 @@ def test_pictures_have_the_colours_of_the_scene_whatever_phase_the_network_takes
     network = ClassicalDecoder(scale=2, pattern=trained)
     ((_, rgb),) = reconstruct(tmp_path / "flat.npz", network=network, pattern="BGGR", white=0.4)
     torch.testing.assert_close(rgb.mean(dim=(1, 2)), colour, rtol=0, atol=0.04)
-
-
-def test_pictures_of_a_grey_camera_are_grey(recording):
-    ((_, rgb),) = reconstruct(recording, network=ClassicalDecoder(scale=2), pattern="grey", frame="40")
-    assert rgb[0].equal(rgb[1])
-    assert rgb[0].equal(rgb[2])
-    assert rgb.std() > 0
 
 
 def test_a_dim_recording_is_shown_bright(tmp_path):
@@ -135,41 +127,9 @@ def test_a_film_is_that_of_the_stream_and_parts_of_it_are_the_same(recording):
     assert [*parts[0], *parts[1]] == [*unbroken]
 
 
-@pytest.mark.parametrize(("parts", "future", "interpolated"), [(1, 0, 0), (2, 2, 0), (3, 0, 2), (3, 1, 1)])
-def test_what_comes_before_a_wanted_picture_is_seen_again(recording, parts, future, interpolated):
-    network = RecurrentCSCSR(**TINY).eval()
-    network.warm_up = 4
-    how = {"future": future, "interpolated": interpolated}
-    pictures = reconstruct(recording, network=network, frame="20:79:2", white=0.3, **how)
-    chosen, made, shown = pictures.clips.chosen, {30, 34, 36}, []
-    of_group = list(film_groups(chosen, future, interpolated))
-    for part in range(parts):
-        groups = pictures._groups(pictures._maker(), made, part, parts)
-        assert all(group in of_group for group, _ in groups)
-        seen = [frame for group, _ in groups for frame in group]
-        wanted = [frame for group, whether in groups for frame in group if whether and frame not in made]
-        shown += wanted
-        for frame in wanted:
-            assert set([n for n in chosen if n < frame][-4:]) <= set(seen[: seen.index(frame)])
-    assert shown == [frame for frame in chosen if frame not in made]
-
-
 def test_tiles_views_and_tolerance_reach_the_network(recording):
     torch.manual_seed(0)
     network = CSCSR(**TINY).eval()
     ((_, plain),) = reconstruct(recording, network=network, frame="40", white=0.3)
     ((_, mean),) = reconstruct(recording, network=network, frame="40", white=0.3, self_ensemble=2)
     assert not torch.allclose(plain, mean)
-    with pytest.raises(ValueError, match="interpolated: expected a whole number"):
-        reconstruct(recording, network=network, interpolated=-1)
-
-
-def test_mistakes_are_said_in_one_line(recording, tmp_path):
-    with pytest.raises(ValueError, match="white: expected a finite number above 0, got -1"):
-        reconstruct(recording, network=ClassicalDecoder(), white=-1)
-    with pytest.raises(ValueError, match="speed, budget, network: expected one of them, got fast, 2s"):
-        reconstruct(recording, "fast", budget="2s")
-    with pytest.raises(ValueError, match=r"none\.npz"):
-        reconstruct(tmp_path / "none.npz")
-    with pytest.raises(ValueError, match="scale: expected one that was measured"):
-        reconstruct(recording, scale=7)

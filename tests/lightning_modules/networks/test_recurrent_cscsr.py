@@ -4,7 +4,6 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from lightning_modules.inference.film import FilmMaker, film
 from lightning_modules.networks import CSCSR, ClassicalDecoder, RecurrentCSCSR
-from lightning_modules.storage.pretrained import Weights, settings_of, write_weights
 from spikekit import flow_warp
 
 TINY = {"scale": 2, "width": 8, "representation_width": 8, "features": 1, "stages": 1, "end_blocks": 1, "skip": True}
@@ -48,15 +47,6 @@ def test_the_first_key_frame_is_that_of_a_single_clip_and_the_others_are_not(net
     pictures, single = network(spikes[None], flow[None])[0], network(spikes, flow)
     torch.testing.assert_close(pictures[0], single[0])
     assert ((pictures[1:] - single[1:]).abs().amax(dim=(1, 2, 3)) > 1e-3).all()
-
-
-def test_a_film_of_another_gain_is_the_same_film_brighter(network, clips, tmp_path):
-    torch.nn.init.normal_(network.fusion.rest.bias, std=0.05)
-    write_weights(Weights(tmp_path, settings_of(network), {}, network.state_dict()), tmp_path / "film.safetensors")
-    brighter = CSCSR.from_pretrained(tmp_path / "film.safetensors", alpha=0.1)
-    spikes, flow = clips
-    expected = network(spikes[None], flow[None], future=4) * 4
-    torch.testing.assert_close(brighter(spikes[None], flow[None], future=4), expected, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("future", [0, 1, 4])
@@ -166,12 +156,8 @@ def test_errors(network, clips):
         RecurrentCSCSR(resolution="output")
     with pytest.raises(ValueError, match=r"correlated and sensor.* got early"):
         RecurrentCSCSR(reconstruction="early")
-    spikes, flow = clips
-    with pytest.raises(ValueError, match="every: expected a whole number >= 1, got 0"):
-        network(spikes[None], flow[None], every=0)
+    spikes, _ = clips
     with pytest.raises(ValueError, match=r"clocks: expected 2 increasing ones, got \[40, 20\]"):
         FilmMaker(network)(spikes[:2], [40, 20])
-    with pytest.raises(ValueError, match="future: expected a whole number >= 0, got -1"):
-        film(network, [], future=-1)
     with pytest.raises(ValueError, match="future: expected 0, as ClassicalDecoder takes every clip by itself, got 1"):
         film(ClassicalDecoder(), [], future=1)

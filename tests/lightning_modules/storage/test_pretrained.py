@@ -54,13 +54,6 @@ def test_export_and_from_pretrained(file, capsys):
     assert isinstance(CSCSR.from_pretrained(file, motion=ZeroFlow()).motion, ZeroFlow)
 
 
-def test_weights_serve_cameras_of_another_gain(file):
-    """The same spikes of a camera of half as much gain again are of a scene two thirds as bright."""
-    own, other = CSCSR.from_pretrained(file), CSCSR.from_pretrained(file, alpha=0.6)
-    assert [own.settings["alpha"], other.settings["alpha"]] == [0.4, 0.6]
-    torch.testing.assert_close(other(SPIKES), own(SPIKES) * (0.4 / 0.6))
-
-
 @pytest.mark.parametrize("suffix", [".ckpt", ".safetensors"])
 def test_learned_motion_is_part_of_the_weights(tmp_path, suffix):
     made = network(motion=Spike2Flow(**FLOW_TINY))
@@ -91,7 +84,7 @@ def test_weights_of_something_else(file, tmp_path):
         ClassicalDecoder.from_pretrained(file)
     with pytest.raises(ValueError, match=r"trained with scale=2, width=4; this run asks for scale=4, width=8"):
         SuperResolution(network(scale=4, width=8), weights=str(file))
-    with pytest.raises(FileNotFoundError, match=r"x9-z: neither a file .* nor .* in the package \(.*spike2flow"):
+    with pytest.raises(FileNotFoundError, match=r"x9-z: neither a file .* nor .* in the package"):
         CSCSR.from_pretrained("x9-z")
     plain = tmp_path / "plain.safetensors"
     save_file(load_file(file), plain)
@@ -102,29 +95,8 @@ def test_weights_of_something_else(file, tmp_path):
     save_file(tensors, plain, said)
     with pytest.raises(ValueError, match=r"plain.safetensors: weights that do not fit .*rgb.weight"):
         CSCSR.from_pretrained(plain)
-    save_file(tensors, plain, {**said, "network": json.dumps({"class": "CSCSR", "of_next_year": 1})})
-    with pytest.raises(ValueError, match="of_next_year"):
-        CSCSR.from_pretrained(plain)
     with pytest.raises(ValueError, match=r"ends in .safetensors"):
         write_weights(read_weights(file), tmp_path / "file.bin")
-
-
-@pytest.mark.parametrize("suffix", [".ckpt", ".safetensors"])
-def test_damaged_files_say_so_in_one_line(file, suffix):
-    path = file.with_suffix(suffix)
-    for length in (-1, 1000, 0):
-        path.write_bytes(path.read_bytes()[:length])
-        export = ["export", str(path), "-o", "other.safetensors"]
-        for args in (["predict", "clip.dat", "--weights", str(path), "-o", "out"], export):
-            with pytest.raises(SystemExit, match=rf"^lightning: {path}: not a .*$"):
-                main(args)
-
-
-def test_motion_of_no_class_is_refused(file, tmp_path):
-    said = {"network": json.dumps({"class": "CSCSR", **network().settings}), "motion": json.dumps({"window": 11})}
-    save_file(load_file(file), tmp_path / "odd.safetensors", said)
-    with pytest.raises(ValueError, match=r"odd.safetensors: class: expected one of ClassicalFlow, .*, got None"):
-        CSCSR.from_pretrained(tmp_path / "odd.safetensors")
 
 
 def test_weights_that_share_memory_can_be_exported(tmp_path):

@@ -71,8 +71,6 @@ def test_from_training_to_a_picture(kind, tmp_path):
     ("config", "settings", "expected"),
     [
         ("x2.yaml", ["network=VidarSR", "network.frames=61"], "'frames': 61,.*'flow_times': (7, 53)"),
-        ("x2.yaml", ["network=SwinIR", "network.frames=21"], "'frames': 21,.*'flow_times': (2, 18)"),
-        ("x2.yaml", ["network=SpikeSRNetLike", "network.frames=27"], "'frames': 27,.*'flow_times': (3, 23)"),
         (
             "quick.yaml",
             ["network.size=tiny", "network.stride=6", "network.frames=23"],

@@ -11,7 +11,6 @@ from lightning_modules.networks import BasicVSR, RealRawVSR, SpikeSRNetLike, Swi
 from lightning_modules.networks.baselines.deformable import DeformableConv2d
 from lightning_modules.networks.baselines.per_channel import per_channel
 from lightning_modules.networks.baselines.pictures import mirror_to_multiple
-from lightning_modules.networks.baselines.real_rawvsr import _Fusion, _TemporalAttention
 from lightning_modules.networks.baselines.swinir import AttentionLayer, _hidden
 from lightning_modules.networks.baselines.tscnn import KnownPixels
 from spikekit import bayer_mask, bayer_sites, demosaic_along_motion, demosaic_residual, flow_warp, mosaic, tfi, tfp
@@ -174,26 +173,6 @@ def test_five_mosaics_are_aligned_to_the_middle_of_their_clip():
             torch.testing.assert_close(branch[n, time], expected[0])
 
 
-def test_attention_over_time():
-    maps = torch.randn(2, 3, 4, 5, 6, dtype=torch.float64)
-    part = _TemporalAttention().double()
-    assert part(maps).equal(maps)
-    torch.nn.init.constant_(part.gamma, 0.5)
-    rows = maps.flatten(2)
-    weights = (torch.einsum("bic,bjc->bij", rows, rows) / 120**0.5).softmax(dim=2)
-    expected = maps + 0.5 * torch.einsum("bij,bjc->bic", weights, rows).reshape(maps.shape)
-    torch.testing.assert_close(part(maps), expected)
-
-
-def test_fusion_counts_maps_by_their_likeness_to_the_middle():
-    part, maps = _Fusion(3, 4).double(), torch.randn(1, 3, 4, 8, 8, dtype=torch.float64)
-    seen = seen_by(part.merge)
-    assert part(maps, 1).shape == (1, 4, 8, 8)
-    for n in range(3):
-        likeness = (part.each(maps[:, n]) * part.middle(maps[:, 1])).sum(dim=1, keepdim=True)
-        torch.testing.assert_close(seen[0][:, 4 * n : 4 * n + 4], maps[:, n] / (1 + (-likeness).exp()))
-
-
 # SpikeSR-Net
 
 
@@ -250,11 +229,6 @@ def test_depth_is_stochastic_in_training_alone():
         assert not network(*inputs).equal(network(*inputs))
         network.eval()
         assert network(*inputs).equal(network(*inputs))
-        drops = [layer.drop for group in network.groups for layer in group.layers]
-        assert drops == pytest.approx([0, 1 / 6, 1 / 3, 1 / 2])
-        kept = network.groups[1].layers[1].train()._drop(torch.ones(4000, 1, 1, 1))
-        assert kept.mean().item() == pytest.approx(1, abs=0.1)
-        assert set(kept.unique().tolist()) == {0, 2}
 
 
 # TSCNN
