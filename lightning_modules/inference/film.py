@@ -13,7 +13,8 @@ from torch import Tensor
 
 from lightning_modules.inference.clips import clips_around, film_groups
 from lightning_modules.inference.predict import check_options, predict
-from lightning_modules.inference.tiles import TILE, TILE_ON_GPU, Box, reach, tiled
+from lightning_modules.inference.rest import Rest
+from lightning_modules.inference.tiles import AROUND, TILE, TILE_ON_GPU, Box, reach, tiled
 from lightning_modules.networks import Network, RecurrentCSCSR
 from lightning_modules.networks.recurrent_cscsr import read_forward, read_from_end
 from spikekit import flow_warp, linear_motion, upsample_flow
@@ -149,8 +150,9 @@ class FilmMaker:
         future: key frames that a picture may wait for, of a network that carries a state on.
         interpolated: pictures between two that the network makes.
         tile: side of the tiles in sensor pixels, 0 for none; when not given, what suits the network's device.
-        how: ``psnr_tolerance``, ``self_ensemble`` and ``done`` of :func:`lightning_modules.inference.predict.predict`;
-            a network that carries a state on takes none of them.
+        how: ``psnr_tolerance``, ``self_ensemble`` and ``done`` of :func:`lightning_modules.inference.predict.predict`.
+            With any tolerance but 0, and neither ``future`` nor ``interpolated``, only what moves is computed
+            (:class:`lightning_modules.inference.rest.Rest`). A network that carries a state on has no ensemble.
 
     Raises:
         ValueError: a ``future`` for a network that takes every clip by itself; ``interpolated`` pictures by one that
@@ -176,19 +178,25 @@ class FilmMaker:
             raise ValueError(f"future: expected 0, as {kind} takes every clip by itself, got {future}")
         if interpolated and not network.takes_flow:
             raise ValueError(f"interpolated: expected 0, as {kind} estimates no motion of a clip, got {interpolated}")
-        if self.carries_on and (how.get("psnr_tolerance") or how.get("self_ensemble", 1) > 1):
-            raise ValueError(f"psnr_tolerance, self_ensemble: expected 0 and 1 for {kind}, got {how}")
+        if self.carries_on and how.get("self_ensemble", 1) > 1:
+            raise ValueError(f"self_ensemble: expected 1 for {kind}, got {how['self_ensemble']}")
         check_options(**{name: how[name] for name in ("psnr_tolerance", "self_ensemble") if name in how})
         self.network, self.future, self.interpolated, self._how = network, future, interpolated, how
         on_gpu = any(part.is_cuda for part in network.parameters())
         self.tile = (TILE_ON_GPU if on_gpu else TILE) if tile is None else tile
         self._last: _Made | None = None
         self._known: _Known | None = None
+        self.rest: Rest | None = None
+        if how.get("psnr_tolerance") and network.halo is not None and not (future or interpolated):
+            settings = network.settings
+            self.rest = Rest(network.scale, settings["pattern"], settings["alpha"], network.noise_level > 0)
+            self._how = {**how, "psnr_tolerance": 0.0}
 
     @property
     def warm_up(self) -> int:
         """On how many pictures before a group its pictures depend, as far as one can see."""
-        return max(self.network.warm_up, min(self.interpolated, 1)) * (self.interpolated + 1)
+        pictures = max(self.network.warm_up, min(self.interpolated, 1), Rest.warm_up if self.rest else 0)
+        return pictures * (self.interpolated + 1)
 
     @torch.no_grad()
     def __call__(
@@ -210,6 +218,9 @@ class FilmMaker:
         """
         if len(clocks) != len(spikes) or any(after <= before for before, after in pairwise(clocks)):
             raise ValueError(f"clocks: expected {len(spikes)} increasing ones, got {list(clocks)}")
+        if self.rest is not None and not static:
+            light = torch.as_tensor(exposure).flatten().expand(len(spikes)).tolist()
+            return torch.cat([*map(self._where_it_moves, spikes.split(1), clocks, light)])
         if not self.interpolated:
             return self._made(spikes, list(clocks), None, static, exposure)
         every, total = self.interpolated + 1, len(clocks)
@@ -225,6 +236,28 @@ class FilmMaker:
             between = [clock for clock in clocks if left.clock < clock < right.clock]
             pictures |= {clock: self._interpolate(left, right, clock) for clock in between}
         return torch.cat([pictures[clock] for clock in clocks])
+
+    def _where_it_moves(self, spikes: Tensor, clock: int, exposure: float) -> Tensor:
+        """A picture, of which only what moves is made anew; the rest of a state that is carried on stays as it is."""
+        whole, before, state = Box(0, 0, *spikes.shape[-2:]), self._known, None
+        if before is not None and clock - before.clock <= self.network.frames:
+            state = before.state.clone()
+
+        def make(box: Box, static: bool) -> Tensor:
+            nonlocal state
+            outer = box.grown(self.network.halo + (0 if static else AROUND), whole)
+            if self.carries_on:
+                self._known = None if state is None else _Known(before.clock, outer.of(before.state))
+            rgb = self._made(outer.of(spikes), [clock], None, static, exposure)[0]
+            if self.carries_on:
+                part = self._known.state
+                state = part.new_zeros(*part.shape[:2], *spikes.shape[-2:]) if state is None else state
+                box.of(state).copy_(box.of(part, outer[:2]))
+            return box.of(rgb, outer[:2], self.network.scale)
+
+        rgb = self.rest(spikes[0], clock, make, exposure)
+        self._known = None if state is None else _Known(clock, state)
+        return rgb[None]
 
     def _made(
         self, spikes: Tensor, clocks: list[int], flow: Tensor | None, static: bool, exposure: float | Tensor

@@ -1,0 +1,114 @@
+"""Measure what a film saves where its scene rests, and what its pictures gain: ``python benchmarks/film_activity.py``.
+
+Beside the film that makes everything everywhere, in turns, on scenes whose truth is known. ``--overlay FOLDER`` writes
+pictures of both beside each other, what the network was asked for in green.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from statistics import mean
+
+import torch
+from torch import Tensor
+
+from lightning_modules.data.pictures import embedded_pictures
+from lightning_modules.inference.film import FilmMaker
+from lightning_modules.inference.rest import CELL
+from lightning_modules.networks import Network
+from spikekit import SensorNoise, bin_to_sensor, psnr, read_picture, simulate_spikes, write_picture
+from spikekit.arguments import whole
+from spikekit.scenes.analytic import Layer, Motion, Scene
+
+EVERY = 20
+ALPHA = 0.4
+NOISE = SensorNoise(photons=30_000, dark_current=0.0047, dark_spread=0.39, gain_spread=0.06)
+
+
+def scenes(size: tuple[int, int], clocks: int, scale: int) -> Iterator[tuple[str, Scene, Callable[[int], float]]]:
+    """Yield scenes of so many sensor pixels, and how bright they are at a clock."""
+    ground, thing = (read_picture(path) for path in embedded_pictures()[:2])
+    view = [scale * side for side in size]
+    side = scale * round(math.sqrt(0.05 * size[0] * size[1] * 4 / math.pi))
+    y, x = (torch.linspace(-1, 1, side) for _ in range(2))
+    thing = thing[:, :side, :side]
+    disc = (y[:, None].square() + x.square() <= 1).to(thing)
+    speed = 0.5 * view[1] / clocks
+    moving = Layer(thing, Motion(velocity=(speed, 0.0)), (view[1] // 2 - side // 2, view[0] // 2 - side // 2), disc)
+    still = Scene([Layer(ground)], *view, clocks)
+    yield "still", still, lambda _: 1.0
+    yield "object of 5 %", Scene([Layer(ground), moving], *view, clocks), lambda _: 1.0
+    yield "flicker of 100 Hz", still, lambda clock: 1 + 0.25 * math.sin(2 * math.pi * clock / 200)
+    yield "noisy sensor", still, lambda _: 1.0
+    yield "dark", still, lambda _: 0.05
+    yield "panning", Scene([Layer(ground, Motion(velocity=(0.1 * scale, 0.0)))], *view, clocks), lambda _: 1.0
+
+
+def film_of(name: str, scene: Scene, bright: Callable[[int], float], network: Network) -> Tensor:
+    """The spikes of a scene, (clocks, H, W)."""
+    scale, pattern = network.scale, network.pattern
+    if all(layer.motion == Motion() for layer in scene.layers):
+        light = ALPHA * bin_to_sensor(scene.rgb(0), pattern, scale=scale).expand(scene.frames, -1, -1)
+    else:
+        light = scene.light(pattern, scale=scale, alpha=ALPHA)
+    light = light * torch.tensor([bright(clock) for clock in range(scene.frames)])[:, None, None]
+    noise = NOISE if name == "noisy sensor" else None
+    return simulate_spikes(light, generator=torch.Generator().manual_seed(0), noise=noise)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--weights", default="cscsr_tiny_x4")
+    parser.add_argument("--size", type=whole(16), nargs=2, default=[96, 128])
+    parser.add_argument("--pictures", type=whole(12), default=60)
+    parser.add_argument("--scene", action="append", help="only those that begin so")
+    parser.add_argument("--overlay", type=Path)
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    network = Network.from_pretrained(args.weights)
+    clocks = EVERY * (args.pictures - 1) + network.frames
+    print("weights,scene,time after 10,cells after 10,plain PSNR,PSNR after 1,after 10,at the end")
+    for name, scene, bright in scenes(tuple(args.size), clocks, network.scale):
+        if args.scene and not name.startswith(tuple(args.scene)):
+            continue
+        network.noise_level = float(name == "noisy sensor")
+        spikes = film_of(name, scene, bright, network)
+        plain, resting = FilmMaker(network), FilmMaker(network, psnr_tolerance=0.1)
+        times, cells, found = [], [], []
+        for clock in range(network.frames // 2, clocks - network.frames // 2, EVERY):
+            clip = spikes[None, clock - network.frames // 2 :][:, : network.frames]
+            truth = (bright(clock) * scene.rgb(clock)).clamp(0, 1)
+            made = []
+            for maker in (plain, resting):
+                start = time.process_time()
+                made.append(maker(clip, [clock])[0])
+                times.append(time.process_time() - start)
+            cells.append(resting.rest.computed.float().mean().item())
+            found.append([psnr(picture, truth).item() for picture in made])
+            if args.overlay:
+                write_overlay(args.overlay, f"{name.split()[0]}_{clock:05}.png", made, truth, resting.rest.computed)
+        late = times[20::2], times[21::2]
+        ratio, share = sum(late[1]) / sum(late[0]), mean(cells[10:])
+        figures = [mean(one for one, _ in found), *(found[n][1] - found[n][0] for n in (1, 10, -1))]
+        print(f"{args.weights},{name},{ratio:.3f},{share:.3f},{','.join(f'{figure:.2f}' for figure in figures)}")
+
+
+def write_overlay(folder: Path, name: str, made: list[Tensor], truth: Tensor, computed: Tensor) -> None:
+    """Write the plain picture, the other, what was computed of it, and four times their difference."""
+    folder.mkdir(parents=True, exist_ok=True)
+    side = CELL * truth.shape[-1] // (CELL * computed.shape[-1])
+    green = computed.repeat_interleave(side, 0).repeat_interleave(side, 1)[: truth.shape[-2], : truth.shape[-1]]
+    shown = made[1].clone()
+    shown[1] = torch.where(green, 0.6 * shown[1] + 0.4, shown[1])
+    apart = (0.5 + 4 * (made[1] - made[0])).clamp(0, 1)
+    rows = torch.cat([torch.cat([made[0], made[1]], -1), torch.cat([shown, apart], -1)], -2)
+    write_picture(folder / name, rows)
+
+
+if __name__ == "__main__":
+    main()

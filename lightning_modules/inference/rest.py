@@ -1,0 +1,257 @@
+"""What rests in a film: told from its spikes, and kept as long as it does."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from lightning_modules.inference.tiles import Box
+from spikekit import bin_to_sensor, demosaic
+from spikekit.color.cfa import GREY
+
+#: sensor pixels along the side of a cell, the smallest part that rests by itself
+CELL = 8
+
+_RISK = 1e-5  # of calling a cell at rest moved
+_TESTS = 5  # of a cell: blocks of 1, 2 and 4 pixels, all of them, and the cell
+_PICTURES = 8  # of which a cell at rest shows the mean, before the network is no longer asked
+_LEAST = 1 / 12  # variance that is always allowed for, in spikes: light is not known exactly
+_NOISY = 0.01  # variance of a noisy sensor, for a spike, beside that of counting: photons of 100 electrons a threshold
+_AROUND = 24  # sensor pixels around a box that it costs as well, about
+
+
+class Changes(NamedTuple):
+    """What became of a scene.
+
+    Args:
+        moved: cells (h, w) whose spikes are no longer those of the same scene.
+        gain: by how much all light has changed.
+    """
+
+    moved: Tensor
+    gain: float
+
+
+def find_changes(recent: Tensor, reference: Tensor, share: Tensor, noise: float = 0.0) -> Changes:
+    r"""Tell where a scene has changed between two counts of spikes, and by how much a lamp has.
+
+    A pixel that integrates light l counts :math:`n l` spikes in n clocks, rounded up or down: the part f of it behind
+    the point decides how often, and the variance is :math:`f (1 - f)`, a quarter at most, however many spikes there
+    are. A reference of m clocks, with :math:`q = n / m`, predicts the count of an ideal sensor with
+
+    .. math:: d = c - g q r, \quad |d| \le 1 + g q, \quad
+        \operatorname{var} d \approx \max_{|\epsilon| \le q} f_\epsilon (1 - f_\epsilon) + \frac{q^2 + q}{4}
+
+    where the first part is the largest that light as the reference may have rounded it gives, and the rest is the
+    reference's own rounding, and what it shares with the next count. g, the gain of lamps that flicker, is the median
+    of the ratio over all cells, weighted by their light; it is 1 unless it differs by five standard deviations.
+
+    A cell has moved if a pixel exceeds the bound, if the sum of :math:`d^2 / \operatorname{var}` over its blocks of 1,
+    2 or 4 pixels, or the cell as one, exceeds what K normal numbers do in one of 1 / risk cases,
+    :math:`K + 2 \sqrt{K x} + 2 x` with :math:`x = \ln(\text{tests} / \text{risk})`, or if a single block does. Larger
+    blocks see faint motion, whose changes have the same sign side by side; single ones see what is smaller than a cell.
+    The risk is 0.00001 a cell.
+
+    Args:
+        recent: counts (H, W).
+        reference: earlier counts (H, W).
+        share: (h, w), for how much of the reference's clocks the recent ones stand, in every cell; infinity where there
+            is no reference, which counts as moved.
+        noise: variance of the sensor beside that of rounding, for a spike; 0 for an ideal one.
+
+    Example:
+        >>> at_rest, lamp = torch.full((16, 16), 8.0), torch.full((16, 16), 12.0)
+        >>> moved, gain = find_changes(lamp, at_rest, torch.ones(2, 2))
+        >>> moved.any().item(), gain
+        (False, 1.5)
+    """
+    known = share.isfinite()
+    each = _pixels(share.where(known, 0.0), recent.shape)
+    expected = each * reference
+    gain = _gain(_sum(recent, CELL)[known], _sum(expected, CELL)[known])
+    expected, each = gain * expected, gain * each
+    off = recent - expected
+    part = (expected - expected.floor() - 0.5).abs()
+    variance = (0.25 - (part - each).clamp(min=0).square()).clamp(min=_LEAST) + each * (each + 1) / 4
+    variance = variance + noise * expected * (1 + each)
+    size = 1 + each + 0.1 + 6 * (noise * expected * (1 + each)).sqrt()
+    moved = F.max_pool2d((off.abs() - size)[None], CELL, ceil_mode=True)[0] > 0
+    x = math.log(_TESTS / _RISK)
+    for block in (1, 2, 4, CELL):
+        squares = _sum(off, block).square() / _sum(variance, block)
+        count = _sum(torch.ones_like(squares), CELL // block)
+        moved |= _sum(squares, CELL // block) > count + 2 * (count * x).sqrt() + 2 * x
+        if block in (2, 4):
+            most = F.max_pool2d(squares[None], CELL // block, ceil_mode=True)[0]
+            moved |= most > 2 * (x + math.log(2 * (CELL // block) ** 2))
+    return Changes(moved | ~known, gain)
+
+
+def _gain(recent: Tensor, expected: Tensor) -> float:
+    """Weighted median of ratios; 1 where it may be 1."""
+    recent, expected = recent[expected > 0], expected[expected > 0]
+    if not len(expected):
+        return 1.0
+    ratio, order = (recent / expected).sort()
+    weight = expected[order].cumsum(0)
+    gain = ratio[int(torch.searchsorted(weight, weight[-1] / 2))].item()
+    spread = 0.6 * CELL * math.sqrt(len(expected)) / weight[-1].item()
+    return gain if abs(gain - 1) > 5 * spread else 1.0
+
+
+def _sum(plane: Tensor, side: int) -> Tensor:
+    """Sums over blocks, those at the right and at the bottom cut off."""
+    return F.avg_pool2d(plane[None], side, ceil_mode=True, divisor_override=1)[0]
+
+
+def _pixels(cells: Tensor, size: tuple[int, ...], scale: int = 1) -> Tensor:
+    """The value of its cell for every pixel."""
+    side = CELL * scale
+    return cells.repeat_interleave(side, -2).repeat_interleave(side, -1)[..., : size[-2], : size[-1]]
+
+
+class Rest:
+    r"""Makes the pictures of key frames one after the other, and asks the network only where something moves.
+
+    Convention:
+        The spikes that came since the last key frame are compared with those before, twice: they alone, which sees what
+        begins to move; and they with those before them, up to as many as there are in the reference, which sees what
+        drifts. So the reference grows as long as nothing moves, and begins anew where something does.
+
+        A cell rests when all its clip does. It then shows the mean of the network's next eight pictures, for which
+        nothing is said to move; after that no network is asked. Cells beside one that moves are computed, and blended.
+        A lamp's gain is taken out of what is kept, and put into what is shown.
+
+        An ideal or calibrated sensor's mean over all clocks is exact in the end. The picture is drawn towards it, at
+        the sensor's resolution, by the share of their difference that is not the mean's own noise.
+
+    Args:
+        scale: pixels of the picture for one of the sensor's.
+        pattern: colours of the sensor.
+        white: light of what the network shows white, in spikes a clock.
+        noisy: the sensor is not known to be ideal: its mean is not trusted.
+
+    Attributes:
+        computed: cells (h, w) that the network made of the last picture.
+    """
+
+    #: pictures that are seen again where a film goes on, so that what rests rests again
+    warm_up = _PICTURES + 3
+
+    def __init__(self, scale: int, pattern: str, white: float, noisy: bool = False) -> None:
+        self.scale, self.pattern, self.white, self.noisy = scale, pattern, white, noisy
+        self._clock = -math.inf
+
+    def _start(self, spikes: Tensor) -> None:
+        planes = spikes.new_zeros(2, *spikes.shape[-2:], dtype=torch.float32)
+        self._earlier, self._later = planes
+        # the clocks of both, each as bright as the first; clocks without a change; pictures in the mean
+        self._before, self._since, self._calm, self._count = _sum(torch.zeros_like(planes[:1]), CELL).repeat(4, 1, 1)
+        self._mean: Tensor | None = None
+        self._light = 1.0
+
+    def __call__(self, spikes: Tensor, clock: int, make: Callable[[Box, bool], Tensor], exposure: float) -> Tensor:
+        """Return a picture.
+
+        Args:
+            spikes: its clip (N, H, W).
+            clock: its number, larger than the last.
+            make: asks the network for the picture (3, s h, s w) of a box; nothing moves there, if so said.
+            exposure: what the network's pictures are multiplied by.
+        """
+        frames, whole, scale = len(spikes), Box(0, 0, *spikes.shape[-2:]), self.scale
+        came = int(min(clock - self._clock, frames + 1))
+        if came > frames or self._earlier.shape != spikes.shape[-2:]:
+            self._start(spikes)
+        else:
+            self._compare(spikes[frames - came :])
+        self._clock = clock
+        moved = self._calm < frames
+        near = F.max_pool2d(moved[None].float(), 3, 1, 1)[0] > 0
+        self._count[moved] = 0
+        self.computed = near | (self._count < _PICTURES)
+        gain, fresh = 1.0, None
+        if not moved.all():
+            middle = spikes[frames // 2 - came // 2 :][:came]
+            clocks = self._before + self._since
+            expected = _sum(self._earlier + self._later, CELL) * (came / clocks)
+            gain = _gain(_sum(middle.sum(0, dtype=torch.float32), CELL)[clocks > 0], expected[clocks > 0])
+        for box, static in _boxes(self.computed, near, whole):
+            part = make(box, static).float()
+            if fresh is None:
+                size = scale * whole.bottom, scale * whole.right
+                fresh = part.new_zeros(len(part), *size) if self._mean is None else self._mean * gain
+            box.of(fresh, scale=scale).copy_(part)
+        if fresh is not None:
+            new = self.computed & ~near
+            self._count += new
+            weight = torch.where(new, 1 / self._count, (self._count == 0).float())
+            if self._mean is None:
+                self._mean = fresh / gain
+            self._mean += _pixels(weight, self._mean.shape, scale) * (fresh / gain - self._mean)
+        shown = gain * (self._mean if self.noisy else self._drawn(exposure))
+        if near.any():
+            share = F.interpolate(near[None, None].float(), scale_factor=CELL * scale, mode="bilinear")[0, 0]
+            shown = shown.lerp(fresh, share[: shown.shape[-2], : shown.shape[-1]])
+        return shown.clamp(0, 1)
+
+    def _compare(self, spikes: Tensor) -> None:
+        """Take new spikes into the counts; where the scene has changed they begin anew."""
+        recent, noise = spikes.sum(0, dtype=torch.float32), _NOISY * self.noisy
+        came = len(spikes) * self._light
+        alone = find_changes(recent, self._earlier, came / self._before, noise)
+        self._light *= alone.gain
+        self._later += recent
+        self._since += came * alone.gain
+        joint = find_changes(self._later, self._earlier, self._since / self._before, noise)
+        self._since *= joint.gain
+        self._calm += len(spikes)
+        changed = (alone.moved | joint.moved) & (self._before > 0)
+        self._calm[changed] = self._before[changed] = self._since[changed] = 0
+        full = self._since >= self._before
+        kept, grown = (_pixels(cells.float(), recent.shape) for cells in (~changed, full & ~changed))
+        self._earlier = self._earlier * kept + self._later * grown
+        self._later *= kept * (1 - grown)
+        self._before += self._since * full
+        self._since *= ~full
+        if not self._before.any():
+            self._light = 1.0
+
+    def _drawn(self, exposure: float) -> Tensor:
+        """The mean of pictures, drawn towards that of all spikes."""
+        clocks = self._before + self._since
+        share = (exposure / self.white / clocks).nan_to_num(posinf=0)
+        picture = self._mean
+        if len(picture) == 1:
+            seen = F.avg_pool2d(picture, self.scale)[0]
+        else:
+            seen = bin_to_sensor(picture, self.pattern, scale=self.scale)
+        off = (self._earlier + self._later) * _pixels(share, seen.shape) - seen
+        power = _sum(off.square(), CELL) / _sum(torch.ones_like(off), CELL)
+        trust = (1 - share.square() / 6 / power).nan_to_num(0).clamp(min=0) * (share > 0)
+        off = off * _pixels(trust, off.shape)
+        colors = off[None] if self.pattern == GREY else demosaic(off, self.pattern)
+        if self.scale > 1:
+            colors = F.interpolate(colors[None], scale_factor=self.scale, mode="bilinear")[0]
+        return picture + colors
+
+
+def _boxes(computed: Tensor, near: Tensor, whole: Box) -> list[tuple[Box, bool]]:
+    """Boxes around the cells that are computed, and whether nothing moves there; of two that meet, the last counts."""
+    from scipy.ndimage import find_objects, label
+
+    found = []
+    for cells, static in ((computed & ~near, True), (near, False)):
+        for rows, columns in find_objects(label(cells.cpu().numpy())[0]):
+            box = Box(*(CELL * end for end in (rows.start, columns.start, rows.stop, columns.stop)))
+            found.append((box.grown(CELL // 2, whole), static))
+    seen = [box.grown(_AROUND, whole) for box, _ in found]
+    area = sum((box.bottom - box.top) * (box.right - box.left) for box in seen)
+    if found and area >= 1.2 * whole.bottom * whole.right:
+        return [(whole, not near.any().item())]
+    return found

@@ -1,0 +1,138 @@
+"""Films of which only what moves is computed."""
+
+import math
+
+import pytest
+import torch
+
+from lightning_modules.inference.film import FilmMaker
+from lightning_modules.inference.rest import CELL, find_changes
+from lightning_modules.networks import CSCSR, RecurrentCSCSR
+from spikekit import psnr, simulate_spikes
+from spikekit.scenes import Layer, Motion, Scene
+
+TINY = {"scale": 2, "width": 8, "representation_width": 8, "features": 1, "stages": 1, "end_blocks": 1}
+EVERY, SIDE = 20, 64
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def texture(side, scale=1):
+    coarse = torch.rand(1, 3, side // 4, side // 4, generator=generator(1))
+    return torch.nn.functional.interpolate(coarse, scale_factor=4 * scale, mode="bicubic")[0].clamp(0.05, 0.95)
+
+
+def counts(light, before, after, seed=0):
+    spikes = simulate_spikes(light.expand(before + after, -1, -1), generator=generator(seed)).float()
+    return spikes[before:].sum(0), spikes[:before].sum(0)
+
+
+@pytest.mark.parametrize("clocks", [20, 400])
+@pytest.mark.parametrize("bright", [1.0, 0.3, 0.01, 0.0])
+def test_hardly_a_cell_at_rest_is_called_moved(clocks, bright):
+    light = bright * torch.rand(256, 256, generator=generator())
+    share = torch.full((32, 32), 20 / clocks)
+    wrong = [find_changes(*counts(light, clocks, 20, seed), share).moved.sum() for seed in range(4)]
+    assert sum(wrong) <= 1
+
+
+def test_counts_stay_within_the_bound_and_the_variance_that_are_said():
+    light = torch.linspace(0.01, 0.9, 4096).expand(64, -1)
+    recent, reference = counts(light, 400, 20)
+    off = recent - reference * 20 / 400
+    assert off.abs().max() <= 1 + 20 / 400
+    part = (20 * light) % 1
+    assert off.square().mean().item() == pytest.approx((part * (1 - part)).mean().item(), rel=0.15)
+
+
+@pytest.mark.parametrize(("recent", "reference"), [(20, 200), (160, 160)])
+def test_a_shift_of_half_a_pixel_is_seen_in_every_textured_cell(recent, reference):
+    picture = texture(2 * SIDE + 8)[0]
+    first, second = (0.4 * picture[: 2 * SIDE : 2, at : at + 2 * SIDE : 2] for at in (0, 1))
+    share = torch.full((SIDE // CELL, SIDE // CELL), recent / reference)
+    for seed in range(8):
+        found = find_changes(counts(second, 20, recent, seed)[0], counts(first, reference, 1, seed + 9)[1], share)
+        assert found.moved.all()
+
+
+def test_something_smaller_than_a_cell_is_seen_and_only_where_it_is():
+    light = torch.full((SIDE, SIDE), 0.2)
+    reference = counts(light, 60, 20)[1]
+    light[21:23, 34:36] = 0.35
+    moved = find_changes(counts(light, 60, 20, 1)[0], reference, torch.full((8, 8), 20 / 60)).moved
+    assert moved.nonzero().tolist() == [[2, 4]]
+
+
+@pytest.mark.parametrize("gain", [0.5, 0.9, 1.4])
+def test_a_lamp_that_changes_is_a_gain_and_no_motion(gain):
+    light = 0.1 + 0.3 * torch.rand(SIDE, SIDE, generator=generator())
+    reference, recent = counts(light, 60, 20)[1], counts(gain * light, 60, 20, 1)[0]
+    moved, found = find_changes(recent, reference, torch.full((8, 8), 20 / 60))
+    assert not moved.any()
+    assert found == pytest.approx(gain, rel=0.02)
+
+
+def film(light, network=None, **how):
+    network = CSCSR(**TINY).eval() if network is None else network
+    spikes = simulate_spikes(light, generator=generator())[None]
+    maker = FilmMaker(network, **how)
+    for clock in range(20, light.shape[0] - 20, EVERY):
+        yield maker(spikes[:, clock - 20 : clock + 21], [clock])[0], maker.rest and maker.rest.computed
+
+
+def still(clocks, side=SIDE):
+    return Scene([Layer(texture(2 * side))], 2 * side, 2 * side).light(scale=2)[:1].expand(clocks, -1, -1)
+
+
+@pytest.mark.parametrize("kind", [CSCSR, RecurrentCSCSR])
+def test_a_scene_at_rest_asks_the_network_for_eight_pictures_and_no_more(kind):
+    torch.manual_seed(0)
+    computed = [cells.all().item() for _, cells in film(still(321), kind(**TINY).eval(), psnr_tolerance=0.1)]
+    assert all(computed[:8])
+    assert not any(computed[11:])
+
+
+def test_where_all_moves_pictures_are_those_of_every_clip_by_itself():
+    scene = Scene([Layer(texture(2 * SIDE), Motion(velocity=(0.3, 0.1)))], 2 * SIDE, 2 * SIDE, 141)
+    light = scene.light(scale=2)
+    network = CSCSR(**TINY).eval()
+    pairs = zip(film(light, network), film(light, network, psnr_tolerance=0.1), strict=True)
+    for (plain, _), (found, computed) in pairs:
+        assert computed.all()
+        assert found.equal(plain)
+
+
+def test_slow_drift_is_seen_before_it_is_half_a_pixel():
+    scene = Scene([Layer(texture(2 * SIDE), Motion(velocity=(1 / 300, 0.0)))], 2 * SIDE, 2 * SIDE, 441)
+    shares = [cells.float().mean().item() for _, cells in film(scene.light(scale=2), psnr_tolerance=0.1)]
+    assert max(shares[11:]) > 0.5
+
+
+class Sensor(CSCSR):
+    """Shows the mean of its clip, and asks for a margin."""
+
+    halo = 4
+
+    def forward(self, spikes, flow=None, static=False):
+        return (spikes.float().mean(1, keepdim=True) / 0.4).expand(-1, 3, -1, -1)
+
+
+def test_a_picture_at_rest_becomes_that_of_all_its_clocks():
+    pattern = 0.3 + 0.1 * torch.rand(SIDE, SIDE, generator=generator())
+    network = Sensor(**{**TINY, "scale": 1, "pattern": "grey"})
+    pictures = [rgb[:1] for rgb, _ in film(pattern.expand(801, -1, -1), network, psnr_tolerance=0.1)]
+    truth = pattern[None] / 0.4
+    assert psnr(pictures[-1], truth) > psnr(pictures[0], truth) + 15
+
+
+def test_a_lamp_that_flickers_leaves_the_picture_at_rest_and_its_light_is_shown():
+    lamp = torch.tensor([1 + 0.3 * math.sin(2 * math.pi * clock / 200) for clock in range(541)])[:, None, None]
+    network = Sensor(**{**TINY, "scale": 1, "pattern": "grey"})
+    light = 0.5 * lamp * still(541)
+    found = list(film(light, network, psnr_tolerance=0.1))
+    assert not found[-1][1].any()
+    for n in range(-6, 0):
+        clock = 20 + EVERY * (len(found) + n)
+        assert found[n][0].mean().item() == pytest.approx(light[clock].mean().item() / 0.4, rel=0.03)
