@@ -57,11 +57,6 @@ def sections(documented):
     return {"Summary": parts[0], **dict(zip(parts[1::2], map(inspect.cleandoc, parts[2::2]), strict=True))}
 
 
-def items(section):
-    """The names that an Args or Raises block explains."""
-    return re.findall(r"^(\w+): ", section, flags=re.MULTILINE)
-
-
 def documented(kind):
     """Where ``.. autofunction::`` and its like name something: {name: page}."""
     found = [(name, path) for path, text in PAGES.items() for name in re.findall(kind + r":: spikekit\.(\w+)", text)]
@@ -73,79 +68,66 @@ def test_every_public_name_is_on_a_page_and_nothing_else():
     assert sorted(documented(r"auto\w+")) == sorted(sk.__all__)
 
 
+def figures(text):
+    return re.findall(r"^\.\. plot:: (\S+)$", text, flags=re.MULTILINE)
+
+
 @pytest.mark.parametrize("name", OPERATORS)
 def test_operator_has_a_page_with_its_module_and_a_picture(name):
     page = documented("autofunction")[name]
     assert page.parent.name == "operators"
     if name not in WITHOUT_MODULE:
         assert documented("autoclass")[camel(name)] == page
-    (figure,) = re.findall(r"^\.\. plot:: (\S+)$", PAGES[page], flags=re.MULTILINE)
+    (figure,) = figures(PAGES[page])
     assert page.stem == Path(figure).stem
     assert ":alt: " in PAGES[page]
-
-
-def contents():
-    """The pages that some table of contents leads to, by their names from the root of the pages."""
-    found = []
-    for path, text in PAGES.items():
-        for block in re.findall(r"^\.\. toctree::\n((?:   :\w+:.*\n)*)\n((?:   \S+\n)+)", text, flags=re.MULTILINE):
-            for entry in block[1].split():
-                name = DOCS / entry[1:] if entry.startswith("/") else path.parent / entry
-                found.append(name.relative_to(DOCS).as_posix())
-    return found
 
 
 def test_every_page_under_operators_is_an_operators_and_every_page_is_in_the_contents_once():
     pages = {path for path in PAGES if path.parent.name == "operators"}
     assert pages == {documented("autofunction")[name] for name in OPERATORS}
+    assert sorted(figure for text in PAGES.values() for figure in figures(text)) == [path.name for path in FIGURES]
+    contents = []
+    for path, text in PAGES.items():
+        for block in re.findall(r"^\.\. toctree::\n(?:   :\w+:.*\n)*\n((?:   \S+\n)+)", text, flags=re.MULTILINE):
+            for entry in block.split():
+                name = DOCS / entry[1:] if entry.startswith("/") else path.parent / entry
+                contents.append(name.relative_to(DOCS).as_posix())
     named = {path.relative_to(DOCS).with_suffix("").as_posix() for path in PAGES if "_templates" not in path.parts}
-    assert sorted(contents()) == sorted(named - {"index", "examples/README"} | {"gallery/index"})
+    assert sorted(contents) == sorted(named - {"index", "examples/README"} | {"gallery/index"})
 
 
 def test_every_public_name_is_in_the_list_of_its_room():
-    listed = [
-        name
-        for path, text in PAGES.items()
-        if path.parent.name == "api" and ".. autosummary::\n\n" in text
-        for name in text.split(".. autosummary::\n\n")[1].split("\n\n")[0].split()
-    ]
-    assert len(listed) == len(set(listed)), "in two rooms"
+    listed = {}
+    for path, text in PAGES.items():
+        if path.parent.name == "api" and ".. autosummary::\n\n" in text:
+            for name in text.split(".. autosummary::\n\n")[1].split("\n\n")[0].split():
+                assert name not in listed, "in two rooms"
+                listed[name] = path.stem
     modules = {camel(name) for name in OPERATORS} & set(MODULES)
     without_room = {"CAMERAS", "PATTERNS", "PictureError", "SpikeFileError", "VideoError", "psnr", "ssim", *modules}
     assert sorted(listed) == sorted(set(sk.__all__) - without_room)
-    for name in listed:
-        room = next(path.stem for path, text in PAGES.items() if path.parent.name == "api" and f"   {name}\n" in text)
+    for name, room in listed.items():
         assert getattr(sk, name).__module__.startswith(f"spikekit.{room}."), name
-
-
-def test_every_figure_is_on_one_page():
-    shown = [name for text in PAGES.values() for name in re.findall(r"^\.\. plot:: (\S+)$", text, flags=re.MULTILINE)]
-    assert sorted(shown) == [path.name for path in FIGURES]
-
-
-@pytest.mark.parametrize("name", OPERATORS)
-def test_docstring_of_operator(name):
-    parts = sections(FUNCTIONS[name])
-    assert parts["Summary"].splitlines()[0].endswith(".")
-    assert (".. math::" in parts["Summary"]) == (name not in WITHOUT_EQUATION)
-    assert len(parts["Convention"]) > 40
-    assert (len(parts.get("Reference", "")) > 10) == (name not in WITHOUT_REFERENCE)
-    assert list(parts)[1:] == [
-        part for part in ("Convention", "Args", "Returns", "Raises", "Example", "Reference") if part in parts
-    ]
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_docstring_of_function(name):
     function, parts = FUNCTIONS[name], sections(FUNCTIONS[name])
-    signature = inspect.signature(function)
-    assert items(parts["Args"]) == list(signature.parameters)
+    explained, raised = (re.findall(r"^(\w+): ", parts[part], flags=re.MULTILINE) for part in ("Args", "Raises"))
+    assert explained == list(inspect.signature(function).parameters)
     assert ("Returns" in parts) == (typing.get_type_hints(function)["return"] is not type(None))
-    raised = items(parts["Raises"])
     assert raised
     for error in raised:
         assert issubclass(getattr(sk, error, None) or getattr(builtins, error), Exception)
     assert ">>> " in parts["Example"]
+    if name in OPERATORS:
+        assert parts["Summary"].splitlines()[0].endswith(".")
+        assert (".. math::" in parts["Summary"]) == (name not in WITHOUT_EQUATION)
+        assert len(parts["Convention"]) > 40
+        assert (len(parts.get("Reference", "")) > 10) == (name not in WITHOUT_REFERENCE)
+        order = ["Summary", "Convention", "Args", "Returns", "Raises", "Example", "Reference"]
+        assert list(parts) == [part for part in order if part in parts]
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -165,25 +147,18 @@ def test_quickstart_runs():
     assert failed == 0
 
 
-def shown(page, name):
-    """The file that a page shows, and the commands under it."""
-    text = PAGES[DOCS / "howto" / f"{page}.rst"]
-    code, commands = re.search(rf"   # {name}\n((?:   .*\n|\n)+?)\.\. code-block:: sh\n\n((?:   .*\n)+)", text).groups()
-    return textwrap.dedent(code), [line.strip() for line in commands.splitlines()]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("page", "name"), [("training", "mynet.py"), ("motion", "myflow.py")])
 def test_networks_and_estimators_of_ones_own_go_through_the_verbs_as_shown(page, name, tmp_path):
-    code, commands = shown(page, name)
-    (tmp_path / name).write_text(code)
+    """The file that a page shows, and the commands under it."""
+    text = PAGES[DOCS / "howto" / f"{page}.rst"]
+    code, commands = re.search(rf"   # {name}\n((?:   .*\n|\n)+?)\.\. code-block:: sh\n\n((?:   .*\n)+)", text).groups()
+    (tmp_path / name).write_text(textwrap.dedent(code))
     sk.write_spikes(tmp_path / "FILE.dat", torch.rand(61, 24, 32) < 0.3)
     few = "--trainer.max_steps 4 --data.train_clips 8 --data.val_clips 2 --data.workers 0 --data.batch_size 2"
-    for command in commands:
-        arguments = command.split()[1:]
-        if arguments[0] == "predict":
-            arguments = command.replace("250", "24").replace("400", "32").split()[1:]
-        else:
+    for command in commands.splitlines():
+        arguments = command.replace("250", "24").replace("400", "32").split()[1:]
+        if arguments[0] != "predict":
             arguments += few.split()
         program = [sys.executable, "-c", "from lightning_modules.__main__ import main; main()", *arguments]
         environment = {**os.environ, "PYTHONPATH": str(DOCS.parent)}
@@ -194,41 +169,25 @@ def test_networks_and_estimators_of_ones_own_go_through_the_verbs_as_shown(page,
         assert len(list((tmp_path / "out").glob("*.png"))) == 2
 
 
-#: what the copied conf.py ends with: figures are small
-PRINTED = """
-plot_formats = [("png", 40)]
-"""
-
-
-@pytest.fixture(scope="module")
-def built(tmp_path_factory):
-    """The pages, built from a copy, since the gallery is written beside its source."""
+@pytest.mark.slow
+def test_docs_build_without_a_warning_and_need_no_network(tmp_path):
+    """From a copy, since the gallery is written beside its source."""
     for needed in ("sphinx", "furo", "matplotlib", "sphinx_gallery"):
         pytest.importorskip(needed, reason="the docs extra is not installed")
-    folder = tmp_path_factory.mktemp("docs")
-    shutil.copytree(DOCS, folder / "docs", ignore=shutil.ignore_patterns(*MADE))
-    shutil.copytree(DOCS.parent / "results", folder / "results")
-    with (folder / "docs" / "conf.py").open("a") as file:
-        file.write(PRINTED)
+    shutil.copytree(DOCS, tmp_path / "docs", ignore=shutil.ignore_patterns(*MADE))
+    shutil.copytree(DOCS.parent / "results", tmp_path / "results")
+    with (tmp_path / "docs" / "conf.py").open("a") as file:
+        file.write('plot_formats = [("png", 40)]\n')  # small figures
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", "docs", "pages"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(DOCS.parent), os.environ.get("PYTHONPATH", "")])}
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    return folder / "pages"
-
-
-@pytest.mark.slow
-def test_docs_build_without_a_warning(built):
+    built, formulas = tmp_path / "pages", 0
     for script in FIGURES:
         assert list((built / "_images").glob(f"{script.stem}*.png"))
     for script in EXAMPLES:
         assert list((built / "_images").glob(f"sphx_glr_{script.stem}_*.png"))
         assert (built / "gallery" / f"{script.stem}.html").is_file()
-
-
-@pytest.mark.slow
-def test_pages_need_no_network(built):
-    formulas = 0
     for page in built.rglob("*.html"):
         html = page.read_text()
         for tag in re.findall(r"<(?:script|link|img|iframe)\b[^>]*>", html):

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import pytorch_lightning as pl
 import torch
 from skimage import io
 
@@ -19,6 +18,7 @@ from lightning_modules.data.textures import outline_mask, texture
 from spikekit import SensorNoise, bin_to_sensor
 
 SMALL = {"patch": 8, "val_patch": 8, "train_clips": 8, "val_clips": 4, "batch_size": 2}
+NEEDS_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 
 
 def scenes(**options):
@@ -51,20 +51,15 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_a_clip_is_what_the_network_reads():
-    clip = scenes(scale=3, patch=10, brightness=(1.0, 1.0)).train_set[5]
-    assert {name: (value.shape, value.dtype) for name, value in clip.items()} == {
-        "spikes": ((41, 10, 10), torch.uint8),
-        "rgb": ((3, 30, 30), torch.float32),
-        "flow": ((2, 2, 10, 10), torch.float32),
-    }
-    assert 0 <= clip["rgb"].min() < clip["rgb"].max() <= 1
-    assert clip["spikes"].max() == 1
-
-
-def test_clip_is_its_scene():
+def test_a_clip_is_its_scene():
     data = scenes(patch=12, flow_times=(5, 35, 20), alpha=0.7, pattern="GBRG")
     scene, clip = data.train_set.scene(3), data.train_set[3]
+    assert {name: (value.shape, value.dtype) for name, value in clip.items()} == {
+        "spikes": ((41, 12, 12), torch.uint8),
+        "rgb": ((3, 48, 48), torch.float32),
+        "flow": ((3, 2, 12, 12), torch.float32),
+    }
+    assert 0 <= clip["rgb"].min() < clip["rgb"].max() <= 1
     assert torch.equal(clip["rgb"], scene.rgb(20))
     assert torch.equal(clip["flow"], torch.stack([scene.flow(t, scale=4) for t in (5, 35, 20)]))
     assert not clip["flow"][2].any()
@@ -102,24 +97,21 @@ def test_a_cache_gives_the_same_clips_of_the_same_settings(tmp_path, monkeypatch
         assert torch.equal(clip["spikes"], plain["spikes"])
         assert torch.equal(clip["rgb"], plain["rgb"])
         assert torch.equal(clip["flow"], plain["flow"].half().float())
-    for other in ({"alpha": 0.5}, {"flow_patch": 6}, {"seed": 1}):
+    for other in ({"alpha": 0.5}, {"flow_patch": 6}, {"seed": 1}, {"noise": SensorNoise()}):
         with pytest.raises(pytest.fail.Exception, match="made again"):
             scenes(**{**options, **other}).train_set[3]
 
 
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")
 def test_same_clips_whatever_the_workers():
-    alone = scenes()
+    alone, data = scenes(), scenes(workers=2)
     expected = clips_of(alone.train_dataloader())
-    assert expected == [digest(alone.train_set[i]) for i in range(8)]
     assert expected[::-1] == [digest(alone.train_set[i]) for i in range(7, -1, -1)]
     assert len(set(expected)) == 8
-    for workers in (2,):
-        data = scenes(workers=workers)
-        loader = data.train_dataloader()
-        assert loader.num_workers == workers
+    loader = data.train_dataloader()
+    assert loader.num_workers == 2
+    for _ in range(2):  # workers stay, the second round starts anew
         assert clips_of(loader) == expected
-        assert clips_of(loader) == expected  # workers stay, the second round starts anew
         assert clips_of(data.val_dataloader()) == clips_of(alone.val_dataloader())
 
 
@@ -134,51 +126,6 @@ def test_chance_of_others_does_not_matter():
     assert digest(scenes().val_set[0]) != first
 
 
-class Watcher(pl.LightningModule):
-    """Takes steps and remembers what it saw."""
-
-    def __init__(self):
-        super().__init__()
-        self.weight = torch.nn.Parameter(torch.zeros(1))
-        self.seen, self.validated = [], []
-
-    def training_step(self, batch):
-        self.seen.append(digest(batch))
-        return (self.weight * batch["rgb"].mean()).sum()
-
-    def validation_step(self, batch):
-        self.validated.append(digest(batch))
-
-    def configure_optimizers(self):
-        return torch.optim.SGD(self.parameters(), 0.1)
-
-
-@pytest.mark.parametrize(("workers", "stop"), [(0, 3), (1, 6)])
-def test_resumed_training_sees_what_unbroken_training_would(tmp_path, workers, stop):
-    def train(steps, **how):
-        watcher = Watcher()
-        trainer = pl.Trainer(
-            max_steps=steps,
-            accelerator="cpu",
-            logger=False,
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            num_sanity_val_steps=1,
-            default_root_dir=tmp_path,
-        )
-        trainer.fit(watcher, StillScenes(**SMALL, workers=workers), **how)
-        return watcher, trainer
-
-    unbroken, _ = train(10)  # two and a half epochs of four batches
-    assert len(set(unbroken.seen)) == 10
-    assert unbroken.validated[1:3] == unbroken.validated[3:5]
-    broken, trainer = train(stop)
-    trainer.save_checkpoint(tmp_path / "at.ckpt")
-    resumed, _ = train(10, ckpt_path=tmp_path / "at.ckpt")
-    assert broken.seen + resumed.seen == unbroken.seen
-
-
 def test_workers_run_one_thread():
     class Threads(StillClips):
         def __getitem__(self, index):
@@ -189,22 +136,15 @@ def test_workers_run_one_thread():
     assert next(iter(data.train_dataloader()))["threads"].tolist() == [1, 1]
 
 
-def test_motion_keeps_to_its_bounds():
-    clips = scenes(motion=2.0, rotation=0.0, zoom=0.0, objects=0).train_set
-    flows = torch.stack([clips.scene(i).flow(40, scale=4)[:, 0, 0] for i in range(30)])
-    assert 1.2 < flows.norm(dim=1).max() <= 2.0 + 1e-5
-    assert (flows.amin(0) < -0.8).all()
-    assert (flows.amax(0) > 0.8).all()
-    still = scenes(motion=0.0, rotation=0.0, zoom=0.0).train_set[1]
-    assert not still["flow"].any()
-
-
-def test_bend_keeps_to_its_bounds():
-    """Where nothing else moves, what acceleration adds is the same before and after the middle."""
-    clips = scenes(bend=2.0, motion=0.0, rotation=0.0, zoom=0.0, objects=0).train_set
+@pytest.mark.parametrize("kind", ["motion", "bend"])
+def test_motion_keeps_to_its_bounds(kind):
+    clips = scenes(**{"motion": 0.0, kind: 2.0}, rotation=0.0, zoom=0.0, objects=0).train_set
     first, last = (torch.stack([clips.scene(i).flow(t, scale=4)[:, 0, 0] for i in range(30)]) for t in (0, 40))
-    torch.testing.assert_close(first, last)
+    torch.testing.assert_close(first, last if kind == "bend" else -last)  # acceleration adds the same at both ends
     assert 1.2 < last.norm(dim=1).max() <= 2.0 + 1e-5
+    assert (last.amin(0) < -0.8).all()
+    assert (last.amax(0) > 0.8).all()
+    assert not scenes(motion=0.0, rotation=0.0, zoom=0.0).train_set[1]["flow"].any()
 
 
 def test_options_do_what_they_say():
@@ -230,8 +170,6 @@ def test_training_sees_sensors_from_the_ideal_to_the_noisiest():
     assert 0.012 < more.mean() < 0.028
     shown = StillClips(embedded_pictures(), scale=2, patch=32, augment=False, noise=SensorNoise(dead=0.04))
     assert (shown[0]["spikes"].amax(dim=0) == 0).double().mean() > 0.035
-    keys = {StillClips(embedded_pictures(), noise=noise)._source for noise in (None, SensorNoise(), shown.noise)}
-    assert len(keys) == 3  # of what is kept on disk
 
 
 def test_key_frames_are_one_scene_that_moves_on():
@@ -248,16 +186,17 @@ def test_key_frames_are_one_scene_that_moves_on():
 
 
 @pytest.mark.parametrize("options", [{}, {"pattern": "grey", "key_frames": 2}, {"gains": (0.05, 1.0), "scale": 3}])
-def test_a_batch_has_the_clips_that_are_made_one_by_one(options):
+@pytest.mark.parametrize("on", ["cpu", pytest.param("cuda", marks=NEEDS_GPU)])
+def test_a_batch_has_the_clips_that_are_made_one_by_one(on, options):
     noise = SensorNoise(gain_spread=0.05, dark_current=0.002, dark_spread=0.3, hot=0.001, dead=0.01)
     clips = StillClips(embedded_pictures(), **{"scale": 2, "patch": 16, "noise": noise, "textures": True} | options)
     drawn = [clips.draw(index) for index in range(6)]
     drawn = {name: np.stack([one[name] for one in drawn]) for name in drawn[0]}
-    batch = clips.render(drawn, clips.sources.gallery("cpu"))
+    batch = {name: value.cpu() for name, value in clips.render(drawn, clips.sources.gallery(on)).items()}
     for index in range(6):
         alone = clips[index]
         spikes = clips._cut({"spikes": batch["spikes"][index]})["spikes"]
-        assert (alone["spikes"] != spikes).double().mean() < 1e-3
+        assert (alone["spikes"] != spikes).double().mean() < (1e-3 if on == "cpu" else 5e-3)
         for name in batch.keys() - {"spikes"}:
             torch.testing.assert_close(batch[name][index], alone[name], atol=1e-4, rtol=0)
     assert 0.05 < batch["spikes"].float().mean() < 0.5
@@ -276,12 +215,14 @@ def test_any_folder(folder):
     names = ["colour.png", "grey.JPG", "tiny.tif", "deep.png", "rgba.png"]
     assert [path.name for path in folder_pictures(folder)] == names
     data = scenes(root=str(folder), val_root=str(folder), patch=12, val_patch=12)
-    for i in range(6):
-        for clips in (data.train_set, data.val_set):
-            clip = clips[i]
-            assert clip["rgb"].shape == (3, 48, 48)
-            assert clip["rgb"].isfinite().all()
-            assert clip["rgb"].amax() > 0
+    for clips in (data.train_set, data.val_set):
+        for i in range(6):
+            rgb = clips[i]["rgb"]
+            assert rgb.shape == (3, 48, 48)
+            assert rgb.isfinite().all()
+            assert rgb.amax() > 0
+    in_turn = [int(data.val_set.draw(i)["picture"][0]) for i in range(7)]
+    assert in_turn == [0, 1, 2, 3, 4, 0, 1]
 
 
 def test_folder_without_validation_is_split(folder):
@@ -298,30 +239,19 @@ def test_folder_without_validation_is_split(folder):
     assert split_pictures(many[:1], 0) == (many[:1], many[:1])
 
 
-def test_validation_takes_every_picture_in_turn(folder):
-    data = scenes(root=str(folder), val_root=str(folder), objects=0)
-    seen = [int(data.val_set.draw(i)["picture"][0]) for i in range(7)]
-    assert seen == [0, 1, 2, 3, 4, 0, 1]
-
-
 def test_errors_say_what_is_wrong(folder, tmp_path):
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    with pytest.raises(FileNotFoundError, match="nowhere: no such folder"):
-        scenes(root=str(tmp_path / "nowhere"))
-    with pytest.raises(FileNotFoundError, match="nowhere: no such folder"):
-        scenes(val_root=str(tmp_path / "nowhere"))
-    with pytest.raises(FileNotFoundError, match="no picture in this folder"):
-        scenes(val_root=str(empty))
-    with pytest.raises(NotADirectoryError, match="expected a folder of pictures, got a file"):
-        scenes(root=str(folder / "notes.txt"))
+    (tmp_path / "empty").mkdir()
     for name, value, message in (
-        ("pattern", "RGBG", "pattern: expected one of RGGB"),
-        ("patch", 0, "patch: expected at least 1, got 0"),
-        ("motion", -1.0, "motion: expected 0 or more, got -1.0"),
+        ("root", "nowhere", "nowhere: no such folder"),
+        ("val_root", "nowhere", "nowhere: no such folder"),
+        ("val_root", "empty", "no picture in this folder"),
+        ("root", "notes.txt", "expected a folder of pictures, got a file"),
+    ):
+        with pytest.raises(OSError, match=message):
+            scenes(**{name: str(tmp_path / value)})
+    for name, value, message in (
         ("brightness", (0.9, 0.5), "brightness: expected two numbers"),
         ("gains", (0.0, 1.0), "gains: expected two numbers"),
-        ("alpha", 0.0, "alpha: expected"),
         ("flow_times", (5, 41), r"flow_times: expected clocks in \[0, 41\), got \(5, 41\)"),
         ("batch_size", 9, "train_clips: expected at least batch_size"),
     ):
@@ -384,17 +314,3 @@ def test_linked_folders_of_pictures_are_seen_and_links_that_lead_back_are_not_fo
     (tmp_path / "in" / "there").symlink_to(tmp_path / "out")
     (tmp_path / "out" / "back").symlink_to(tmp_path / "in")
     assert [path.name for path in folder_pictures(tmp_path / "in")] == ["a.png", "b.png"]
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
-@pytest.mark.parametrize("options", [{}, {"pattern": "grey", "key_frames": 3, "every": 8}])
-def test_a_gpu_renders_the_same_scenes(options):
-    clips = StillClips(
-        embedded_pictures(), **{"scale": 4, "patch": 24, "noise": SensorNoise(gain_spread=0.05)} | options
-    )
-    drawn = [clips.draw(index) for index in range(16)]
-    drawn = {name: np.stack([one[name] for one in drawn]) for name in drawn[0]}
-    here, there = (clips.render(drawn, clips.sources.gallery(device)) for device in ("cpu", "cuda"))
-    assert (here.pop("spikes") != there.pop("spikes").cpu()).double().mean() < 5e-3
-    for name in here:
-        torch.testing.assert_close(there[name].cpu(), here[name], atol=1e-4, rtol=0)
