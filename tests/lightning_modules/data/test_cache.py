@@ -62,30 +62,21 @@ def clip(levels, height=6, width=22, scale=2, flow=True):
     return made if flow else {name: made[name] for name in ("spikes", "rgb")}
 
 
-@pytest.mark.parametrize(("levels", "dtype"), [(256, "uint8"), (257, "uint16")])
+@pytest.mark.parametrize(("levels", "dtype"), [(256, "uint8"), (257, "uint16"), (99999, "float32")])
 @pytest.mark.parametrize("flow", [True, False])
 def test_packing_loses_nothing(levels, dtype, flow):
-    original = clip(levels, 60, 70, flow=flow)
+    original = clip(levels, 160, 170, flow=flow)
     packed = pack_clip(original)
     assert packed["rgb"].dtype == dtype
-    assert packed["spikes"].nbytes == 41 * 60 * 9
-    again = unpack_clip(packed, (0, 0, 60, 70), 2)
+    assert packed["spikes"].nbytes == 41 * 160 * 22
+    again = unpack_clip(packed, (0, 0, 160, 170), 2)
     assert again.keys() == original.keys()
     for name in again:
         assert again[name].dtype == original[name].dtype
         assert torch.equal(again[name], original[name]), name
 
 
-def test_more_shades_than_sixteen_bits():
-    original = {"spikes": torch.ones(2, 200, 200), "rgb": torch.rand(3, 200, 200, dtype=torch.float64).float()}
-    packed = pack_clip(original)
-    assert packed["rgb"].dtype == "float32"
-    assert torch.equal(unpack_clip(packed, (2, 4, 100, 90), 1)["rgb"], original["rgb"][:, 2:102, 4:94])
-
-
-@pytest.mark.parametrize(
-    "part", [(0, 0, 6, 22), (2, 8, 4, 8), (1, 7, 3, 2), (0, 6, 6, 13), (5, 21, 1, 1), (2, 3, 2, 19)]
-)
+@pytest.mark.parametrize("part", [(2, 8, 4, 8), (1, 7, 3, 2), (0, 6, 6, 13), (5, 21, 1, 1)])
 def test_a_part_is_cut_out(part):
     original, (top, left, height, width) = clip(200), part
     cut = unpack_clip(pack_clip(original), part, 2)

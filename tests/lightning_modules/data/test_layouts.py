@@ -60,18 +60,16 @@ def test_vid4_is_for_tests(tmp_path, folder, write_film):
 
 
 def test_vimeo_septuplets(tmp_path, septuplets):
-    septuplets(tmp_path, ["00001/0001", "00001/0002", "00002/0001"])
-    (tmp_path / "sep_trainlist.txt").write_text("00001/0001\n00002/0001\n")
-    (tmp_path / "sep_testlist.txt").write_text("00001/0002\n\n")
-    for root in (tmp_path, tmp_path.parent / "up"):
-        films = found(root)
+    root = tmp_path / "up" / "vimeo_septuplet"
+    septuplets(root, ["00001/0001", "00001/0002", "00002/0001"])
+    (root / "sep_trainlist.txt").write_text("00001/0001\n00002/0001\n")
+    (root / "sep_testlist.txt").write_text("00001/0002\n\n")
+    for typed in (root, root.parent):
+        films = found(typed)
         assert (films.name, films.clips, films.scale) == ("Vimeo-90K", 1, 4)
         assert names(films.train) == ["00001/0001", "00002/0001"]
         assert names(films.val) == names(films.test) == ["00001/0002"]
-        assert (films.test[0].folder, films.test[0].shrink) == (tmp_path / "sequences/00001/0002", 4)
-        if root is tmp_path:
-            (tmp_path.parent / "up").mkdir()
-            tmp_path = tmp_path.rename(tmp_path.parent / "up" / "vimeo_septuplet")
+        assert (films.test[0].folder, films.test[0].shrink) == (root / "sequences/00001/0002", 4)
 
 
 @pytest.mark.parametrize("small", ["BIx4", "../vimeo_septuplet_matlabLRx4/sequences"])
@@ -95,11 +93,8 @@ def test_vimeo_test_set(tmp_path, septuplets):
     data = scenes(tmp_path, "test", scale=4)
     assert data.test_names == ["00001/0266/im4"]
     clip = data.test_set[0]
-    assert {name: tuple(value.shape) for name, value in clip.items()} == {
-        "spikes": (41, 16, 24),
-        "rgb": (3, 64, 96),
-        "flow": (2, 2, 16, 24),
-    }
+    assert clip["spikes"].shape == (41, 16, 24)
+    assert clip["flow"].shape == (2, 2, 16, 24)
     assert torch.equal(clip["rgb"], read_picture(tmp_path / "target/00001/0266/im4.png"))
     # the camera sees the small frames, pixel by pixel
     seen = mosaic(read_picture(tmp_path / "low_resolution/00001/0266/im4.png"))
@@ -115,6 +110,11 @@ def test_vimeo_made_small(tmp_path, septuplets):
     assert clip["spikes"].shape == (41, 16, 24)
     small = torch.nn.functional.interpolate(truth[None], scale_factor=0.25, mode="bicubic", antialias=True)[0]
     assert (clip["spikes"].float().mean(0) / 0.4 - mosaic(small)).abs().median() < 1 / 41 / 0.4
+    with pytest.raises(ValueError, match="scale: expected 4 with Vimeo-90K"):
+        scenes(tmp_path, "test", scale=2)
+    (tmp_path / "sep_testlist.txt").write_text("00001/0001\n00001/0009\n00003/0001")
+    with pytest.raises(FileNotFoundError, match=r"2 of 3 sequences are not in .*sequences, the first is 00001/0009"):
+        found(tmp_path)
 
 
 def test_other_films(tmp_path, write_film):
@@ -146,20 +146,11 @@ def test_what_is_missing_is_shown(tmp_path, reds):
         scenes(tmp_path / "reds", "fit")
 
 
-def test_a_listed_sequence_is_missing(tmp_path, septuplets):
-    septuplets(tmp_path, ["00001/0001"])
-    (tmp_path / "sep_testlist.txt").write_text("00001/0001\n00001/0009\n00003/0001")
-    with pytest.raises(FileNotFoundError, match=r"2 of 3 sequences are not in .*sequences, the first is 00001/0009"):
-        found(tmp_path)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"batch_size": 11}, "batch_size: expected at most the 10 training clips"),
-        ({"clips": -1}, "clips: expected a whole number >= 1"),
         ({"flow_times": (5, 41)}, r"flow_times: expected clocks in \[0, 41\)"),
-        ({"seed": -1}, "seed: expected 0 or more"),
         ({"frames": 201}, "000: expected at least 11 frames for a clip, got 9"),
     ],
 )
@@ -167,13 +158,6 @@ def test_arguments_that_make_no_sense(tmp_path, options, message, reds):
     reds(tmp_path)
     with pytest.raises(ValueError, match=message):
         scenes(tmp_path, "fit", **options)
-
-
-def test_vimeo_is_for_four(tmp_path, septuplets):
-    septuplets(tmp_path, ["00001/0001"])
-    (tmp_path / "sep_testlist.txt").write_text("00001/0001")
-    with pytest.raises(ValueError, match="scale: expected 4 with Vimeo-90K"):
-        scenes(tmp_path, "test", scale=2)
 
 
 def test_bad_files_are_named(tmp_path, write_film):

@@ -96,16 +96,3 @@ def test_it_goes_on_where_it_stopped():
     again.load_state_dict(copy.deepcopy(first.state_dict()))
     run(halves, again, gradients[2:])
     assert all(map(torch.equal, whole, halves))
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"lr": -1.0}, "lr: expected 0 or more, got -1.0"),
-        ({"momentum": 1.0}, "momentum: expected 0 or more and below 1, got 1.0"),
-        ({"betas": (0.9, 1.0)}, r"betas: expected 0 or more and below 1, got \(0.9, 1.0\)"),
-    ],
-)
-def test_wrong_arguments_are_refused(wrong, message):
-    with pytest.raises(ValueError, match=f"^{message}$"):
-        MuonWithAdam([nn.Parameter(torch.ones(2, 2))], **wrong)

@@ -3,7 +3,6 @@
 import csv
 import random
 import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import torch
 from pytorch_lightning import LightningDataModule
 
 from lightning_modules.__main__ import main
-from lightning_modules.cli.errors import InputError, UsageError
+from lightning_modules.cli.errors import UsageError
 from lightning_modules.data import FilmScenes
 from lightning_modules.inference import presets
 from lightning_modules.inference.presets import Preset
@@ -25,7 +24,7 @@ from lightning_modules.storage.pretrained import settings_of
 from lightning_modules.trade import cli
 from lightning_modules.trade.films import film_scenes
 from lightning_modules.trade.measure import Measurement, Timed, time_in_turns
-from lightning_modules.trade.runner import Runner, make_runner
+from lightning_modules.trade.runner import CannotRunError, Runner, make_runner
 from lightning_modules.trade.settings import Setting, read_setting, usual_settings
 from lightning_modules.trade.table import figures, front, markdown, write_csv
 from spikekit import flow_warp, psnr
@@ -37,11 +36,6 @@ model: {{network: {{init_args: {WIDTHS}}}}}
 data: {{init_args: {{patch: 8, val_patch: 12, train_clips: 8, val_clips: 3, batch_size: 2, workers: 0}}}}
 """
 TFI = "--model.network ClassicalDecoder --model.network.method tfi"
-
-
-@pytest.fixture(autouse=True)
-def _argv(monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["lightning"])
 
 
 @pytest.fixture(scope="module")
@@ -85,9 +79,7 @@ def traded(shared, checkpoint, tmp_path_factory):
         "missing: --model.weights nowhere.safetensors",
     ]
     words = [word for setting in settings for word in ("--setting", setting)]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["lightning"])
-        main(["trade", *shared, *words, "--rounds", "2", "-o", str(output)])
+    main(["trade", *shared, *words, "--rounds", "2", "-o", str(output)])
     return output
 
 
@@ -224,36 +216,19 @@ def test_usual_settings_are_the_networks_of_the_package_and_the_decoders():
     networks = networks_of(settings.values())
     assert networks == ["cscsr_small_x4", "cscsr_tiny_x4", "cscsr_large_x4", "cscsr_huge_x4"]  # the reference first
     assert [*settings][: len(networks)] == networks
-    assert "Spike2Flow" in settings["cscsr_small_x4, Spike2Flow"].args
-    assert settings["cscsr_small_x4, no tiles"].preset == Preset("cscsr_small_x4", tile=0)
     two = ["--model.weights", "cscsr_tiny_x4", "--self_ensemble", "2"]
     assert settings["cscsr_tiny_x4, self-ensemble of 2"].args == two
-    assert settings["cscsr_tiny_x4, no motion"].preset == Preset("cscsr_tiny_x4", motion="ZeroFlow")
-    assert len([name for name in settings if name.startswith("cscsr_tiny_x4")]) == 3
-    assert len([name for name in settings if name.startswith("cscsr_huge_x4")]) == 5  # larger ensembles of the largest
     assert settings["TFI"].preset == Preset(network="ClassicalDecoder", method="tfi", scale=4)
     assert all(setting.preset is not None for setting in settings.values())
-
-
-def test_usual_settings_of_ones_own_weights_take_the_place_of_the_package():
     own = {setting.name: setting for setting in usual_settings(4, ["--ckpt_path"])}
+    assert not networks_of(own.values())
     assert own["own weights"].args == []
-    assert own["own weights, self-ensemble of 4"].args == ["--self_ensemble", "4"]
     assert own["TFI"].args[-2:] == ["--ckpt_path", "null"]
     tscnn = [setting.name for setting in usual_settings(4, ["--ckpt_path"], TSCNN(width=8, blocks=1))]
-    ensembles = [f"own weights, self-ensemble of {views}" for views in (2, 4, 8)]
-    assert tscnn[:6] == ["own weights", *ensembles, "own weights, bf16-true", "own weights, bf16-mixed"]
-    assert not [name for name in tscnn[6:] if not name.startswith(("TFI", "TFP"))]
-
-
-def test_usual_settings_of_films_have_networks_for_films_and_no_variants():
-    filmed = [setting.name for setting in usual_settings(4, film=True, frames=101)]
-    networks = [name for name in filmed if name.startswith("cscsr_") and "," not in name]
-    assert any(find_model(name).film for name in networks)
-    assert not any(find_model(name).noise for name in networks)
-    assert filmed[: 2 * len(networks)] == [*networks, *(f"{name}, no motion" for name in networks)]
-    single = networks_of(usual_settings(4, frames=101))
-    assert not any(find_model(name).film for name in single)
+    assert not [name for name in tscnn if "motion" in name or "Flow" in name]
+    for film in (True, False):  # networks for films are for films
+        names = networks_of(usual_settings(4, film=film, frames=101))
+        assert any(find_model(name).film for name in names) == film
 
 
 @pytest.mark.parametrize(
@@ -274,40 +249,30 @@ def test_what_is_typed_is_a_preset_where_columns_can_say_it(typed, preset):
 
 
 def test_a_setting_without_a_name_is_called_by_its_arguments():
-    assert read_setting("--tile  8") == ("--tile 8", ["--tile", "8"])
-    assert read_setting("-c 'a: b.yaml'") == ("-c 'a: b.yaml'", ["-c", "a: b.yaml"])
+    assert read_setting("-c 'a: b.yaml'  ") == ("-c 'a: b.yaml'", ["-c", "a: b.yaml"])
     assert read_setting("a, b|c: --tile 8") == ("a, b|c", ["--tile", "8"])
 
 
 def test_a_table_is_read_as_it_is_written(tmp_path, monkeypatch):
     """The reader of the package's tables takes that of a trade, and skips what is no preset."""
-    rows, _ = some_rows(4, [(9.0, 9.0), (2.0, 2.0), (1.0, 1.0), (1.0, 3.0)])
-    typed = [
-        "lost: --model.weights cscsr_large_x4",
-        "one: --model.weights cscsr_small_x4 --self_ensemble 2",
-        "-c my.yaml --model.weights cscsr_small_x4",
-        "tfi: --model.network ClassicalDecoder --model.network.method tfi",
-    ]
-    for n, text in enumerate(typed):
-        rows[n].setting, rows[n].memory = read_setting(text), 10.0
+    rows, _ = some_rows(3, [(9.0, 9.0), (2.0, 2.0), (1.0, 1.0)])
+    typed = ["lost: --model.weights cscsr_large_x4", f"tfi: {TFI}", "-c my.yaml --model.weights cscsr_small_x4"]
+    for row, text in zip(rows, typed, strict=True):
+        row.setting, row.memory = read_setting(text), 10.0
     rows[0].reason = "no such file"
     write_csv(rows, Timed(1, (8, 8), 2, "wall time"), tmp_path / "x4.csv")
     monkeypatch.setattr(presets, "_FOLDER", tmp_path)
-    decoder = Preset(network="ClassicalDecoder", method="tfi")
-    assert {(choice.name, choice.preset, choice.ms) for choice in presets.choices(4, (8, 8))} == {
-        ("one", Preset("cscsr_small_x4", self_ensemble=2), 2000.0),
-        ("tfi", decoder, 2000.0),
-    }
+    [choice] = presets.choices(4, (8, 8))
+    assert (choice.name, choice.preset, choice.ms) == ("tfi", Preset(network="ClassicalDecoder", method="tfi"), 2000.0)
 
 
 MISTAKES = [
     (["--setting", "cscsr_small_x4"], "expected arguments of lightning test, or a name, a colon and such arguments"),
     (["--setting", "a:", "--setting", "a: --tile 8"], "two settings are called 'a'"),
-    (["--setting", "a: --model.network.widht 3"], "widht"),
-    (["--setting", "good:", "--setting", "a: --tile 3"], "a: tile: expected an even number"),
+    (["--setting", "good:", "--setting", "a: --model.network.widht 3"], "widht"),
     (["--setting", "a: --data.motion 9"], "a: data.motion: expected 3.0, the same scenes for all, got 9.0"),
     (["--setting", "a: --model.network.frames 47"], "a: frames: expected at most the 41 of the clips, got 47"),
-    (["--ckpt_path", "nowhere.ckpt"], "nowhere.ckpt: no such checkpoint"),
+    (["-c", str(CONFIGS / "flow.yaml")], "FlowTraining"),
 ]
 
 
@@ -315,16 +280,9 @@ MISTAKES = [
 @pytest.mark.parametrize(("words", "said"), MISTAKES)
 def test_mistakes_are_one_line_before_anything_runs(words, said, shared, tmp_path, monkeypatch):
     monkeypatch.setattr(cli, "measure", lambda *_: pytest.fail("something was run"))
-    with pytest.raises(SystemExit) as stopped:
+    with pytest.raises(SystemExit, match=rf"^[^\n]*{re.escape(said)}[^\n]*$"):
         main(["trade", *shared, "-o", str(tmp_path / "out"), *words])
-    assert said in str(stopped.value)
-    assert "\n" not in str(stopped.value)
     assert not (tmp_path / "out").exists()
-
-
-def test_a_model_that_makes_no_pictures_cannot_be_traded():
-    with pytest.raises(InputError, match="expected a model that makes pictures, got FlowTraining"):
-        Runner(["-c", str(CONFIGS / "flow.yaml")])
 
 
 @pytest.mark.slow
@@ -345,12 +303,10 @@ def test_what_fails_while_it_runs_does_not_take_the_others_along(shared, tmp_pat
 
 @pytest.mark.slow
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is here")
-def test_what_the_machine_lacks_is_a_row(shared, base):
-    from lightning_modules.trade.runner import CannotRunError
-
-    for args in (["--trainer.accelerator", "gpu"], ["--trainer.precision", "16-mixed"]):
-        with pytest.raises(CannotRunError, match=r"gpu|16-mixed: not on this device"):
-            make_runner(shared, args, base)
+@pytest.mark.parametrize("args", [["--trainer.accelerator", "gpu"], ["--trainer.precision", "16-mixed"]])
+def test_what_the_machine_lacks_is_a_row(args, shared, base):
+    with pytest.raises(CannotRunError, match=r"gpu|16-mixed: not on this device"):
+        make_runner(shared, args, base)
 
 
 def test_a_network_of_fewer_frames_sees_the_middle_of_the_clip(shared, base):
@@ -362,22 +318,23 @@ def test_a_network_of_fewer_frames_sees_the_middle_of_the_clip(shared, base):
     assert torch.equal(runner(spikes), expected)
 
 
+class Remember:
+    """A runner that only remembers what it was run on."""
+
+    device = torch.device("cpu")
+    network = torch.nn.Linear(2, 3)
+
+    def __init__(self, name, calls):
+        self.name, self.calls = name, calls
+
+    def __call__(self, spikes):
+        self.calls.append((self.name, int(spikes.sum())))
+
+
 def some_rows(count, seconds=()):
-    """Rows whose runners only remember what they were run on."""
-    calls = []
-
-    class Remember:
-        device = torch.device("cpu")
-        network = torch.nn.Linear(2, 3)
-
-        def __init__(self, name):
-            self.name = name
-
-        def __call__(self, spikes):
-            calls.append((self.name, int(spikes.sum())))
-
-    names = [chr(ord("a") + n) for n in range(count)]
-    rows = [Measurement(Setting(name, []), Remember(name), psnr=[20.0], ssim=[0.5], macs=100.0) for name in names]
+    calls, rows = [], []
+    for name in "abcdefghi"[:count]:
+        rows.append(Measurement(Setting(name, []), Remember(name, calls), psnr=[20.0], ssim=[0.5], macs=100.0))
     for row, times in zip(rows, seconds, strict=False):
         row.seconds = list(times)
     return rows, calls
@@ -385,13 +342,9 @@ def some_rows(count, seconds=()):
 
 def test_order_rotates_and_everyone_is_timed_equally_often_on_the_same_clip():
     rows, calls = some_rows(3)
-    clips = [torch.full((1, 1, 1, 1), n) for n in range(2)]
-    time_in_turns(rows, clips, 6)
-    rounds = [calls[n : n + 3] for n in range(0, 18, 3)]
-    assert ["".join(name for name, _ in turn) for turn in rounds] == ["abc", "bca", "cab"] * 2
-    assert [{clip for _, clip in turn} for turn in rounds] == [{0}, {1}] * 3
+    time_in_turns(rows, [torch.full((1, 1, 1, 1), n) for n in range(2)], 6)
+    assert calls == [(name, n % 2) for n, turn in enumerate(["abc", "bca", "cab"] * 2) for name in turn]
     assert [len(row.seconds) for row in rows] == [6, 6, 6]
-    assert all(seconds >= 0 for row in rows for seconds in row.seconds)
 
 
 def test_ratios_are_of_the_same_round():
@@ -418,13 +371,10 @@ def test_the_front_is_that_of_brute_force():
         assert [points[n][0] for n in found] == sorted(points[n][0] for n in found)
 
 
-def test_the_front_leaves_out_what_cannot_run():
+def test_the_front_leaves_out_what_cannot_run_and_differences_that_nobody_sees():
     rows, _ = some_rows(4, [(2.0,), (3.0,), (1.0,), (4.0,)])
     rows[0] = replace(rows[0], reason="no")
-    rows[1].psnr = [22.0]
-    rows[3].psnr = [21.0]
-    assert front(rows) == [2, 1]
-    rows[3].psnr = [22.001]  # better than the eye and the table see, and slower
+    rows[1].psnr, rows[3].psnr = [22.0], [22.001]
     assert front(rows) == [2, 1]
     text = markdown(rows, "command", Timed(1, (8, 8), 1, "wall time"))
     marked = [line.rstrip("| ").endswith("x") for line in text.splitlines() if line.startswith("|")][2:]
