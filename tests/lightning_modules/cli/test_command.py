@@ -1,13 +1,11 @@
 """The ``lightning`` command, as its users type it."""
 
 import csv
-import os
 import re
 import subprocess
 import sys
 import time
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -75,33 +73,6 @@ def test_fit_leaves_checkpoints_and_pictures(trained):
     assert config["model"]["init_args"]["network"]["init_args"]["width"] == 4
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("stop", [3, 4])  # in the middle of an epoch of four steps, and at its end
-def test_resumed_run_equals_an_unbroken_one(trained, overlay, configs, tmp_path, stop):
-    args = ["fit", "-c", configs / "x4.yaml", "-c", overlay, "-o", tmp_path]
-    main([*map(str, args), "--trainer.max_steps", str(stop)])
-    assert weights(tmp_path)["global_step"] == stop
-    main([*map(str, args), "--ckpt_path", "last"])
-    resumed, unbroken = weights(tmp_path), weights(trained)
-    assert resumed["global_step"] == unbroken["global_step"] == 6
-    for name, value in unbroken["state_dict"].items():
-        assert resumed["state_dict"][name].equal(value), name
-    before = weights(tmp_path, "best")["state_dict"]
-    assert any(not before[name].equal(value) for name, value in unbroken["state_dict"].items())
-
-
-def _killed(process, seen, moment):
-    """Kill a process a moment after ``seen`` says so; return what processes it had started by then."""
-    while process.is_alive() and not seen():
-        time.sleep(0.002)
-    time.sleep(moment)
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")  # Linux has it
-    started = children.read_text().split() if children.exists() else []
-    process.kill()
-    process.join()
-    return [int(pid) for pid in started]
-
-
 def _files(folder, pattern):
     """The files of a name; one that is written anew is another."""
     found = set()
@@ -111,29 +82,21 @@ def _files(folder, pattern):
     return found
 
 
-def _alive(pid):
-    with suppress(ProcessLookupError):
-        os.kill(pid, 0)
-        return True
-    return False
-
-
 @pytest.mark.slow
 def test_a_training_that_is_killed_goes_on(trained, overlay, configs, tmp_path, forked):
-    """What lies there under its name is whole, no worker stays, and the weights are those of an unbroken training."""
+    """What lies there under its name is whole, and the weights are those of an unbroken training."""
     folder = tmp_path / "checkpoints"
     args = ["fit", "-c", configs / "x4.yaml", "-c", overlay, "-o", tmp_path]
     for moment, pattern in ((0.01, "*.ckpt"), (0.0, ".*.part")):
         again = ["--ckpt_path", "last"] if any(folder.glob("*.ckpt")) else ["--data.workers", "1"]
-        seen, before = partial(_files, folder, pattern), _files(folder, pattern)
-        started = _killed(forked([*args, *again]), lambda seen=seen, before=before: seen() - before, moment)
-        assert started or "--data.workers" not in again or sys.platform != "linux"
+        before, process = _files(folder, pattern), forked([*args, *again])
+        while process.is_alive() and not _files(folder, pattern) - before:
+            time.sleep(0.002)
+        time.sleep(moment)
+        process.kill()
+        process.join()
         for path in folder.glob("*.ckpt"):
             read_checkpoint(path)
-        until = time.monotonic() + 60
-        while any(map(_alive, started)):
-            assert time.monotonic() < until, "a worker has stayed"
-            time.sleep(0.1)
     assert any(folder.glob("*.ckpt"))
     main([*map(str, args), "--ckpt_path", "last"])
     resumed, unbroken = weights(tmp_path), weights(trained)
@@ -158,15 +121,6 @@ def test_test_prints_a_table_and_writes_it(trained, overlay, configs, capsys):
         shown = re.search(rf"\n\| {method} +\| (\d+\.\d\d) ", printed)
         assert float(shown[1]) == pytest.approx(mean, abs=0.0051)  # the file has four decimals
     assert read_picture(trained / "test.png").shape == (3, 3 * 48 + 2 * 4, 5 * 48 + 4 * 4)
-
-
-@pytest.mark.slow
-def test_a_finished_run_is_not_written_over(trained, overlay, configs):
-    before = weights(trained)["state_dict"]
-    with pytest.raises(SystemExit, match="holds a run already"):
-        main(["fit", "-c", str(configs / "x4.yaml"), "-c", str(overlay), "-o", str(trained)])
-    after = weights(trained)["state_dict"]
-    assert all(after[name].equal(value) for name, value in before.items())
 
 
 def test_the_short_help_names_options_that_there_are(capsys):
@@ -213,8 +167,7 @@ def test_models_lists_the_weights_of_the_package(capsys):
     main(["models"])
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 120
-    head, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|"))
-    assert head == ["weights", "scale", "size", "parameters", "MMAC/px", "Kodak", "Vid4", "MB"]
+    _, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|"))
     assert [row[0] for row in rows] == [weights.name for weights in list_models()]
     assert ["cscsr_tiny_x4", "x4", "tiny", "300,963", "0.36", "27.95", "23.51"] in [row[:-1] for row in rows]
 
@@ -287,24 +240,19 @@ def test_a_run_goes_on_for_longer_with_other_data_and_from_older_checkpoints(che
     run_command([*words, "--model.optimizer.lr=1e-3"], Fit)
 
 
-def test_the_scales_differ_in_the_scale_alone(configs):
-    x2, x3, x4 = (yaml.safe_load((configs / f"x{scale}.yaml").read_text()) for scale in (2, 3, 4))
-    for scale, config in ((2, x2), (3, x3), (4, x4)):
-        assert config.pop("output") == f"runs/x{scale}"
-        assert config["model"]["network"]["init_args"].pop("scale") == scale
-    assert x2 == x3 == x4
-
-
-def test_the_paper_is_the_default(configs, capsys):
+@pytest.mark.parametrize("scale", [2, 3, 4])
+def test_the_paper_is_the_default(scale, configs, capsys):
     with pytest.raises(SystemExit):
-        main(["fit", "-c", str(configs / "x4.yaml"), "--print_config"])
+        main(["fit", "-c", str(configs / f"x{scale}.yaml"), "--print_config"])
     config = yaml.safe_load(capsys.readouterr().out)
     model, data = config["model"]["init_args"], config["data"]["init_args"]
-    network = model["network"]["init_args"]
-    assert [network[name] for name in ("scale", "frames", "window", "pattern")] == [4, 41, 11, "RGGB"]
-    assert network["alpha"] == 0.4
-    assert [data[name] for name in ("patch", "batch_size", "pattern")] == [96, 4, "RGGB"]
-    assert model["optimizer"]["class_path"] == "torch.optim.Adam"
-    assert model["optimizer"]["init_args"]["lr"] == 1e-4
-    assert model["lr_scheduler"]["init_args"]["step_size"] == 7500
-    assert model["lr_scheduler"]["init_args"]["gamma"] == 0.8
+    network, optimizer, schedule = model["network"], model["optimizer"], model["lr_scheduler"]
+    for part, expected in (
+        (network["init_args"], {"scale": scale, "frames": 41, "window": 11, "pattern": "RGGB", "alpha": 0.4}),
+        (data, {"patch": 96, "batch_size": 4, "pattern": "RGGB"}),
+        (optimizer, {"class_path": "torch.optim.Adam"}),
+        (optimizer["init_args"], {"lr": 1e-4}),
+        (schedule["init_args"], {"step_size": 7500, "gamma": 0.8}),
+    ):
+        assert {name: part[name] for name in expected} == expected
+    assert config["output"] == f"runs/x{scale}"
