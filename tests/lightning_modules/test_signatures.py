@@ -33,16 +33,6 @@ def test_its_own_first_then_by_name_what_is_passed_on():
     assert Outer.__init__.__doc__ == Inner.__doc__
 
 
-def test_what_is_passed_on_in_place_keeps_its_place():
-    class Outer:
-        @inherit_signature(Inner)
-        def __init__(self, *args: object, more: int = 1, **settings: object) -> None:
-            pass
-
-    assert list(signature(Outer).parameters) == ["size", "colour", "hidden", "more"]
-    assert signature(Outer).bind(2, "blue", more=3)
-
-
 @pytest.mark.parametrize(
     ("scenes", "clips", "without", "first"),
     [

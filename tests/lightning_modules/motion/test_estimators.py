@@ -156,14 +156,13 @@ def test_more_warps_are_more_exact():
 
 
 @pytest.mark.parametrize(
-    ("size", "times", "pattern", "message"),
+    ("size", "times", "message"),
     [
-        ((1, 8, 8), (0, 0, 0), "RGGB", "with frames before and after the middle, 0"),
-        ((41, 8, 8), (0, 40, 40), "RGGB", "with frames before and after the middle, 40"),
-        ((41, 1, 8), TIMES, "RGGB", "at least 2 x 2 pixels"),
-        ((41, 8, 8), TIMES, "XYZ", "pattern"),
+        ((1, 8, 8), (0, 0, 0), "with frames before and after the middle, 0"),
+        ((41, 8, 8), (0, 40, 40), "with frames before and after the middle, 40"),
+        ((41, 1, 8), TIMES, "at least 2 x 2 pixels"),
     ],
 )
-def test_classical_flow_refuses_what_has_no_motion(size, times, pattern, message):
+def test_classical_flow_refuses_what_has_no_motion(size, times, message):
     with pytest.raises(ValueError, match=message):
-        ClassicalFlow()(torch.zeros(1, *size), times, pattern)
+        ClassicalFlow()(torch.zeros(1, *size), times, "RGGB")
