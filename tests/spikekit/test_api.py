@@ -118,11 +118,18 @@ def test_tensors_without_data_have_the_sizes_of_the_result(op, options, tensors)
 
 
 @EVERY
-def test_an_array_is_refused_with_the_remedy(op, options, tensors):
-    if op is sk.joint_flow:
-        pytest.skip("it takes any sequence of flows")
-    with pytest.raises(TypeError, match=r"torch\.from_numpy"):
-        op(tensors[0].numpy(), *tensors[1:], **options)
+def test_what_is_no_tensor_of_the_kind_is_refused(op, options, tensors):
+    first, *others = tensors
+    for wrong, error, said in (
+        (first.numpy(), TypeError, r"torch\.from_numpy"),  # the remedy
+        (first.flatten(), ValueError, "expected"),
+        (first[..., :0], ValueError, "expected"),
+        (first.to(torch.complex64), TypeError, "expected"),
+    ):
+        if op is sk.joint_flow and error is TypeError:
+            continue  # it takes any sequence of flows
+        with pytest.raises(error, match=said):
+            op(wrong, *others, **options)
 
 
 @pytest.mark.parametrize("dynamic", [None, True])

@@ -25,21 +25,14 @@ def pair(*lead, size=(9, 12)):
 
 
 @JUDGES
-@pytest.mark.parametrize("size", [(7, 7), (9, 12), (20, 8)])
-def test_against_skimage(metric, judge, size):
-    rgb, target = pair(size=size)
-    assert metric(rgb, target).item() == pytest.approx(judge(rgb, target), rel=1e-10)
-    assert metric(rgb.float(), target.float()).item() == pytest.approx(judge(rgb, target), rel=1e-5)
-
-
-@JUDGES
-@pytest.mark.parametrize("lead", [(), (3,), (2, 3)])
-def test_one_figure_a_picture(metric, judge, lead):
-    rgb, target = pair(*lead)
+@pytest.mark.parametrize(("lead", "size"), [((), (7, 7)), ((3,), (9, 12)), ((2, 3), (20, 8))])
+def test_one_figure_a_picture(metric, judge, lead, size):
+    rgb, target = pair(*lead, size=size)
     figures = metric(rgb, target)
     assert figures.shape == lead
-    each = [judge(a, b) for a, b in zip(rgb.reshape(-1, 3, 9, 12), target.reshape(-1, 3, 9, 12), strict=True)]
-    assert torch.allclose(figures.flatten(), torch.tensor(each, dtype=torch.float64), rtol=1e-10)
+    each = [judge(a, b) for a, b in zip(rgb.reshape(-1, 3, *size), target.reshape(-1, 3, *size), strict=True)]
+    assert figures.flatten().tolist() == pytest.approx(each, rel=1e-10)
+    assert metric(rgb.float(), target.float()).flatten().tolist() == pytest.approx(each, rel=1e-5)
 
 
 @JUDGES
@@ -69,7 +62,6 @@ def test_gradcheck():
         (ValueError, torch.rand(1, 3, 8, 8), torch.rand(3, 8, 8)),
         (ValueError, torch.rand(8, 8), torch.rand(8, 8)),
         (TypeError, torch.ones(3, 8, 8, dtype=torch.uint8), torch.ones(3, 8, 8, dtype=torch.uint8)),
-        (TypeError, torch.rand(3, 8, 8).numpy(), torch.rand(3, 8, 8)),
     ],
 )
 def test_errors(metric, error, rgb, target):

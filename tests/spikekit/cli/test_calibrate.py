@@ -118,14 +118,11 @@ def test_a_scene_in_motion_tells_gains(capsys, truth):
         (["wide.npz", "--flat", "short.npz"], 1, "short.npz: expected 8 x 10 pixels as wide.npz has them, got 8 x 8"),
     ],
 )
-def test_what_is_wrong_is_said_in_a_line(args, status, said, capsys):
+def test_what_is_wrong_is_said_in_a_line(args, status, said, fails):
     save_file({"weight": torch.ones(3)}, "weights.safetensors")
     write("short.npz", torch.ones(50, 8, 8, dtype=torch.uint8))
     write("wide.npz", torch.ones(200, 8, 10, dtype=torch.uint8))
-    assert main(["calibrate", *args]) == status
-    error = capsys.readouterr().err
-    assert error.startswith(f"spikekit: {said}")
-    assert error.count("\n") == 1
+    assert fails(status, "calibrate", *args).startswith(f"spikekit: {said}")
 
 
 # Files from strangers
@@ -146,24 +143,20 @@ KIND = {"kind": "spikekit calibration 1"}
         (planes((24, 30)), KIND, "expected 24 x 32 pixels as scene.dat has them, got 24 x 30"),
         (planes((768,)), KIND, "expected (H, W) of at most"),
         (planes(dark=torch.zeros(3)), KIND, "expected gain, dark and defects of one size"),
-        (planes(more=torch.zeros(3)), KIND, "expected gain, dark and defects of one size"),
-        (planes(gain=torch.full(SIZE, float("inf"))), KIND, "gain: expected 0.0001 to 10000, got inf"),
         (planes(defects=torch.full(SIZE, 9, dtype=torch.uint8)), KIND, "defects: expected 0 to 2, got 9"),
         *(("cut", length, "not a calibration that can be read") for length in (0, 7, 100, -1)),
         ("huge", (b'"shape":[24,32]', b'"shape":[99,99]'), "not a calibration that can be read"),
     ],
     ids=lambda value: "",
 )
-def test_a_file_that_is_no_calibration(truth, tensors, metadata, said, capsys):
+def test_a_file_that_is_no_calibration(truth, tensors, metadata, said, fails):
     if isinstance(tensors, dict):
         save_file(tensors, "bad.safetensors", metadata)
     else:
         write_calibration("bad.safetensors", truth)
         data = Path("bad.safetensors").read_bytes()
         Path("bad.safetensors").write_bytes(data[:metadata] if tensors == "cut" else data.replace(*metadata))
-    assert main(["decode", "scene.dat", *HOW, "-o", "x.png", "--calibration", "bad.safetensors"]) == 1
-    error = capsys.readouterr().err
+    error = fails(1, "decode", "scene.dat", *HOW, "-o", "x.png", "--calibration", "bad.safetensors")
     assert error.startswith("spikekit: bad.safetensors: ")
     assert said in error
-    assert error.count("\n") == 1
     assert not os.path.exists("x.png")

@@ -36,22 +36,6 @@ def clip(tmp_path):
     return tmp_path / "clip.dat"
 
 
-@pytest.fixture
-def fails(capsys):
-    """Run a command line that fails: one line on stderr, nothing on stdout."""
-
-    def check(status, *words):
-        assert main([str(word) for word in words]) == status
-        out, err = capsys.readouterr()
-        assert out == ""
-        assert err.startswith("spikekit: ")
-        assert err.endswith("\n")
-        assert err.count("\n") == 1
-        return err
-
-    return check
-
-
 def sized(path, height=12, width=20):
     return path, "--height", height, "--width", width
 
@@ -241,11 +225,7 @@ def test_time_that_is_not_first_is_said(tmp_path, capsys, save):
     ("words", "message"),
     [
         ([], "required: VERB (see spikekit --help)"),
-        (["look"], "invalid choice: 'look'"),
-        (["info"], "required: FILE (see spikekit info --help)"),
-        (["info", "a.dat", "--hight", 3], "unrecognized arguments: --hight 3"),
         (["decode", "a.dat"], "required: -o/--output (see spikekit decode --help)"),
-        (["decode", "CLIP", "--pattern", "RGB"], "--pattern: invalid choice: 'RGB'"),
         (
             ["decode", "CLIP", "--frame", "1:-2"],
             "expected a whole number, 0 or more, or A:B or A:B:STEP, got 1:-2",
@@ -272,13 +252,9 @@ def test_wrong_command_lines(clip, fails, words, message):
 def test_wrong_files(clip, tmp_path, fails):
     (tmp_path / "clip.raw").write_bytes(b"raw")
     (tmp_path / "folder.png").mkdir()
-    np.savez(tmp_path / "a.npz", spk=np.zeros((3, 12, 20)))
     for path, message in [
         (sized(tmp_path / "none.dat"), "none.dat: no such file"),
-        ((tmp_path,), "got a folder"),
         ((tmp_path / "clip.raw",), "clip.raw: expected a recording that ends in .dat, .npy, .npz, got .raw"),
-        (sized(clip, 7, 7), "1800 bytes at 7 bytes a frame make 257 whole frames and 1 bytes left over"),
-        (sized(tmp_path / "a.npz", 20, 12), "holds frames of 12 x 20, got height 20 and width 12"),
     ]:
         assert message in fails(1, "info", *path)
         assert message in fails(1, "decode", *path, "--method", "tfi", "-o", tmp_path / "a.png")

@@ -41,19 +41,15 @@ def simulate(*words):
     assert main(["simulate", *map(str, words)]) == 0
 
 
-@pytest.fixture
-def fails(capsys):
-    """Run a command line that fails: one line on stderr, nothing on stdout, nothing left."""
+@pytest.fixture(name="fails")
+def _fails(fails):
+    """It leaves nothing, and changes nothing."""
 
     def check(status, *words):
         before = everything()
-        assert main(["simulate", *map(str, words)]) == status
-        out, err = capsys.readouterr()
-        assert out == ""
-        assert err.startswith("spikekit: ")
-        assert err.count("\n") == 1
+        said = fails(status, "simulate", *words)
         assert everything() == before
-        return err
+        return said
 
     return check
 
@@ -159,9 +155,8 @@ def test_made_again_from_its_sidecar(film):
     assert Path("d.dat").read_bytes() == Path("a.dat").read_bytes()
 
 
-def test_not_made_again_from_another_source_or_with_other_settings(film, fails, capsys):
+def test_not_made_again_from_another_source_or_with_other_settings(film, fails):
     simulate(film, "-o", "a.dat", *QUICK)
-    capsys.readouterr()
     assert "got --seed as well" in fails(2, "a.json", "-o", "b.dat", "--seed", 1)
     known = json.loads(Path("a.json").read_text())
     for changed, said in (
@@ -187,15 +182,10 @@ def test_not_made_again_from_another_source_or_with_other_settings(film, fails, 
     ("part", "value", "said"),
     [
         ("source", None, "source: expected names and values, got None"),
-        ("source.frames", 5, "source.frames: expected names and values, got 5"),
         ("stream.frames", True, "stream.frames: expected a whole number, 1 or more, got True"),
         ("settings.alpha", float("nan"), "settings.alpha: expected a finite number above 0, got nan"),
-        ("settings.alpha", 10**400, "settings.alpha: expected a finite number above 0, got 1000"),
         ("settings.pattern", "RGB", "settings.pattern: expected one of RGGB, BGGR, GRBG, GBRG, got 'RGB'"),
-        ("settings.frames", "4", "settings.frames: expected a whole number, 1 or more, or null, got '4'"),
-        ("settings.scale", 2.5, "settings.scale: expected a whole number, 1 or more, got 2.5"),
         ("settings.clocks", 2**31 - 1, "settings.clocks: expected a whole number, 1 .. 1048576, got 2147483647"),
-        ("settings.plan", 1.0, "settings.plan: expected a text or a number of latent frames, got 1.0"),
         ("settings.noise", {"photons": "many"}, "settings.noise: expected names and finite numbers, got {'photons'"),
     ],
     ids=str,
@@ -275,19 +265,17 @@ def test_what_was_killed_is_removed_and_who_comes_second_waits(film):
 
 
 @pytest.mark.parametrize(("room", "words", "name"), [(8000, ["--all", "--clocks", "200"], "a.dat"), (500, [], "a.png")])
-def test_a_full_disk(film, fails, capsys, full_disk, room, words, name):
+def test_a_full_disk(film, fails, full_disk, room, words, name):
     """One line that names the file for which there is no room; what was there is untouched."""
     simulate(film, "-o", "a.dat", *QUICK)
-    capsys.readouterr()
     with full_disk(room):
         said = fails(1, film, "-o", "a.dat", *QUICK, *words)
     assert said == f"spikekit: {name}: File too large\n"
     assert not list(Path().glob(".*"))
 
 
-def test_nothing_of_others_is_replaced(film, fails, capsys):
+def test_nothing_of_others_is_replaced(film, fails):
     simulate(film, "-o", "a.dat", *QUICK)
-    capsys.readouterr()
     Path("b.json").write_text("{}")
     Path("c.dat").mkdir()
     write_picture("d.png", torch.zeros(3, 4, 4))
@@ -318,11 +306,9 @@ def test_nothing_of_others_is_replaced(film, fails, capsys):
         (["film"], 2, "--scale: needed"),
         (["film", "--scale", "2", "--plan", "20"], 2, "0 to 19 latent frames in 20 clocks, got 20"),
         (["film", "--scale", "2", "--dark-current", "-1"], 2, "--dark-current: expected 0 to 1, got -1.0"),
-        (["film", "--scale", "2", "--hot", "much"], 2, "argument --hot: invalid float value: 'much'"),
         (["film/f0.png", "--scale", "2", "--all"], 2, "one picture without an end"),
         (["damaged", "--scale", "2"], 1, "damaged/0.png: not a picture that can be read"),
         (["nothing", "--scale", "2"], 1, "nothing: no such file or folder"),
-        (["nothing.json"], 1, "nothing.json: cannot be read (No such file or directory)"),
     ],
 )
 def test_mistakes(film, fails, words, status, said):
@@ -357,7 +343,6 @@ def test_the_pixels_of_a_sensor_that_was_measured(film, capsys, fails):
     assert read_sidecar(Path("out/real.json")).settings["calibration"] == "../cameras/one.safetensors"
     simulate("out/real.json", "-o", "again.dat")
     assert Path("again.dat").read_bytes() == Path("out/real.dat").read_bytes()
-    capsys.readouterr()
     calibrated("cameras/one.safetensors", gain=0.6)
     assert "one.safetensors: changed since the side-car was written" in fails(1, "out/real.json", "-o", "a.dat")
     calibrated("cameras/one.safetensors", width=20)

@@ -96,9 +96,7 @@ def test_work_is_at_most_tripled():
     ("chunks", "overlap", "decode", "error", "message"),
     [
         ([], -1, tfi, ValueError, "overlap: expected 0 or more frames, got -1"),
-        ([], 2.0, tfi, TypeError, r"overlap: expected a whole number, got 2\.0"),
         ([torch.ones(3, 4)], 2, tfi, ValueError, r"chunks: expected a non-empty tensor of shape \(\*, T, H, W\)"),
-        ([[1, 0]], 2, tfi, TypeError, "chunks: expected a tensor"),
         ([torch.ones(3, 4, 5), torch.ones(3, 5, 4)], 2, tfi, ValueError, r"one size.*4, 5\).*before .*5, 4\)"),
         ([torch.ones(3, 4, 5), torch.ones(3, 4, 5).bool()], 2, tfi, ValueError, "type.*torch.float32.*torch.bool"),
         (

@@ -1,6 +1,5 @@
 """Packed spikes: bits by hand, round trips of every type and width, the torch path, and what cannot be packed."""
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -73,12 +72,8 @@ def test_other_values(value):
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
-        (lambda: pack_spikes(np.zeros((3, 4))), TypeError, r"spikes: expected a tensor of shape \(\*, H, W\)"),
-        (lambda: pack_spikes(torch.zeros(4)), ValueError, r"spikes: expected a non-empty tensor.*got \(4,\)"),
-        (lambda: pack_spikes(torch.zeros(3, 4, dtype=torch.complex64)), TypeError, "a real tensor"),
         (lambda: unpack_spikes(torch.zeros(3, 2), 16), TypeError, "packed: expected bytes, torch.uint8, got torch.fl"),
         (lambda: unpack_spikes(torch.zeros(3, 2).byte(), 17), ValueError, r"width: expected 9 \.\. 16 .* got 17"),
-        (lambda: unpack_spikes(torch.zeros(3, 2).byte(), 9.5), ValueError, "width: expected a whole number"),
         (lambda: unpack_spikes(torch.zeros(3, 2).byte(), 9, dtype="int8"), TypeError, r"to\(\)"),
     ],
 )

@@ -31,15 +31,8 @@ def stored(tmp_path, **changes):
 
 def test_presets_say_what_is_known():
     known = {name: camera(name) for name in CAMERAS}
-    assert {name: (c.height, c.width, c.stored_width) for name, c in known.items()} == {
-        "m1k40": (1000, 1000, 1024),
-        "m1k40-bayer": (1000, 1000, 1024),
-        "uhsr": (250, 250, 250),
-        "vidar": (250, 400, 416),
-    }
     assert {name for name, c in known.items() if c.flip} == {"m1k40", "m1k40-bayer", "vidar"}
-    assert {c.rate for c in known.values()} == {20_000}
-    assert all(c.source and c.title and c.name == name for name, c in known.items())
+    assert all(c.source and c.title and c.rate == 20_000 for c in known.values())
     colour = known.pop("m1k40-bayer")
     assert (colour.pattern, colour.prepared_pattern, colour.prepared_size) == ("BGGR", "RGGB", (992, 992))
     for grey in known.values():
@@ -98,14 +91,12 @@ def test_a_camera_of_ones_own(tmp_path):
     ("given", "message"),
     [
         ({"height": 0}, "height: expected a whole number >= 1, got 0"),
-        ({"rate": -1}, "rate: expected a finite number above 0, got -1"),
         ({"gain": "1"}, "gain: expected a finite number above 0, got '1'"),
         ({"flip": 1}, "flip: expected bool, got 1"),
         ({"pattern": "RGBG"}, "RGBG"),
         ({"crop": [3, 3, 0, 0]}, "crop: expected \\[top, bottom, left, right\\] that leaves pixels"),
         ({"crop": [0, 0, 0, -1]}, "crop: expected"),
         ({"drop": [[4, 2]]}, "drop: expected"),
-        ({"drop": [[9, 10]]}, "drop: expected"),
         ({"drop": [["a", "b"]]}, "drop: expected pairs"),
         ({"colour": "red"}, "got title, .*, colour"),
         ([1], "expected an object with title, height, .*, got list"),
@@ -134,5 +125,3 @@ def test_errors_say_what_was_expected(tmp_path):
     for name, width, said in (("vidar", 250, "250 x 400 or 416"), ("uhsr", 400, "250 x 250")):
         with pytest.raises(ValueError, match=f"spikes: expected {said} of the camera {name}, got 250 x {width}"):
             camera(name).prepare(torch.zeros(3, 250, width))
-    with pytest.raises(TypeError, match="picture: expected a floating-point tensor"):
-        camera("vidar").display(torch.zeros(3, 3, dtype=torch.uint8))

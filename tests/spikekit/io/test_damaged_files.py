@@ -240,22 +240,14 @@ def test_folders_of_pictures(fuzz, tmp_path):
     assert 0.3 < refused / len(cases) < 1
 
 
-@pytest.mark.parametrize("name", ["a.png", "a.bmp", "a.tif", "deep.tiff"])
-def test_a_few_bytes_that_claim_a_large_picture(name, tmp_path, monkeypatch):
-    """What is refused by its header takes no memory."""
-    PICTURES[name](tmp_path / name)
-    assert read_picture(tmp_path / name).shape == (3, 12, 14)
-    monkeypatch.setattr("spikekit.io.images.MOST_PIXELS", 20)
-    with pytest.raises(PictureError, match=f"{name}: not a picture .*expected at most 20 pixels, got"):
-        read_picture(tmp_path / name)
-
-
-@pytest.mark.parametrize("name", ["a.dat", "a.npz"])
-def test_frames_of_a_recording_are_no_larger_than_pictures(name, tmp_path, monkeypatch):
-    """A packed file of 260 kB could hold a frame whose statistics take gigabytes."""
-    write_spikes(tmp_path / name, SPIKES)
-    monkeypatch.setattr("spikekit.io.files.MOST_PIXELS", 45)
-    assert read_spikes(tmp_path / name, 5, 9).equal(SPIKES)
-    monkeypatch.setattr("spikekit.io.files.MOST_PIXELS", 44)
-    with pytest.raises(SpikeFileError, match=f"{name}: expected frames of at most 44 pixels, got 5 x 9"):
-        read_spikes(tmp_path / name, 5, 9)
+@pytest.mark.parametrize("name", ["a.png", "a.bmp", "a.tif", "deep.tiff", "a.dat", "a.npz"])
+def test_a_few_bytes_that_claim_a_large_picture_or_frame(name, tmp_path, monkeypatch):
+    """What is refused by its header takes no memory; a packed file of 260 kB could hold a frame of gigabytes."""
+    read, make, error, _ = FILES[name]
+    make(tmp_path / name)
+    module, least, most = ("files", 45, 44) if read is read_all else ("images", 1000, 20)
+    monkeypatch.setattr(f"spikekit.io.{module}.MOST_PIXELS", least)
+    read(tmp_path / name)
+    monkeypatch.setattr(f"spikekit.io.{module}.MOST_PIXELS", most)
+    with pytest.raises(error, match=f"{name}: .*at most {most} pixels, got"):
+        read(tmp_path / name)

@@ -172,9 +172,6 @@ def test_wrong_files_and_sizes(clip, read):
     ("options", "error", "message"),
     [
         ({"height": 3.0}, TypeError, r"height: expected a whole number, got 3\.0"),
-        ({"start": 1.0}, TypeError, r"start: expected a whole number, got 1\.0"),
-        ({"frames": 1.5}, TypeError, r"frames: expected a whole number, got 1\.5"),
-        ({"chunk": 0}, ValueError, "chunk: expected a whole number >= 1, got 0"),
         ({"start": -1}, SpikeFileError, r"clip.dat: expected frames within 0 \.\. 4, got 6 from frame -1 on"),
         ({"start": 3, "frames": 3}, SpikeFileError, "got 3 from frame 3 on"),
         ({"frames": 6}, SpikeFileError, "got 6 from frame 0 on"),
@@ -197,11 +194,8 @@ def test_truncated_while_it_is_read(clip):
     ("spikes", "error", "message"),
     [
         (torch.zeros(3, 5), ValueError, r"non-empty tensor of shape \(T, H, W\), got \(3, 5\)"),
-        (torch.zeros(0, 3, 5), ValueError, "non-empty"),
         (torch.full((2, 3, 5), 2, dtype=torch.uint8), ValueError, "zeros and ones, got values from 2 to 2 in frame 0"),
         (torch.full((2, 3, 5), torch.nan), ValueError, "zeros and ones, got values from nan"),
-        (torch.zeros(2, 3, 5, dtype=torch.complex64), TypeError, "real"),
-        (np.zeros((2, 3, 5)), TypeError, "expected a tensor"),
         ([], ValueError, "at least one chunk"),
         (5, TypeError, r"spikes: expected a tensor of shape \(T, H, W\), or chunks of it, got int"),
         ([torch.ones(2, 3, 5), torch.ones(2, 5, 3)], ValueError, r"frames of 3 x 5 as before, got \(2, 5, 3\)"),
@@ -219,12 +213,10 @@ def test_what_cannot_be_written_leaves_the_old_file(tmp_path, name, spikes, erro
 
 
 def test_where_nothing_can_be_written(tmp_path):
-    (tmp_path / "file").touch()
     (tmp_path / "folder.dat").mkdir()
-    for name, error in (("file/a.dat", OSError), ("folder.dat", OSError), ("a.png", SpikeFileError)):
+    for name, error in (("folder.dat", OSError), ("a.png", SpikeFileError)):
         with pytest.raises(error, match=name):
             write_spikes(tmp_path / name, random_spikes(3, 4, 5))
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["file", "folder.dat"]
 
 
 @pytest.mark.skipif(not SPIKES.is_dir(), reason="the shared recordings are not beside the repository")

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
@@ -11,13 +12,12 @@ from spikekit.sensor.noise import SensorNoise
 
 
 class Steady:
-    """Flow that is the same everywhere, in pixels of what it is called with; counts the calls."""
+    """Flow that is the same everywhere, in pixels of what it is called with."""
 
     def __init__(self, x=0.0, y=0.0):
-        self.velocity, self.calls, self.sizes = torch.tensor([x, y]), 0, []
+        self.velocity, self.sizes = torch.tensor([x, y]), []
 
     def __call__(self, first, second):
-        self.calls += 1
         self.sizes.append(tuple(first.shape))
         flow = self.velocity[:, None, None].expand(2, *first.shape[1:]).to(first)
         return SimpleNamespace(forward=flow, backward=-flow)
@@ -30,15 +30,10 @@ def profile_of(first, second, motion=None, **settings):
 MOVING = SceneProfile((64, 64), 20, (0.0, 0.2, 0.4), 0.0, (0, 0, 64, 64), 0.1, 0.12, 0.02)
 
 
-def test_where_nothing_changes_motion_is_not_looked_for():
-    picture, motion = torch.rand(3, 16, 24), Steady(1.0)
-    profile = profile_of(picture, picture, motion)
-    assert motion.calls == 0
-    assert profile.static == 1
-    assert profile.region is None
-    assert profile.displacement == 0
-    assert profile.blending == 0
-    assert profile.plan().latent == 0
+def test_where_nothing_changes_there_is_no_region():
+    picture = torch.rand(3, 16, 24)
+    profile = profile_of(picture, picture)
+    assert (profile.static, profile.region, profile.displacement, profile.blending) == (1, None, 0, 0)
 
 
 def test_displacement_is_in_sensor_pixels_per_clock():
@@ -81,31 +76,30 @@ def test_a_gain_is_no_motion():
     assert profile.plan().latent == 0
 
 
-@pytest.mark.parametrize(("fast_rows", "cells"), [(1, 1.0), (12, 2.0)])  # of 300
-def test_one_per_cent_may_be_faster(fast_rows, cells):
-    first, second = torch.rand(2, 3, 1200, 32).unbind()
+@pytest.mark.parametrize(
+    ("shape", "where", "flow", "back", "typical", "most"),
+    [
+        ((1200, 32), np.s_[0, 100:101], 2.0, True, 1.0, None),  # one row of 300 may be faster
+        ((1200, 32), np.s_[0, 100:112], 2.0, True, 2.0, None),
+        ((64, 64), np.s_[0, :, 10:], 2.0, True, 1.0, 2.0),  # in what is flat nothing is seen
+        ((64, 64), np.s_[0, :, :4], 30.0, False, 1.0, 1.0),  # there and back do not meet
+    ],
+)
+def test_flow_that_does_not_count(shape, where, flow, back, typical, most):
+    first, second = torch.rand(2, 3, *shape).unbind()
+    if where == np.s_[0, :, 10:]:
+        first[..., 24:], second[..., 24:] = 0.5, 0.7  # flat, and brighter at the next frame
 
     def motion(one, other):
-        flow = Steady(1.0)(one, other).forward.clone()
-        flow[0, 100 : 100 + fast_rows] = 2.0
-        return SimpleNamespace(forward=flow, backward=-flow)
-
-    assert profile_of(first, second, motion).displacement == pytest.approx(2 * cells / 20)
-
-
-def test_motion_where_nothing_is_seen_does_not_count():
-    first, second = torch.rand(2, 3, 64, 64).unbind()
-    first[..., 24:] = 0.5  # flat, and brighter at the next frame
-    second[..., 24:] = 0.7
-
-    def motion(one, other):
-        flow = Steady(1.0)(one, other).forward.clone()
-        flow[0, :, 10:] = 2.0
-        return SimpleNamespace(forward=flow, backward=-flow)
+        between = Steady(1.0)(one, other)
+        forward = between.forward.clone()
+        forward[where] = flow
+        return SimpleNamespace(forward=forward, backward=-forward if back else between.backward)
 
     profile = profile_of(first, second, motion)
-    assert profile.displacement == pytest.approx(2 * 1.0 / 20, rel=0.3)
-    assert profile.displacement_max == pytest.approx(2 * 2.0 / 20)
+    assert profile.displacement == pytest.approx(2 * typical / 20, rel=0.3 if shape[0] == 64 else 1e-6)
+    if most is not None:
+        assert profile.displacement_max == pytest.approx(2 * most / 20, rel=1e-6 if back else 0.05)
 
 
 def test_blending_along_a_diagonal():
@@ -114,18 +108,6 @@ def test_blending_along_a_diagonal():
     first, second = ((0.5 + 0.4 * torch.sin((x + y) / 4 + phase)).expand(3, 64, 64) for phase in (0.0, 0.5))
     across, along = (profile_of(first, second, Steady(0.5, y)).blending for y in (0.5, -0.5))
     assert along < 0.2 * across
-
-
-def test_inconsistent_flow_does_not_count():
-    first, second = torch.rand(2, 3, 64, 64).unbind()
-
-    def motion(one, other):
-        between = Steady(1.0)(one, other)
-        forward = between.forward.clone()
-        forward[0, :, :4] = 30.0
-        return SimpleNamespace(forward=forward, backward=between.backward)
-
-    assert profile_of(first, second, motion).displacement_max == pytest.approx(2 * 1.0 / 20, rel=0.05)
 
 
 @pytest.mark.parametrize("backward", [torch.ones(2, 16, 16), None])
@@ -196,10 +178,6 @@ def test_profiles_join():
     [
         (lambda: Plan(-1), "latent: expected 0 frames or more, got -1"),
         (lambda: Plan(1, (1, 0, 4, 4)), "region: expected an even row and column"),
-        (lambda: Plan(1, (0, 0, 0, 4)), "region: expected an even row and column"),
-        (lambda: Plan.everything(0), "clocks: expected a whole number >= 1"),
-        (lambda: MOVING.plan(spike_tolerance=0), "spike_tolerance: expected a finite number above 0"),
-        (lambda: MOVING.plan(step=0), "step: expected a finite number above 0"),
     ],
 )
 def test_errors(make, message):

@@ -155,21 +155,22 @@ def test_flow_is_that_of_the_object_on_top():
     torch.testing.assert_close(flow, expected)
 
 
-def test_errors_say_what_was_expected():
-    picture = torch.rand(3, 8, 8)
-    with pytest.raises(ValueError, match="layers: expected a background"):
-        Scene([], 8, 8)
-    with pytest.raises(ValueError, match="layers: expected a background"):
-        Scene([Layer(picture), Layer(picture)], 8, 8)
-    with pytest.raises(ValueError, match=r"mask: expected \(8, 8\), got \(8, 7\)"):
-        Layer(picture, mask=torch.ones(8, 7))
-    with pytest.raises(ValueError, match=r"picture: expected \(3, h, w\)"):
-        Layer(torch.rand(2, 8, 8))
-    with pytest.raises(TypeError, match="float32 or float64"):
-        Layer(picture.half())
-    with pytest.raises(ValueError, match="zoom: expected"):
-        Motion(zoom=0.0)
-    with pytest.raises(ValueError, match="scale: expected a divisor of the view 8 x 8, got 3"):
-        Scene([Layer(picture)], 8, 8).light(scale=3)
-    with pytest.raises(ValueError, match="frames: expected at least 1"):
-        Scene([Layer(picture)], 8, 8, 0)
+PICTURE = torch.rand(3, 8, 8)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "said"),
+    [
+        (lambda: Scene([], 8, 8), ValueError, "layers: expected a background"),
+        (lambda: Scene([Layer(PICTURE)] * 2, 8, 8), ValueError, "layers: expected a background"),
+        (lambda: Layer(PICTURE, mask=torch.ones(8, 7)), ValueError, r"mask: expected \(8, 8\), got \(8, 7\)"),
+        (lambda: Layer(PICTURE[:2]), ValueError, r"picture: expected \(3, h, w\)"),
+        (lambda: Layer(PICTURE.half()), TypeError, "float32 or float64"),
+        (lambda: Motion(zoom=0.0), ValueError, "zoom: expected"),
+        (lambda: Scene([Layer(PICTURE)], 8, 8).light(scale=3), ValueError, "scale: expected a divisor of .* got 3"),
+        (lambda: Scene([Layer(PICTURE)], 8, 8, 0), ValueError, "frames: expected at least 1"),
+    ],
+)
+def test_errors(make, error, said):
+    with pytest.raises(error, match=said):
+        make()

@@ -304,14 +304,10 @@ def test_a_noise_that_cannot_be_says_so(settings, message):
 def test_errors_say_what_was_expected():
     light = torch.rand(6, 4, 5)
     for make, message in (
-        (lambda: SpikeSensor(threshold=0.0), "threshold: expected a finite number above 0"),
-        (lambda: SpikeSensor(readout=0), "readout: expected a whole number >= 1, got 0"),
         (lambda: SpikeSensor(clock=-1), "clock: expected 0 or more, got -1"),
         (lambda: SpikeSensor(readout=4).expose(light), "light: expected a multiple of 4 frames, one read-out, got 6"),
         (lambda: simulate_spikes(light, charge=torch.zeros(3, 5)), r"charge: expected \(4, 5\), got \(3, 5\)"),
-        (lambda: simulate_spikes(light[0]), r"light: expected a non-empty tensor of shape \(\*, T, H, W\)"),
         (lambda: SensorNoise().spike_changes(-0.1, 41), "light: expected a finite number, 0 or more, got -0.1"),
-        (lambda: SensorNoise().spike_changes(0.1, 0), "frames: expected a whole number >= 1, got 0"),
     ):
         with pytest.raises(ValueError, match=message):
             make()
@@ -319,5 +315,3 @@ def test_errors_say_what_was_expected():
     sensor.expose(light)
     with pytest.raises(ValueError, match=r"light: expected the size \(4, 5\) that came before, got \(4, 6\)"):
         sensor.expose(torch.rand(6, 4, 6))
-    with pytest.raises(TypeError, match="light: expected a floating-point tensor"):
-        simulate_spikes(torch.ones(3, 4, 5, dtype=torch.uint8))

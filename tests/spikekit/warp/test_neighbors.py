@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from spikekit import bayer_mask
-from spikekit.warp.neighbors import idw_neighbors, nearest_known
+from spikekit.warp.neighbors import nearest_known
 
 UNIT = 64  # flows below are multiples of 1 / UNIT, squared distances are whole numbers in units of 1 / UNIT^2
 
@@ -104,13 +104,3 @@ def test_float32_is_compared_in_double(path):
         index[:, :, centre], ({centre, right, up, down}, {centre, left, up, down}), strict=True
     ):
         assert set(nearest.tolist()) == expected
-
-
-def test_vmap_is_over_the_flow():
-    flow, mask = torch.randn(3, 2, 2, 4, 6), bayer_mask(4, 6)[0]
-    index, weight = torch.func.vmap(idw_neighbors, (1, None), 1)(flow.movedim(0, 1), mask)
-    expected = idw_neighbors(flow.flatten(0, 1), mask)
-    assert torch.equal(index.movedim(1, 0).flatten(0, 1), expected[0])
-    assert torch.equal(weight.movedim(1, 0).flatten(0, 1), expected[1])
-    with pytest.raises(ValueError, match="first 1 argument"):
-        torch.func.vmap(idw_neighbors, (0, 0))(flow, mask.expand(3, 4, 6))

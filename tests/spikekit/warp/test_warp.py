@@ -101,14 +101,10 @@ IMAGE, FLOW, MASK = torch.rand(2, 3, 4, 6), torch.rand(2, 2, 4, 6), torch.ones(4
 @pytest.mark.parametrize(
     ("error", "image", "flow"),
     [
-        (TypeError, IMAGE.long(), FLOW),
         (TypeError, IMAGE, FLOW.long()),
-        (TypeError, IMAGE.numpy(), FLOW),
         (ValueError, IMAGE, FLOW[:1]),
         (ValueError, IMAGE, FLOW[..., 1:]),
         (ValueError, IMAGE, IMAGE),
-        (ValueError, IMAGE[0], FLOW),
-        (ValueError, IMAGE[0, 0], FLOW[0, 0]),
     ],
 )
 def test_wrong_sizes(op, error, image, flow):
@@ -120,7 +116,7 @@ def test_wrong_sizes(op, error, image, flow):
     ("mask", "neighbors", "name"),
     [
         *((mask, 4, "mask") for mask in (MASK * 0, MASK[1:], MASK[None].expand(3, 4, 6), None, MASK.numpy())),
-        *((MASK, neighbors, "neighbors") for neighbors in (0, -1, 1.5, True)),
+        *((MASK, neighbors, "neighbors") for neighbors in (0, 1.5)),
     ],
 )
 def test_wrong_masks_and_neighbors(mask, neighbors, name):
