@@ -57,26 +57,26 @@ def check(run, name, *args, rtol=0.0, atol=0.0):
 of_the_cpu = pytest.mark.skipif(INTERPRETED, reason="the interpreter has nothing to do with it")
 
 
+ARGUMENTS = {
+    "integrate_fire": lambda x: (x, 0.6, x[..., 0, :, :].float(), torch.uint8),
+    "spike_interval": lambda x: (x.round(),),
+    "tfi": lambda x: (x.round(), 1.0, torch.float16),
+    "tfp": lambda x: (x, 3, 1.0, torch.float64),
+    "tfp_grad": lambda x: (x, 3, 1.0, torch.float64),
+}
+
+
 @of_the_cpu
-@pytest.mark.parametrize(
-    ("name", "args"),
-    [
-        ("integrate_fire", (LIGHT, 1.0, LIGHT[0], torch.uint8)),
-        ("spike_interval", (LIGHT,)),
-        ("tfi", (LIGHT, 1.0, torch.float32)),
-        ("tfp", (LIGHT, 3, 1.0, torch.float32)),
-        ("tfp_grad", (LIGHT, 3, 1.0, torch.float32)),
-    ],
-)
-def test_the_kernel_is_what_runs(name, args, monkeypatch, without_kernels):
+@pytest.mark.parametrize("name", ARGUMENTS)
+def test_the_kernel_is_what_runs(name, monkeypatch, without_kernels):
     def stop(*_):
         raise InterruptedError
 
     monkeypatch.setattr(cpu, "_tiles", stop)
     with pytest.raises(InterruptedError):
-        OPERATORS[name](*args)
+        OPERATORS[name](*ARGUMENTS[name](LIGHT))
     with without_kernels(*OPERATORS.values()):
-        OPERATORS[name](*args)
+        OPERATORS[name](*ARGUMENTS[name](LIGHT))
 
 
 @of_the_cpu
@@ -100,22 +100,9 @@ def test_any_light(run, dtype):
     """Three clocks of ordinary and of strange light, each after each."""
     wide, inf = torch.promote_types(dtype, torch.float32), float("inf")
     theta = torch.tensor(0.3, dtype=wide)
+    below, nan = theta.nextafter(theta * 0), float("nan")
     # of the last two float32's remainder is above theta, or below 0
-    values = [
-        0,
-        -0.0,
-        -0.5,
-        0.1,
-        0.3,
-        theta.nextafter(theta * 0),
-        1e-12,
-        7.75,
-        float("nan"),
-        inf,
-        -inf,
-        5036367.5,
-        50865,
-    ]
+    values = [0, -0.0, -0.5, 0.1, 0.3, below, 1e-12, 7.75, nan, inf, -inf, 5036367.5, 50865]
     values = torch.tensor(values, dtype=torch.float64)
     light = torch.cartesian_prod(values, values, values).to(dtype).T.reshape(3, 13, 169)
     for charge in (torch.zeros(13, 169), torch.rand(13, 169) * 0.29):
@@ -181,16 +168,7 @@ def test_long_streams(run, monkeypatch):
         assert interval[100].flatten().tolist() == [frames + 1, frames - 8, frames, frames]
 
 
-@pytest.mark.parametrize(
-    ("name", "args"),
-    {
-        "integrate_fire": lambda x: (x, 0.6, x[..., 0, :, :].float(), torch.uint8),
-        "spike_interval": lambda x: (x.round(),),
-        "tfi": lambda x: (x.round(), 1.0, torch.float16),
-        "tfp": lambda x: (x, 3, 1.0, torch.float64),
-        "tfp_grad": lambda x: (x, 3, 1.0, torch.float64),
-    }.items(),
-)
+@pytest.mark.parametrize(("name", "args"), ARGUMENTS.items())
 def test_layouts(run, name, args):
     """Of the input; a GPU's result has the same."""
     x = torch.rand(2, 9, 5, 4)

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 import torch
 
-from spikekit import bayer_mask, spike_integrate_fire, spike_interval, tfi, tfp
+from spikekit import bayer_mask
 from spikekit.flow import tvl1
 from spikekit.kernels.layout import is_channels_last
-from spikekit.warp import gather, neighbors, site_search, warp
+from spikekit.warp import gather, neighbors, site_search
 
 triton = pytest.importorskip("triton", reason="triton is not installed")
 from spikekit.kernels import gpu  # noqa: E402
@@ -27,7 +27,6 @@ DEVICE = "cpu" if INTERPRETED else "cuda"
 computes = pytest.mark.skipif(
     not INTERPRETED and not torch.cuda.is_available(), reason="no GPU; test_by_the_interpreter runs it on the CPU"
 )
-on_a_gpu = pytest.mark.skipif(not torch.cuda.is_available() or INTERPRETED, reason="no GPU")
 FLOATS = [torch.float64, torch.float32, torch.bfloat16, torch.float16]
 
 
@@ -155,52 +154,6 @@ def test_a_level_of_tvl1():
     expected = tvl1.refine(pictures, times, limit, flow, 1)
     got = call("tvl1_level", pictures, times, limit, flow, 1, *constants)
     torch.testing.assert_close(got, expected, rtol=0, atol=1e-3)
-
-
-def same_on_both(function, *tensors, eps, absolute):
-    """Results, and gradients of their squares, on CPU and GPU."""
-    found = {}
-    for device in ("cpu", "cuda"):
-        leaves = [tensor.detach().to(device).requires_grad_() for tensor in tensors]
-        results = function(*leaves)
-        loss = sum(result.square().sum() for result in results if result.requires_grad)
-        found[device] = [r.detach().cpu() for r in (*results, *torch.autograd.grad(loss, leaves))]
-    for got, expected in zip(found["cuda"], found["cpu"], strict=True):
-        torch.testing.assert_close(got, expected, rtol=eps, atol=absolute)
-
-
-@on_a_gpu
-@pytest.mark.parametrize("dtype", FLOATS)
-def test_sensor_and_decoders_on_the_gpu(dtype):
-    """The operators find their kernels: forward and backward as on the CPU."""
-
-    def decoded(light):
-        spikes, charge = spike_integrate_fire(light, 0.6)
-        return spikes, charge, spike_interval(spikes), tfi(spikes), tfp(spikes, 5)
-
-    same_on_both(decoded, torch.rand(2, 17, 33, 35).to(dtype), eps=4 * torch.finfo(dtype).eps, absolute=1e-4)
-
-
-@on_a_gpu
-@pytest.mark.parametrize("dtype", FLOATS)
-@pytest.mark.parametrize("layout", [torch.contiguous_format, torch.channels_last])
-@pytest.mark.parametrize("deterministic", [False, True])
-def test_warp_on_the_gpu(dtype, layout, deterministic):
-    mask = (torch.rand(13, 17) < 0.3) | torch.eye(13, 17, dtype=torch.bool)
-    tensors = torch.randn(2, 5, 13, 17).to(dtype), (torch.randn(2, 2, 13, 17) * 3).to(dtype)
-    tensors = [tensor.to(memory_format=layout) for tensor in tensors]
-
-    def warped(features, flow):
-        result = warp.flow_warp_idw(features, flow, mask.to(flow.device))
-        assert result.is_contiguous(memory_format=layout)
-        return (result,)
-
-    torch.use_deterministic_algorithms(deterministic)
-    try:
-        eps = 16 * torch.finfo(dtype).eps
-        same_on_both(warped, *tensors, eps=eps, absolute=max(eps, 1e-4 if dtype is torch.float32 else 0))
-    finally:
-        torch.use_deterministic_algorithms(False)
 
 
 def compile_calls():
