@@ -42,6 +42,7 @@ nitpicky = True
 nitpick_ignore_regex = [
     ("py:.*", r"(torch|kornia|collections|pathlib|optional|numpy|pytorch_lightning)\b.*"),
     ("py:.*", "(CFA|Tensor|Path)|.*MeasuredPixels"),
+    ("py:class", r".*\._\w+"),  # private
 ]
 
 templates_path = ["_templates"]  # of the pages that autosummary makes
