@@ -226,10 +226,7 @@ def test_time_that_is_not_first_is_said(tmp_path, capsys, save):
     [
         ([], "required: VERB (see spikekit --help)"),
         (["decode", "a.dat"], "required: -o/--output (see spikekit decode --help)"),
-        (
-            ["decode", "CLIP", "--frame", "1:-2"],
-            "expected a whole number, 0 or more, or A:B or A:B:STEP, got 1:-2",
-        ),
+        (["decode", "CLIP", "--frame", "1:-2"], "expected a whole number, 0 or more, or A:B or A:B:STEP, got 1:-2"),
         *(
             (["decode", "CLIP", "--frame", n], f"expected frames within 0 .. 59, got {n}")
             for n in ("60", "5:5", "0:61")
@@ -237,10 +234,7 @@ def test_time_that_is_not_first_is_said(tmp_path, capsys, save):
         (["decode", "CLIP", "--frame", "0:3"], "--output: expected {frame} in the name of 3 pictures, got "),
         (["decode", "CLIP", "--window", "4"], "odd number, with --method tfp, got 4"),
         (["decode", "CLIP", "--method", "tfi", "--order", "3"], "expected --method tfp, got 3 with tfi"),
-        (
-            ["decode", "CLIP", "-o", "a.dat"],
-            "ends in .png, .jpg, .jpeg, .bmp, .tif, .tiff, .pgm, .ppm, .pnm, got",
-        ),
+        (["decode", "CLIP", "-o", "a.dat"], "ends in .png, .jpg, .jpeg, .bmp, .tif, .tiff, .pgm, .ppm, .pnm, got"),
     ],
 )
 def test_wrong_command_lines(clip, fails, words, message):

@@ -162,10 +162,7 @@ def test_not_made_again_from_another_source_or_with_other_settings(film, fails):
     for changed, said in (
         ({"seed": 1}, "c.dat: not the stream of its side-car, though the source is the same (by the same versions)"),
         ({"scale": 3}, "c.dat: not the stream of its side-car"),
-        (
-            {"interpolation": "os.mkdir"},
-            "b.json: not settings of a simulation (interpolation: expected Flow",
-        ),
+        ({"interpolation": "os.mkdir"}, "b.json: not settings of a simulation (interpolation: expected Flow"),
         ({"frames": 2**31 - 1}, "expected more frames, or fewer clocks"),
     ):
         Path("b.json").write_text(json.dumps(known | {"settings": known["settings"] | changed}))

@@ -104,13 +104,7 @@ def test_tfp_forgets_what_has_left_the_window():
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [
-        *({"window": window} for window in (0, 2, 2.5)),
-        {"order": 0},
-        {"max_range": 0},
-    ],
-    ids=str,
+    "wrong", [*({"window": window} for window in (0, 2, 2.5)), {"order": 0}, {"max_range": 0}], ids=str
 )
 def test_wrong_options(wrong):
     (name,) = wrong

@@ -7,16 +7,7 @@ from hypothesis import strategies as st
 
 from spikekit.decoders.packing import _pack_bits, _unpack_bits, pack_spikes, unpack_spikes
 
-DTYPES = [
-    torch.bool,
-    torch.uint8,
-    torch.int8,
-    torch.int64,
-    torch.float16,
-    torch.bfloat16,
-    torch.float32,
-    torch.float64,
-]
+DTYPES = [torch.bool, torch.uint8, torch.int8, torch.int64, torch.float16, torch.bfloat16, torch.float32, torch.float64]
 
 
 def random_spikes(*shape):
@@ -61,12 +52,9 @@ def test_torch_path(width):
 
 @pytest.mark.parametrize("value", [2, -1, 0.5, float("nan"), float("inf")])
 def test_other_values(value):
-    for dtype in (torch.float32, torch.bfloat16, torch.float64):
+    for dtype in (torch.float32, torch.bfloat16, torch.float64, *([torch.uint8] if value == 2 else [])):
         with pytest.raises(ValueError, match="expected zeros and ones"):
             pack_spikes(torch.tensor([[0, 1, value]], dtype=dtype))
-    if value == 2:
-        with pytest.raises(ValueError, match="expected zeros and ones"):
-            pack_spikes(torch.tensor([[0, 1, 2]], dtype=torch.uint8))
 
 
 @pytest.mark.parametrize(

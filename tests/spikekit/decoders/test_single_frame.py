@@ -21,10 +21,7 @@ def test_against_one_pixel_at_a_time(frames, rate, seed, data):
     assert _spike_interval_at(spikes, frame).flatten().tolist() == expected  # what runs on other devices
 
 
-@pytest.mark.parametrize(
-    "dtype",
-    [torch.bool, torch.uint8, torch.int32, torch.float16, torch.bfloat16, torch.float64],
-)
+@pytest.mark.parametrize("dtype", [torch.bool, torch.uint8, torch.int32, torch.float16, torch.bfloat16, torch.float64])
 def test_equals_that_frame_of_the_whole(dtype):
     spikes = (torch.rand(2, 3, 30, 4, 5) < torch.rand(4, 5) * 0.3).to(dtype)
     for frame in (0, 14, 29):

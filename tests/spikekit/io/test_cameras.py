@@ -91,17 +91,13 @@ def test_a_camera_of_ones_own(tmp_path):
     ("given", "message"),
     [
         ({"height": 0}, "height: expected a whole number >= 1, got 0"),
-        ({"gain": "1"}, "gain: expected a finite number above 0, got '1'"),
         ({"flip": 1}, "flip: expected bool, got 1"),
         ({"pattern": "RGBG"}, "RGBG"),
         ({"crop": [3, 3, 0, 0]}, "crop: expected \\[top, bottom, left, right\\] that leaves pixels"),
-        ({"crop": [0, 0, 0, -1]}, "crop: expected"),
         ({"drop": [[4, 2]]}, "drop: expected"),
-        ({"drop": [["a", "b"]]}, "drop: expected pairs"),
         ({"colour": "red"}, "got title, .*, colour"),
         ([1], "expected an object with title, height, .*, got list"),
         ('{"title": "a', "line 1"),
-        ("", "Expecting value"),
     ],
 )
 def test_a_file_that_describes_no_camera_says_why(tmp_path, given, message):

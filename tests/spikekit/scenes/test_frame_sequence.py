@@ -313,10 +313,7 @@ def film_of(frames=FRAMES, **settings):
             lambda: film_of([*FRAMES, torch.rand(3, 8, 9)]).light(),
             r"frames\[3\]: expected 8 x 8 as the first, got 8 x 9",
         ),
-        (
-            lambda: film_of().light(0, 42),
-            "first, count: expected clocks of the film, 0 to 40, got 42 from 0 on",
-        ),
+        (lambda: film_of().light(0, 42), "first, count: expected clocks of the film, 0 to 40, got 42 from 0 on"),
         (lambda: film_of().rgb(3), "frame: expected 0 to 2, got 3"),
         (lambda: film_of().plan(2), "interval: expected 0 to 1, got 2"),
         (lambda: film_of().flow(1, 41), "clock: expected 0 to 40, got 41"),

@@ -44,8 +44,7 @@ def correct(estimate, raw, flow, mask, sigma_space, sigma_range, tau):
 
 
 @pytest.mark.parametrize(
-    ("pattern", "widths"),
-    [("RGGB", {}), ("GRBG", {"sigma_space": 0.8, "sigma_range": 0.2, "tau": 1.5})],
+    ("pattern", "widths"), [("RGGB", {}), ("GRBG", {"sigma_space": 0.8, "sigma_range": 0.2, "tau": 1.5})]
 )
 def test_against_loops(pattern, widths):
     generator = torch.Generator().manual_seed(0)
