@@ -60,6 +60,7 @@ WRONG = {
     "fit -c flow --data.frames 51": "data.frames: expected 41, as the model has it, got 51",
     f"fit {X4} --data.workers -1": "workers: expected 0 or more, got -1",
     f"fit {X4} --trainer.logger WandbLogger": "Requirement 'wandb",
+    f"fit {X4} --trainer.accelerator cpu --trainer.devices -1": "devices",
     f"fit {X4} --trainer.callbacks Foo": "trainer.callbacks: expected the name of a class, got Foo",
     f"validate {X4} --data Nonsense": "Nonsense",
     f"test {X4} -o a.txt": "-o: expected a folder, got the file",

@@ -27,27 +27,21 @@ def test_a_clip_comes_back(tmp_path):
         ClipCache(tmp_path / "new" / "folder").packed(clip_key(frames=["b", "a"], scale=4), made_again)
 
 
-@pytest.mark.parametrize("damage", [slice(0, 0), slice(0, 500), slice(0, -1), "a bit", "a folder"])
+@pytest.mark.parametrize("damage", [slice(0, 0), slice(0, 500), slice(0, -1), "a bit"])
 def test_a_damaged_clip_is_made_again_and_said_so_once(tmp_path, damage):
     made = ClipCache(tmp_path).packed(KEY, lambda: clip(200))
     (path,) = tmp_path.glob("*/*.npz")
     stored = bytearray(path.read_bytes())
-    if damage == "a folder":
-        path.unlink()
-        path.mkdir()
-    elif damage == "a bit":
+    if damage == "a bit":
         stored[len(stored) // 2] ^= 1
-        path.write_bytes(stored)
-    else:
-        path.write_bytes(stored[damage])
+    path.write_bytes(stored if damage == "a bit" else stored[damage])
     cache = ClipCache(tmp_path)
     with pytest.warns(UserWarning, match="cannot be read") as said:
         assert same(cache.packed(KEY, lambda: clip(200)), made)
     assert len(said) == 1
-    if damage != "a folder":
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            assert same(cache.packed(KEY, made_again), made)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert same(cache.packed(KEY, made_again), made)
 
 
 def clip(levels, height=6, width=22, scale=2, flow=True):

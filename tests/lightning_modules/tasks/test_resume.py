@@ -124,12 +124,6 @@ def test_processes_that_lightning_spawns_itself(tmp_path, configs):
     assert torch.load(tmp_path / "run/checkpoints/last.ckpt", weights_only=True)["global_step"] == 2
 
 
-def test_devices_that_a_cpu_lacks(fit):
-    with pytest.raises(SystemExit) as ended:
-        fit("run", "--trainer.devices=-1")
-    assert ended.value.code == 2
-
-
 def test_a_home_in_an_output_is_found(fit, monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "there.yaml").write_text("output: ~/run")
