@@ -1,9 +1,4 @@
-"""Laws of the camera, on streams, pictures, masks and flows of any kind.
-
-Laws that stand elsewhere, by hypothesis too: charge is conserved, light below zero is a debt, and the sensor in chunks
-equals one run (test_sensor); the decoders in chunks equal the whole (test_streams); TFP of a whole clip is its rate
-(test_decoders).
-"""
+"""Laws of the camera, on streams, pictures, masks and flows of any kind."""
 
 import math
 

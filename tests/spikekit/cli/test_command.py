@@ -101,7 +101,6 @@ def test_decode(clip, tmp_path, capsys, method, least):
     command(*words)
     report = capsys.readouterr().out
     assert report.startswith(f"{out}: frame 30 of 60 by {method} from frames {0 if method == 'tfi' else 10} .. ")
-    assert report.endswith("so that the 99.9th percentile of the spike rate around frame 30 is white\n")
     assert 1.9 < float(report.split("multiplied by ")[1].split(",")[0]) <= 2
     assert psnr(read_picture(out)[:, 1:], light[:, 1:] / 0.5) > least
 
@@ -125,25 +124,18 @@ def test_pictures_are_those_of_the_whole_recording(tmp_path, capsys, name, words
         "decode", *sized(tmp_path / name, 12, 9), *words, "--frame", frames, "-o", out / "a{frame}.png", "--alpha", 0.6
     )
     chosen = range(500)[slice(*[int(part) if part else None for part in frames.split(":")])] if ":" in frames else [250]
-    report, err = capsys.readouterr()
-    assert err == ""
-    many = f"{len(chosen)} pictures of frames {chosen[0]} .. {chosen[-1]} of 500"
-    assert (many if len(chosen) > 1 else f"a{chosen[0]:03}.png: frame {chosen[0]} of 500") in report
-    assert f" by {'tfp' if '--window' in words else 'tfi'} from" in report
+    assert capsys.readouterr().err == ""
     assert sorted(path.name for path in out.iterdir()) == [f"a{n:03}.png" for n in chosen]
     whole = (decode(spikes) / 0.6).clamp(0, 1)
     for n in chosen:
         assert torch.equal((read_picture(out / f"a{n:03}.png")[0] * 255).round(), (whole[n] * 255).round())
 
 
-def test_decode_many_at_one_scale(tmp_path, capsys):
+def test_decode_many_at_one_scale(tmp_path):
     """A light that goes on stays darker than white before: pictures can be compared."""
     spikes = torch.cat([expose(torch.full((6, 8), level), 100) for level in (0.1, 0.4)])
     write_spikes(tmp_path / "a.npz", spikes)
     command("decode", tmp_path / "a.npz", "--window", 21, "-o", tmp_path / "{frame}.png", "--frame", "50:200:50")
-    report = capsys.readouterr().out
-    assert "3 pictures of frames 50 .. 150 of 200, 50 apart, by tfp from up to 10 frames on each side" in report
-    assert "99.9th percentile of the spike rate around frame 100 is white" in report
     dark, bright = (read_picture(tmp_path / f"{n:03}.png").mean() for n in (50, 150))
     assert dark < bright / 2
 

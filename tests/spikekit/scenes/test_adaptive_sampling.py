@@ -117,7 +117,6 @@ def test_where_motion_is_not_found_everything_is_modelled(backward):
     profile = profile_of(first, second, lambda one, other: SimpleNamespace(forward=forward, backward=backward))
     assert profile.displacement == float("inf")
     assert profile.plan() == Plan.everything(20)
-    assert "latent frames: 19 an interval, as motion is not found, for all pixels" in str(profile.plan())
 
 
 @pytest.mark.parametrize(
@@ -154,7 +153,6 @@ def test_noise_that_changes_nothing_is_left_out():
     noise = SensorNoise(photons=1e12, hot=0.1)
     plan = MOVING.plan(noise=noise)
     assert plan.noise == SensorNoise(hot=0.1)
-    assert "noise: hot (left out: photons)" in str(plan)
     assert MOVING.plan(noise=noise, spike_tolerance=1e-9).noise == noise
     dark = replace(MOVING, brightness=(0.0, 0.001, 0.01))
     assert dark.plan(noise=SensorNoise(dark_current=1e-4)).noise == SensorNoise(dark_current=1e-4)
