@@ -5,6 +5,7 @@ import gc
 import os
 import random
 import resource
+import signal
 import tempfile
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,12 @@ import torch
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ["OMP_NUM_THREADS"] = "1"
     torch.set_num_threads(1)
+
+
+def pytest_configure():
+    """Programs that tests start hear Ctrl-C, also where the shell runs tests in the background and ignores it."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_addoption(parser):

@@ -34,8 +34,8 @@ class ErrorModel:
 
     still: float = 0.18
     textured: float = 0.07
-    moved: float = 0.00068
-    faint: float = 1.3e-5
+    moved: float = 0.0005
+    faint: float = 9e-6
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
