@@ -95,7 +95,7 @@ def test_the_readmes_call_in_python_gives_the_pictures_of_a_recording(folder, mo
     monkeypatch.chdir(folder)
     names: dict = {}
     exec(code.replace("height=250, width=400", "height=24, width=32"), names)
-    assert len(names["pictures"]) == 11
+    assert len(names["pictures"]) == 10
     assert names["rgb"].shape == (3, 96, 128)
     assert 0 <= names["rgb"].min() < names["rgb"].max() <= 1
 

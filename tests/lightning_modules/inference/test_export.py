@@ -10,7 +10,7 @@ import torch
 from lightning_modules.inference import export
 from lightning_modules.inference.export import as_exported, difference, example_inputs, export_network
 from lightning_modules.motion import ClassicalFlow, ZeroFlow
-from lightning_modules.networks import CSCSR, ClassicalDecoder, RecurrentCSCSR, SpikeSRNetLike, SwinIR
+from lightning_modules.networks import CSCSR, ClassicalDecoder, RecurrentCSCSR, SpikeSRNetLike
 from spikekit import write_spikes
 
 TINY = {"width": 4, "representation_width": 4, "features": 1, "stages": 1, "blocks": 1, "end_blocks": 1}
@@ -18,10 +18,8 @@ TINY = {"width": 4, "representation_width": 4, "features": 1, "stages": 1, "bloc
 FILM = {**TINY, "fusion_width": 4, "fusion_blocks": 1, "memory": 2}
 #: of every kind of part one: an export of any network is compared with it before it is written
 MADE = [
-    (CSCSR, {**TINY, "representation": "spikes", "reconstruction": "separate"}),
     (CSCSR, {**TINY, "motion_fusion": "assembled", "resolution": "sensor"}),
     (RecurrentCSCSR, FILM),
-    (SwinIR, {"width": 12, "groups": 1, "layers": 2, "heads": 2}),
     (SpikeSRNetLike, {"width": 8, "maps": 4, "corrections": 1, "per_channel": True}),
 ]
 
