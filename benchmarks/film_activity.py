@@ -72,7 +72,7 @@ def main() -> None:
     torch.set_num_threads(1)
     network = Network.from_pretrained(args.weights)
     clocks = EVERY * (args.pictures - 1) + network.frames
-    print("weights,scene,time after 10,cells after 10,plain PSNR,PSNR after 1,after 10,at the end")
+    print("weights,sensor pixels,scene,time after 10,cells after 10,plain PSNR,PSNR after 1,after 10,at the end")
     for name, scene, bright in scenes(tuple(args.size), clocks, network.scale):
         if args.scene and not name.startswith(tuple(args.scene)):
             continue
@@ -95,7 +95,8 @@ def main() -> None:
         late = times[20::2], times[21::2]
         ratio, share = sum(late[1]) / sum(late[0]), mean(cells[10:])
         figures = [mean(one for one, _ in found), *(found[n][1] - found[n][0] for n in (1, 10, -1))]
-        print(f"{args.weights},{name},{ratio:.3f},{share:.3f},{','.join(f'{figure:.2f}' for figure in figures)}")
+        size = " x ".join(map(str, args.size))
+        print(f"{args.weights},{size},{name},{ratio:.3f},{share:.3f},{','.join(f'{figure:.2f}' for figure in figures)}")
 
 
 def write_overlay(folder: Path, name: str, made: list[Tensor], truth: Tensor, computed: Tensor) -> None:
