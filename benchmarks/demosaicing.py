@@ -1,6 +1,7 @@
 """Quality of the demosaicings on pictures whose truth is known: of mosaics, and of TFI of simulated films.
 
-``python benchmarks/demosaicing.py --pictures FOLDER --films FOLDER`` prints the table.
+``python benchmarks/demosaicing.py --pictures FOLDER --films FOLDER`` prints the table; ``--weights`` adds the column of
+a colour network of scale 1, which demosaics and reconstructs in one.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from lightning_modules.inference.predict import predict
+from lightning_modules.networks import Network
 from spikekit.color import demosaic, demosaic_residual, mosaic
 from spikekit.decoders import tfi_at
 from spikekit.flow import linear_motion
@@ -37,15 +40,17 @@ def picture_row(folder: Path) -> list[float]:
     return torch.tensor(found).mean(0).tolist()
 
 
-def film_row(folder: Path, clocks: int, alpha: float) -> list[float]:
-    """Return the PSNR of the middle frame of a film, by TFI and all three demosaicings.
+def film_row(folder: Path, clocks: int, alpha: float, network: Network | None = None) -> list[float]:
+    """Return the PSNR of the middle frame of a film, by TFI and all three demosaicings, and by a network.
 
-    The sensor has a pixel for each of the film. The motion is that which the film's latent frames are made with.
+    The sensor has a pixel for each of the film. The motion is that which the film's latent frames are made with;
+    the network estimates its own.
 
     Args:
         folder: its frames.
         clocks: of the camera, from one frame to the next.
         alpha: light of a white pixel per clock, in thresholds.
+        network: of scale 1.
     """
     frames = read_video(folder)
     middle = len(frames) // 2
@@ -58,7 +63,9 @@ def film_row(folder: Path, clocks: int, alpha: float) -> list[float]:
     raw = torch.stack([tfi_at(spikes, n) for n in TIMES]) / alpha
     flow = linear_motion(*(clip.flow(n) for n in ENDS), TIMES, first=ENDS[0], middle=FRAMES // 2, last=ENDS[1])
     alone, truth = raw[len(TIMES) // 2], clip.rgb(clip.middle)
-    pictures = demosaic(alone), demosaic_residual(alone), demosaic_along_motion(raw, flow)
+    pictures = [demosaic(alone), demosaic_residual(alone), demosaic_along_motion(raw, flow)]
+    if network is not None:
+        pictures.append(predict(network, spikes[None], exposure=network.settings["alpha"] / alpha)[0])
     return [_decibels(rgb, truth) for rgb in pictures]
 
 
@@ -66,20 +73,29 @@ def _decibels(rgb: Tensor, truth: Tensor) -> float:
     return psnr(rgb.clamp(0, 1), truth).item()
 
 
-def lines(pictures: Path | None, films: Path | None, clocks: int, alpha: float) -> Iterator[str]:
+def lines(
+    pictures: Path | None, films: Path | None, clocks: int, alphas: Sequence[float], weights: str | None
+) -> Iterator[str]:
     """Yield the table as Markdown, each line as soon as it is known."""
-    names = "demosaic", "demosaic_residual", "demosaic_along_motion"
+    names = ["demosaic", "demosaic_residual", "demosaic_along_motion"]
+    network = None
+    if weights is not None:
+        network = Network.from_pretrained(weights)
+        names.append(weights)
     yield f"| mosaic of | {' | '.join(names)} |"
     yield f"|{'---|' * (len(names) + 1)}"
     if pictures is not None:
-        yield _line(pictures.name, picture_row(pictures))
-    for folder in sorted(filter(Path.is_dir, films.iterdir())) if films is not None else []:
-        yield _line(f"{folder.name}, TFI, {clocks} clocks, alpha {alpha:g}", film_row(folder, clocks, alpha))
+        yield _line(pictures.name, [*picture_row(pictures), *[None] * (len(names) - 2)])
+    for alpha in alphas if films is not None else ():
+        rows, how = [], f"TFI, {clocks} clocks, alpha {alpha:g}"
+        for folder in sorted(filter(Path.is_dir, films.iterdir())):
+            rows.append(film_row(folder, clocks, alpha, network))
+            yield _line(f"{folder.name}, {how}", rows[-1])
+        yield _line(f"mean, {how}", torch.tensor(rows).mean(0).tolist())
 
 
-def _line(name: str, decibels: Sequence[float]) -> str:
-    cells = [f"{value:.2f}" for value in decibels] + ["-"] * (3 - len(decibels))
-    return f"| {name} | {' | '.join(cells)} |"
+def _line(name: str, decibels: Sequence[float | None]) -> str:
+    return f"| {name} | {' | '.join('-' if value is None else f'{value:.2f}' for value in decibels)} |"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -88,11 +104,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="pictures, whose own mosaics are filled in")
     parser.add_argument("--films", type=Path, metavar="FOLDER", help="a folder of frames for every film")
     parser.add_argument("--clocks", type=int, default=20, help="of the camera from one frame to the next; default 20")
-    parser.add_argument("--alpha", type=float, default=0.4, help="light of a white pixel per clock; default 0.4")
+    parser.add_argument(
+        "--alpha", type=float, nargs="+", default=[0.4], help="light of a white pixel per clock; default 0.4"
+    )
+    parser.add_argument("--weights", metavar="NAME", help="those of a colour network of scale 1")
     asked = parser.parse_args(arguments)
     if asked.pictures is None and asked.films is None:
         parser.error("expected --pictures or --films")
-    for line in lines(asked.pictures, asked.films, asked.clocks, asked.alpha):
+    for line in lines(asked.pictures, asked.films, asked.clocks, asked.alpha, asked.weights):
         print(line, flush=True)
 
 
