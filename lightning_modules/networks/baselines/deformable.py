@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import sys
-
-import kornia.feature
 import torch
+from kornia.feature.aliked.deform_conv2d import deform_conv2d
 from torch import Tensor, nn
 
 from lightning_modules.networks.layers import conv
-
-# of the module, whose name a function of the same name hides
-_deform_conv2d = sys.modules[f"{kornia.feature.__name__}.aliked.deform_conv2d"].deform_conv2d
 
 
 class DeformableConv2d(nn.Module):
@@ -49,4 +44,4 @@ class DeformableConv2d(nn.Module):
         offsets, masks = where.split([where.shape[1] * 2 // 3, where.shape[1] // 3], dim=1)
         with torch.autocast(features.device.type, enabled=False):
             features = features.to(self.weight.dtype)
-            return _deform_conv2d(features, offsets, self.weight, self.bias, padding=1, mask=masks.sigmoid())
+            return deform_conv2d(features, offsets, self.weight, self.bias, padding=1, mask=masks.sigmoid())
