@@ -5,15 +5,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields, replace
-from pathlib import Path
+from dataclasses import fields
 from typing import Any
 
 from spikekit.arguments import UsageError, ending_in, home_path, positive, whole
 from spikekit.calibration.files import read_calibration
 from spikekit.color.cfa import PATTERNS
 from spikekit.io.files import RECORDING_ENDINGS
-from spikekit.io.sidecar import Sidecar, read_sidecar
 from spikekit.io.video import VideoError
 from spikekit.scenes.simulation import INTERPOLATIONS, Settings, Source, simulate
 from spikekit.sensor.noise import SensorNoise
@@ -34,10 +32,8 @@ def run(args: argparse.Namespace) -> None:
 
     OUT.dat gets the stream, 8 pixels a byte: a clip around one frame of the film, or all of it. OUT.png gets the
     ground truth, that frame in 8 bits, cropped to whole cells of the sensor; with --all, the folder OUT gets every
-    frame. OUT.json, the side-car, gets every setting, what of the scene was modelled, and hashes of the source and of
-    the stream.
-
-    With OUT.json as INPUT, the same stream is made again, bit for bit, which is checked.
+    frame. OUT.json, the side-car, gets every setting, what of the scene was modelled, and a hash of the stream. The
+    same settings give the same stream, bit for bit.
 
     All appear under their names when they are complete, the side-car last: a stream without one is not to be
     believed.
@@ -45,21 +41,10 @@ def run(args: argparse.Namespace) -> None:
     if args.output.is_dir():
         raise ValueError(f"{args.output}: expected a stream to write, got a folder")
     known = {field.name for field in (*fields(Settings), *fields(SensorNoise))}
-    given = {name: value for name, value in vars(args).items() if name in known}
-    replayed = None
-    if args.input.suffix.lower() == ".json":
-        replayed = read_sidecar(args.input)
-        settings = _settings_of(args.input, replayed, given)
-        path = args.source or args.input.parent / replayed.source["path"]
-    else:
-        if args.source is not None:
-            raise UsageError(f"--source: expected a side-car as INPUT with it, got {args.input}")
-        if "scale" not in given:
-            raise UsageError("--scale: needed, unless INPUT is a side-car")
-        settings, path = _settings(given), args.input
+    settings = _settings({name: value for name, value in vars(args).items() if name in known})
     with _options():
-        source = Source(path, settings)
-    for line in simulate(source, settings, args.output, replayed):
+        source = Source(args.input, settings)
+    for line in simulate(source, settings, args.output):
         say(line)
 
 
@@ -82,33 +67,18 @@ def _settings(given: dict[str, Any]) -> Settings:
         return Settings(**others, noise=SensorNoise(**noise, calibration=known))
 
 
-def _settings_of(path: Path, sidecar: Sidecar, given: dict[str, Any]) -> Settings:
-    others = [f"--{name.replace('_', '-')}" for name in given]
-    if others:
-        raise UsageError(f"{path}: a side-car has its own settings, got {', '.join(others)} as well")
-    try:
-        settings = Settings(**sidecar.settings | {"noise": SensorNoise(**sidecar.settings["noise"])})
-    except (TypeError, ValueError, KeyError) as error:
-        raise ValueError(f"{path}: not settings of a simulation ({error})") from error
-    if settings.calibration is None:
-        return settings
-    calibration = path.parent / settings.calibration
-    noise = replace(settings.noise, calibration=read_calibration(calibration))
-    return replace(settings, noise=noise, calibration=str(calibration))
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.argument_default = argparse.SUPPRESS  # what is not given is not there, so that a side-car can be had alone
+    parser.argument_default = argparse.SUPPRESS  # Settings has the defaults
     add = parser.add_argument
 
     def option(name: str, kind: Callable[[str], Any], metavar: str, said: str, to: Any = parser) -> None:
         to.add_argument(f"--{name}", type=kind, metavar=metavar, help=f"{said}; {getattr(Settings, name)} if not given")
 
-    add("input", type=home_path, metavar="INPUT", help="a folder of pictures, a video file, a picture, or a side-car")
+    add("input", type=home_path, metavar="INPUT", help="a folder of pictures, a video file or a picture")
     stream = ending_in(*RECORDING_ENDINGS, said=f"a stream that ends in {', '.join(RECORDING_ENDINGS)}")
     add("-o", "--output", required=True, type=stream, metavar="OUT.dat", help="the stream to write")
-    add("--scale", type=whole(1), metavar="S", help="pixels of a frame that a sensor pixel is wide")
+    add("--scale", required=True, type=whole(1), metavar="S", help="pixels of a frame that a sensor pixel is wide")
     said = f"Bayer phase of the sensor; {Settings.pattern} if not given"
     add("--pattern", type=str.upper, choices=PATTERNS, help=said)
     option("alpha", positive, "A", "times that a white pixel fires per clock")
@@ -120,8 +90,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--frame", type=whole(0), metavar="M", help=said)
     option("readout", whole(1), "N", "clocks for every frame of the stream")
     option("seed", whole(0), "N", "random seed: first charge and noise")
-    said = "where the frames of a side-car are, if they have moved"
-    add("--source", type=home_path, default=None, metavar="PATH", help=said)
 
     model = parser.add_argument_group("what is modelled")
     said = "what the scene requires, every clock and all noise, or K latent frames between two frames"

@@ -32,7 +32,7 @@ class Sidecar:
 
     stream: dict[str, Any]  # file, frames, height, width and sha256, that of the frames as a .dat holds them
     truth: dict[str, float]  # pictures, by their path from the side-car: the frame of the stream at which each was seen
-    source: dict[str, Any]  # path, from the side-car, and frames: SHA-256 of the pixels of each that was looked at
+    source: dict[str, Any]  # path, and the names of the frames that were looked at
     settings: dict[str, Any]  # all that was asked for, or left at its default
     plan: dict[str, Any]  # what was modelled
     versions: dict[str, str]  # of what computed it
@@ -85,44 +85,22 @@ def _check(sidecar: Sidecar) -> None:
                 raise ValueError(f"{part}.{name}: expected {expected}, got {values[name]!r}")
 
 
-def _is_whole(value: Any, least: int = 1, most: int = (1 << 31) - 1) -> bool:
-    return type(value) is int and least <= value <= most  # True is an int, and JSON's have no end
-
-
-def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and abs(value) <= sys.float_info.max
-
-
-def _is_noise(value: Any) -> bool:
-    known = isinstance(value, dict) and value.get("calibration") is None  # that is a file, of the settings
-    return known and all(one is None or _is_number(one) for one in value.values())
+def _is_whole(value: Any) -> bool:
+    return type(value) is int and 1 <= value < 1 << 31  # True is an int, and JSON's have no end
 
 
 _TEXT = ("a text", lambda value: isinstance(value, str))
 _WHOLE = ("a whole number, 1 or more", _is_whole)
-# a minute of a camera between two frames; a few bytes could ask for a stream that never ends
-_CLOCKS = (f"a whole number, 1 .. {1 << 20}", lambda value: _is_whole(value, 1, 1 << 20))
-_POSITIVE = ("a finite number above 0", lambda value: _is_number(value) and value > 0)
 
-# What to expect, and whether a value is that; settings that are not there have their defaults.
+# What to expect of what is read again, and whether a value is that.
 _VALUES: dict[str, dict[str, tuple[str, Callable[[Any], bool]]]] = {
     "stream": {"file": _TEXT, "sha256": _TEXT, "frames": _WHOLE, "height": _WHOLE, "width": _WHOLE},
-    "source": {"path": _TEXT, "frames": ("names and values", lambda value: isinstance(value, dict) and bool(value))},
     "settings": {
-        "scale": _WHOLE,
         "pattern": (f"one of {', '.join(PATTERNS)}", lambda value: value in PATTERNS),
-        "alpha": _POSITIVE,
-        "clocks": _CLOCKS,
-        "frame": ("a whole number, 0 or more, or null", lambda value: value is None or _is_whole(value, 0)),
-        "frames": ("a whole number, 1 or more, or null", lambda value: value is None or _is_whole(value)),
-        "readout": _CLOCKS,
-        "seed": ("a whole number, 0 or more", lambda value: type(value) is int and value >= 0),
-        "plan": ("a text or a number of latent frames", lambda value: isinstance(value, str) or _is_whole(value, 0)),
-        "tolerance": _POSITIVE,
-        "step": _POSITIVE,
-        "interpolation": _TEXT,
-        "noise": ("names and finite numbers", _is_noise),
-        "calibration": ("a text or null", lambda value: value is None or isinstance(value, str)),
+        "alpha": (
+            "a finite number above 0",
+            lambda value: type(value) in (int, float) and 0 < value <= sys.float_info.max,
+        ),
     },
 }
 
@@ -161,10 +139,10 @@ def published(output: Path) -> Iterator[Path]:
 
     Convention:
         The folder lies beside ``output``, hidden. Its contents move to where ``output`` is, each by one renaming, and
-        the side-car, ``output`` with the ending ``.json``, after all others. One that is there already and says
-        something else goes first. So a stream beside its side-car is complete, whenever the process was killed. What
-        remains of one that was is a hidden folder that ends in ``.part``, which the next one empties. Processes that
-        write the same output do so one after the other.
+        the side-car, ``output`` with the ending ``.json``, after all others. One that is there already goes first. So a
+        stream beside its side-car is complete, whenever the process was killed. What remains of one that was is a
+        hidden folder that ends in ``.part``, which the next one empties. Processes that write the same output do so one
+        after the other.
 
     Raises:
         ValueError: the place of the side-car or of a picture is taken by something else.
@@ -227,15 +205,12 @@ def _publish(part: Path, target: Path, last: str) -> None:
         taken = name.suffix == ".png" and name.as_posix() not in known and final.exists()
         if taken and not (final.is_file() and final.read_bytes() == path.read_bytes()):
             raise ValueError(f"{final}: would be lost, and is no ground truth of {last}; choose another name")
-    if sidecar.is_file() and sidecar.read_bytes() != (part / last).read_bytes():
-        sidecar.unlink()
-    folders = {target}
+    sidecar.unlink(missing_ok=True)
     for path in files:
         final = target / path.relative_to(part)
         final.parent.mkdir(exist_ok=True)
-        folders.add(final.parent)
         if path == part / last:  # the others have to be on the disk before it says that they are
-            for folder in folders:
+            for folder in {(target / other.relative_to(part)).parent for other in files}:
                 flush_folder(folder)
         os.replace(path, final)
     flush_folder(target)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -16,7 +16,6 @@ from spikekit.check import check_positive, check_whole
 from spikekit.color.cfa import bin_to_sensor, mosaic
 from spikekit.flow.fields import upsample_flow
 from spikekit.flow.interpolate import FlowInterpolation
-from spikekit.sensor.noise import SensorNoise
 from spikekit.warp.warp import flow_warp
 
 #: A rectangle of the sensor: first row, first column, rows, columns.
@@ -50,7 +49,6 @@ class Plan:
         latent: frames that are synthesised in the interval, evenly spaced; with none, its two ends are blended.
         region: the part of the sensor they are synthesised for, the ends being blended in the rest; first row and
             column even; ``None`` for all of it.
-        noise: noise of the sensor, ``None`` for none.
         because: reasons of the decisions, one line each, to be printed.
 
     Raises:
@@ -63,7 +61,6 @@ class Plan:
 
     latent: int = 0
     region: Region | None = None
-    noise: SensorNoise | None = None
     because: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
@@ -74,9 +71,9 @@ class Plan:
             raise ValueError(f"region: expected an even row and column, and a size, got {self.region}")
 
     @classmethod
-    def everything(cls, clocks: int, noise: SensorNoise | None = None) -> Plan:
-        """Model everything: a frame for every clock of the interval, all pixels, every source of noise."""
-        return cls(check_whole("clocks", clocks) - 1, noise=noise)
+    def everything(cls, clocks: int) -> Plan:
+        """Model everything: a frame for every clock of the interval, all pixels."""
+        return cls(check_whole("clocks", clocks) - 1)
 
     def __str__(self) -> str:
         return "\n".join(self.because or [f"latent frames: {self.latent} an interval"])
@@ -113,36 +110,7 @@ class SceneProfile:
     displacement_max: float = 0.0
     blending: float = 0.0
 
-    @classmethod
-    def join(cls, profiles: Iterable[SceneProfile]) -> SceneProfile:
-        """Make one profile of those of several intervals: the fastest motion, the mean brightness, all that moves."""
-        every = list(profiles)
-        if not every:
-            raise ValueError("profiles: expected at least one, got none")
-        darkest, mean, brightest = zip(*(one.brightness for one in every), strict=True)
-        boxes = [one.region for one in every if one.region]
-        region = None
-        if boxes:
-            top, left = min(box[0] for box in boxes), min(box[1] for box in boxes)
-            bottom, right = max(box[0] + box[2] for box in boxes), max(box[1] + box[3] for box in boxes)
-            region = top, left, bottom - top, right - left
-        return cls(
-            every[0].size,
-            every[0].clocks,
-            (min(darkest), sum(mean) / len(mean), max(brightest)),
-            sum(one.static for one in every) / len(every),
-            region,
-            *(max(getattr(one, name) for one in every) for name in ("displacement", "displacement_max", "blending")),
-        )
-
-    def plan(
-        self,
-        *,
-        spike_tolerance: float = 0.05,
-        step: float = 0.5,
-        noise: SensorNoise | None = None,
-        frames: int = 41,
-    ) -> Plan:
+    def plan(self, *, spike_tolerance: float = 0.05, step: float = 0.5) -> Plan:
         r"""Decide what must be modelled.
 
         .. math:: K = \max\left(\left\lceil \frac{d}{\text{step}} \right\rceil,
@@ -155,14 +123,9 @@ class SceneProfile:
             Nothing is synthesised where nothing moves, and a frame for every clock where motion is not found: the
             interpolation may find it in finer detail, or that the film was cut.
 
-            A source of noise is left out where it changes less than the tolerance, by its bound in
-            :meth:`spikekit.SensorNoise.required`.
-
         Args:
-            spike_tolerance: share of the spikes that may change, by each decision.
+            spike_tolerance: share of the spikes that may change.
             step: displacement between two latent frames, in sensor pixels.
-            noise: the sensor's sources of noise.
-            frames: clocks of a clip, over which noise adds up.
 
         Returns:
             The plan; change it by ``dataclasses.replace``.
@@ -193,14 +156,7 @@ class SceneProfile:
         else:
             blended = f"blending changes {self.blending:.2%} of the spikes" if self.static < 1 else "nothing moves"
             because.append(f"latent frames: none, {blended}")
-        if noise is not None:
-            needed = noise.required(mean, frames, spike_tolerance * min(1.0, mean))
-            on, kept = noise.spike_changes(mean, frames), needed.spike_changes(mean, frames)
-            left_out = [source for source in on if source not in kept]
-            without = f" (left out: {', '.join(left_out)})" if left_out else ""
-            because.append(f"noise: {', '.join(kept) or 'none'}{without}")
-            noise = needed
-        return Plan(steps - 1, region, noise, tuple(because))
+        return Plan(steps - 1, region, tuple(because))
 
 
 def profile_interval(

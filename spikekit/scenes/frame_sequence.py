@@ -207,23 +207,19 @@ class FrameSequence:
             )
         return SequenceClip(self, frame, frames)
 
-    def profile(self, interval: int | None = None) -> SceneProfile:
-        """Profile the change between frame ``interval`` and the next, or in the whole film.
+    def profile(self, interval: int) -> SceneProfile:
+        """Profile the change between frame ``interval`` and the next.
 
         Args:
-            interval: 0 to ``len(frames) - 2``; all of them, joined, when not given.
+            interval: 0 to ``len(frames) - 2``.
 
         Returns:
-            The profile; that of a film of one frame is that of a static scene.
+            The profile.
 
         Raises:
             ValueError: no such interval, a frame of another size than the first.
         """
-        if interval is not None:
-            return self._interval(interval).profile
-        if len(self.frames) == 1:
-            return self._profile(self._view(0), self._view(0))
-        return SceneProfile.join(self._interval(n).profile for n in range(len(self.frames) - 1))
+        return self._interval(interval).profile
 
     def plan(self, interval: int) -> Plan:
         """Return what is modelled between frame ``interval`` and the next.
@@ -302,10 +298,6 @@ class FrameSequence:
     def _seen(self, rgb: Tensor) -> Tensor:
         return self.alpha * bin_to_sensor(rgb, self.pattern, scale=self.scale)
 
-    def _profile(self, first: Tensor, second: Tensor) -> SceneProfile:
-        names = "scale", "pattern", "alpha", "clocks", "spike_tolerance", "motion"
-        return profile_interval(first, second, **{name: getattr(self, name) for name in names})
-
     def _interval(self, index: int) -> _Interval:
         if not 0 <= index < len(self.frames) - 1:
             raise ValueError(f"interval: expected 0 to {len(self.frames) - 2}, got {index}")
@@ -323,7 +315,8 @@ class _Interval:
     @cached_property
     def profile(self) -> SceneProfile:
         """Change within the interval."""
-        return self.film._profile(*self.frames)
+        names = "scale", "pattern", "alpha", "clocks", "spike_tolerance", "motion"
+        return profile_interval(*self.frames, **{name: getattr(self.film, name) for name in names})
 
     @cached_property
     def plan(self) -> Plan:
@@ -423,23 +416,8 @@ class SequenceClip:
             raise ValueError(f"clock: expected that of a source frame, as {self.middle}, got {clock}")
         return self.sequence.rgb(frame)
 
-    def light(
-        self, pattern: str | CFA | None = None, *, scale: int | None = None, alpha: float | None = None
-    ) -> Tensor:
-        """Return the light at every clock, (frames, height / scale, width / scale).
-
-        Args:
-            pattern: that of the sequence, if given; so are the others.
-            scale: that of the sequence.
-            alpha: that of the sequence.
-
-        Raises:
-            ValueError: another pattern, scale or alpha than the sequence's.
-        """
-        wanted = pattern and cfa_pattern(pattern), scale, alpha
-        own = self.sequence.pattern, self.sequence.scale, self.sequence.alpha
-        if any(value is not None and value != has for value, has in zip(wanted, own, strict=True)):
-            raise ValueError(f"pattern, scale, alpha: expected those of the sequence, {own}, got {wanted}")
+    def light(self) -> Tensor:
+        """Return the light at every clock, (frames, height / scale, width / scale)."""
         return self.sequence.light(self.first, self.frames)
 
     def flow(self, clock: float, *, scale: int | None = None) -> Tensor:

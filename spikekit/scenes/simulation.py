@@ -20,7 +20,7 @@ from spikekit.io.sidecar import Sidecar, published, versions
 from spikekit.io.video import VideoFrames, read_video
 from spikekit.io.whole_file import whole_file
 from spikekit.progress import progress
-from spikekit.scenes.adaptive_sampling import Plan, SceneProfile
+from spikekit.scenes.adaptive_sampling import Plan
 from spikekit.scenes.frame_sequence import FrameSequence
 from spikekit.sensor.noise import SensorNoise
 
@@ -55,8 +55,6 @@ class Settings:
                 f"plan: expected scene, everything or 0 to {self.clocks - 1} latent frames in {self.clocks} clocks, "
                 f"got {self.plan}"
             )
-        if self.interpolation not in INTERPOLATIONS:
-            raise ValueError(f"interpolation: expected {', '.join(INTERPOLATIONS)}, got {self.interpolation[:80]!r}")
 
     def film(self, frames: Sequence[Tensor]) -> FrameSequence:
         """Return the film of these frames."""
@@ -124,11 +122,8 @@ class Source:
         return self.path / name if self.path.is_dir() else self.path
 
 
-def simulate(source: Source, settings: Settings, output: Path, replayed: Sidecar | None = None) -> list[str]:
-    """Write a stream, and beside it its ground truth and its side-car; return what was done, line by line.
-
-    Source and stream must be those of a side-car that is ``replayed``.
-    """
+def simulate(source: Source, settings: Settings, output: Path) -> list[str]:
+    """Write a stream, and beside it its ground truth and its side-car; return what was done, line by line."""
     stem = output.stem
     names = source.used.names
     pictures = {index: Path(f"{stem}.png") for index in source.truth}
@@ -144,35 +139,26 @@ def simulate(source: Source, settings: Settings, output: Path, replayed: Sidecar
         film = settings.film(source.frames)
     except ValueError as error:
         raise ValueError(f"{source.path}: {error}") from error
-    _check_calibration(settings, film, replayed)
+    height, width = film.height // film.scale, film.width // film.scale
+    known = settings.noise.calibration
+    if known is not None and known.size != (height, width):
+        sizes = f"expected {height} x {width} pixels as the film gives them, got {known.size[0]} x {known.size[1]}"
+        raise ValueError(f"{settings.calibration}: {sizes}")
     with _one_thread(), published(output) as part:
-        prints = _look(source, film, pictures, part, replayed)
+        for index, picture in progress(pictures.items(), "pictures"):
+            with whole_file(part / picture) as file:
+                file.write(png_bytes(film.rgb(index)))
         noise, told = _needed_noise(source, settings, film)
         plans: list[Plan] = []
         bits, digest = _expose(source, settings, film, noise, part / output.name, plans)
-        height, width = film.height // film.scale, film.width // film.scale
         frames = source.clocks // settings.readout
-        stream = {"file": output.name, "frames": frames, "height": height, "width": width, "sha256": digest}
-        if replayed is not None and any(replayed.stream[name] != stream[name] for name in stream if name != "file"):
-            ours = versions()
-            changed = [
-                f"{name} {was}, now {ours.get(name)}"
-                for name, was in replayed.versions.items()
-                if was != ours.get(name)
-            ]
-            raise ValueError(
-                f"{output}: not the stream of its side-car, though the source is the same "
-                f"({'; '.join(changed) or 'by the same versions'})"
-            )
         sidecar = Sidecar(
-            stream=stream,
+            stream={"file": output.name, "frames": frames, "height": height, "width": width, "sha256": digest},
             truth={path.as_posix(): source.truth[index] / settings.readout for index, path in pictures.items()},
-            source={"path": _relative(source.path, output.parent), "frames": prints} | _print_of(settings),
-            settings=asdict(replace(settings, frame=source.frame, noise=replace(settings.noise, calibration=None)))
-            | {"calibration": _calibration(settings, settings.noise, output)},
+            source={"path": str(source.path), "frames": names},
+            settings=asdict(replace(settings, frame=source.frame, noise=replace(settings.noise, calibration=None))),
             plan={
-                "noise": asdict(replace(noise, calibration=None))
-                | {"calibration": _calibration(settings, noise, output)},
+                "noise": asdict(replace(noise, calibration=None)),
                 "intervals": [{"latent": plan.latent, "region": plan.region} for plan in plans],
             },
             versions=versions(),
@@ -182,62 +168,20 @@ def simulate(source: Source, settings: Settings, output: Path, replayed: Sidecar
     return _report(source, settings, film, sidecar, bits, [*_plan_lines(plans, source), *told], output)
 
 
-def _check_calibration(settings: Settings, film: FrameSequence, replayed: Sidecar | None) -> None:
-    """Refuse the calibration of a sensor of another size, or one that has changed."""
-    known = settings.noise.calibration
-    sensor = film.height // settings.scale, film.width // settings.scale
-    if known is not None and known.size != sensor:
-        sizes = " x ".join(map(str, sensor)), " x ".join(map(str, known.size))
-        raise ValueError(f"{settings.calibration}: expected {sizes[0]} pixels as the film gives them, got {sizes[1]}")
-    if replayed is not None and replayed.source.get("calibration") != _print_of(settings).get("calibration"):
-        raise ValueError(f"{settings.calibration}: changed since the side-car was written")
-
-
-def _print_of(settings: Settings) -> dict[str, str]:
-    """Return the hash of the calibration, where there is one."""
-    if settings.calibration is None:
-        return {}
-    return {"calibration": hashlib.sha256(Path(settings.calibration).read_bytes()).hexdigest()}
-
-
-def _calibration(settings: Settings, noise: SensorNoise, output: Path) -> str | None:
-    """Return the way from the stream to the calibration, where noise has it."""
-    return None if noise.calibration is None else _relative(Path(settings.calibration), output.parent)
-
-
-def _look(
-    source: Source, film: FrameSequence, pictures: dict[int, Path], part: Path, replayed: Sidecar | None
-) -> dict[str, str]:
-    """Read every frame once, so that a damaged one shows now; write the truth; return the hashes of the frames."""
-    expected = None if replayed is None else replayed.source["frames"]
-    names = source.used.names
-    if expected is not None and list(expected) != names:
-        raise ValueError(f"{source.path}: not the frames of the side-car: expected {_few(expected)}, got {_few(names)}")
-    prints = {}
-    still = source.still
-    for index, name in enumerate(progress(names, "frames read")):
-        frame = source.used[index]
-        prints[name] = hashlib.sha256(frame.numpy().tobytes()).hexdigest()
-        if expected is not None and expected[name] != prints[name]:
-            where = f" (frame {name})" if source.file(name) == source.path else ""
-            raise ValueError(f"{source.file(name)}: changed since the side-car was written{where}")
-        index = next(iter(pictures)) if still else index
-        if index in pictures:
-            with whole_file(part / pictures[index]) as file:
-                file.write(png_bytes(frame[:, : film.height, : film.width]))
-    return prints
-
-
 def _needed_noise(source: Source, settings: Settings, film: FrameSequence) -> tuple[SensorNoise, list[str]]:
     """Return the noise that changes spikes, and a line about it."""
-    if settings.noise == SensorNoise():
-        return settings.noise, []
-    if settings.frames is None or settings.plan == "everything":
-        return settings.noise, ["noise: all that was asked for"]
-    last = -(-(source.first + source.clocks - 1) // settings.clocks)
-    profile = SceneProfile.join(film.profile(n) for n in range(source.first // settings.clocks, last or 1))
-    plan = profile.plan(spike_tolerance=settings.tolerance, noise=settings.noise, frames=settings.frames)
-    return plan.noise, [plan.because[-1]]
+    noise, frames = settings.noise, settings.frames
+    if noise == SensorNoise():
+        return noise, []
+    if frames is None or settings.plan == "everything":
+        return noise, ["noise: all that was asked for"]
+    looks = range(len(film.frames))
+    light = sum(film.light(n * settings.clocks, 1).mean().item() for n in looks) / len(looks)
+    needed = noise.required(light, frames, settings.tolerance * min(1.0, light))
+    kept = needed.spike_changes(light, frames)
+    left_out = [source for source in noise.spike_changes(light, frames) if source not in kept]
+    without = f" (left out: {', '.join(left_out)})" if left_out else ""
+    return needed, [f"noise: {', '.join(kept) or 'none'}{without}"]
 
 
 def _expose(
@@ -306,17 +250,8 @@ def _report(
     return [f"{'' if n else name:12} {line}" for name, lines in report.items() for n, line in enumerate(lines)]
 
 
-def _few(names: Sequence[str] | dict[str, str]) -> str:
-    names = list(names)
+def _few(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{names[0]} .. {names[-1]} ({len(names)} frames)"
-
-
-def _relative(path: Path, folder: Path) -> str:
-    """Return the way from a folder to a path, so that both may move together."""
-    try:
-        return Path(os.path.relpath(os.path.realpath(path), os.path.realpath(folder))).as_posix()
-    except ValueError:  # another drive
-        return Path(os.path.realpath(path)).as_posix()
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""``spikekit simulate`` as a user types it: whole sets of files or none, the same every time, and made again."""
+"""``spikekit simulate`` as a user types it: whole sets of files or none, the same every time."""
 
 import hashlib
 import json
@@ -81,8 +81,7 @@ def test_a_clip(film, capsys):
     known = read_sidecar(Path("made/a.json"))
     assert [known.stream[name] for name in ("frames", "height", "width")] == [41, 16, 18]
     assert known.truth == {"a.png": 20}
-    assert known.source["path"] == "../film"
-    assert list(known.source["frames"]) == ["f1.png", "f2.png", "f3.png"]
+    assert known.source == {"path": "film", "frames": ["f1.png", "f2.png", "f3.png"]}
     assert known.settings["frame"] == 2
     assert [interval["latent"] for interval in known.plan["intervals"]] == [
         FrameSequence(frames(5), scale=2, pattern="GBRG").plan(n).latent for n in (1, 2)
@@ -138,40 +137,7 @@ def test_noise_that_changes_nothing_is_left_out_and_the_plan_can_be_given(film, 
         assert latent in (None, {one["latent"] for one in made["intervals"]})
 
 
-# --- the same again ---------------------------------------------------------------------------------------------------
-
-
-def test_made_again_from_its_sidecar(film):
-    simulate(film, "-o", "a.dat", "--scale", 2, "--photons", 30, "--gain-spread", 0.1, "--frames", 21, "--seed", 10**30)
-    simulate("a.json", "-o", "else/where/b.dat")
-    assert Path("else/where/b.dat").read_bytes() == Path("a.dat").read_bytes()
-    assert Path("else/where/b.png").read_bytes() == Path("a.png").read_bytes()
-    assert read_sidecar(Path("else/where/b.json")).source["path"] == "../../film"
-    simulate("else/where/b.json", "-o", "c.npz")
-    assert read_spikes("c.npz").equal(read_spikes("a.dat", 16, 18))
-    Path("film").rename("moved")
-    simulate("a.json", "-o", "d.dat", "--source", "moved")
-    assert Path("d.dat").read_bytes() == Path("a.dat").read_bytes()
-
-
-def test_not_made_again_from_another_source_or_with_other_settings(film, fails):
-    simulate(film, "-o", "a.dat", *QUICK)
-    assert "got --seed as well" in fails(2, "a.json", "-o", "b.dat", "--seed", 1)
-    known = json.loads(Path("a.json").read_text())
-    for changed, said in (
-        ({"seed": 1}, "c.dat: not the stream of its side-car, though the source is the same (by the same versions)"),
-        ({"scale": 3}, "c.dat: not the stream of its side-car"),
-        ({"interpolation": "os.mkdir"}, "b.json: not settings of a simulation (interpolation: expected Flow"),
-        ({"frames": 2**31 - 1}, "expected more frames, or fewer clocks"),
-    ):
-        Path("b.json").write_text(json.dumps(known | {"settings": known["settings"] | changed}))
-        assert said in fails(2 if "frames" in changed else 1, "b.json", "-o", "c.dat")
-    write_picture("film/f3.png", frames(5, seed=1)[3])
-    assert f"film{os.sep}f3.png: changed since the side-car was written" in fails(1, "a.json", "-o", "c.dat")
-    Path("film/f0.png").unlink()
-    assert "not the frames of the side-car: expected f1.png .. f3.png" in fails(1, "a.json", "-o", "c.dat")
-    Path("film").rename("moved")
-    assert "film: no such file or folder" in fails(1, "a.json", "-o", "c.dat")
+# --- side-cars -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -181,8 +147,6 @@ def test_not_made_again_from_another_source_or_with_other_settings(film, fails):
         ("stream.frames", True, "stream.frames: expected a whole number, 1 or more, got True"),
         ("settings.alpha", float("nan"), "settings.alpha: expected a finite number above 0, got nan"),
         ("settings.pattern", "RGB", "settings.pattern: expected one of RGGB, BGGR, GRBG, GBRG, got 'RGB'"),
-        ("settings.clocks", 2**31 - 1, "settings.clocks: expected a whole number, 1 .. 1048576, got 2147483647"),
-        ("settings.noise", {"photons": "many"}, "settings.noise: expected names and finite numbers, got {'photons'"),
     ],
     ids=str,
 )
@@ -202,7 +166,6 @@ def test_a_sidecar_edited_by_hand(tmp_path, monkeypatch, fails, capsys, part, va
     section, _, name = part.partition(".")
     Path("a.json").write_text(json.dumps(known | {section: known[section] | {name: value} if name else value}))
     expected = f"spikekit: a.json: not a side-car that can be read ({said}"
-    assert fails(1, "a.json", "-o", "b.dat").startswith(expected)
     for words in (["info"], ["decode", "-o", "a.png"], ["view", "-o", "a.png"]):
         assert main([words[0], "a.dat", *words[1:]]) == 1
         assert capsys.readouterr().err.startswith(expected)
@@ -299,7 +262,7 @@ def test_nothing_of_others_is_replaced(film, fails):
         (["film", "--scale", "2", "--frames", "401"], 2, "--frame: expected more frames, or fewer clocks, got 2"),
         (["film", "--scale", "2", "--all", "--frame", "1"], 2, "--frame: expected none with the whole film, got 1"),
         (["film", "--scale", "20"], 1, "film: frames: expected 40 x 40 pixels or more, got 35 x 37"),
-        (["film"], 2, "--scale: needed"),
+        (["film"], 2, "--scale"),
         (["film", "--scale", "2", "--plan", "20"], 2, "0 to 19 latent frames in 20 clocks, got 20"),
         (["film", "--scale", "2", "--dark-current", "-1"], 2, "--dark-current: expected 0 to 1, got -1.0"),
         (["film/f0.png", "--scale", "2", "--all"], 2, "one picture without an end"),
@@ -313,10 +276,10 @@ def test_mistakes(film, fails, words, status, said):
     assert said in fails(status, *words, "-o", "a.dat")
 
 
-def calibrated(path, width=18, gain=0.5):
+def calibrated(path, width=18):
     """A sensor whose left half sees half of the light, with a dead pixel and a hot one."""
     gains, defects = torch.ones(16, width), torch.zeros(16, width, dtype=torch.uint8)
-    gains[:, : width // 2] = gain
+    gains[:, : width // 2] = 0.5
     defects[3, 5], defects[4, 6] = DEAD, HOT
     write_calibration(path, Calibration(gains, torch.zeros(16, width), defects))
 
@@ -336,11 +299,7 @@ def test_the_pixels_of_a_sensor_that_was_measured(film, capsys, fails):
     works[3, 5] = works[4, 6] = False
     expected = torch.where(torch.arange(18) < 9, plain / 2, plain)
     assert (real - expected)[works].abs().max() < 0.02
-    assert read_sidecar(Path("out/real.json")).settings["calibration"] == "../cameras/one.safetensors"
-    simulate("out/real.json", "-o", "again.dat")
-    assert Path("again.dat").read_bytes() == Path("out/real.dat").read_bytes()
-    calibrated("cameras/one.safetensors", gain=0.6)
-    assert "one.safetensors: changed since the side-car was written" in fails(1, "out/real.json", "-o", "a.dat")
+    assert read_sidecar(Path("out/real.json")).settings["calibration"] == "cameras/one.safetensors"
     calibrated("cameras/one.safetensors", width=20)
     said = "one.safetensors: expected 16 x 18 pixels as the film gives them, got 16 x 20"
     assert said in fails(1, *words, *sensor, "-o", "a.dat")

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from spikekit.scenes.adaptive_sampling import Plan, SceneProfile, profile_interval
-from spikekit.sensor.noise import SensorNoise
 
 
 class Steady:
@@ -147,28 +146,6 @@ def test_the_region_has_a_margin_and_whole_cells():
     assert left + width == 300
     assert replace(small, region=(10, 10, 180, 280)).plan().region is None
     assert replace(small, displacement=0.0).plan().region is None  # nothing is synthesised
-
-
-def test_noise_that_changes_nothing_is_left_out():
-    noise = SensorNoise(photons=1e12, hot=0.1)
-    plan = MOVING.plan(noise=noise)
-    assert plan.noise == SensorNoise(hot=0.1)
-    assert MOVING.plan(noise=noise, spike_tolerance=1e-9).noise == noise
-    dark = replace(MOVING, brightness=(0.0, 0.001, 0.01))
-    assert dark.plan(noise=SensorNoise(dark_current=1e-4)).noise == SensorNoise(dark_current=1e-4)
-    assert replace(MOVING, brightness=(0.3, 0.9, 0.9)).plan(noise=SensorNoise(dark_current=1e-4)).noise == SensorNoise()
-    assert MOVING.plan().noise is None
-
-
-def test_profiles_join():
-    other = SceneProfile((64, 64), 20, (0.1, 0.4, 0.5), 1.0, (10, 70, 4, 6), 0.3, 0.4, 0.01)
-    joined = SceneProfile.join([replace(MOVING, region=(20, 30, 10, 10)), other, replace(MOVING, region=None)])
-    assert joined.brightness == pytest.approx((0.0, 0.8 / 3, 0.5))
-    assert joined.static == pytest.approx(1 / 3)
-    assert joined.region == (10, 30, 20, 46)
-    assert (joined.displacement, joined.displacement_max, joined.blending) == (0.3, 0.4, 0.02)
-    with pytest.raises(ValueError, match="profiles: expected at least one"):
-        SceneProfile.join([])
 
 
 @pytest.mark.parametrize(
