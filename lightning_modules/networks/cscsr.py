@@ -26,29 +26,29 @@ from spikekit.color.cfa import count_colors
 from spikekit.warp.bayer_warp import bayer_warp_idw
 from spikekit.warp.site_search import SMALLEST, search_sites, site_table
 
-#: positions per pixel of the picture, along each axis, that motion is rounded to: exported programs search in integers
+#: motion is rounded to 1/16 of an output pixel, because exported programs search in integers
 _STEPS = 16
-_SEARCHED = 1 << 19  # positions that are searched in one go on a CPU, whose cache is small
-_SEARCHED_ELSEWHERE = 1 << 25  # where a launch costs more
+_SEARCHED = 1 << 19  # positions per search on a CPU, limited by its cache
+_SEARCHED_ELSEWHERE = 1 << 25  # on other devices, where a kernel launch costs more
 
 _MOTION_FUSIONS = {"joint": joint_motion, "independent": independent_motion, "assembled": assembled_motion}
 _RECONSTRUCTIONS = {"correlated": ColorCorrelation, "separate": SeparateColors, "early": EarlyFusion}
 
 
 def one_a_clip(name: str, value: float | Tensor, clips: Tensor) -> Tensor:
-    """Return a number, or one for every clip, (B,), so that it can be multiplied with them, (B, 1, ...).
+    """Return a number, or one number per clip (B,), in a shape that broadcasts with the clips, (B, 1, ...).
 
     Raises:
-        ValueError: another shape.
+        ValueError: the value is neither a number nor of shape (B,).
     """
     value = torch.as_tensor(value, dtype=clips.dtype, device=clips.device)
     if value.shape not in ((), (len(clips),)):
-        raise ValueError(f"{name}: expected a number or ({len(clips)},), one a clip, got {tuple(value.shape)}")
+        raise ValueError(f"{name}: expected a number or shape ({len(clips)},), got {tuple(value.shape)}")
     return value.reshape(-1, *[1] * (clips.ndim - 1)).expand(len(clips), *[1] * (clips.ndim - 1))
 
 
 def _representation(config: CSCSRConfig) -> nn.Module:
-    """Features of the time points of one colour."""
+    """Build the module that extracts the features of one colour at each time point."""
     if config.representation == "spikes":
         return WindowMeans(config.window, config.stride)
     if config.representation == "interval":
@@ -66,24 +66,24 @@ def _representation(config: CSCSRConfig) -> nn.Module:
 
 @lru_cache(maxsize=32)
 def _shares(times: tuple[int, ...], flow_times: tuple[int, int, int], device: torch.device) -> Tensor:
-    """Shares of the flows to the first and to the last time point in the motion to every one, (T, 2)."""
+    """Return the weights (T, 2) of the flows to the first and last time points in the motion to each time point."""
     first, middle, last = flow_times
     shares = [[max(0.0, (t - middle) / (end - middle)) for end in (first, last)] for t in times]
     with torch.inference_mode(False):
         return torch.tensor(shares, device=device)
 
 
-@lru_cache(maxsize=6)  # at rest, a picture and its sides have three sizes
+@lru_cache(maxsize=6)
 def _masks(height: int, width: int, pattern: str, scale: int, device: torch.device) -> tuple[Tensor, ...]:
-    """Masks of the colours, the same tensors every time, so that the tables of the search are found again."""
-    with torch.inference_mode(False):  # what is made in inference mode cannot be kept for a gradient
+    """Return the colour masks; the cache returns the same tensors each time, so the search reuses its tables."""
+    with torch.inference_mode(False):  # autograd cannot save inference tensors
         return bayer_mask(height, width, pattern, scale=scale, device=device, dtype=torch.bool).unbind(0)
 
 
 def _kept_near(offsets: Tensor) -> Tensor:
-    """Let no offset (..., 2, H, W) lead further than half a pixel beyond the picture, where nothing more is known.
+    """Clamp offsets (..., 2, H, W) so that they point no more than half a pixel beyond the picture's border.
 
-    What it leads to is rounded as in an export, so that both find the same pixels; the gradient is that of no rounding.
+    Offsets are rounded as in exported programs, so that both find the same pixels. The gradient ignores the rounding.
     """
     kept = []
     for axis, offset in zip((-1, -2), offsets.unbind(-3), strict=True):
@@ -96,33 +96,32 @@ def _kept_near(offsets: Tensor) -> Tensor:
 
 
 class CSCSR(Network):
-    r"""Super-resolution of a colour picture from a Bayer-pattern spike stream, or of a grey one from a grey stream.
+    r"""Colour spike camera super-resolution, from a Bayer-pattern spike stream or from that of a grey sensor.
 
-    The middle frame of the clip is reconstructed. At scale 1 the temporal pixel search finds what the pixels were at
-    other times, and no new ones.
+    The network reconstructs the picture at the middle of the clip. At scale 1 it keeps the sensor's resolution, and
+    the temporal pixel search collects each pixel's values at other times.
 
     Args:
         *args: fields of :class:`CSCSRConfig`, in its order; ``CSCSR(4)`` is ``CSCSR(scale=4)``.
-        motion: estimator that is asked where no flow is given; when not given,
+        motion: motion estimator, called when no flow is given. Default:
             :class:`lightning_modules.motion.ClassicalFlow`.
         **settings: fields of :class:`CSCSRConfig`, by name.
 
     Attributes:
         config: the configuration.
-        by_sites: look temporal pixels up a sensor pixel at a time, with one flow for each, where that is possible; an
-            export searches for every temporal pixel by itself.
+        by_sites: search once per sensor pixel, with one flow each, where possible. If False, and in exported
+            programs, the network searches once per output pixel.
 
     Shape:
-        - Input: spikes :math:`(B, N, H, W)`, zeros and ones, any real dtype, any H and W of at least 3; optionally
-          the flows from the middle to the first and to the last time point, :math:`(B, 2, 2, H, W)`, in sensor
-          pixels, or those of R, G and B, :math:`(B, 3, 2, 2, H, W)`; or ``static=True`` where nothing moves: what
-          flows of zeros give, in less time; optionally ``alpha``, the gain of the camera, and ``noise``, the level of
-          its noise, 0 for an ideal sensor and 1 for the one of training, both a number or :math:`(B,)`
-        - Output: rgb :math:`(B, 3, s H, s W)`, or :math:`(B, 1, s H, s W)` where the pattern is grey, not clamped
+        - Input: spikes :math:`(B, N, H, W)`, zeros and ones of any real dtype, with H and W of at least 3. Optional:
+          ``flow`` from the middle to the first and last time points, in sensor pixels, :math:`(B, 2, 2, H, W)`, or one
+          flow per colour, :math:`(B, 3, 2, 2, H, W)`; ``static=True`` for a scene without motion, which gives the
+          result of zero flow faster; ``alpha``, the gain of the camera; ``noise``, the noise level, 0 for an ideal
+          sensor and 1 for the sensor used in training. ``alpha`` and ``noise`` are numbers or :math:`(B,)`
+        - Output: rgb :math:`(B, 3, s H, s W)`, or :math:`(B, 1, s H, s W)` for a grey sensor, not clamped
 
     Raises:
-        ValueError: a field that :class:`CSCSRConfig` refuses; a ``noise`` that the network
-            was not trained to be told.
+        ValueError: :class:`CSCSRConfig` rejects a field, or ``noise`` is given to a network trained without it.
 
     Example:
         >>> network = CSCSR(scale=2, width=8, representation_width=8, features=1, stages=1, end_blocks=1)
@@ -133,10 +132,10 @@ class CSCSR(Network):
         Dong et al., Super-Resolution Reconstruction from Bayer-Pattern Spike Streams, CVPR 2024.
     """
 
-    halo = 16  #: enough for every shipped network; its weights bring their own
+    halo = 16  #: upper bound for all shipped networks; weights define their own
     by_sites = True
     flow_groups = ((), (3,))
-    configuration: ClassVar[type[CSCSRConfig]] = CSCSRConfig  #: of the fields that ``settings`` are
+    configuration: ClassVar[type[CSCSRConfig]] = CSCSRConfig  #: class of ``config``
 
     @inherit_signature(CSCSRConfig)
     def __init__(self, *args: Any, motion: MotionEstimator | None = None, **settings: Any) -> None:
@@ -191,25 +190,25 @@ class CSCSR(Network):
         return self._exposed(rgb + self._base(spikes) if self.config.skip else rgb, alpha)
 
     def _told(self, noise: float | Tensor | None, spikes: Tensor) -> dict[str, Tensor]:
-        """The level of the noise as an argument, (B, 1, 1, 1), or none; of clips (B, N, H, W)."""
+        """Return the noise level of clips (B, N, H, W) as a keyword argument (B, 1, 1, 1), or no argument."""
         if noise is None and self.config.noise and self.noise_level:
             noise = self.noise_level
         if noise is None:
             return {}
         if not self.config.noise:
-            raise ValueError(f"noise: expected none, as the network was not trained to be told of it, got {noise}")
+            raise ValueError(f"noise: expected None for a network trained without noise levels, got {noise}")
         return {"noise": one_a_clip("noise", noise, spikes)}
 
     def _exposed(self, rgb: Tensor, alpha: float | Tensor | None) -> Tensor:
-        """Pictures (B, ..., C, H, W) of cameras whose gain is known."""
+        """Scale pictures (B, ..., C, H, W) to the gain of their cameras."""
         return rgb if alpha is None else rgb * (self.config.alpha / one_a_clip("alpha", alpha, rgb))
 
     def _colors(self, spikes: Tensor, flow: Tensor | None, **told: Tensor) -> list[Tensor]:
-        """Features of R, G and B, refined over time, each (B, width, H, W) at the resolution of the reconstruction."""
+        """Return the refined features of each colour, (B, width, H, W), at the resolution of the reconstruction."""
         planes = split_colors(spikes, self.pattern)
-        # one colour after the other: high resolution takes memory
+        # one colour at a time, to save memory
         features = (encode(plane, **told) for encode, plane in zip(self.representation, planes, strict=True))
-        if not self.config.search or (flow is None and self.colors == 1):  # at rest, all pixels of grey are known
+        if not self.config.search or (flow is None and self.colors == 1):  # a grey sensor at rest knows all pixels
             pixels = (enlarge(part, self.scale) for part in features)
         elif self._by_sites(spikes, flow):
             pixels = self._search_sites(features, flow, spikes)
@@ -221,7 +220,7 @@ class CSCSR(Network):
         return [refine(part) for refine, part in zip(self.refinement, pixels, strict=True)]
 
     def _by_sites(self, spikes: Tensor, flow: Tensor | None) -> bool:
-        """Whether the temporal pixels of a site can be looked up together, without a derivative in the flow."""
+        """Return whether one search per sensor pixel is possible; it has no gradient with respect to the flow."""
         config = self.config
         learned = flow is not None and flow.requires_grad and torch.is_grad_enabled()
         if learned or not self.by_sites or is_exporting() or torch.jit.is_tracing():
@@ -230,7 +229,7 @@ class CSCSR(Network):
         return known and self.fold == self.scale and min(spikes.shape[-2:]) >= SMALLEST
 
     def _search_sites(self, features: Iterable[Tensor], flow: Tensor | None, spikes: Tensor) -> Iterator[Tensor]:
-        """Temporal pixel search of every colour, (B, T, C, H, W) to (B, T C s^2, H, W)."""
+        """Run the temporal pixel search for each colour, (B, T, C, H, W) to (B, T C s^2, H, W)."""
         height, width = spikes.shape[-2:]
         moved = spikes.new_zeros(len(spikes), 2, 2, height, width) if flow is None else flow
         flows = moved.unbind(1) if moved.ndim == 6 else [moved] * self.colors
@@ -246,13 +245,13 @@ class CSCSR(Network):
         self.reconstruction.rgb.bias *= factor
 
     def estimate_flow(self, spikes: Tensor) -> Tensor:
-        """Flows from the middle to the first and to the last time point, in sensor pixels; zero if nothing is searched.
+        """Estimate the flows from the middle to the first and last time points; zero for networks without search.
 
         Args:
             spikes: (B, N, H, W).
 
         Returns:
-            (B, 2, 2, H, W), or (B, 3, 2, 2, H, W) where every colour has its own.
+            Flows in sensor pixels, (B, 2, 2, H, W), or (B, 3, 2, 2, H, W) with one flow per colour.
         """
         self.check_spikes(spikes)
         if not self.config.search:
@@ -260,7 +259,7 @@ class CSCSR(Network):
         return _MOTION_FUSIONS[self.config.motion_fusion](self.motion, spikes, self.flow_times, self.pattern)
 
     def _offsets(self, flow: Tensor | None, spikes: Tensor) -> Sequence[Tensor]:
-        """How far every colour has moved at every time point, each (B, T, 2, s H, s W), T being 1 at rest."""
+        """Return the displacement of each colour at each time point, (B, T, 2, s H, s W); T is 1 at rest."""
         if flow is None:
             size = [self.scale * length for length in spikes.shape[-2:]]
             return [spikes.new_zeros(len(spikes), 1, 2, *size)] * self.colors
@@ -272,16 +271,16 @@ class CSCSR(Network):
         return _kept_near(offsets).expand(-1, self.colors, -1, -1, -1, -1).unbind(1)
 
     def _search(self, features: Tensor, offsets: Tensor, color: int) -> Tensor:
-        """Temporal pixel search (section 4.3, Fig. 5 b): (B, T, C, H, W) to (B, T, C, s H, s W).
+        """Run the temporal pixel search (section 4.3, Fig. 5 b), (B, T, C, H, W) to (B, T, C, s H, s W).
 
-        Offsets of a single time point are those of all.
+        Offsets with T = 1 apply to all time points.
         """
         neighbors = self.config.neighbors
         mask = _masks(*features.shape[-2:], self.pattern, self.scale, features.device)[color]
         if offsets.shape[1] == 1:
             pixels = self._enlarge(features, mask)
             return flow_warp_idw(pixels.flatten(1, 2), offsets[:, 0], mask, neighbors=neighbors).reshape(pixels.shape)
-        # a few time points after the others: what the search needs on the way is many times its result
+        # in chunks of time points: the search needs many times the memory of its result
         searched = _SEARCHED if features.device.type == "cpu" else _SEARCHED_ELSEWHERE
         few = max(1, searched // (offsets.shape[-2] * offsets.shape[-1]))
         pixels = [
@@ -291,7 +290,7 @@ class CSCSR(Network):
         return torch.cat(pixels).unflatten(0, features.shape[:2])
 
     def _enlarge(self, features: Tensor, mask: Tensor) -> Tensor:
-        """Enlarge features; those without weights are zero at other colours' pixels, which must not darken them."""
+        """Enlarge features; those without weights are zero at other colours' pixels, so they are renormalised."""
         pixels = enlarge(features, self.scale)
         if self.config.representation == "bssr" or self.scale == 1:
             return pixels
@@ -299,9 +298,9 @@ class CSCSR(Network):
         return pixels / known.where(mask, 1)
 
     def _search_in_graph(self, features: Tensor, offsets: Tensor, color: int) -> Tensor:
-        """The same in operations that other programs know, for any even height and width."""
+        """Run the same search with exportable operations, for any even height and width."""
         if self.config.neighbors > 4:
-            raise ValueError(f"neighbors: expected 4 at most to export, got {self.config.neighbors}")
+            raise ValueError(f"neighbors: expected at most 4 for export, got {self.config.neighbors}")
         offsets = offsets.expand(-1, features.shape[1], -1, -1, -1)
         height, width = features.shape[-2:]
         mask = bayer_mask(height, width, self.pattern, scale=self.scale, device=features.device, dtype=torch.bool)
@@ -311,13 +310,13 @@ class CSCSR(Network):
         return found.unflatten(0, features.shape[:2])
 
     def _base(self, spikes: Tensor) -> Tensor:
-        """TFP of the whole clip, demosaiced, smoothed, enlarged; of third order, which moves less, of a grey sensor."""
+        """Return the enlarged TFP picture: demosaiced and smoothed, or third-order TFP for a grey sensor."""
         if self.colors == 1:
             smooth = tfp_at(spikes, self.frames // 2, (self.frames - 1) // 6 * 2 + 1, order=3).unsqueeze(1)
             smooth = smooth / self.config.alpha
         else:
             raw = tfp_at(spikes, self.frames // 2, self.frames) / self.config.alpha
-            # zero at the Nyquist frequency, where demosaicing leaves a zipper that training would have to undo first
+            # zero at the Nyquist frequency, to remove the zipper artefacts of demosaicing
             binomial = torch.cat([raw.new_full((1, 1), weight) for weight in (0.25, 0.5, 0.25)], dim=1)
             smooth = filter2d_separable(demosaic(raw, self.pattern), binomial, binomial)
         if self.scale == 1:

@@ -1,4 +1,4 @@
-"""Configuration of CSCSR, a frozen dataclass."""
+"""Configuration of CSCSR."""
 
 from __future__ import annotations
 
@@ -12,56 +12,56 @@ from spikekit.color.cfa import GREY, cfa_pattern
 
 @dataclass(frozen=True)
 class CSCSRConfig:
-    """Configuration of a :class:`lightning_modules.networks.CSCSR`: a YAML file fills it, and weights carry it.
+    """Configuration of a :class:`lightning_modules.networks.CSCSR`, set in YAML files and stored with weights.
 
-    The paper leaves widths and depths open: a ``size`` of this project gives those that are not given. The fields from
-    ``representation`` to ``reconstruction`` are the ablations of the paper's Table 3, see ``configs/ablation``; the
-    defaults are the full network (J).
+    The paper does not specify widths and depths; the preset ``size`` sets those that are not given. The fields from
+    ``representation`` to ``reconstruction`` select the ablations A to I of the paper's Table 3, see
+    ``configs/ablation``; the defaults are the full network (J).
 
     Args:
         scale: super-resolution factor s.
-        frames: spike frames N of a clip, odd.
-        window: spike frames that a time point sees, odd.
-        stride: spike frames between two time points; must divide frames - window. When not given, that of the size, or
-            what gives eleven time points: 3 for 41 frames, 9 for 101.
-        pattern: Bayer phase of the streams; ``"grey"`` where all pixels see the same: there is one colour then.
-        size: a name of :data:`lightning_modules.networks.sizes.SIZES`, for what is not given of ``stride``, the widths
-            and depths up to ``end_width``, and ``resolution``. Weights carry the values, not the name.
+        frames: number N of spike frames per clip, odd.
+        window: number of spike frames per time point, odd.
+        stride: spike frames between two time points; must divide frames - window. Default: that of the size, or the
+            stride for eleven time points: 3 for 41 frames, 9 for 101.
+        pattern: Bayer phase of the sensor, or ``"grey"`` for a sensor without colour filters.
+        size: preset in :data:`lightning_modules.networks.sizes.SIZES` for ``stride``, the widths and depths up to
+            ``end_width``, and ``resolution``. Weights store the values, not the name.
         width: channels of refinement and reconstruction.
         representation_width: channels of the spike representation, at sensor resolution.
-        features: channels of every time point that are warped.
-        stages: fusions of the colours.
-        blocks: residual blocks of every colour before every fusion.
+        features: feature channels per time point.
+        stages: number of colour fusions.
+        blocks: residual blocks per colour before each fusion.
         end_blocks: residual blocks after the last fusion.
-        end_width: channels after the last fusion; when neither the size gives them, ``width``.
-        skip: learn what to add to a smooth, enlarged TFP picture instead of the picture itself. The paper has no
-            such skip; with it training starts where the classical decoder ends. The picture of a grey sensor, which
-            has nothing to demosaic, is the widest mean of third order that the clip has room for, and not smooth.
-        alpha: gain of the camera, what a white pixel receives per clock in thresholds, of clips that come without one:
-            the picture is light, divided by it. Weights trained with another are adapted when they are loaded.
-        noise: whether the network is told how noisy the sensor is.
-        neighbors: known pixels that the temporal pixel search weighs.
-        representation: features of a time point: ``"bssr"`` learns them; ``"spikes"``, without BSSR (A), averages the
-            spikes of the window; ``"interval"`` (C) takes the inverse of the spike interval. These two have no weights
-            and one feature.
-        global_perception: BSSR sees the whole clip beside the window; False is B.
-        motion_fusion: where no flow is given, ``"joint"`` moves all colours alike; ``"independent"`` (D) moves each
-            by the flow of its own sub-stream, green by the mean of its two; ``"assembled"`` (E) puts the sub-streams'
-            flows together as their pixels are in the Bayer pattern.
-        search: temporal pixel search along the motion. Without it no motion is estimated, a given one is ignored, and
-            the features of every time point are only enlarged; without refinement as well it is F, no MSR.
-        refinement: FR; False is G, which merges the time points by one convolution.
-        reconstruction: ``"correlated"`` is CCR; ``"separate"`` (H) lets every colour make its channel by itself;
+        end_width: channels after the last fusion. Default: that of the size, or ``width``.
+        skip: predict a residual, which is added to a smooth, enlarged TFP picture, so that training starts from the
+            result of the classical decoder. The paper has no such skip. For a grey sensor, the picture is third-order
+            TFP with the largest window that fits in the clip, without smoothing.
+        alpha: default gain of the camera: light of a white pixel per clock, in thresholds. The picture is light divided
+            by alpha. Weights trained with another alpha are adapted when they are loaded.
+        noise: condition the network on the noise level of the sensor.
+        neighbors: number of known pixels in the weighted mean of the temporal pixel search.
+        representation: features of a time point. ``"bssr"`` learns them; ``"spikes"`` (A, without BSSR) averages the
+            spikes of the window; ``"interval"`` (C) inverts the spike interval. A and C have one feature and no
+            weights.
+        global_perception: BSSR also sees the whole clip; False is B.
+        motion_fusion: motion of the colours when no flow is given. ``"joint"`` uses one flow for all colours;
+            ``"independent"`` (D) one per colour, from its own sub-stream, with the mean of two for green;
+            ``"assembled"`` (E) interleaves the flows of the sub-streams as in the Bayer pattern.
+        search: temporal pixel search along the motion. False ignores motion and only enlarges the features of each
+            time point; with ``refinement=False`` it is F, no MSR.
+        refinement: feature refinement FR; False is G, one convolution over all time points.
+        reconstruction: ``"correlated"`` is CCR; ``"separate"`` (H) reconstructs each colour channel independently;
             ``"early"`` (I) fuses the colours once, at the beginning.
-        resolution: where refinement and reconstruction work. ``"output"`` is that of the picture, as in the paper;
-            ``"sensor"`` that of the sensor, with the s x s temporal pixels of a site as channels and a sub-pixel
-            convolution at the end: the same width then costs 1 / s^2 of the work.
+        resolution: resolution of refinement and reconstruction. ``"output"`` is that of the picture, as in the paper;
+            ``"sensor"`` has s x s temporal pixels per sensor pixel as channels and ends with a sub-pixel convolution,
+            for 1 / s^2 of the work at the same width.
 
     Raises:
-        ValueError: sizes that do not fit each other, an unknown choice, or choices that would have no effect:
-            ``global_perception=False`` without BSSR, a ``motion_fusion`` without search, an ``end_width`` of separate
-            colours; ``noise`` without BSSR or correlated colours; another ``motion_fusion`` or ``reconstruction`` than
-            the default of a single colour.
+        ValueError: values are inconsistent or unknown, or options have no effect together:
+            ``global_perception=False`` without BSSR, ``motion_fusion`` without search, ``end_width`` with separate
+            colours, ``noise`` without BSSR and correlated colours, ``motion_fusion`` or ``reconstruction`` with a grey
+            sensor.
 
     Example:
         >>> CSCSRConfig(scale=2).times
@@ -110,26 +110,26 @@ class CSCSRConfig:
             )
         if self.representation != "bssr" and not self.global_perception:
             raise ValueError(
-                f"global_perception: part of representation bssr, cannot be taken from {self.representation}"
+                f"global_perception: expected true for representation {self.representation}, got false"
             )
         if self.motion_fusion != "joint" and not self.search:
             raise ValueError(
-                f"motion_fusion: expected joint without search, which asks for no motion, got {self.motion_fusion}"
+                f"motion_fusion: expected joint, as motion has no effect without search, got {self.motion_fusion}"
             )
         if self.noise and (self.representation, self.reconstruction) != ("bssr", "correlated"):
             got = f"{self.representation} and {self.reconstruction}"
-            raise ValueError(f"noise: expected representation bssr and reconstruction correlated with it, got {got}")
+            raise ValueError(f"noise: expected representation bssr and reconstruction correlated, got {got}")
         if self.pattern == GREY and (self.motion_fusion, self.reconstruction) != ("joint", "correlated"):
             got = f"{self.motion_fusion} and {self.reconstruction}"
             raise ValueError(
-                f"motion_fusion, reconstruction: expected joint and correlated for the one colour of grey, got {got}"
+                f"motion_fusion, reconstruction: expected joint and correlated for a grey sensor, got {got}"
             )
         if self.end_width is not None and self.reconstruction == "separate":
-            raise ValueError(f"end_width: separate colours are never fused, expected none, got {self.end_width}")
+            raise ValueError(f"end_width: expected None, as separate colours are never fused, got {self.end_width}")
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Return the values of all fields but the name of the size, from which the same network is built again."""
+        """Return all fields except ``size``; they define the same network."""
         return {name: value for name, value in asdict(self).items() if name != "size"}
 
     @property
@@ -139,10 +139,10 @@ class CSCSRConfig:
 
 
 def _check_fields(config: Any) -> None:
-    """Check every field of a dataclass by its type, and write whole numbers as Python's own.
+    """Check every field of a dataclass by its type, and convert integers to Python's int.
 
-    ``int`` is a whole number, 1 or more; ``float`` a finite number above 0; a field called ``pattern`` a Bayer phase,
-    or ``"grey"``. A field that may be None is checked where it is not.
+    An ``int`` must be positive, a ``float`` finite and positive, a field named ``pattern`` a Bayer phase or ``"grey"``.
+    Fields that are None are not checked.
     """
     hints = get_type_hints(type(config))
     for field in fields(config):

@@ -19,41 +19,40 @@ from lightning_modules.storage.pretrained import check_weights, load_weights, re
 from lightning_modules.storage.settings import own_class
 from spikekit.check import check_planes
 
-#: settings of all networks
+#: settings that every network has
 _ALL_HAVE = "scale", "frames", "pattern", "alpha"
 
 
 class Network(nn.Module):
-    r"""Base of the networks that map a clip of spikes to the colour picture of its middle frame.
+    r"""Base class of networks that map a clip of spike frames to the picture at its middle.
 
-    A network of your own calls ``super().__init__()`` and keeps its arguments as attributes of the same names; its
-    ``forward`` takes spikes and flow, which is None where nobody gives it: :meth:`estimate_flow` is there to ask. It is
-    then trained, tested and read again by its class, whole pictures at a time.
+    A subclass calls ``super().__init__()`` and stores its arguments as attributes of the same names. Its ``forward``
+    takes spikes and flow; flow is None by default, and :meth:`estimate_flow` computes it. Training, testing and
+    loading then work through the name of the class. Such a network runs on whole pictures, without tiles.
 
     Args:
-        settings: what the constructor was given, as plain values, with at least ``scale``, ``frames``, ``pattern``
-            and ``alpha``; a checkpoint remembers them, because they are not all to be seen in its weights. When not
-            given, the attributes that are called as the constructor's arguments, and those four.
-        flow_times: spike frames that the flows run between: the first, the middle and the last time point. When not
-            given, those of windows of 11 frames.
-        motion: estimator that is asked where no flow is given; :class:`lightning_modules.motion.ClassicalFlow` when
-            not given.
+        settings: arguments of the constructor as plain values, with at least ``scale``, ``frames``, ``pattern`` and
+            ``alpha``. Checkpoints store them to build the network again. Default: those four, and the attributes
+            named like the constructor's arguments.
+        flow_times: spike frames between which the flows run: the first, middle and last time points. Default: the
+            centres of windows of 11 frames.
+        motion: motion estimator, called when no flow is given. Default:
+            :class:`lightning_modules.motion.ClassicalFlow`.
 
     Attributes:
-        halo: how many sensor pixels around a place the network sees, beside those that motion reaches over; even, as
-            the Bayer phase is kept. None where it sees the whole picture, or where nobody knows: such a network is
-            not run in tiles. Shipped weights bring their own.
-        takes_flow: whether a flow changes anything.
-        error_model: what less work costs it, for a tolerance; that of the weights, once they are loaded.
-        noise_level: of the sensor, where a call does not say: 0 for an ideal one, 1 for that of training. Networks that
-            were not trained to be told it do not ask.
-        warm_up: how many key frames before a picture of a film it depends on, as far as one can see; 0 where every
-            clip stands for itself.
-        flow_groups: leading dimensions of the flows that the network takes, behind the batch.
+        halo: radius of the receptive field in sensor pixels, without the reach of motion; even, to keep the Bayer
+            phase. None if it covers the whole picture or is unknown: such a network does not run in tiles. Shipped
+            weights define their own.
+        takes_flow: whether the flow affects the result.
+        error_model: predicted loss of accuracy when work is saved, used for tolerances; loaded with the weights.
+        noise_level: default noise level, 0 for an ideal sensor and 1 for the sensor used in training. Networks
+            trained without noise levels ignore it.
+        warm_up: number of earlier key frames that visibly affect a picture of a film; 0 for independent clips.
+        flow_groups: accepted dimensions of the flow between the batch and ``(2, 2, H, W)``.
 
     Shape:
         - Input: spikes :math:`(B, N, H, W)`; optionally flow :math:`(B, 2, 2, H, W)`, from the middle to the first
-          and to the last time point, in sensor pixels; or ``static=True`` where nothing moves
+          and last time points, in sensor pixels; or ``static=True`` for a scene without motion
         - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
     """
 
@@ -82,7 +81,7 @@ class Network(nn.Module):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the network was built with, by name, as plain values."""
+        """Arguments of the constructor, by name, as plain values."""
         if self._settings is not None:
             return self._settings
         names = dict.fromkeys((*_ALL_HAVE, *signature(type(self)).parameters))
@@ -90,26 +89,28 @@ class Network(nn.Module):
 
     @property
     def flow_times(self) -> tuple[int, int, int]:
-        """Spike frames that the flows run between: the first, the middle and the last time point."""
+        """Spike frames between which the flows run: the first, middle and last time points."""
         return self._flow_times or (5, self.frames // 2, self.frames - 6)
 
     @classmethod
     def from_pretrained(cls, weights: str | Path, motion: MotionEstimator | None = None, **arguments: Any) -> Self:
-        """Build the network that weights belong to, this class or a subclass, and load them.
+        """Build the network of a weights file, of this class or a subclass, and load its weights.
 
         Args:
-            weights: the name of weights that come with the package, such as ``"cscsr_small_x4"``; a file of
-                safetensors; or a checkpoint of ``lightning fit``.
-            motion: estimator that is asked where no flow is given; when not given, the one inside the weights, or
-                :class:`lightning_modules.motion.ClassicalFlow` where none is.
-            arguments: of the constructor, such as ``alpha``, that weights serve with any of.
+            weights: name of weights in the package, such as ``"cscsr_small_x4"``; path of a safetensors file; or
+                checkpoint of ``lightning fit``.
+            motion: motion estimator, called when no flow is given. Default: the estimator in the weights file, or
+                :class:`lightning_modules.motion.ClassicalFlow`.
+            arguments: constructor options that do not affect the weights, such as ``alpha``. Default: those stored
+                with the weights.
 
         Returns:
             The network, in evaluation mode, on the CPU.
 
         Raises:
-            FileNotFoundError: neither a file nor the name of one; the message says which names there are.
-            ValueError: a file that is damaged, or of another kind of network; an estimator for one that takes no flow.
+            FileNotFoundError: ``weights`` is neither a file nor a known name; the message lists the names.
+            ValueError: the file is damaged or holds another class of network, or ``motion`` is given for a network
+                that takes no flow.
         """
         found = read_weights(weights)
         named = found.settings.get("class")
@@ -117,7 +118,7 @@ class Network(nn.Module):
         if kind is None:
             raise ValueError(f"{weights}: expected weights of {cls.__name__}, got those of {named}")
         takes = signature(kind).parameters
-        # a user's own constructor need not take all that every network has
+        # constructors of user-defined networks need not take all common settings
         missing = set() if _ours(kind) else {*_ALL_HAVE} - takes.keys()
         settings = {name: value for name, value in found.settings.items() if name not in missing}
         check_weights(replace(found, settings=settings), {named: kind, **ESTIMATORS})
@@ -125,7 +126,7 @@ class Network(nn.Module):
         own = motion is not None
         same = own and type(motion).__name__ == found.motion.get("class") and found.motion["class"] not in ESTIMATORS
         if own and not kind.takes_flow:
-            raise ValueError(f"motion: {named} takes no flow, expected none, got {type(motion).__name__}")
+            raise ValueError(f"motion: expected None, as {named} takes no flow, got {type(motion).__name__}")
         try:
             if found.motion and not own:
                 estimator, built_with = own_class(found.motion, weights, ESTIMATORS)
@@ -138,18 +139,18 @@ class Network(nn.Module):
         return network.eval()
 
     def scale_picture(self, factor: float) -> None:
-        """Multiply the picture by a factor, in the weights, once and for all.
+        """Scale the output by a factor, in the weights, to adapt them to another gain.
 
-        A camera of twice the gain sees a scene as the other sees one twice as bright: the same spikes, half the
-        picture. A network whose input is divided by alpha does this already; others override this method.
+        With twice the gain, the same spikes come from a scene half as bright. Networks that divide their input by
+        alpha adapt already; others override this method.
         """
 
     def check_spikes(self, spikes: Tensor) -> None:
-        """Raise unless the network can take a clip.
+        """Check that spikes are valid input of the network.
 
         Raises:
-            TypeError: not a tensor of real numbers.
-            ValueError: another number of frames, or less than 3 x 3 pixels.
+            TypeError: ``spikes`` is not a tensor of real numbers.
+            ValueError: the number of spike frames is wrong, or there are fewer than 3 x 3 pixels.
         """
         check_planes("spikes", spikes, 4, "(B, N, H, W)")
         if spikes.ndim != 4 or spikes.shape[1] != self.frames or min(spikes.shape[-2:]) < 3:
@@ -157,40 +158,40 @@ class Network(nn.Module):
             raise ValueError(f"spikes: expected {expected}, got {tuple(spikes.shape)}")
 
     def estimate_flow(self, spikes: Tensor) -> Tensor:
-        """Flows from the middle to the first and to the last time point, (B, 2, 2, H, W), in sensor pixels."""
+        """Estimate the flows from the middle to the first and last time points, (B, 2, 2, H, W), in sensor pixels."""
         return torch.stack(self.motion(spikes, self.flow_times, self.pattern), dim=1)
 
     def resolve_flow(self, spikes: Tensor, flow: Tensor | None, static: bool) -> Tensor | None:
-        """Return the flow that is given, or the network's own estimate, or None where nothing moves.
+        """Return the given flow, or the network's own estimate, or None for a scene without motion.
 
         Raises:
-            ValueError: a flow of another size, or both a flow and ``static``.
-            RuntimeError: ``torch.jit.trace``, which would keep the motion of its example.
+            ValueError: the flow has a wrong shape, or is given together with ``static``.
+            RuntimeError: ``torch.jit.trace`` would record the motion of its example input.
         """
         if static and flow is not None:
             raise ValueError("flow, static: expected a flow or static=True, got both")
         if static or (flow is None and self.motion.static):
             return None
-        if torch.jit.is_tracing():  # not of torch.compile and torch.export, which see the code
+        if torch.jit.is_tracing():  # False in torch.compile and torch.export
             raise RuntimeError(
-                "torch.jit.trace: expected static=True or ZeroFlow, as a trace would keep the motion of its example "
-                "for every clip; torch.compile keeps none"
+                "torch.jit.trace: expected static=True or ZeroFlow, as the motion of the example input would become "
+                "a constant; use torch.compile instead"
             )
         if flow is None and is_exporting():
-            raise ValueError("flow: expected it as an input, as the estimate of motion cannot be exported, got none")
+            raise ValueError("flow: expected a tensor, as motion estimation cannot be exported, got None")
         if flow is None:
             flow = self.estimate_flow(spikes)
         shapes = [(len(spikes), *groups, 2, 2, *spikes.shape[-2:]) for groups in self.flow_groups]
-        # number by number: the compiler finds no shape in a list where it knows one side of the picture alone
+        # compared element by element: list membership fails in the compiler if one side of the picture is symbolic
         same = (flow.ndim == len(shape) and all(map(eq, flow.shape, shape)) for shape in shapes)
         if not isinstance(flow, Tensor) or not any(same):
-            got = tuple(flow.shape) if isinstance(flow, Tensor) else f"{flow!r}; static=True says that nothing moves"
+            got = tuple(flow.shape) if isinstance(flow, Tensor) else f"{flow!r}; for no motion, pass static=True"
             raise ValueError(f"flow: expected {' or '.join(map(str, shapes))}, got {got}")
         return flow
 
 
 def _family(kind: type[Network]) -> Iterator[type[Network]]:
-    """A class and what derives from it in this package: a file builds no other class by its name."""
+    """Yield a class and its subclasses in this package; weights files may name no other classes."""
     yield kind
     for child in kind.__subclasses__():
         if _ours(child):
@@ -202,14 +203,14 @@ def _ours(kind: type[Network]) -> bool:
 
 
 def read_network(weights: str | Path) -> nn.Module:
-    """Build the network or the estimator of motion that weights belong to, ready to be trained.
+    """Load the network or motion estimator of a weights file, in training mode.
 
     Args:
-        weights: as :meth:`Network.from_pretrained` takes them.
+        weights: name or path, as in :meth:`Network.from_pretrained`.
 
     Raises:
-        FileNotFoundError: neither a file nor the name of one.
-        ValueError: a file that is damaged, or of no class of this package.
+        FileNotFoundError: ``weights`` is neither a file nor a known name.
+        ValueError: the file is damaged, or holds no class of this package.
     """
     found = read_weights(weights)
     if found.settings.get("class") not in ESTIMATORS:

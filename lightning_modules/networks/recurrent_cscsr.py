@@ -1,4 +1,4 @@
-"""CSCSR for films: the state of a key frame helps its neighbours."""
+"""CSCSR for films, with a recurrent state that passes between key frames."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ class RecurrentCSCSRConfig(CSCSRConfig):
     """Configuration of a :class:`lightning_modules.networks.RecurrentCSCSR`.
 
     Args:
-        fusion_width: channels where a key frame meets what is known of its neighbours.
-        fusion_blocks: residual blocks there.
-        memory: channels that are carried on beside the picture.
+        fusion_width: channels of the fusion with neighbouring key frames.
+        fusion_blocks: residual blocks of the fusion.
+        memory: channels of the state in addition to the picture.
 
     Other fields: see :class:`CSCSRConfig`.
 
     Raises:
-        ValueError: as :class:`CSCSRConfig`; colours that are not correlated, or a resolution other than the sensor's.
+        ValueError: as :class:`CSCSRConfig`; or reconstruction is not correlated, or resolution is not sensor.
     """
 
     fusion_width: int = 64
@@ -45,21 +45,21 @@ class RecurrentCSCSRConfig(CSCSRConfig):
         super().__post_init__()
         if self.reconstruction != "correlated" or self.resolution != "sensor":
             raise ValueError(
-                "reconstruction, resolution: expected correlated and sensor, where key frames meet, "
+                "reconstruction, resolution: expected correlated and sensor for a recurrent network, "
                 f"got {self.reconstruction} and {self.resolution}"
             )
 
 
 class StateFusion(nn.Module):
-    """Mixes the picture of a clip with those of its neighbours, where they agree; beside it goes a memory.
+    """Fusion of a clip's picture with the warped states of its neighbours.
 
-    Before it is trained it leaves the picture as it is. The weights are the same for both neighbours: a film may be
-    read from either end.
+    Before training it returns the picture unchanged. Both neighbours share the same weights, so a film can be
+    processed in either direction.
 
     Shape:
-        - Input: features :math:`(B, features, H, W)`, the clip's picture :math:`(B, picture, H, W)`, and the states of
-          its neighbours, moved, :math:`(B, picture + memory, H, W)`, one or more
-        - Output: a state
+        - Input: features :math:`(B, features, H, W)`, the clip's picture :math:`(B, picture, H, W)`, and one or more
+          warped states of neighbours, :math:`(B, picture + memory, H, W)`
+        - Output: the state of the clip, :math:`(B, picture + memory, H, W)`
     """
 
     def __init__(self, features: int, picture: int, memory: int, width: int, blocks: int) -> None:
@@ -88,24 +88,25 @@ class StateFusion(nn.Module):
 
 
 class RecurrentCSCSR(CSCSR):
-    r"""CSCSR for films: the state of the key frame before, or of those on both sides, moved along the motion, helps.
+    r"""CSCSR for films, which fuses each key frame with the warped states of its neighbours.
 
-    A clip by itself gives what CSCSR with the same weights would. The state of a key frame is its picture, whose
-    temporal pixels are channels at the sensor's resolution, and a memory. The picture is moved at its own resolution,
-    so that nothing finer than a sensor pixel is lost on the way, and compared with that of the present clip.
+    The neighbours are the previous key frame, or those on both sides. A single clip gives the same picture as
+    :class:`CSCSR` with the same weights. The state of a key frame is its picture, with s x s output pixels per sensor
+    pixel as channels, and a memory. The picture is warped at its full resolution, which keeps its fine detail, and
+    compared with the picture of the present clip.
 
     Convention:
-        A key frame's neighbour is ``every`` clocks away. The motion to it is that of its own clip, taken to go on as it
-        is: no further estimate is needed.
+        Key frames are ``every`` clocks apart. The flow to a neighbour extrapolates the motion of the key frame's own
+        clip, so it needs no further estimate.
 
     Args:
         *args: fields of :class:`RecurrentCSCSRConfig`, in its order.
-        motion: as of :class:`CSCSR`.
+        motion: motion estimator, called when no flow is given; see :class:`CSCSR`.
         **settings: fields of :class:`RecurrentCSCSRConfig`, by name.
 
     Shape:
-        - Input: spikes :math:`(B, N, H, W)` of a clip, as of :class:`CSCSR`; or :math:`(B, K, N, H, W)`, those around K
-          key frames ``every`` clocks apart; optionally flows, :math:`(B, 2, 2, H, W)` or :math:`(B, K, 2, 2, H, W)`
+        - Input: spikes :math:`(B, N, H, W)` of one clip, or :math:`(B, K, N, H, W)` of the clips around K key frames;
+          optionally flows, :math:`(B, 2, 2, H, W)` or :math:`(B, K, 2, 2, H, W)`. Values as for :class:`CSCSR`
         - Output: rgb :math:`(B, 3, s H, s W)` or :math:`(B, K, 3, s H, s W)`, not clamped
 
     Example:
@@ -143,16 +144,16 @@ class RecurrentCSCSR(CSCSR):
         alpha: float | Tensor | None = None,
         noise: float | Tensor | None = None,
     ) -> Tensor:
-        """Return the picture of a clip, or those of a film.
+        """Return the picture of a clip, or the pictures of a film.
 
         Args:
-            spikes: see the class.
-            flow: likewise.
-            static: nothing moves, instead of a flow.
+            spikes: a clip (B, N, H, W) or a film (B, K, N, H, W).
+            flow: see the class. Default: estimated from the spikes.
+            static: the scene does not move, instead of a flow.
             every: clocks between two key frames.
-            future: key frames that a picture may wait for; see :meth:`film`.
-            alpha: see :class:`CSCSR`; of films, one a film.
-            noise: likewise.
+            future: number of later key frames that a picture may depend on; see :meth:`film`.
+            alpha: gain of the camera, a number or (B,). Default: that of the configuration.
+            noise: noise level, a number or (B,); see :class:`CSCSR`.
         """
         if spikes.ndim == 5:
             return self.film(spikes, flow, static, every, future, alpha, noise)[-1]
@@ -170,25 +171,25 @@ class RecurrentCSCSR(CSCSR):
         alpha: float | Tensor | None = None,
         noise: float | Tensor | None = None,
     ) -> list[Tensor]:
-        """Return the pictures of a film, as they are after every time that it was read.
+        """Return the pictures of a film after each pass over it.
 
-        It is read in groups of ``future + 1`` key frames: a single one knows the one before it; more are read from
-        their end and then forward, so that a key frame knows both its neighbours.
+        The film is processed in groups of ``future + 1`` key frames. A group of one uses the state of the previous key
+        frame. Larger groups take a backward pass and then a forward pass, so that key frames use both neighbours.
 
         Args:
             spikes: (B, K, N, H, W).
-            flow: (B, K, 2, 2, H, W), or None to ask the estimator.
-            static: nothing moves, instead of a flow.
+            flow: (B, K, 2, 2, H, W). Default: estimated from the spikes.
+            static: the scene does not move, instead of a flow.
             every: clocks between two key frames.
-            future: key frames that a picture may wait for.
-            alpha: see :class:`CSCSR`; a number or (B,).
-            noise: likewise.
+            future: number of later key frames that a picture may depend on.
+            alpha: gain of the camera, a number or (B,). Default: that of the configuration.
+            noise: noise level, a number or (B,); see :class:`CSCSR`.
 
         Returns:
-            rgb (B, K, 3, s H, s W), once or, with a ``future``, twice: the last is the best.
+            A list of rgb (B, K, 3, s H, s W): one for ``future=0``, otherwise two, of which the second is better.
 
         Raises:
-            ValueError: ``every`` is not a whole number above 0, or ``future`` a negative one; sizes that do not fit.
+            ValueError: ``every`` is not a positive integer, ``future`` is negative, or shapes do not match.
         """
         every, size = check_whole("every", every), check_whole("future + 1", future + 1)
         clips = spikes.flatten(0, 1)
@@ -219,23 +220,23 @@ class RecurrentCSCSR(CSCSR):
     @torch.no_grad()
     def scale_picture(self, factor: float) -> None:  # noqa: D102
         super().scale_picture(factor)
-        # key frames meet as before: what is read of pictures, and what is added to them
+        # the fusion must read and write pictures on the new scale
         picture = self.colors * self.scale**2
         self.fusion.neighbor.weight[:, :picture] /= factor
         self.fusion.rest.weight[:picture] *= factor
         self.fusion.rest.bias[:picture] *= factor
 
     def features(self, spikes: Tensor, flow: Tensor | None, noise: float | Tensor | None = None) -> Tensor:
-        """Return what a picture is made of, (B, width, H, W), from a clip alone; without flow nothing moves."""
+        """Return the features of a clip, (B, width, H, W); without flow the scene does not move."""
         spikes = spikes.to(self.reconstruction.rgb.weight.dtype)
         told = self._told(noise, spikes)
         return self.reconstruction.features(self._colors(spikes, flow, **told), **told)
 
     def advance(self, features: Tensor, spikes: Tensor, *neighbors: Tensor) -> Tensor:
-        """Return the state of a key frame, given its features, its clip, and the states of its neighbours, moved to it.
+        """Return the state of a key frame from its features, its clip, and its neighbours' warped states.
 
         Returns:
-            Its picture, as channels, and a memory, (B, 3 s^2 + memory, H, W), or (B, s^2 + memory, H, W) of grey.
+            Picture and memory as channels, (B, 3 s^2 + memory, H, W), or (B, s^2 + memory, H, W) for a grey sensor.
         """
         features = channels_last(features)
         rgb = self.reconstruction.rgb(features)
@@ -255,15 +256,16 @@ class RecurrentCSCSR(CSCSR):
         return F.pixel_shuffle(self._parted(state)[0], self.scale)
 
     def flow_to(self, flow: Tensor, clocks: int) -> Tensor:
-        """Return the flow, (B, 2, H, W), to what is so many clocks later, or earlier where they are negative.
+        """Extrapolate the flow (B, 2, 2, H, W) of a clip to a time ``clocks`` later, or earlier if negative.
 
-        That of the clip, (B, 2, 2, H, W), is taken to go on as it is.
+        Returns:
+            Flow (B, 2, H, W).
         """
         first, middle, last = self.flow_times
         return flow[:, 1] * (clocks / (last - middle)) if clocks > 0 else flow[:, 0] * (-clocks / (middle - first))
 
     def moved(self, state: Tensor, flow: Tensor | None) -> Tensor:
-        """Return a neighbour's state, moved by the flow to it, (B, 2, H, W); as it is where nothing moves."""
+        """Warp a neighbour's state along the flow to it, (B, 2, H, W); return it unchanged without flow."""
         if flow is None:
             return state
         picture, memory = self._parted(state)
@@ -272,11 +274,12 @@ class RecurrentCSCSR(CSCSR):
 
 
 def read_from_end(group: Sequence[int], meet: Callable[[int, State | None, State | None], State]) -> Iterator[State]:
-    """Yield the states of key frames that know the one behind them, from the last to the first.
+    """Yield the states of a backward pass, from the last key frame to the first; each uses the next key frame's state.
 
     Args:
-        group: numbers of the key frames.
-        meet: makes the state of a key frame out of those before and behind it, None where there is none.
+        group: indices of the key frames.
+        meet: function of a key frame's index, the state before it and the state after it (None if absent), which
+            returns the state of the key frame.
 
     Example:
         >>> list(read_from_end("abc", lambda n, before, after: f"({before or ''}{n}{after or ''})"))
@@ -294,14 +297,14 @@ def read_forward(
     before: State | None,
     behind: list[State],
 ) -> Iterator[State]:
-    """Yield the states of key frames that know the one before them, and what was read from the end behind them.
+    """Yield the states of a forward pass; each uses the previous key frame's state and the next one's backward state.
 
     Args:
-        group: numbers of the key frames.
-        meet: as of :func:`read_from_end`.
-        before: state of the key frame before the group, if there is one.
-        behind: states of :func:`read_from_end`, from the last to the second, or none; emptied on the way, as states
-            are large.
+        group: indices of the key frames.
+        meet: see :func:`read_from_end`.
+        before: state of the key frame before the group, or None.
+        behind: states from :func:`read_from_end`, from the last to the second, or an empty list. They are popped in
+            use, to free memory.
 
     Example:
         >>> meet = lambda n, before, after: f"({before or ''}{n}{after or ''})"

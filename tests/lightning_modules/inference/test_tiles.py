@@ -87,7 +87,7 @@ def test_static_is_a_flow_of_zeros(settings, size):
 
 @pytest.mark.parametrize("flow", [0, "still"])
 def test_a_number_is_no_flow(flow):
-    message = f"^flow: expected .*, got {flow!r}; static=True says that nothing moves$"
+    message = f"^flow: expected .*, got {flow!r}; for no motion, pass static=True$"
     spikes = torch.zeros(1, 41, 8, 8)
     for run in (CSCSR(2, **TINY), lambda spikes, flow: forward_in_tiles(CSCSR(2, **TINY), spikes, 4, flow=flow)):
         with pytest.raises(ValueError, match=message):
