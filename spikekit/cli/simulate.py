@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import fields
 from typing import Any
 
@@ -12,8 +11,7 @@ from spikekit.arguments import UsageError, ending_in, home_path, positive, whole
 from spikekit.calibration.files import read_calibration
 from spikekit.color.cfa import PATTERNS
 from spikekit.io.files import RECORDING_ENDINGS
-from spikekit.io.video import VideoError
-from spikekit.scenes.simulation import INTERPOLATIONS, Settings, Source, simulate
+from spikekit.scenes.simulation import INTERPOLATIONS, Settings, simulate
 from spikekit.sensor.noise import SensorNoise
 from spikekit.standard_output import say
 
@@ -41,30 +39,15 @@ def run(args: argparse.Namespace) -> None:
     if args.output.is_dir():
         raise ValueError(f"{args.output}: expected a stream to write, got a folder")
     known = {field.name for field in (*fields(Settings), *fields(SensorNoise))}
-    settings = _settings({name: value for name, value in vars(args).items() if name in known})
-    with _options():
-        source = Source(args.input, settings)
-    for line in simulate(source, settings, args.output):
-        say(line)
-
-
-@contextmanager
-def _options() -> Iterator[None]:
-    """Say of a setting that makes no sense which option it is; what is wrong with a file passes."""
+    given = {name: value for name, value in vars(args).items() if name in known}
+    noise = {name: given.pop(name) for name in _NOISE if name in given}
+    pixels = read_calibration(given["calibration"]) if "calibration" in given else None
     try:
-        yield
-    except VideoError:
-        raise
+        settings = Settings(**given, noise=SensorNoise(**noise, calibration=pixels))
     except ValueError as error:
         raise UsageError(f"--{str(error).replace('_', '-', 1)}") from error
-
-
-def _settings(given: dict[str, Any]) -> Settings:
-    noise = {name: value for name, value in given.items() if name in _NOISE}
-    known = read_calibration(given["calibration"]) if "calibration" in given else None
-    with _options():
-        others = {name: value for name, value in given.items() if name not in noise}
-        return Settings(**others, noise=SensorNoise(**noise, calibration=known))
+    for line in simulate(args.input, settings, args.output):
+        say(line)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -88,7 +71,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     part.add_argument("--all", dest="frames", action="store_const", const=None, help="the whole film")
     said = "which frame of the film is in the middle, from 0; that in its middle if not given"
     add("--frame", type=whole(0), metavar="M", help=said)
-    option("readout", whole(1), "N", "clocks for every frame of the stream")
     option("seed", whole(0), "N", "random seed: first charge and noise")
 
     model = parser.add_argument_group("what is modelled")

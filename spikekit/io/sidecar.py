@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import shutil
 import sys
 import tempfile
@@ -13,9 +12,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-import torch
 
 from spikekit.arguments import one_line
 from spikekit.color.cfa import PATTERNS
@@ -40,19 +36,6 @@ class Sidecar:
     def dumps(self) -> str:
         """Return the text of the file."""
         return json.dumps({"kind": KIND} | asdict(self), indent=1) + "\n"
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of what a stream depends on."""
-    from spikekit._version import __version__
-
-    return {
-        "spikekit": __version__,
-        "torch": str(torch.__version__),
-        "numpy": np.__version__,
-        "python": platform.python_version(),
-        "machine": f"{platform.machine()}, {torch.backends.cpu.get_cpu_capability()}",
-    }
 
 
 def read_sidecar(path: Path) -> Sidecar:

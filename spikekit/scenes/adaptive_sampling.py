@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -49,19 +49,17 @@ class Plan:
         latent: frames that are synthesised in the interval, evenly spaced; with none, its two ends are blended.
         region: the part of the sensor they are synthesised for, the ends being blended in the rest; first row and
             column even; ``None`` for all of it.
-        because: reasons of the decisions, one line each, to be printed.
 
     Raises:
         ValueError: a negative number of frames, a region that begins at an odd pixel or has none.
 
     Example:
-        >>> print(Plan(latent=3))
-        latent frames: 3 an interval
+        >>> Plan(latent=3).region is None  # for the whole sensor
+        True
     """
 
     latent: int = 0
     region: Region | None = None
-    because: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
         if self.latent < 0:
@@ -75,39 +73,32 @@ class Plan:
         """Model everything: a frame for every clock of the interval, all pixels."""
         return cls(check_whole("clocks", clocks) - 1)
 
-    def __str__(self) -> str:
-        return "\n".join(self.because or [f"latent frames: {self.latent} an interval"])
-
 
 @dataclass(frozen=True)
 class SceneProfile:
-    r"""How a scene moves and how bright it is, from frames that are some clocks apart.
+    r"""How a scene moves, from frames that are some clocks apart.
 
     Convention:
-        Light is in thresholds per clock, displacements in sensor pixels. A pixel is static where its light changes so
+        Displacements are in sensor pixels. A pixel is static where its light changes so
         little in an interval that its charge is off by less than the tolerance at the end, whichever way the light
         takes from one end to the other.
 
     Args:
         size: rows and columns of the sensor.
         clocks: clocks of an interval.
-        brightness: least, mean and greatest light.
         static: share of static pixels.
         region: the smallest rectangle, beginning at even pixels, that holds all others; ``None`` without any.
         displacement: per clock, in pixels that are not static; one per cent is faster, by weight of the squared slope
             of the light along the motion, because where there is none, motion neither shows nor matters.
-        displacement_max: of the very fastest pixel.
         blending: share of the spikes that would change if the ends of an interval were blended, estimated from the
             displacements and from how the light bends along them, and on the safe side.
     """
 
     size: tuple[int, int]
     clocks: int
-    brightness: tuple[float, float, float]
     static: float = 1.0
     region: Region | None = None
     displacement: float = 0.0
-    displacement_max: float = 0.0
     blending: float = 0.0
 
     def plan(self, *, spike_tolerance: float = 0.05, step: float = 0.5) -> Plan:
@@ -143,20 +134,7 @@ class SceneProfile:
             region = _grown(self.region, self.size, math.ceil(moves) + _MARGIN) if steps > 1 and self.region else None
             if region and region[2] * region[3] > _NEARLY_ALL * height * width:
                 region = None
-        darkest, mean, brightest = self.brightness
-        because = [
-            f"scene: {self.static:.0%} static, the rest moves {self.displacement:.3g} sensor pixels per clock "
-            f"(at most {self.displacement_max:.3g})",
-            f"light: {mean:.3g} thresholds per clock ({darkest:.3g} to {brightest:.3g})",
-        ]
-        if steps > 1:
-            where = f"{region[2]} x {region[3]} of {height} x {width}" if region else "all"
-            apart = f"{moves / steps:.2g} sensor pixels apart" if math.isfinite(moves) else "as motion is not found"
-            because.append(f"latent frames: {steps - 1} an interval, {apart}, for {where} pixels")
-        else:
-            blended = f"blending changes {self.blending:.2%} of the spikes" if self.static < 1 else "nothing moves"
-            because.append(f"latent frames: none, {blended}")
-        return Plan(steps - 1, region, tuple(because))
+        return Plan(steps - 1, region)
 
 
 def profile_interval(
@@ -194,11 +172,10 @@ def profile_interval(
     ends = torch.stack(light)
     size = tuple(ends.shape[-2:])
     mean = ends.mean().item()
-    brightness = ends.min().item(), mean, ends.max().item()
     moving = (light[1] - light[0]).abs() * clocks > spike_tolerance * mean
     region = _bounds(moving)
     if region is None:
-        return SceneProfile(size, clocks, brightness)
+        return SceneProfile(size, clocks)
 
     top, left, height, width = _grown(region, size, 2 * _MARGIN)
     part = slice(top, top + height), slice(left, left + width)
@@ -208,9 +185,7 @@ def profile_interval(
     cells = F.avg_pool2d(small, 2)
     motion = FlowInterpolation(shrink=1) if motion is None else motion
     found = motion(cells[0], (cells[1] / gain).clamp(0, 1))
-    lost = SceneProfile(
-        size, clocks, brightness, 1 - moving.sum().item() / ends[0].numel(), region, math.inf, math.inf, math.inf
-    )
+    lost = SceneProfile(size, clocks, 1 - moving.sum().item() / ends[0].numel(), region, math.inf, math.inf)
     if found.forward is None or found.backward is None:
         return lost
     forward, backward = (upsample_flow(flow[None], 2) for flow in (found.forward, found.backward))
@@ -228,7 +203,6 @@ def profile_interval(
     return replace(
         lost,
         displacement=_fast(distance, slope.square() * sure) / clocks,
-        displacement_max=(distance * sure).max().item() / clocks,
         blending=_SAFETY * clocks / 6 * alpha * error.item() / pixels / mean,
     )
 

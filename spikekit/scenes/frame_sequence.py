@@ -158,7 +158,6 @@ class FrameSequence:
         count: int | None = None,
         *,
         noise: SensorNoise | None = None,
-        readout: int = 1,
         seed: int = 0,
         chunk: int = 64,
     ) -> Iterator[Tensor]:
@@ -168,9 +167,8 @@ class FrameSequence:
 
         Args:
             first: the first clock.
-            count: how many, a multiple of ``readout``; up to the film's end when not given.
+            count: how many; up to the film's end when not given.
             noise: noise of the sensor, see :class:`spikekit.SensorNoise`.
-            readout: clocks for every frame of spikes, see :class:`spikekit.SpikeSensor`.
             seed: random seed: the first charge and all noise.
             chunk: clocks of light that are held.
 
@@ -180,9 +178,8 @@ class FrameSequence:
         Raises:
             ValueError: as :meth:`light` and :class:`spikekit.SpikeSensor`, and a chunk below 1.
         """
-        sensor = SpikeSensor(noise, readout=readout, seed=seed)
-        count = self._count(first, count) // readout * readout if count is None else self._count(first, count)
-        chunk, last = -(-check_whole("chunk", chunk) // readout) * readout, first + count
+        sensor = SpikeSensor(noise, seed=seed)
+        chunk, last = check_whole("chunk", chunk), first + self._count(first, count)
         return (sensor.expose(self.light(at, min(chunk, last - at))) for at in range(first, last, chunk))
 
     def clip(self, frame: int, frames: int = 41) -> SequenceClip:

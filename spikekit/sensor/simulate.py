@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from spikekit.check import check_planes, check_positive, check_whole
+from spikekit.check import check_planes, check_positive
 from spikekit.sensor.integrate_fire import spike_integrate_fire
 from spikekit.sensor.noise import NoisyPixels, SensorNoise, random_numbers
 
@@ -19,25 +19,18 @@ class SpikeSensor:
         camera has been running before. The sensor remembers the charge and the clock, so that light cut into chunks
         gives the spikes of the whole, bit for bit. No gradient.
 
-        The read-out takes the bits every ``readout`` frames of the light. A pixel that reaches its threshold is reset
-        at once and keeps a flag, which is read at the end of the period and cleared: one spike at most, however often
-        it fired. As the reset subtracts the threshold and light is never negative, that is the same as summing the
-        light of a period and then integrating it, and is computed so. A clock is a read-out: noise is that of a
-        read-out, not of a frame of light.
-
         The same seed gives the same spikes on every device, as far as the light is the same. With leading dimensions,
         every (H, W) of them is a sensor of its own.
 
     Args:
         noise: noise of the sensor; none when not given.
         threshold: charge of one spike.
-        readout: frames of light for every frame of spikes.
         seed: random seed, 0 or more.
         charge: charge at the start, broadcastable to :math:`(*, H, W)`, below the threshold.
-        clock: read-outs before the first, to continue where another sensor of the same seed stopped.
+        clock: clocks before the first, to continue where another sensor of the same seed stopped.
 
     Raises:
-        ValueError: a threshold that is not above 0, a read-out period below 1, a negative seed or clock.
+        ValueError: a threshold that is not above 0, a negative seed or clock.
 
     Example:
         >>> light = torch.rand(40, 6, 8)
@@ -46,11 +39,6 @@ class SpikeSensor:
         >>> whole = SpikeSensor(SensorNoise(photons=100, dark_current=0.01), seed=1).expose(light)
         >>> bool((torch.cat([first, second]) == whole).all())
         True
-        >>> SpikeSensor(readout=4).expose(light).shape
-        torch.Size([10, 6, 8])
-
-    Reference:
-        Dong et al., CVPR 2024, section 3.1: flags "are checked and reset at discrete time points".
     """
 
     def __init__(
@@ -58,7 +46,6 @@ class SpikeSensor:
         noise: SensorNoise | None = None,
         *,
         threshold: float = 1.0,
-        readout: int = 1,
         seed: int = 0,
         charge: Tensor | None = None,
         clock: int = 0,
@@ -68,7 +55,7 @@ class SpikeSensor:
             if value < 0:
                 raise ValueError(f"{name}: expected 0 or more, got {value}")
         self.noise = SensorNoise() if noise is None else noise
-        self.threshold, self.readout, self.seed = threshold, check_whole("readout", readout), seed
+        self.threshold, self.seed = threshold, seed
         self.charge, self.clock = charge, clock
         self._pixels: NoisyPixels | None = None
 
@@ -76,30 +63,26 @@ class SpikeSensor:
         """Return the spikes of the next light.
 
         Args:
-            light: charge per frame, :math:`(*, T, H, W)`, floating, T a multiple of ``readout``; chunks of one
-                recording have the same :math:`(*, H, W)`.
+            light: charge per clock, :math:`(*, T, H, W)`, floating; chunks of one recording have the same
+                :math:`(*, H, W)`.
 
         Returns:
-            ``spikes`` of shape :math:`(*, T / readout, H, W)`, uint8.
+            ``spikes`` of shape :math:`(*, T, H, W)`, uint8.
 
         Raises:
             TypeError: ``light`` is not a floating-point tensor.
-            ValueError: fewer than three dimensions, a length that the read-out period does not divide, a size that
-                differs from that of the light before or does not fit the charge.
+            ValueError: fewer than three dimensions, a size that differs from that of the light before or does not fit
+                the charge.
         """
         check_planes("light", light, 3, "(*, T, H, W)", floating=True)
-        size, frames = light.shape[:-3] + light.shape[-2:], light.shape[-3]
+        size = light.shape[:-3] + light.shape[-2:]
         if self._pixels is None:
             self._pixels = NoisyPixels(self.noise, tuple(size), self.seed)
         if self._pixels.size != tuple(size):
             raise ValueError(f"light: expected the size {self._pixels.size} that came before, got {tuple(size)}")
-        if frames % self.readout:
-            raise ValueError(f"light: expected a multiple of {self.readout} frames, one read-out, got {frames}")
-        wide = torch.promote_types(light.dtype, torch.float32)
-        if self.readout > 1:
-            light = light.detach().unflatten(-3, (-1, self.readout)).sum(-3, dtype=wide)
         if self.charge is None:
             fraction = random_numbers(self.seed, "charge").random(size, dtype="float32")
+            wide = torch.promote_types(light.dtype, torch.float32)
             self.charge = torch.from_numpy(fraction).to(light.device, wide) * self.threshold
         charge = self._pixels.charge(light, self.threshold, self.clock)
         spikes, self.charge = spike_integrate_fire(charge, self.threshold, self.charge, dtype=torch.uint8)
@@ -112,7 +95,6 @@ def simulate_spikes(
     *,
     threshold: float = 1.0,
     noise: SensorNoise | None = None,
-    readout: int = 1,
     charge: Tensor | None = None,
     generator: torch.Generator | None = None,
 ) -> Tensor:
@@ -125,20 +107,18 @@ def simulate_spikes(
         generator state gives the same charge with and without noise. No gradient.
 
     Args:
-        light: charge per frame, :math:`(*, T, H, W)`, floating, on the generator's device.
+        light: charge per clock, :math:`(*, T, H, W)`, floating, on the generator's device.
         threshold: :math:`\theta`, charge of one spike.
         noise: noise of the sensor; none when not given.
-        readout: frames of light for every frame of spikes; it divides T.
         charge: charge at the start, broadcastable to :math:`(*, H, W)`, below the threshold; random when not given.
         generator: of random numbers; torch's default one when not given.
 
     Returns:
-        ``spikes``, uint8, :math:`(*, T / \text{readout}, H, W)`.
+        ``spikes``, uint8, :math:`(*, T, H, W)`.
 
     Raises:
         TypeError: ``light`` is not a floating-point tensor.
-        ValueError: fewer than three dimensions, a threshold that is not above 0, a read-out period that does not
-            divide T, a charge that does not fit.
+        ValueError: fewer than three dimensions, a threshold that is not above 0, a charge that does not fit.
 
     Example:
         >>> spikes = simulate_spikes(torch.full((40, 8, 8), 0.25), generator=torch.Generator().manual_seed(0))
@@ -155,4 +135,4 @@ def simulate_spikes(
     seed = 0
     if noise is not None:
         seed = int(torch.randint(2**63 - 1, (), generator=generator, device=light.device))
-    return SpikeSensor(noise, threshold=threshold, readout=readout, seed=seed, charge=charge).expose(light)
+    return SpikeSensor(noise, threshold=threshold, seed=seed, charge=charge).expose(light)

@@ -40,7 +40,7 @@ SIDECAR = {
     "truth": {"walk/0.png": 1.5},
     "source": {"path": "film", "frames": {"0.png": "0" * 64}},
     "settings": {
-        "scale": 2, "pattern": "RGGB", "alpha": 0.4, "clocks": 20, "frame": None, "frames": 3, "readout": 1, "seed": 0,
+        "scale": 2, "pattern": "RGGB", "alpha": 0.4, "clocks": 20, "frame": None, "frames": 3, "seed": 0,
         "plan": "auto", "tolerance": 0.1, "step": 1.0, "interpolation": "Linear()", "noise": {"dark": 0.1},
     },
     "plan": {"frames": 3},

@@ -26,7 +26,7 @@ def profile_of(first, second, motion=None, **settings):
     return profile_interval(first, second, **({"scale": 2, "motion": motion or Steady()} | settings))
 
 
-MOVING = SceneProfile((64, 64), 20, (0.0, 0.2, 0.4), 0.0, (0, 0, 64, 64), 0.1, 0.12, 0.02)
+MOVING = SceneProfile((64, 64), 20, 0.0, (0, 0, 64, 64), 0.1, 0.02)
 
 
 def test_where_nothing_changes_there_is_no_region():
@@ -39,7 +39,6 @@ def test_displacement_is_in_sensor_pixels_per_clock():
     first, second = torch.rand(2, 3, 64, 64).unbind()
     profile = profile_of(first, second, Steady(0.75, 1.0), clocks=10)  # cells are two sensor pixels wide
     assert profile.displacement == pytest.approx(2 * 1.25 / 10)
-    assert profile.displacement_max == pytest.approx(2 * 1.25 / 10)
 
 
 def test_only_what_changes_is_looked_at():
@@ -76,15 +75,15 @@ def test_a_gain_is_no_motion():
 
 
 @pytest.mark.parametrize(
-    ("shape", "where", "flow", "back", "typical", "most"),
+    ("shape", "where", "flow", "back", "typical"),
     [
-        ((1200, 32), np.s_[0, 100:101], 2.0, True, 1.0, None),  # one row of 300 may be faster
-        ((1200, 32), np.s_[0, 100:112], 2.0, True, 2.0, None),
-        ((64, 64), np.s_[0, :, 10:], 2.0, True, 1.0, 2.0),  # in what is flat nothing is seen
-        ((64, 64), np.s_[0, :, :4], 30.0, False, 1.0, 1.0),  # there and back do not meet
+        ((1200, 32), np.s_[0, 100:101], 2.0, True, 1.0),  # one row of 300 may be faster
+        ((1200, 32), np.s_[0, 100:112], 2.0, True, 2.0),
+        ((64, 64), np.s_[0, :, 10:], 2.0, True, 1.0),  # in what is flat nothing is seen
+        ((64, 64), np.s_[0, :, :4], 30.0, False, 1.0),  # there and back do not meet
     ],
 )
-def test_flow_that_does_not_count(shape, where, flow, back, typical, most):
+def test_flow_that_does_not_count(shape, where, flow, back, typical):
     first, second = torch.rand(2, 3, *shape).unbind()
     if where == np.s_[0, :, 10:]:
         first[..., 24:], second[..., 24:] = 0.5, 0.7  # flat, and brighter at the next frame
@@ -97,8 +96,6 @@ def test_flow_that_does_not_count(shape, where, flow, back, typical, most):
 
     profile = profile_of(first, second, motion)
     assert profile.displacement == pytest.approx(2 * typical / 20, rel=0.3 if shape[0] == 64 else 1e-6)
-    if most is not None:
-        assert profile.displacement_max == pytest.approx(2 * most / 20, rel=1e-6 if back else 0.05)
 
 
 def test_blending_along_a_diagonal():

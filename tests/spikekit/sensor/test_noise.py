@@ -154,13 +154,12 @@ def test_a_source_switched_on_leaves_the_others_alone():
 @given(
     noise=st.sampled_from(NOISES),
     cuts=st.sets(st.integers(1, 23), max_size=5),
-    readout=st.sampled_from([1, 2, 3]),
     threshold=st.sampled_from([1.0, 0.7]),
     dtype=st.sampled_from([torch.float32, torch.float64, torch.float16]),
 )
-def test_chunks_make_the_whole(noise, cuts, readout, threshold, dtype):
-    light = torch.rand(24 * readout, 5, 6, generator=chance(2)).to(dtype) * threshold / readout
-    settings = {"threshold": threshold, "readout": readout, "seed": 7}
+def test_chunks_make_the_whole(noise, cuts, threshold, dtype):
+    light = torch.rand(24, 5, 6, generator=chance(2)).to(dtype) * threshold
+    settings = {"threshold": threshold, "seed": 7}
     whole = SpikeSensor(noise, **settings)
     expected = whole.expose(light)
     edges = [0, *sorted(cuts), 24]
@@ -170,7 +169,7 @@ def test_chunks_make_the_whole(noise, cuts, readout, threshold, dtype):
         # half of the time another sensor goes on, as after a break
         if start % 2:
             sensor = SpikeSensor(noise, **settings, charge=sensor.charge, clock=sensor.clock)
-        parts.append(sensor.expose(light[start * readout : stop * readout]))
+        parts.append(sensor.expose(light[start:stop]))
     assert torch.equal(torch.cat(parts), expected)
     assert torch.equal(sensor.charge, whole.charge)
     assert sensor.clock == 24
@@ -194,24 +193,6 @@ def test_random_numbers_stay_what_they_are():
     assert torch.equal(
         noisy[1:], arriving(SensorNoise(photons=10.0, dark_current=0.1), torch.full((1, 1, 4), 0.5), seed=2, clock=4)
     )
-
-
-# The read-out
-
-
-@given(period=st.integers(1, 5), seed=st.integers(0, 9), bright=st.floats(0.1, 3.0))
-def test_the_readout_takes_flags(period, seed, bright):
-    """Against a pixel that is reset at once, keeps a flag, and is asked every period."""
-    light = torch.rand(4 * period, 3, 4, generator=chance(seed), dtype=torch.float64) * bright
-    charge = torch.rand(3, 4, generator=chance(seed + 1), dtype=torch.float64)
-    bits = simulate_spikes(light, readout=period, charge=charge)
-    for n in range(4):
-        flag = torch.zeros(3, 4, dtype=torch.bool)
-        for now in light[n * period : (n + 1) * period]:
-            charge = charge + now
-            flag |= charge >= 1
-            charge = charge - charge.floor()
-        assert torch.equal(bits[n].bool(), flag)
 
 
 # What it changes
@@ -305,7 +286,6 @@ def test_errors_say_what_was_expected():
     light = torch.rand(6, 4, 5)
     for make, message in (
         (lambda: SpikeSensor(clock=-1), "clock: expected 0 or more, got -1"),
-        (lambda: SpikeSensor(readout=4).expose(light), "light: expected a multiple of 4 frames, one read-out, got 6"),
         (lambda: simulate_spikes(light, charge=torch.zeros(3, 5)), r"charge: expected \(4, 5\), got \(3, 5\)"),
         (lambda: SensorNoise().spike_changes(-0.1, 41), "light: expected a finite number, 0 or more, got -0.1"),
     ):
