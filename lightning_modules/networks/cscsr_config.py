@@ -109,9 +109,7 @@ class CSCSRConfig:
                 f"got {frames}, {window}, {stride}"
             )
         if self.representation != "bssr" and not self.global_perception:
-            raise ValueError(
-                f"global_perception: expected true for representation {self.representation}, got false"
-            )
+            raise ValueError(f"global_perception: expected true for representation {self.representation}, got false")
         if self.motion_fusion != "joint" and not self.search:
             raise ValueError(
                 f"motion_fusion: expected joint, as motion has no effect without search, got {self.motion_fusion}"
