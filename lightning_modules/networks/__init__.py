@@ -7,7 +7,7 @@ from lightning_modules.networks.cscsr_config import CSCSRConfig
 from lightning_modules.networks.network import Network
 from lightning_modules.networks.recurrent_cscsr import RecurrentCSCSR
 
-#: what weights and configurations may name
+#: networks by name, for weights and configurations
 NETWORKS = {
     kind.__name__: kind
     for kind in (CSCSR, RecurrentCSCSR, ClassicalDecoder, BasicVSR, RealRawVSR, SpikeSRNetLike, SwinIR, TSCNN, VidarSR)

@@ -1,4 +1,4 @@
-"""The classical baseline without weights: decode, demosaic, enlarge."""
+"""Classical baseline without weights: decode, demosaic, enlarge."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from spikekit.decoders.methods import DECODERS
 
 
 class ClassicalDecoder(Network):
-    r"""TFI or TFP of the middle frame, demosaicing, bicubic enlargement; the baseline that every network must beat.
+    r"""Classical decoder: TFI or TFP of the middle frame, demosaicing and bicubic enlargement.
 
     Args:
-        method: the decoder, a name in ``spikekit.decoders.methods.DECODERS``: ``"tfi"`` or ``"tfp"``.
-        scale: super-resolution factor.
+        method: decoder, ``"tfi"`` or ``"tfp"``.
+        scale: super-resolution factor s.
         pattern: Bayer phase, or ``"grey"``.
-        alpha: gain of the camera, what a white pixel receives per clock in thresholds; the result is divided by it.
-        window: frames that TFP averages, odd.
-        order: how often it does, see :func:`spikekit.tfp`.
-        frames: spike frames N of a clip, odd.
+        alpha: gain of the camera: light of a white pixel per clock, in thresholds. The picture is light divided by it.
+        window: number of spike frames that TFP averages, odd.
+        order: number of averaging passes of TFP, see :func:`spikekit.tfp`.
+        frames: number N of spike frames per clip, odd.
 
     Shape:
         - Input: spikes :math:`(B, N, H, W)`, any real dtype
-        - Output: rgb :math:`(B, 3, s H, s W)`, or :math:`(B, 1, s H, s W)` where the pattern is grey
+        - Output: rgb :math:`(B, 3, s H, s W)`, or :math:`(B, 1, s H, s W)` for a grey sensor
 
     Example:
         >>> import torch
@@ -35,7 +35,7 @@ class ClassicalDecoder(Network):
         torch.Size([1, 3, 16, 16])
     """
 
-    halo = 4  # two pixels of demosaicing and two of the bicubic enlargement
+    halo = 4  # two pixels for demosaicing and two for bicubic enlargement
     takes_flow = False
 
     def __init__(
@@ -67,7 +67,7 @@ class ClassicalDecoder(Network):
         self.method, self.window, self.order = method, window, order
 
     def forward(self, spikes: Tensor, flow: Tensor | None = None, static: bool = False) -> Tensor:
-        """Return rgb; a flow changes nothing."""
+        """Return rgb; the flow is ignored."""
         check_planes("spikes", spikes, 4, "(B, N, H, W)")
         n = spikes.shape[1] // 2
         decoder = DECODERS[self.method]

@@ -8,12 +8,12 @@ from torch import Tensor, nn
 
 
 def channels_last(planes: Tensor) -> Tensor:
-    """(B, C, H, W) with its channels side by side in memory, the layout in which convolutions are faster."""
+    """Convert (B, C, H, W) to the channels-last memory format, which makes convolutions faster."""
     return planes.contiguous(memory_format=torch.channels_last)
 
 
 def enlarge(features: Tensor, scale: int) -> Tensor:
-    """Bilinear: (*, C, H, W) to (*, C, s H, s W)."""
+    """Enlarge bilinearly, (*, C, H, W) to (*, C, s H, s W)."""
     if scale == 1:
         return features
     planes = features.reshape(-1, *features.shape[-3:])
@@ -22,14 +22,14 @@ def enlarge(features: Tensor, scale: int) -> Tensor:
 
 
 def fold(planes: Tensor, size: int) -> Tensor:
-    """(B, C, size H, size W) to (B, C size^2, H, W) as ``pixel_unshuffle`` and :func:`channels_last` in one copy."""
+    """Apply ``pixel_unshuffle`` and :func:`channels_last` at once, (B, C, size H, size W) to (B, C size^2, H, W)."""
     batch, channels, height, width = planes.shape
     blocks = planes.reshape(batch, channels, height // size, size, width // size, size).permute(0, 2, 4, 1, 3, 5)
     return channels_last(blocks.flatten(3).movedim(-1, 1))
 
 
 def conv(inputs: int, outputs: int) -> nn.Conv2d:
-    """3 x 3 convolution that keeps the size."""
+    """Return a 3 x 3 convolution that keeps the size."""
     return nn.Conv2d(inputs, outputs, 3, padding=1)
 
 
@@ -41,7 +41,7 @@ class ConvBlock(nn.Sequential):
 
 
 class ResBlock(nn.Module):
-    """Convolution, activation, convolution, plus the input: a residual block without normalisation."""
+    """Residual block without normalisation: convolution, activation, convolution, plus the input."""
 
     def __init__(self, width: int, activation: nn.Module | None = None) -> None:
         super().__init__()
@@ -52,14 +52,14 @@ class ResBlock(nn.Module):
 
 
 def res_blocks(width: int, count: int) -> nn.Sequential:
-    """Residual blocks one after another."""
+    """Return a sequence of residual blocks."""
     return nn.Sequential(*(ResBlock(width) for _ in range(count)))
 
 
 class NoiseLevel(nn.Module):
-    """What the level of the sensor's noise changes: gain and shift of every channel, nothing at level 0.
+    """Gain and shift per channel, linear in the noise level of the sensor; the identity at level 0.
 
-    One layer of FiLM (Perez et al., AAAI 2018), linear in the level. Before it is trained it changes nothing.
+    This is a FiLM layer (Perez et al., AAAI 2018). Before training it is the identity at every level.
     """
 
     def __init__(self, width: int) -> None:
@@ -72,10 +72,10 @@ class NoiseLevel(nn.Module):
 
 
 def start_pixel_by_pixel(part: nn.Module) -> None:
-    """Initialize convolutions: orthogonal centre taps, small ones around (Xiao et al., ICML 2018).
+    """Initialise convolutions with orthogonal centre taps and small outer taps (Xiao et al., ICML 2018).
 
-    A dozen random 3 x 3 filters in a row would blur what the network is to sharpen: training then rests for
-    hundreds of steps on a plateau, or dies on it.
+    A dozen random 3 x 3 filters in sequence blur the input: training then stays on a plateau for hundreds of steps, or
+    never leaves it.
     """
     for module in part.modules():
         if isinstance(module, nn.Conv2d):

@@ -11,12 +11,12 @@ from spikekit import bayer_sites, merge_bayer
 
 
 def joint_motion(motion: MotionEstimator, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> Tensor:
-    """One motion of all colours: flows to the first and to the last time point, (B, 2, 2, H, W), in sensor pixels."""
+    """Estimate one flow for all colours, to the first and last time points, (B, 2, 2, H, W), in sensor pixels."""
     return torch.stack(motion(spikes, times, pattern), dim=1)
 
 
 def independent_motion(motion: MotionEstimator, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> Tensor:
-    """The motion of every colour by itself (ablation D), (B, 3, 2, 2, H, W); green is the mean of its two sites."""
+    """Estimate one flow per colour (ablation D), (B, 3, 2, 2, H, W); green takes the mean of its two sub-streams."""
     height, width = spikes.shape[-2:]
     red, *greens, blue = (
         _to_sensor(flow, row, column, height, width)
@@ -28,13 +28,13 @@ def independent_motion(motion: MotionEstimator, spikes: Tensor, times: tuple[int
 
 
 def assembled_motion(motion: MotionEstimator, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> Tensor:
-    """The sub-streams' flows side by side as their pixels are on the sensor (ablation E), (B, 2, 2, H, W)."""
+    """Interleave the flows of the four sub-streams as in the Bayer pattern (ablation E), (B, 2, 2, H, W)."""
     height, width = spikes.shape[-2:]
     return 2 * merge_bayer(_channel_flows(motion, spikes, times, pattern), pattern)[..., :height, :width]
 
 
 def _channel_flows(motion: MotionEstimator, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> Tensor:
-    """Both flows of the four sub-streams, (4, B, 2, 2, h, w), in Bayer cells."""
+    """Return the two flows of each of the four sub-streams, (4, B, 2, 2, h, w), in Bayer cells."""
     batch, _, height, width = spikes.shape
     to_first, to_last = motion.channel_flows(spikes, times, pattern)
     expected = 4, batch, 2, (height + 1) // 2, (width + 1) // 2
@@ -46,9 +46,9 @@ def _channel_flows(motion: MotionEstimator, spikes: Tensor, times: tuple[int, in
 
 
 def _to_sensor(flow: Tensor, row: int, column: int, height: int, width: int) -> Tensor:
-    """Bring a sub-stream's flow, whose pixel (i, j) is the sensor's (2 i + row, 2 j + column), to the sensor."""
+    """Resample a sub-stream's flow to the sensor; its pixel (i, j) is the sensor's (2 i + row, 2 j + column)."""
     flow, both = flow.flatten(0, 1), flow.shape[:2]
     flow = F.pad(flow, (column, 1 - column, row, 1 - row), mode="replicate")
     size = 2 * flow.shape[-2] - 1, 2 * flow.shape[-1] - 1
-    flow = 2 * F.interpolate(flow, size, mode="bilinear", align_corners=True)  # a value kept, one between two
+    flow = 2 * F.interpolate(flow, size, mode="bilinear", align_corners=True)  # keeps values, adds one between two
     return flow[..., row : row + height, column : column + width].unflatten(0, both)

@@ -1,4 +1,4 @@
-"""Reconstruction from the features of three colours: CCR, and the ablations H and I (Fig. 6)."""
+"""Reconstruction from the features of the colours: CCR, and the ablations H and I (Fig. 6)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lightning_modules.networks.layers import NoiseLevel, conv, res_blocks
 
 
 class ToRgb(nn.Conv2d):
-    """Sub-pixel convolution to the colours, never in half precision, which would round the picture itself."""
+    """Sub-pixel convolution to the colours; it disables autocast, as half precision would round the picture."""
 
     def __init__(self, inputs: int, enlarge: int = 1, groups: int = 1, colors: int = 3) -> None:
         super().__init__(inputs, colors * enlarge**2, 3, padding=1, groups=groups)
@@ -22,30 +22,29 @@ class ToRgb(nn.Conv2d):
 
 
 class ColorFusion(nn.Sequential):
-    """3 x 3 convolution and LeakyReLU: everything passes through here, and must not die as with a ReLU."""
+    """3 x 3 convolution and LeakyReLU; all features pass through here, so a dying ReLU would be fatal."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__(conv(inputs, outputs), nn.LeakyReLU(0.1, inplace=True))
 
 
 class ColorCorrelation(nn.Module):
-    """CCR (section 4.4, Fig. 6 a): the colours are refined side by side and fused after every stage.
+    """CCR (section 4.4, Fig. 6 a): parallel refinement of the colours, with a fusion after every stage.
 
-    A single colour, of a grey sensor, has as many residual blocks, and one fusion behind them.
+    The single colour of a grey sensor has the same number of residual blocks, followed by one fusion.
 
     Args:
-        width: channels, of every colour and inside.
-        stages: how often the colours are fused.
-        blocks: residual blocks of every colour in every stage.
+        width: channels per colour and between stages.
+        stages: number of fusions.
+        blocks: residual blocks per colour and stage.
         end_blocks: residual blocks after the last fusion.
-        enlarge: how many times larger the picture is than the features.
-        end_width: channels after the last fusion; when not given, ``width``.
-        colors: how many there are.
-        noise: be told the level of the sensor's noise.
+        enlarge: size of the picture relative to the features.
+        end_width: channels after the last fusion. Default: ``width``.
+        colors: number of colours, 3, or 1 for a grey sensor.
+        noise: condition the network on the noise level of the sensor.
 
     Shape:
-        - Input: features of every colour, each :math:`(B, width, H, W)`; perhaps the level of the noise,
-          :math:`(B, 1, 1, 1)`
+        - Input: features of each colour, :math:`(B, width, H, W)`; optionally the noise level, :math:`(B, 1, 1, 1)`
         - Output: rgb :math:`(B, colors, enlarge H, enlarge W)`
     """
 
@@ -75,7 +74,7 @@ class ColorCorrelation(nn.Module):
         self.rgb = ToRgb(end_width, enlarge, colors=colors)
 
     def features(self, colors: list[Tensor], noise: Tensor | None = None) -> Tensor:
-        """Features of all colours that the picture is made of, (B, end_width, H, W)."""
+        """Return the fused features before the last convolution, (B, end_width, H, W)."""
         fused: list[Tensor] = []
         for refine, fuse in zip(self.refine, self.fuse, strict=True):
             colors = [branch(color) for branch, color in zip(refine, colors, strict=True)]
@@ -88,9 +87,10 @@ class ColorCorrelation(nn.Module):
 
 
 class SeparateColors(nn.Module):
-    """No colour correlation (Fig. 6 b, ablation H): every colour makes its own channel of the picture.
+    """Reconstruction of each colour channel independently (Fig. 6 b, ablation H).
 
-    The number of residual blocks is that of :class:`ColorCorrelation`, the last ones shared out and rounded up.
+    The number of residual blocks is that of :class:`ColorCorrelation`; ``end_blocks`` are divided among the colours and
+    rounded up.
     """
 
     def __init__(self, width: int, stages: int, blocks: int, end_blocks: int, enlarge: int = 1) -> None:
@@ -106,7 +106,7 @@ class SeparateColors(nn.Module):
 
 
 class EarlyFusion(nn.Module):
-    """Colours fused once, at the beginning (Fig. 6 c, ablation I), and as many blocks as :class:`ColorCorrelation`."""
+    """Reconstruction with one fusion at the beginning (Fig. 6 c, ablation I), as deep as :class:`ColorCorrelation`."""
 
     def __init__(
         self, width: int, stages: int, blocks: int, end_blocks: int, enlarge: int = 1, end_width: int | None = None

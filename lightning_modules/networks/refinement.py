@@ -1,4 +1,4 @@
-"""Feature refinement over the time points: FR (section 4.3), and the ablation G (one convolution)."""
+"""Feature refinement over the time points: FR (section 4.3), and ablation G (one convolution)."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from lightning_modules.networks.layers import ConvBlock, conv
 
 
 class FeatureRefinement(nn.Module):
-    """FR (section 4.3, Fig. 5 c): what deviates from the mean over time is looked at by itself.
+    """FR (section 4.3, Fig. 5 c): separate branches for the features and for their deviation from the temporal mean.
 
-    From temporal-pixel features, one time point after another, (B, T features, H, W), to (B, width, H, W).
+    Maps the features of all time points, (B, T features, H, W), to (B, width, H, W).
     """
 
     def __init__(self, times: int, features: int, width: int) -> None:
@@ -22,15 +22,15 @@ class FeatureRefinement(nn.Module):
         self.residual = nn.Sequential(ConvBlock(times * features, width), conv(width, width))
 
     def first(self) -> tuple[Tensor, Tensor]:
-        """Weight and bias of the first convolution, that of both branches."""
+        """Return weight and bias of the first convolution of both branches."""
         base, residual = self.base[0][0], self.residual[0][0]
-        # the mean is taken off the weights, which are few, not off the pixels
+        # subtracting the mean from the few weights is cheaper than from the pixels
         weight = residual.weight.unflatten(1, (self.times, -1))
         weight = (weight - weight.mean(dim=1, keepdim=True)).flatten(1, 2)
         return torch.cat([base.weight, weight]), torch.cat([base.bias, residual.bias])
 
     def finish(self, seen: Tensor) -> Tensor:
-        """The layers behind the first convolution."""
+        """Apply the layers after the first convolution."""
         base, residual = self.base[1], self.residual[1]
         weight = torch.cat([base.weight, residual.weight], dim=1)
         return F.conv2d(seen.relu_(), weight, base.bias + residual.bias, padding=1)
@@ -40,27 +40,26 @@ class FeatureRefinement(nn.Module):
 
 
 class TimeFusion(nn.Conv2d):
-    """No refinement (ablations F and G): one convolution over the features of all time points."""
+    """One convolution over the features of all time points, without refinement (ablations F and G)."""
 
     def __init__(self, times: int, features: int, width: int) -> None:
         super().__init__(times * features, width, 3, padding=1)
         self.times = times
 
     def first(self) -> tuple[Tensor, Tensor]:
-        """Its weight and bias."""
+        """Return weight and bias of the convolution."""
         return self.weight, self.bias
 
     def finish(self, seen: Tensor) -> Tensor:
-        """Nothing more."""
+        """Return the features unchanged."""
         return seen
 
     @torch.no_grad()
     def start_at_the_mean(self, pixels: int) -> None:
-        """Set weights, so that the first channels are the means over time of the first feature.
+        """Initialise the first channels as temporal means of the first feature.
 
-        A single linear layer with random weights would have to find them behind the noise of every time point: training
-        would then stay on a plateau, for a time that depends on the seed. The first feature comes in so many temporal
-        ``pixels``, the first channels of every time point.
+        With random weights, training of this single linear layer stays on a plateau, for a time that depends on the
+        seed. The first feature of each time point has ``pixels`` channels, one per temporal pixel.
         """
         weight = self.weight.unflatten(1, (self.times, -1))
         means = min(pixels, len(weight))

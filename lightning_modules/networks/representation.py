@@ -1,4 +1,4 @@
-"""Spike representation, features of every time point of one colour: BSSR (section 4.2), and the ablations A and C."""
+"""Spike representation, the features of one colour at each time point: BSSR (section 4.2), and ablations A and C."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from torch import Tensor, nn
 from lightning_modules.networks.layers import ConvBlock, NoiseLevel, ResBlock, channels_last, conv
 from spikekit import tfi, tfi_at
 
-_PIXELS = 1 << 16  # of all time points that a CPU takes at once
+_PIXELS = 1 << 16  # pixels of all time points per step on a CPU
 
 
 class SpikeRepresentation(nn.Module):
-    """BSSR of one colour (section 4.2, Fig. 4): features of every time point, from its window and the whole clip.
+    """BSSR of one colour (section 4.2, Fig. 4): features of each time point, from its window and the whole clip.
 
     Shape:
-        - Input: the spikes of one colour, zero elsewhere, :math:`(B, N, H, W)`, and perhaps the level of the noise,
+        - Input: spikes :math:`(B, N, H, W)` of one colour, zero at other pixels; optionally the noise level,
           :math:`(B, 1, 1, 1)`
         - Output: :math:`(B, T, features, H, W)` with :math:`T = (N - window) / stride + 1`
     """
@@ -46,10 +46,9 @@ class SpikeRepresentation(nn.Module):
 
     @torch.no_grad()
     def start_at_the_mean(self) -> None:
-        """Set weights, so that the first feature is the share of the window's frames in which a pixel fired.
+        """Initialise the first feature as the firing rate in the window, and scale down the others.
 
-        The others are faint: random filters of single spikes are noise to all that follows, and training would first
-        have to learn to ignore them.
+        Random filters of single spikes are noise that training would first have to suppress.
         """
         local, fuse, last = self.local[0][0], self.fuse[0][0], self.fuse[-1]
         for layer, source, weight in ((local, slice(None), 1 / self.window), (fuse, 0, 1), (last, 0, 1)):
@@ -63,17 +62,17 @@ class SpikeRepresentation(nn.Module):
         windows = spikes.unfold(1, self.window, self.stride).movedim(-1, 2)
         everywhere = None
         if self.whole is not None:
-            # what is seen of the whole clip is the same at all times: it is convolved once, apart
+            # features of the whole clip are the same for all time points, so they are convolved once
             _, weight = self.fuse[0][0].weight.chunk(2, dim=1)
             everywhere = F.conv2d(self.whole(channels_last(spikes)), weight, padding=1).unsqueeze(1)
         few = windows.shape[1]
         if spikes.device.type == "cpu" and not (torch.is_grad_enabled() or torch.jit.is_tracing()):
-            few = max(1, _PIXELS // spikes[:, 0].numel())  # time points at once, so that they stay in the cache
+            few = max(1, _PIXELS // spikes[:, 0].numel())  # time points per step, to fit in the cache
         parts = [self._features(part, everywhere, noise) for part in windows.split(few, dim=1)]
         return torch.cat(parts, dim=1)
 
     def _features(self, windows: Tensor, everywhere: Tensor | None, noise: Tensor | None) -> Tensor:
-        """Features (B, T, features, H, W) of some time points, given their windows (B, T, window, H, W)."""
+        """Return the features (B, T, features, H, W) of windows (B, T, window, H, W)."""
         batch, times = windows.shape[:2]
         (fuse, relu), block, last = self.fuse
         local = self.local(channels_last(windows.flatten(0, 1)))
@@ -86,7 +85,7 @@ class SpikeRepresentation(nn.Module):
 
 
 class WindowMeans(nn.Module):
-    """The spikes as they are, without weights (ablation A): the share of a window's frames in which a pixel fired.
+    """Mean of the spikes in each window, without weights (ablation A).
 
     Example:
         >>> spikes = torch.tensor([1.0, 0, 1, 1, 1]).reshape(1, 5, 1, 1)
@@ -106,9 +105,9 @@ class WindowMeans(nn.Module):
 
 
 class IntervalRepresentation(nn.Module):
-    r"""Light from spike intervals, without weights (ablation C): :math:`1 / \Psi` of eq. (5) at every time point.
+    r"""Light from spike intervals, without weights (ablation C): :math:`1 / \Psi` of eq. (5) at each time point.
 
-    A pixel that never fires gives 0, those of the other colours among them.
+    Pixels that never fire are 0, and so are the pixels of other colours.
 
     Example:
         >>> spikes = torch.tensor([[0.0, 0], [1, 0], [0, 0], [0, 0], [1, 0]]).reshape(1, 5, 1, 2)
@@ -124,7 +123,7 @@ class IntervalRepresentation(nn.Module):
 
     def forward(self, spikes: Tensor) -> Tensor:  # noqa: D102
         fired = spikes.any(dim=1, keepdim=True)
-        if is_exporting():  # of the operators of TFI, that of single frames has a path which other programs know
+        if is_exporting():  # only tfi_at has an exportable implementation
             light = torch.stack([tfi_at(spikes, n) for n in self.times], dim=1)
         else:
             light = tfi(spikes)[:, self.times]

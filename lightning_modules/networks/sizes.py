@@ -1,4 +1,4 @@
-"""Sizes of CSCSR by name: widths and depths, which the paper leaves open."""
+"""Named sizes of CSCSR; the paper does not specify widths and depths."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ def _widths(width: int, representation_width: int, **depths: int) -> dict[str, i
     return {"width": width, "representation_width": representation_width, **depths}
 
 
-#: as the paper lays the network out: refinement and reconstruction work at the resolution of the picture
+#: as in the paper: refinement and reconstruction at the resolution of the picture
 _FULL = {"resolution": "output", "blocks": 1}
-#: at the resolution of the sensor, with the temporal pixels of a site as channels: a fraction of the work
+#: at sensor resolution, with the temporal pixels of each sensor pixel as channels: a fraction of the work
 _SENSOR = {"resolution": "sensor", "blocks": 1}
 _CLIP = {**_SENSOR, "width": 32, "representation_width": 16, "features": 2, "stages": 3}
 
-#: fields of :class:`lightning_modules.networks.CSCSRConfig` by the name of a size. Parameters and million
-#: multiplications by sensor pixel at x4: tiny 0.30 M and 0.36, small 1.08 M and 1.48, base 1.32 M and 1.72, large
-#: 2.26 M and 2.66, huge 3.78 M and 4.18, full_small 0.17 M and 1.86, full_base 0.73 M and 9.06, full_large 2.83 M
-#: and 42.7. Of those for x1, where a site is one temporal pixel and time points have more features, for a grey sensor:
-#: small_x1 0.53 M and 0.67, large_x1 1.72 M and 2.02
+#: fields of :class:`lightning_modules.networks.CSCSRConfig` by size. Parameters, and million multiplications per sensor
+#: pixel, at x4: tiny 0.30 M and 0.36, small 1.08 M and 1.48, base 1.32 M and 1.72, large 2.26 M and 2.66, huge 3.78 M
+#: and 4.18, full_small 0.17 M and 1.86, full_base 0.73 M and 9.06, full_large 2.83 M and 42.7. At x1 for a grey
+#: sensor: small_x1 0.53 M and 0.67, large_x1 1.72 M and 2.02. Sizes for x1 have more features, as there is one temporal
+#: pixel per sensor pixel
 SIZES: dict[str, dict[str, Any]] = {
     "tiny": {**_SENSOR, "stride": 6, **_widths(24, 8, features=1, stages=2, end_blocks=1)},
     "small": {**_CLIP, "end_blocks": 3},
@@ -35,7 +35,7 @@ SIZES: dict[str, dict[str, Any]] = {
 
 
 def default_stride(frames: int, window: int) -> int:
-    """Return the stride between time points that gives eleven of them, or the next larger number that fits.
+    """Return the stride that gives eleven time points, or the next larger number that fits.
 
     Example:
         >>> default_stride(41, 11), default_stride(101, 11), default_stride(23, 11)

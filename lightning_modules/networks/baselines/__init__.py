@@ -1,4 +1,4 @@
-"""The methods that the paper compares CSCSR with (Table 2), implemented from their publications."""
+"""Methods to which the paper compares CSCSR (Table 2), implemented from their publications."""
 
 from lightning_modules.networks.baselines.basicvsr import BasicVSR
 from lightning_modules.networks.baselines.real_rawvsr import RealRawVSR

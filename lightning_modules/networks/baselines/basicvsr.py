@@ -1,4 +1,4 @@
-"""BasicVSR behind demosaiced pictures of several times."""
+"""BasicVSR on demosaiced pictures at several times."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ _TIMES = 11
 
 
 class BasicVSR(Baseline):
-    r"""BasicVSR (Chan et al., CVPR 2021) behind pictures of 3DRI, as the paper's 3DRI+BasicVSR.
+    r"""BasicVSR (Chan et al., CVPR 2021) on 3DRI-like pictures, the paper's 3DRI+BasicVSR.
 
-    From the publication: features go from time to time, backwards and forwards, warped by flow, through a convolution
-    and residual blocks; both directions are merged, enlarged by sub-pixel convolutions, and added to the bilinear
-    picture. Only the middle picture is asked for, so the times behind it in either direction are not run.
+    As published: features propagate forwards and backwards in time, warped by flow, through a convolution and residual
+    blocks. Both directions are merged, enlarged by sub-pixel convolutions, and added to the bilinear picture. Only the
+    middle picture is computed, so each direction ends there.
 
-    Ours: the pictures are those of 3DRI-like demosaicing of what TFI makes of 11 frames, 5, 8, ..., 35 of 41, each with
-    its two neighbours in time on either side. The weights of SPyNet are not to be had: the flow from one time to the
-    next is the difference of the linear motions to both, which are those of CSCSR's kind of estimator. That leaves out
-    SPyNet's 1,440,300 weights. The published size has 30 blocks in each direction, the default 10. A
-    ``width`` of 24 does the work of CSCSR's size small.
+    Differences: the 11 pictures, at frames 5, 8, ..., 35 of 41, are TFI mosaics with 3DRI-like demosaicing, each with
+    two neighbours in time on either side. Instead of SPyNet, whose weights are not available (1,440,300 parameters),
+    the flow between two times is the difference of their linear motions from CSCSR's motion estimators. The published
+    size has 30 blocks per direction, the default 10. A ``width`` of 24 takes as much work as CSCSR's size small.
 
-    A picture goes through 70 and more convolutions on its way, so it is not run tile by tile.
+    More than 70 convolutions follow each other, so the receptive field is too large for tiles.
 
     Args:
         scale: super-resolution factor s.
-        frames: spike frames N of a clip, odd, at least 13.
+        frames: number N of spike frames per clip, odd, at least 13.
         pattern: Bayer phase.
-        alpha: gain of the camera, what a white pixel receives per clock in thresholds; pictures are divided by it.
+        alpha: gain of the camera: light of a white pixel per clock, in thresholds. The picture is light divided by it.
         width: channels.
-        blocks: residual blocks in each direction.
-        neighbors: pictures on either side in time that demosaicing goes by; 0 for residual interpolation alone.
-        motion: estimator that is asked where no flow is given.
+        blocks: residual blocks per direction.
+        neighbors: pictures on either side in time that demosaicing uses; 0 for residual interpolation only.
+        motion: motion estimator, called when no flow is given. Default:
+            :class:`lightning_modules.motion.ClassicalFlow`.
 
     Shape:
-        - Input: spikes :math:`(B, N, H, W)`, zeros and ones, any real dtype; optionally the flows from the middle to
-          the first and to the last time point, :math:`(B, 2, 2, H, W)`, in sensor pixels; or ``static=True``
+        - Input: spikes :math:`(B, N, H, W)`, zeros and ones of any real dtype; optionally the flows from the middle to
+          the first and last time points, :math:`(B, 2, 2, H, W)`, in sensor pixels; or ``static=True``
         - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
 
     Example:
@@ -96,20 +96,20 @@ class BasicVSR(Baseline):
 
     @torch.no_grad()
     def _demosaic(self, spikes: Tensor, offsets: Tensor) -> Tensor:
-        """Pictures of all times, (B, T, 3, H, W)."""
+        """Return the demosaiced pictures at all times, (B, T, 3, H, W)."""
         raws = decode_pictures(spikes, self.times, self.alpha)
         if not self.neighbors:
             return demosaic_residual(raws, self.pattern)
         pictures = []
         for n in range(_TIMES):
-            # mirrored in time, so that the picture itself is in the middle
+            # mirrored in time, to keep the picture in the middle
             around = [_TIMES - 1 - abs(_TIMES - 1 - abs(n + k)) for k in range(-self.neighbors, self.neighbors + 1)]
             motion = offsets[:, around] - offsets[:, n : n + 1]
             pictures.append(demosaic_along_motion(raws[:, around], motion, self.pattern))
         return torch.stack(pictures, dim=1)
 
     def _propagate(self, trunk: nn.Module, pictures: Tensor, offsets: Tensor, times: Iterable[int]) -> Tensor:
-        """Carry features from time to time; return those of the last."""
+        """Propagate features through time, and return those of the last time."""
         state, before = None, None
         for time in times:
             if state is None:

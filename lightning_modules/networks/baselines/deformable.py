@@ -10,10 +10,10 @@ from lightning_modules.networks.layers import conv
 
 
 class DeformableConv2d(nn.Module):
-    r"""Modulated deformable convolution, 3 x 3, whose offsets and masks a convolution finds in other features.
+    r"""Modulated deformable 3 x 3 convolution; a convolution predicts its offsets and masks from guide features.
 
-    That convolution starts at zero: no offset, and every tap at one half. Positions are computed in the precision of
-    the weights, under autocast too. So many groups of channels share their offsets.
+    The predictor is initialised with zeros: no offset, and all masks 0.5. Positions are computed in the precision of
+    the weights, also under autocast. Each of the ``groups`` of channels has its own offsets.
 
     Shape:
         - Input: features and guide, each :math:`(B, C, H, W)`
@@ -31,7 +31,7 @@ class DeformableConv2d(nn.Module):
         super().__init__()
         if width % groups:
             raise ValueError(
-                f"width: expected a multiple of {groups}, the groups of a deformable convolution, got {width}"
+                f"width: expected a multiple of {groups}, the groups of the deformable convolution, got {width}"
             )
         self.where = conv(width, 27 * groups)
         nn.init.zeros_(self.where.weight)

@@ -1,4 +1,4 @@
-"""The star of Table 2: one network of one colour, which reconstructs the four Bayer sub-streams one by one."""
+"""Methods with a star in Table 2: one single-channel network reconstructs the four Bayer sub-streams separately."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from spikekit.color.cfa import bayer_sites
 def per_channel(
     reconstruct: Callable[[Tensor, Tensor], Tensor], spikes: Tensor, flow: Tensor, pattern: str, scale: int
 ) -> Tensor:
-    r"""Reconstruct every Bayer sub-stream by itself with one shared network, and put the colours together.
+    r"""Reconstruct each Bayer sub-stream separately with one shared network, and merge the colours.
 
-    The paper says of VidarSR\* and SpikeSR-Net\* that they handle "each color channel separately", and no more. How is
-    ours: the four sub-streams, each half as large as the sensor, are enlarged by 2 s, moved by the half pixel of the
-    sensor that their sites are off the middle of the Bayer cell, bilinearly, and the two greens are averaged.
+    The paper only says that VidarSR\* and SpikeSR-Net\* handle "each color channel separately". Here the four
+    sub-streams, each half the size of the sensor, are enlarged by 2 s and shifted bilinearly by half a sensor pixel,
+    the distance of their pixels from the centre of the Bayer cell. The two greens are averaged.
 
-    ``reconstruct`` maps the spikes of sub-streams, (4 B, N, h, w), and their flows, (4 B, 2, 2, h, w), in pixels of the
-    sub-streams, to pictures of one channel, (4 B, 1, 2 s h, 2 s w); what is returned is rgb, (B, 3, s H, s W).
+    ``reconstruct`` maps the spikes of sub-streams, (4 B, N, h, w), and their flows, (4 B, 2, 2, h, w), in pixels of
+    the sub-streams, to pictures (4 B, 1, 2 s h, 2 s w). The result is rgb (B, 3, s H, s W).
     """
     batch, (height, width) = len(spikes), spikes.shape[-2:]
     planes = split_any_size(spikes, pattern)
@@ -30,7 +30,7 @@ def per_channel(
     pictures = reconstruct(planes.flatten(0, 1), flows.flatten(0, 1)).unflatten(0, (4, batch))
     colors: list[list[Tensor]] = [[], [], []]
     for picture, (color, row, column) in zip(pictures, bayer_sites(pattern), strict=True):
-        # the value at (x, y) stands at (x, y) + shift in the picture of the sub-stream
+        # the value at (x, y) is at (x, y) + shift in the sub-stream's picture
         shift = picture.new_tensor([scale / 2 - scale * column, scale / 2 - scale * row]).reshape(1, 2, 1, 1)
         colors[color].append(flow_warp(picture, shift.expand(batch, 2, *picture.shape[-2:])))
     rgb = torch.cat([torch.stack(found).mean(dim=0) for found in colors], dim=1)

@@ -1,4 +1,4 @@
-"""What the baselines share: decoded pictures, padding to any size, settings, the skip, sub-pixel convolutions."""
+"""Parts shared by the baselines: decoded pictures, padding, settings, the skip, sub-pixel convolutions."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ Decoder = Literal["tfi", "tfp"]
 
 
 def whole_sizes(**sizes: int) -> dict[str, int]:
-    """Return sizes by name; raise unless each is a whole number, 1 or more."""
+    """Return sizes by name, after a check that each is a positive integer."""
     return {name: check_whole(name, size) for name, size in sizes.items()}
 
 
 def check_decoder(decoder: str, window: int) -> None:
-    """Raise unless the decoder is TFI, or TFP with an odd window."""
+    """Check that the decoder is TFI or TFP, and the window odd."""
     if decoder not in ("tfi", "tfp"):
         raise ValueError(f"decoder: expected 'tfi' or 'tfp', got {decoder!r}")
     if window % 2 == 0:
@@ -36,41 +36,40 @@ def check_decoder(decoder: str, window: int) -> None:
 def decode_pictures(
     spikes: Tensor, times: Sequence[int], alpha: float, decoder: Decoder = "tfi", window: int = 41
 ) -> Tensor:
-    """Mosaics (B, T, H, W) of a clip at some of its frames, white being 1; nothing is learned through them."""
+    """Decode mosaics (B, T, H, W) at T frames of a clip, with white at 1, without gradient."""
     decoded = [tfi_at(spikes, n) if decoder == "tfi" else tfp_at(spikes, n, window) for n in times]
     return torch.stack(decoded, dim=1) / alpha
 
 
 def mirror_to_multiple(planes: Tensor, multiple: int) -> Tensor:
-    """Continue planes (*, H, W) at the bottom and at the right until their sides are multiples of a number.
+    """Pad planes (*, H, W) at the bottom and right, until both sides are multiples of a number.
 
-    They are mirrored without repeating the outermost pixel, and so again where they are shorter than what is missing:
-    a mosaic keeps its Bayer phase.
+    Padding reflects, without repeating the edge pixel, to keep the Bayer phase; small planes are reflected repeatedly.
     """
     for axis in (-2, -1):
         length = planes.shape[axis]
         whole = (length + multiple - 1) // multiple * multiple
-        if is_exporting() or whole > length:  # a program is for any length
+        if is_exporting() or whole > length:  # exported programs accept any length
             at = torch.arange(whole, device=planes.device)
-            if not is_exporting():  # whose lengths are 16 or more, and less than that is missing
+            if not is_exporting():  # exported programs have sides of at least 16, so one reflection suffices
                 at %= 2 * length - 2
             planes = planes.index_select(axis, torch.minimum(at, 2 * length - 2 - at))
     return planes
 
 
 def cut_to(planes: Tensor, height: int, width: int) -> Tensor:
-    """Return the first rows and columns of planes (*, H, W), as what was mirrored is cut off again."""
+    """Crop planes (*, H, W) to their first rows and columns, to remove the padding."""
     if not is_exporting():
         return planes[..., :height, :width]
-    # copied also where nothing is cut off: a program is for both
+    # always copied, as exported programs accept sizes with and without padding
     rows, columns = (torch.arange(length, device=planes.device) for length in (height, width))
     return planes.index_select(-2, rows).index_select(-1, columns)
 
 
 class Baseline(Network):
-    """Base of the baselines that learn: what they all are built with, and ``more`` that each has for itself.
+    """Base class of the learned baselines, with the common settings and ``more`` settings of each subclass.
 
-    Their flows run between the frames 5, 20 and 35 of 41, as those of CSCSR.
+    Their flows run between frames 5, 20 and 35 of 41, as for CSCSR.
     """
 
     def __init__(
@@ -91,31 +90,31 @@ class Baseline(Network):
         self.alpha = alpha
 
     def flow_or_estimate(self, spikes: Tensor, flow: Tensor | None, static: bool = False) -> Tensor:
-        """Return the flow that was given, what the network's estimator sees, or zeros, (B, 2, 2, H, W)."""
+        """Return the given flow, the estimated flow, or zeros if ``static``, (B, 2, 2, H, W)."""
         flow = self.resolve_flow(spikes, flow, static)
         return torch.zeros(len(spikes), 2, 2, *spikes.shape[-2:], device=spikes.device) if flow is None else flow
 
     def offsets(self, flow: Tensor, times: Sequence[int]) -> Tensor:
-        """Return the motion from the middle to each of T times, (B, T, 2, H, W), linear on both sides of it."""
+        """Return the displacement from the middle to each of T times, (B, T, 2, H, W), linear on either side."""
         first, middle, last = self.flow_times
         return linear_motion(flow[:, 0], flow[:, 1], times, first=first, middle=middle, last=last)
 
 
 @torch.no_grad()
 def along_motion(network: Baseline, spikes: Tensor, flow: Tensor) -> Tensor:
-    """The 3DRI-like picture (B, 3, H, W) of five TFI mosaics, of the frames 10, 15, ..., 30 of 41; without gradient."""
+    """Return the 3DRI-like picture (B, 3, H, W) of five TFI mosaics, at frames 10, 15, ..., 30 of 41; no gradient."""
     times = [network.frames // 2 + n * (network.frames // 8) for n in range(-2, 3)]
     raw = decode_pictures(spikes, times, network.alpha)
     return demosaic_along_motion(raw, network.offsets(flow, times), network.pattern)
 
 
 def enlarge_picture(picture: Tensor, scale: int) -> Tensor:
-    """Bicubic: (B, C, H, W) to (B, C, s H, s W)."""
+    """Enlarge bicubically, (B, C, H, W) to (B, C, s H, s W)."""
     return picture if scale == 1 else F.interpolate(picture, scale_factor=scale, mode="bicubic", align_corners=False)
 
 
 def begin_at_zero(*layers: nn.Conv2d) -> None:
-    """Initialise convolutions with zeros, so that training starts from what their result is added to."""
+    """Initialise convolutions with zeros, so that training starts from the skip connection."""
     for layer in layers:
         nn.init.zeros_(layer.weight)
         nn.init.zeros_(layer.bias)
@@ -123,12 +122,12 @@ def begin_at_zero(*layers: nn.Conv2d) -> None:
 
 @torch.no_grad()
 def enlarged_raw(raw: Tensor, pattern: str | None, scale: int) -> Tensor:
-    """Demosaic (B, H, W) by residual interpolation, unless all pixels see one colour, and enlarge bicubically."""
+    """Demosaic (B, H, W) by residual interpolation, unless ``pattern`` is None, and enlarge bicubically."""
     return enlarge_picture(raw.unsqueeze(1) if pattern is None else demosaic_residual(raw, pattern), scale)
 
 
 def sub_pixel_convolutions(width: int, scale: int, *after: nn.Module) -> nn.Sequential:
-    """A convolution and a pixel shuffle (Shi et al., CVPR 2016) for every prime factor of the scale.
+    """Return a convolution and a pixel shuffle (Shi et al., CVPR 2016) for each prime factor of the scale.
 
     Example:
         >>> [layer.upscale_factor for layer in sub_pixel_convolutions(8, 6)[1::2]]

@@ -1,4 +1,4 @@
-"""Real-RawVSR, joint demosaicing and super-resolution of raw video, behind TFI or TFP."""
+"""Real-RawVSR, joint demosaicing and super-resolution of raw video, on mosaics of TFI or TFP."""
 
 from __future__ import annotations
 
@@ -27,35 +27,34 @@ _FRAMES = 5
 
 
 class RealRawVSR(Baseline):
-    r"""Real-RawVSR (Yue et al., ECCV 2022), behind one of the decoders, as the paper's TFI+ and TFP+Real-RawVSR.
+    r"""Real-RawVSR (Yue et al., ECCV 2022) on decoded mosaics, the paper's TFI+Real-RawVSR and TFP+Real-RawVSR.
 
-    From the publication: two branches, of the mosaics and of the same packed as four channels of half the size;
-    features on three levels; neighbours aligned to the middle by deformable convolutions of which the packed branch
-    finds the offsets for both; the branches tell each other what they have; attention over time, fusion in time and
-    space as in EDVR, a selective kernel over the branches; ten residual blocks; what is added to the picture comes from
-    the middle mosaic of each branch by convolutions.
+    As published: two branches, one for the mosaics and one for the mosaics packed as four channels of half the size;
+    features on three levels; deformable alignment of neighbours to the middle, with offsets of both branches from the
+    packed one; exchange of features between the branches; attention over time; fusion in time and space as in EDVR; a
+    selective kernel over the branches; ten residual blocks; convolutional skips from the middle mosaic of each branch.
 
-    Ours: the five mosaics are what TFI or TFP makes of the frames 10, 15, 20, 25 and 30 of 41. Attention over time
-    is scaled by the root of the number of values, as attention is. The colour correction by the ground truth is left
-    out. Sides are mirrored to multiples of 8, on which the levels meet. A ``width`` of 24 does the work of CSCSR's size
-    small.
+    Differences: TFI or TFP decodes the five mosaics, at frames 10, 15, 20, 25 and 30 of 41. Attention over time is
+    scaled by the square root of the number of values, as usual. There is no colour correction with the ground truth.
+    Sides are padded by reflection to multiples of 8, as the levels require. A ``width`` of 24 takes as much work as
+    CSCSR's size small.
 
-    Attention and the selective kernel look at the whole picture: not run tile by tile.
+    Attention and the selective kernel depend on the whole picture, so the network does not run in tiles.
 
     Args:
         decoder: ``"tfi"`` or ``"tfp"``.
         scale: super-resolution factor s.
-        frames: spike frames N of a clip, odd, at least 9.
+        frames: number N of spike frames per clip, odd, at least 9.
         pattern: Bayer phase.
-        alpha: gain of the camera, what a white pixel receives per clock in thresholds; mosaics are divided by it.
-        tfp_window: spike frames that TFP averages, odd.
+        alpha: gain of the camera: light of a white pixel per clock, in thresholds. The picture is light divided by it.
+        tfp_window: number of spike frames that TFP averages, odd.
         width: channels, a multiple of 8.
-        blocks: residual blocks after fusion; half as many make the features of every branch.
-        skip: learn what to add to the middle mosaic, demosaiced by residual interpolation and enlarged bicubically. The
-            publication has no such skip; with it training starts where a decoder ends.
+        blocks: residual blocks after fusion; each branch has half as many before it.
+        skip: predict a residual, which is added to the middle mosaic, demosaiced by residual interpolation and enlarged
+            bicubically, so that training starts from the result of the decoder. The publication has no such skip.
 
     Shape:
-        - Input: spikes :math:`(B, N, H, W)`, zeros and ones, any real dtype; a flow changes nothing
+        - Input: spikes :math:`(B, N, H, W)`, zeros and ones of any real dtype; the flow is ignored
         - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
 
     Example:
@@ -96,7 +95,7 @@ class RealRawVSR(Baseline):
             begin_at_zero(*self.enlarge.pictures)
 
     def forward(self, spikes: Tensor, flow: Tensor | None = None, static: bool = False) -> Tensor:
-        """Return rgb; a flow changes nothing."""
+        """Return rgb; the flow is ignored."""
         self.check_spikes(spikes)
         height, width = spikes.shape[-2:]
         spikes = mirror_to_multiple(spikes, 8).to(self.align.cascade.weight.dtype)
@@ -111,14 +110,14 @@ class RealRawVSR(Baseline):
         return rgb.to(spikes.dtype)
 
     def _align(self, raws: Tensor, packed: Tensor) -> tuple[Tensor, Tensor]:
-        """Features of both branches as they are in the middle, (B, T, C, H, W) and (B, T, C, H / 2, W / 2)."""
+        """Return features of both branches, aligned to the middle, (B, T, C, H, W) and (B, T, C, H / 2, W / 2)."""
         times = raws.shape[:2]
         raw, packed = self.raw_features(raws.flatten(0, 1)), self.packed_features(packed.flatten(0, 1))
         middle = [level.unflatten(0, times)[:, _FRAMES // 2].repeat_interleave(_FRAMES, dim=0) for level in packed]
         return tuple(branch.unflatten(0, times) for branch in self.align(raw, packed, middle))
 
     def _fuse(self, raw: Tensor, packed: Tensor) -> Tensor:
-        """Bring the times and the branches together: (B, C, H, W)."""
+        """Fuse the times and the branches, to (B, C, H, W)."""
         times = raw.shape[:2]
         told_raw = self.to_raw(packed.flatten(0, 1)).unflatten(0, times)
         told_packed = self.to_packed(raw.flatten(0, 1)).unflatten(0, times)
@@ -132,7 +131,7 @@ def _relu() -> nn.LeakyReLU:
 
 
 class _Pyramid(nn.Module):
-    """Features on three levels, each half as large as the one before."""
+    """Features on three levels, each half the size of the previous one."""
 
     def __init__(self, inputs: int, width: int, blocks: int) -> None:
         super().__init__()
@@ -150,7 +149,7 @@ class _Pyramid(nn.Module):
 
 
 class _Alignment(nn.Module):
-    """Pyramid, cascading and deformable alignment (EDVR) of two branches, one of which finds the offsets for both."""
+    """Pyramid, cascading and deformable alignment (EDVR) of two branches, with offsets from the packed one."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -164,7 +163,7 @@ class _Alignment(nn.Module):
         self.act = _relu()
 
     def forward(self, raw: list[Tensor], packed: list[Tensor], middle: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Move what two branches have of any time to the middle, of which the packed branch is given."""
+        """Align the features of both branches to the packed features of the middle frame."""
         guide, moved = None, []
         for level in reversed(range(_LEVELS)):
             found = self.act(self.compare[level](torch.cat([packed[level], middle[level]], dim=1)))
@@ -184,7 +183,7 @@ class _Alignment(nn.Module):
 
 
 class _TemporalAttention(nn.Module):
-    """Every map plus what it has in common with the others, from nothing on."""
+    """Attention between the feature maps of all times, with a learned weight that starts at 0."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -225,12 +224,12 @@ class _Fusion(nn.Module):
 
 
 def _pooled(maps: Tensor) -> Tensor:
-    """Maxima and means of half the size, side by side."""
+    """Concatenate max pooling and average pooling to half the size."""
     return torch.cat([F.max_pool2d(maps, 3, 2, 1), F.avg_pool2d(maps, 3, 2, 1)], dim=1)
 
 
 class _SelectiveKernel(nn.Module):
-    """Two branches weighed channel by channel, going by the mean of both over the picture (Li et al., CVPR 2019)."""
+    """Channel weights of two branches from their mean over the picture (Li et al., CVPR 2019)."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -244,7 +243,7 @@ class _SelectiveKernel(nn.Module):
 
 
 class _Enlargement(nn.Module):
-    """From features to the picture, x4 in two steps; the middle mosaic of either branch has a way of its own to it."""
+    """Enlargement of features to the picture, x4 in two steps, with a skip from the middle mosaic of each branch."""
 
     def __init__(self, width: int, scale: int) -> None:
         super().__init__()
@@ -259,7 +258,7 @@ class _Enlargement(nn.Module):
 
     @property
     def pictures(self) -> list[nn.Conv2d]:
-        """The convolutions whose results add up to the picture."""
+        """Convolutions whose outputs are summed to the picture."""
         return [self.last[-1], self.raw_picture[0], self.packed_picture[0]]
 
     def forward(self, features: Tensor, raw: Tensor, packed: Tensor) -> Tensor:

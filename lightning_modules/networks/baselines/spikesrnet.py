@@ -1,4 +1,4 @@
-"""A stand-in for SpikeSR-Net, whose code and text are not public."""
+"""Stand-in for SpikeSR-Net, whose code and text are not public."""
 
 from __future__ import annotations
 
@@ -23,35 +23,36 @@ from spikekit import split_colors
 class SpikeSRNetLike(Baseline):
     r"""SpikeSR-Net (Zhao et al., AAAI 2023), for grey spike cameras, as far as it is published.
 
-    From the publication, of which no more than the abstract and figures in later papers could be had: a spike encoder
-    that adapts to every pixel turns the stream into representations of several times; a resolver that is led by the
-    observation model aligns them and exploits them again and again; at x4 the grey network has 3.34 million weights.
+    As published, according to the abstract and to figures in later papers: a pixel-adaptive spike encoder turns the
+    stream into representations at several times; a resolver, guided by the observation model, aligns them and uses
+    them repeatedly; at x4 the grey network has 3.34 million weights.
 
-    Ours, and so everything that can be counted: windows of 13 spikes at every 7th; kernels over the spikes of a
-    window, predicted for every pixel, 16 of them; alignment to the middle one by a deformable convolution whose offsets
-    come from both; a picture's features that are corrected four times by the enlarged difference of the mean of the
-    aligned representations and the shrunk features. The 16 filtered maps are split into the three colours, zeros
-    elsewhere: a convolution over a bare mosaic could not know which colour is where. No flow is asked for. A ``width``
-    of 32 with 12 ``maps`` does the work of CSCSR's size small, or 24 and 8 ``per_channel``.
+    The details are this project's own: windows of 13 spike frames, 7 apart; 16 predicted kernels per pixel over the
+    spikes of a window; deformable alignment to the middle representation, with offsets from both; four corrections of
+    the picture's features by the enlarged difference between the mean of the aligned representations and the shrunk
+    features. The 16 filtered maps are split into three colour planes with zeros at other pixels, so that convolutions
+    can tell the colours apart. The network needs no flow. A ``width`` of 32 with 12 ``maps`` takes as much work as
+    CSCSR's size small, and so does 24 with 8 ``per_channel``.
 
-    Offsets may reach anywhere, so it is not run tile by tile.
+    Offsets are unbounded, so the network does not run in tiles.
 
     Args:
         scale: super-resolution factor s.
-        frames: spike frames N of a clip, odd.
-        length: spike frames of a representation, odd.
-        every: spike frames between two representations; must divide frames - length an even number of times, so that
-            one of them is of the middle frame.
+        frames: number N of spike frames per clip, odd.
+        length: number of spike frames per representation, odd.
+        every: spike frames between two representations; (frames - length) / every must be even, so that one
+            representation is centred on the middle frame.
         pattern: Bayer phase.
-        alpha: gain of the camera, what a white pixel receives per clock in thresholds; the spikes are divided by it.
+        alpha: gain of the camera: light of a white pixel per clock, in thresholds. The picture is light divided by it.
         width: channels, a multiple of 8.
-        maps: kernels of every pixel.
-        corrections: of the picture's features.
-        per_channel: the star of the paper's table: every sub-stream by itself, one network for all.
-        skip: learn what to add to the bicubically enlarged TFI picture; with it training starts where a decoder ends.
+        maps: number of kernels per pixel.
+        corrections: number of corrections of the picture's features.
+        per_channel: reconstruct each Bayer sub-stream separately, as the paper's SpikeSR-Net with a star.
+        skip: predict a residual, which is added to the demosaiced and bicubically enlarged TFI picture, so that
+            training starts from the result of the decoder.
 
     Shape:
-        - Input: spikes :math:`(B, N, H, W)`, zeros and ones, any real dtype; a flow changes nothing
+        - Input: spikes :math:`(B, N, H, W)`, zeros and ones of any real dtype; the flow is ignored
         - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
 
     Example:
@@ -79,8 +80,8 @@ class SpikeSRNetLike(Baseline):
         super().__init__(scale, frames, pattern, alpha, {**sizes, "per_channel": per_channel, "skip": skip}, ZeroFlow())
         if length % 2 == 0 or length > frames or (frames - length) % (2 * every):
             raise ValueError(
-                "length, every: expected an odd length, and every so many frames that they divide frames - length an "
-                f"even number of times, got {length} and {every} with {frames} frames"
+                "length, every: expected an odd length and an even (frames - length) / every, "
+                f"got {length} and {every} with {frames} frames"
             )
         self.length, self.every, self.maps = length, every, maps
         self.per_channel, self.skip = per_channel, skip
@@ -99,7 +100,7 @@ class SpikeSRNetLike(Baseline):
             begin_at_zero(self.picture)
 
     def forward(self, spikes: Tensor, flow: Tensor | None = None, static: bool = False) -> Tensor:
-        """Return rgb; a flow changes nothing."""
+        """Return rgb; the flow is ignored."""
         self.check_spikes(spikes)
         spikes = spikes.to(self.picture.weight.dtype)
         if self.per_channel:
@@ -110,7 +111,7 @@ class SpikeSRNetLike(Baseline):
         return rgb.to(spikes.dtype)
 
     def _reconstruct(self, spikes: Tensor) -> Tensor:
-        """Return pictures, (B, 1 or 3, s H, s W), s being twice the scale where every colour is by itself."""
+        """Return pictures (B, 3, s H, s W), or (B, 1, 2 s H, 2 s W) of a sub-stream."""
         windows = spikes.unfold(1, self.length, self.every).movedim(-1, 2)  # (B, M, length, H, W)
         count = windows.shape[1]
         features = self._represent(windows.flatten(0, 1)).unflatten(0, (-1, count))
@@ -128,7 +129,7 @@ class SpikeSRNetLike(Baseline):
         return rgb
 
     def _represent(self, window: Tensor) -> Tensor:
-        """Filter the spikes of every pixel by kernels of its own: (B, length, H, W) to (B, width, H, W)."""
+        """Filter the spikes with kernels predicted per pixel, (B, length, H, W) to (B, width, H, W)."""
         kernels = self.kernels(window).unflatten(1, (self.maps, self.length)).softmax(dim=2)
         maps = torch.einsum("bkthw,bthw->bkhw", kernels, window.to(kernels.dtype)) / self.alpha
         if not self.per_channel:
@@ -137,7 +138,7 @@ class SpikeSRNetLike(Baseline):
 
 
 class _Correction(nn.Module):
-    """The error of the features of a picture, seen at the sensor's resolution."""
+    """Correction of the picture's features, from their error at the sensor's resolution."""
 
     def __init__(self, width: int, scale: int) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""SwinIR on the demosaiced picture of the middle frame: the paper's "3DRI + SwinIR"."""
+"""SwinIR on the demosaiced picture of the middle frame, the paper's "3DRI + SwinIR"."""
 
 from __future__ import annotations
 
@@ -20,45 +20,46 @@ from lightning_modules.networks.baselines.pictures import (
 )
 from lightning_modules.networks.layers import conv
 
-_MEAN = 0.4488, 0.4371, 0.4040  # of the DIV2K pictures that SwinIR was trained on
-_SIDE = 8  # of an attention window, in pixels
+_MEAN = 0.4488, 0.4371, 0.4040  # mean colour of DIV2K, SwinIR's training data
+_SIDE = 8  # side of an attention window, in pixels
 _SHIFT = _SIDE // 2
 
 
 class SwinIR(Baseline):
-    r"""Residual groups of window attention on the 3DRI-like picture of the middle frame.
+    r"""SwinIR, residual groups of window attention, on the 3DRI-like picture of the middle frame.
 
-    From the publication: all layers, their widths and their order; parameters and initialisation are those of SwinIR
-    for RGB, light or full. Ours: what the picture is made of, :func:`spikekit.demosaic_along_motion` of five TFI
-    mosaics, through which nothing is learned; that sides are mirrored without repeating the outermost pixel; the
-    optional ``skip``; and the training, which is that of all networks here. The original's is l1, Adam at 2e-4 with
-    betas of 0.9 and 0.99, 500,000 steps, halved at 250, 400, 450 and 475 thousand.
+    As published: all layers, their widths and their order; parameters and initialisation are those of SwinIR for RGB,
+    light or full. Differences: the picture is :func:`spikekit.demosaic_along_motion` of five TFI mosaics, without
+    gradient; padding reflects without repeating the edge pixel; ``skip`` is optional; the training is that of all
+    networks here. The original uses the l1 loss and Adam at 2e-4 with betas of 0.9 and 0.99, for 500,000 steps, halved
+    at 250, 400, 450 and 475 thousand.
 
     Args:
-        scale: super-resolution factor.
-        frames: spike frames N of a clip, odd.
-        pattern: Bayer phase of the streams.
-        alpha: gain of the camera, what a white pixel receives per clock in thresholds; pictures are divided by it.
-        width: channels; 60 is the light network, 180 the full one.
-        groups: residual groups; 4 or 6.
-        layers: attention layers of a group; windows are shifted by half their side in every other one.
-        heads: attention heads, which divide ``width``.
-        upsampler: ``"direct"``, one sub-pixel convolution, is the light network; ``"steps"``, 64 channels that are
-            enlarged by a prime factor at a time, the full one.
-        drop_path: in training, the share of clips that skip the last layer, rising from 0 at the first.
-        skip: learn what to add to the bicubically enlarged picture. The publication has no such skip; with it
-            training starts where demosaicing ends.
-        motion: estimator that is asked where no flow is given; when not given,
+        scale: super-resolution factor s.
+        frames: number N of spike frames per clip, odd.
+        pattern: Bayer phase.
+        alpha: gain of the camera: light of a white pixel per clock, in thresholds. The picture is light divided by it.
+        width: channels; 60 for the light network, 180 for the full one.
+        groups: residual groups; 4 for the light network, 6 for the full one.
+        layers: attention layers per group; every other one shifts its windows by half their side.
+        heads: attention heads, a divisor of ``width``.
+        upsampler: ``"direct"``, one sub-pixel convolution, as in the light network; or ``"steps"``, one sub-pixel
+            convolution of 64 channels per prime factor, as in the full one.
+        drop_path: probability of skipping the last layer in training (stochastic depth); it rises linearly from 0 at
+            the first layer.
+        skip: predict a residual, which is added to the bicubically enlarged picture, so that training starts from the
+            result of demosaicing. The publication has no such skip.
+        motion: motion estimator, called when no flow is given. Default:
             :class:`lightning_modules.motion.ClassicalFlow`.
 
     Shape:
-        - Input: spikes :math:`(B, N, H, W)`, any real dtype, any H and W of at least 3; optionally flow
-          :math:`(B, 2, 2, H, W)`, from the middle to the frames 5 and 35 of 41, in sensor pixels
+        - Input: spikes :math:`(B, N, H, W)` of any real dtype, with H and W of at least 3; optionally flow
+          :math:`(B, 2, 2, H, W)`, from the middle to frames 5 and 35 of 41, in sensor pixels
         - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
 
     Raises:
-        ValueError: a size below 1, heads that do not divide the width, an unknown upsampler, a ``drop_path`` outside
-            [0, 1).
+        ValueError: a size is below 1, heads do not divide the width, the upsampler is unknown, or ``drop_path`` is
+            outside [0, 1).
 
     Example:
         >>> network = SwinIR(scale=2, width=12, groups=1, layers=2, heads=2)
@@ -69,7 +70,7 @@ class SwinIR(Baseline):
         Liang et al., SwinIR: Image Restoration Using Swin Transformer, ICCV Workshops 2021.
     """
 
-    halo = None  # windows that are shifted layer after layer: 24 layers see about a hundred pixels
+    halo = None  # shifted windows widen the receptive field: 24 layers see about a hundred pixels
 
     def __init__(
         self,
@@ -92,7 +93,7 @@ class SwinIR(Baseline):
         if upsampler not in ("direct", "steps"):
             raise ValueError(f"upsampler: expected 'direct' or 'steps', got {upsampler!r}")
         if not 0 <= drop_path < 1:
-            raise ValueError(f"drop_path: expected a share in [0, 1), got {drop_path}")
+            raise ValueError(f"drop_path: expected a probability in [0, 1), got {drop_path}")
         more = {**sizes, "upsampler": upsampler, "drop_path": drop_path, "skip": skip}
         super().__init__(scale, frames, pattern, alpha, more, motion)
         self.skip = skip
@@ -127,7 +128,7 @@ class SwinIR(Baseline):
 
 
 class ResidualGroup(nn.Module):
-    """Attention layers, a convolution, plus the input (RSTB): (B, H, W, C) to the same."""
+    """Residual group (RSTB): attention layers and a convolution, plus the input, (B, H, W, C) to (B, H, W, C)."""
 
     def __init__(self, width: int, heads: int, drops: list[float]) -> None:
         super().__init__()
@@ -144,7 +145,7 @@ class ResidualGroup(nn.Module):
 
 
 class AttentionLayer(nn.Module):
-    """Attention inside windows, then two linear layers, each with its norm before and its skip (STL)."""
+    """Attention layer (STL): window attention and a two-layer perceptron, each with layer norm and a skip."""
 
     def __init__(self, width: int, heads: int, shift: int, drop: float) -> None:
         super().__init__()
@@ -177,7 +178,7 @@ class AttentionLayer(nn.Module):
         return seen.roll((self.shift, self.shift), (1, 2))
 
     def _drop(self, change: Tensor) -> Tensor:
-        """Stochastic depth: leave the layer out for some clips, and weigh it more for the others."""
+        """Apply stochastic depth: skip the layer for random clips, and scale it up for the others."""
         if not (self.training and self.drop):
             return change
         kept = torch.rand(len(change), 1, 1, 1, device=change.device) >= self.drop
@@ -185,21 +186,21 @@ class AttentionLayer(nn.Module):
 
 
 def _windows(planes: Tensor) -> Tensor:
-    """(B, H, W, C) to (B, windows, pixels of a window, C)."""
+    """Partition (B, H, W, C) into windows, (B, windows, pixels of a window, C)."""
     batch, height, width, channels = planes.shape
     parts = planes.reshape(batch, height // _SIDE, _SIDE, width // _SIDE, _SIDE, channels)
     return parts.transpose(2, 3).reshape(batch, -1, _SIDE**2, channels)
 
 
 def _offsets() -> Tensor:
-    """Index of the bias of every pair of pixels of a window: one for each offset between two."""
+    """Return the index of the relative position bias of each pair of pixels of a window."""
     at = torch.stack(torch.meshgrid(torch.arange(_SIDE), torch.arange(_SIDE), indexing="ij")).flatten(1)
     rows, columns = at[:, :, None] - at[:, None, :] + _SIDE - 1
     return rows * (2 * _SIDE - 1) + columns
 
 
 def _hidden(height: int, width: int, device: torch.device) -> Tensor:
-    """Mask added to the scores of shifted windows: far below 0 between pixels that are not neighbours.
+    """Return the mask to add to the scores of shifted windows, -100 between pixels of different regions.
 
     Returns:
         (windows, 1, pixels of a window, pixels of a window).

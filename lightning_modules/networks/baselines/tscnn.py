@@ -1,4 +1,4 @@
-"""TSCNN on one decoded mosaic: the paper's "TFI + TSCNN" and "TFP + TSCNN"."""
+"""TSCNN on one decoded mosaic, the paper's "TFI + TSCNN" and "TFP + TSCNN"."""
 
 from __future__ import annotations
 
@@ -20,41 +20,40 @@ from lightning_modules.networks.baselines.pictures import (
 from lightning_modules.networks.layers import ConvBlock, ResBlock, conv
 from spikekit import bayer_mask, demosaic_residual
 
-_SQUEEZED = 4  # channels in the middle of a channel attention
-_ATTENTIONS = 3  # attention blocks of a group
+_SQUEEZED = 4  # hidden channels of a channel attention
+_ATTENTIONS = 3  # attention blocks per group
 
 
 class TSCNN(Baseline):
-    r"""Two stages on the mosaic of the middle frame: demosaicing, then super-resolution.
+    r"""TSCNN, two stages on the mosaic of the middle frame: demosaicing, then super-resolution.
 
-    From the publication and its public code, of which nothing is copied: all layers, their widths and how they are
-    joined; the parameters are as many. Ours: the mosaic is TFI or TFP of the middle frame, in [0, 1] where the
-    original has [0, 255]; the picture beside it is made by :func:`spikekit.demosaic_residual`, where the original
-    takes MLRI; any Bayer phase; the optional ``skip``; and the training, which is that of all networks here. The
-    original's is mean squared error, Adam at 2e-4, batches of 64, 500 epochs. What no source states: no activation
-    follows the 3 x 3 convolutions of the first stage, and the global skip begins at the first convolution of the
-    second stage.
+    As published, and as in the public code, of which nothing is copied: all layers, their widths and connections, and
+    so the number of parameters. Differences: the mosaic is TFI or TFP of the middle frame, in [0, 1] instead of
+    [0, 255]; :func:`spikekit.demosaic_residual` replaces MLRI; any Bayer phase is accepted; ``skip`` is optional; the
+    training is that of all networks here. The original uses mean squared error, Adam at 2e-4 and batches of 64, for 500
+    epochs. Two details are not documented and chosen here: no activation follows the 3 x 3 convolutions of the first
+    stage, and the global skip begins at the first convolution of the second stage.
 
     Args:
-        decoder: what the mosaic is decoded by, ``"tfi"`` or ``"tfp"``.
-        scale: super-resolution factor.
-        frames: spike frames N of a clip, odd.
-        pattern: Bayer phase of the streams.
-        alpha: gain of the camera, what a white pixel receives per clock in thresholds; pictures are divided by it.
-        tfp_window: frames that TFP averages, odd.
+        decoder: decoder of the mosaic, ``"tfi"`` or ``"tfp"``.
+        scale: super-resolution factor s.
+        frames: number N of spike frames per clip, odd.
+        pattern: Bayer phase.
+        alpha: gain of the camera: light of a white pixel per clock, in thresholds. The picture is light divided by it.
+        tfp_window: number of spike frames that TFP averages, odd.
         width: channels, a multiple of 8.
-        blocks: octave residual dense blocks, side by side; 3 is TSCNN-L, 4 TSCNN-H.
+        blocks: parallel octave residual dense blocks; 3 for TSCNN-L, 4 for TSCNN-H.
         low: groups of attention blocks at half the resolution, in each of a block's two rounds; 2 or 4.
-        high: the same at full resolution; 3 or 6.
-        skip: learn what to add to the bicubically enlarged demosaiced picture. The publication has no such skip; with
-            it training starts where demosaicing ends.
+        high: groups of attention blocks at full resolution, in each round; 3 or 6.
+        skip: predict a residual, which is added to the demosaiced and bicubically enlarged picture, so that training
+            starts from the result of demosaicing. The publication has no such skip.
 
     Shape:
-        - Input: spikes :math:`(B, N, H, W)`, any real dtype, any H and W of at least 3; a flow changes nothing
+        - Input: spikes :math:`(B, N, H, W)` of any real dtype, with H and W of at least 3; the flow is ignored
         - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
 
     Raises:
-        ValueError: an unknown decoder, an even window, a size below 1, a width that is no multiple of 8.
+        ValueError: the decoder is unknown, the window is even, a size is below 1, or the width is not a multiple of 8.
 
     Example:
         >>> network = TSCNN("tfp", scale=2, width=8, blocks=1, low=1, high=1)
@@ -65,7 +64,7 @@ class TSCNN(Baseline):
         Guo et al., joint demosaicing and super-resolution by a two-stage network (TSCNN), IEEE TCSVT 2021.
     """
 
-    halo = None  # its channel attention pools the whole picture
+    halo = None  # channel attention pools over the whole picture
     takes_flow = False
 
     def __init__(
@@ -97,7 +96,7 @@ class TSCNN(Baseline):
             begin_at_zero(self.upsample[0])
 
     def forward(self, spikes: Tensor, flow: Tensor | None = None, static: bool = False) -> Tensor:
-        """Return rgb; a flow changes nothing."""
+        """Return rgb; the flow is ignored."""
         self.check_spikes(spikes)
         height, width = spikes.shape[-2:]
         raw = decode_pictures(spikes, [self.frames // 2], self.alpha, self.decoder, self.tfp_window)
@@ -114,7 +113,7 @@ class TSCNN(Baseline):
 
 
 class DemosaicingStage(nn.Module):
-    """What is added to the demosaiced picture: (B, 1, H, W) and the masks of the colours (3, H, W) to (B, 3, H, W)."""
+    """Residual of the demosaiced picture (B, 3, H, W), from the mosaic (B, 1, H, W) and the colour masks (3, H, W)."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -138,7 +137,7 @@ class DemosaicingStage(nn.Module):
 
 
 class KnownPixels(nn.Module):
-    """Features of the pixels of one colour: a convolution divided by how many are known, and one of its results."""
+    """Features of one colour's pixels: a convolution normalised by the number of known pixels, and another one."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -153,7 +152,7 @@ class KnownPixels(nn.Module):
 
 
 class OctaveBlock(nn.Module):
-    """Two rounds of attention at two resolutions, a quarter of the channels at the lower: (B, C, H, W) to the same."""
+    """Two rounds of attention at two resolutions, a quarter of the channels at the lower, (B, C, H, W) to the same."""
 
     def __init__(self, width: int, low: int, high: int) -> None:
         super().__init__()
@@ -174,7 +173,7 @@ class OctaveBlock(nn.Module):
 
 
 class DenseGroups(nn.Module):
-    """Groups of attention blocks; each sees, through a 1 x 1 convolution, what all before it made. Plus the input."""
+    """Densely connected groups of attention blocks, joined by 1 x 1 convolutions, plus the input."""
 
     def __init__(self, width: int, groups: int) -> None:
         super().__init__()
@@ -192,7 +191,7 @@ class DenseGroups(nn.Module):
 
 
 class AttentionBlock(nn.Module):
-    """Two bottlenecks side by side, their sum weighed channel by channel, plus the input."""
+    """Two parallel bottlenecks, whose sum is weighted by channel attention, plus the input."""
 
     def __init__(self, width: int) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""VidarSR, super-resolution of grey spike streams, fed with those of a colour camera."""
+"""VidarSR, super-resolution of grey spike streams, applied to Bayer-pattern streams."""
 
 from __future__ import annotations
 
@@ -25,35 +25,34 @@ _Move = Callable[[int, int, int], nn.Module]
 class VidarSR(Baseline):
     r"""VidarSR (Xiang et al., TCSVT 2023), a network of the RBPN family for grey spike cameras, after its public code.
 
-    From the publication: an encoder of the spikes pixel by pixel; for every neighbour in time the features of the pair
-    of its picture and the middle one; recurrent back-projection, the weights shared by the neighbours; the last
-    convolution over what every neighbour has led to. Convolutions, PReLU and no normalisation.
+    As published: a pixel-wise encoder of the spikes; for each neighbour in time, features of the pair of its picture
+    and the middle one; recurrent back-projection with weights shared by the neighbours; a last convolution over the
+    results of all neighbours. It uses convolutions and PReLU, without normalisation.
 
-    Ours: the colours. The spikes are those of the Bayer mosaic, and a picture is three planes, each with the
-    pixels of one colour and zeros elsewhere: a convolution over a bare mosaic could not know which colour is where.
-    Pictures and spikes are divided by alpha instead of by their maximum. Of 41 frames the middle one is 20 and the
-    neighbours are 6, 13, 27 and 34. The flow to them is that of linear motion instead of pyflow's. The default is a
-    small one, of a fifth of the work; the published size has a ``width`` of 256 and 64 ``features``; 16 and 8 do the
-    work of CSCSR's size small, or 10 and 4 ``per_channel``.
+    Differences: spikes are those of the Bayer mosaic, and a picture is split into three colour planes with zeros at
+    other pixels, so that convolutions can tell the colours apart. Pictures and spikes are divided by alpha instead of
+    their maximum. Of 41 frames the middle one is 20 and the neighbours are 6, 13, 27 and 34. Linear motion replaces
+    the flow of pyflow. The default size takes a fifth of the work of the published one, which has a ``width`` of 256
+    and 64 ``features``; 16 and 8 take as much work as CSCSR's size small, and so do 10 and 4 ``per_channel``.
 
-    At x2 a pixel sees 102 sensor pixels in every direction, so that tiles would be margin for the most part: it is not
-    run tile by tile.
+    At x2 the receptive field reaches 102 sensor pixels in each direction, which is too large for tiles.
 
     Args:
         scale: super-resolution factor s.
-        frames: spike frames N of a clip, odd, at least 9.
+        frames: number N of spike frames per clip, odd, at least 9.
         pattern: Bayer phase.
-        alpha: gain of the camera, what a white pixel receives per clock in thresholds; the input is divided by it.
+        alpha: gain of the camera: light of a white pixel per clock, in thresholds. The picture is light divided by it.
         width: channels at the sensor's resolution.
         features: channels at the picture's resolution.
-        per_channel: the star of the paper's table: every sub-stream by itself, one network for all.
-        skip: learn what to add to the bicubically enlarged TFI picture. The publication has no such skip; with it
-            training starts where a decoder ends.
-        motion: estimator that is asked where no flow is given.
+        per_channel: reconstruct each Bayer sub-stream separately, as the paper's VidarSR with a star.
+        skip: predict a residual, which is added to the demosaiced and bicubically enlarged TFI picture, so that
+            training starts from the result of the decoder. The publication has no such skip.
+        motion: motion estimator, called when no flow is given. Default:
+            :class:`lightning_modules.motion.ClassicalFlow`.
 
     Shape:
-        - Input: spikes :math:`(B, N, H, W)`, zeros and ones, any real dtype; optionally the flows from the middle to
-          the first and to the last time point, :math:`(B, 2, 2, H, W)`, in sensor pixels; or ``static=True``
+        - Input: spikes :math:`(B, N, H, W)`, zeros and ones of any real dtype; optionally the flows from the middle to
+          the first and last time points, :math:`(B, 2, 2, H, W)`, in sensor pixels; or ``static=True``
         - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
 
     Example:
@@ -77,7 +76,7 @@ class VidarSR(Baseline):
         more = {**whole_sizes(width=width, features=features), "per_channel": per_channel, "skip": skip}
         super().__init__(scale, frames, pattern, alpha, more, motion)
         self.per_channel, self.skip = per_channel, skip
-        #: the middle frame, and the neighbours in time
+        #: the middle frame and its neighbours in time
         self.times = frames // 2, frames // 6, frames // 3, frames - 1 - frames // 3, frames - 1 - frames // 6
         planes, enlarged = (1, 2 * self.scale) if per_channel else (3, self.scale)
         self.enlarged = enlarged
@@ -102,7 +101,7 @@ class VidarSR(Baseline):
         return rgb.to(spikes.dtype)
 
     def _reconstruct(self, spikes: Tensor, flow: Tensor) -> Tensor:
-        """Return pictures, (B, 1 or 3, s H, s W), s being twice the scale where every colour is by itself."""
+        """Return pictures (B, 3, s H, s W), or (B, 1, 2 s H, 2 s W) of a sub-stream."""
         offsets = self.offsets(flow, self.times[1:])
         raws = decode_pictures(spikes, self.times, self.alpha)
         planes = raws.unsqueeze(2) if self.per_channel else split_colors(raws, self.pattern).movedim(0, 2)
@@ -122,13 +121,13 @@ class VidarSR(Baseline):
 
 
 class _ResBlock(nn.Module):
-    """Convolution, PReLU, convolution, plus the input, and PReLU."""
+    """Residual block: convolution, PReLU, convolution, plus the input, PReLU."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.first = conv(width, width)
         self.second = conv(width, width)
-        self.act = nn.PReLU()  # one for both, as there
+        self.act = nn.PReLU()  # shared, as in the original
 
     def forward(self, x: Tensor) -> Tensor:
         return self.act(x + self.second(self.act(self.first(x))))
@@ -147,7 +146,7 @@ def _down(inputs: int, outputs: int, scale: int) -> nn.Sequential:
 
 
 class _Unit(nn.Module):
-    """There, back, and there again with what went wrong on the way back (Haris et al., CVPR 2018)."""
+    """Projection unit: resize, resize back, and resize the error of the way back (Haris et al., CVPR 2018)."""
 
     def __init__(self, width: int, scale: int, there: _Move, back: _Move) -> None:
         super().__init__()
@@ -159,7 +158,7 @@ class _Unit(nn.Module):
 
 
 class _BackProjection(nn.Module):
-    """DBPN with three units up and two down: (B, inputs, H, W) to (B, width, s H, s W)."""
+    """DBPN with three up-projections and two down-projections, (B, inputs, H, W) to (B, width, s H, s W)."""
 
     def __init__(self, inputs: int, width: int, scale: int) -> None:
         super().__init__()

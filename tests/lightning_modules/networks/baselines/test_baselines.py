@@ -187,7 +187,7 @@ def test_a_mosaic_moved_by_a_pixel_is_one_of_another_phase(case):
         ("SpikeSRNetLike", {"length": 12}, "length, every: expected .*, got 12 and 7 with 41 frames"),
         ("SwinIR", {"width": 12, "heads": 5}, "heads: expected a divisor of width = 12, got 5"),
         ("SwinIR", {"upsampler": "bicubic"}, "upsampler: expected 'direct' or 'steps', got 'bicubic'"),
-        ("SwinIR", {"drop_path": 1.0}, r"drop_path: expected a share in \[0, 1\), got 1.0"),
+        ("SwinIR", {"drop_path": 1.0}, r"drop_path: expected a probability in \[0, 1\), got 1.0"),
         ("TSCNN", {"tfp_window": 40}, "tfp_window: expected an odd number, got 40"),
         ("TSCNN", {"width": 12}, "width: expected a multiple of 8, got 12"),
         ("VidarSR", {"frames": 40}, "frames: expected an odd number, 9 or more, got 40"),
