@@ -1,4 +1,4 @@
-"""Networks, data and commands that learn from colour spike streams, built on spikekit."""
+"""Networks, data modules and commands for learning from spike streams, built on spikekit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 __all__ = ["CSCSR", "SuperResolution", "list_models", "reconstruct"]
 
-# where what the package offers is
+# module of each public name
 _HOME = {
     "CSCSR": "networks",
     "SuperResolution": "tasks.super_resolution",
@@ -23,7 +23,7 @@ _HOME = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import what the package offers when it is asked for: importing the package takes no time."""
+    """Import public names on first use, to keep the import of the package fast."""
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)

@@ -1,4 +1,4 @@
-"""The ``lightning`` command, and ``python -m lightning_modules``: one of Lightning's verbs, or one of ours."""
+"""Entry point of the ``lightning`` command and of ``python -m lightning_modules``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lightning_modules.cli.short_help import VERBS, overview, usage
 from lightning_modules.configurations import with_found_configs
 from spikekit.standard_output import stopped_by_sigterm
 
-#: where the verbs that are not Lightning's are
+#: modules of the verbs that Lightning does not provide
 _OURS = {
     "predict": "cli.predict",
     "sweep": "sweep.cli",
@@ -27,7 +27,7 @@ def main(args: Sequence[str] | None = None) -> None:
     """Run the command.
 
     Args:
-        args: what was typed after ``lightning``; ``sys.argv`` when not given.
+        args: arguments after ``lightning``. Default: those of ``sys.argv``.
     """
     typed = sys.argv[1:] if args is None else list(args)
     with errors.as_one_line():
@@ -44,13 +44,13 @@ def main(args: Sequence[str] | None = None) -> None:
         elif verb not in _OURS and {"-h", "--help"} & {*rest}:
             print(usage(verb))  # noqa: T201
         else:
-            # Threads of torch that spin while they wait hold up the workers that make clips: before it is imported.
+            # Set before torch is imported: its idle threads would spin and slow down the data workers.
             os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
             if "" not in sys.path and os.getcwd() not in sys.path:
-                sys.path.append(os.getcwd())  # where users' own networks are; behind all else, so that it hides nothing
+                sys.path.append(os.getcwd())  # for users' own networks; last, so that it shadows nothing
             if verb in _OURS:
                 run = getattr(import_module(f"lightning_modules.{_OURS[verb]}"), verb)
-                with stopped_by_sigterm():  # Lightning's verbs have a way of their own, which leaves a checkpoint
+                with stopped_by_sigterm():  # Lightning handles SIGTERM itself and saves a checkpoint
                     run(with_found_configs(rest))
             else:
                 from lightning_modules.cli.command import run

@@ -1,4 +1,4 @@
-"""Configurations that come with the package: ``-c x4`` and ``-c configs/x4.yaml`` find them from anywhere."""
+"""Lookup of the package's configurations, so that ``-c x4`` and ``-c configs/x4.yaml`` work from any folder."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-# in an installed package inside it, in a clone beside it
+# inside an installed package, beside the package in a clone
 _FOLDERS = Path(__file__).with_name("configs"), Path(__file__).parents[1] / "configs"
 
 
 def find_configs(name: str) -> list[str]:
-    """Return the files that a configuration is meant by: the user's own, or else those of the package.
+    """Return the files that a name refers to: the user's own file, or else configurations of the package.
 
     Args:
-        name: a file; or one of the package, with ``configs/`` in front and ``.yaml`` behind it or without, in which
-            ``*`` stands for anything, such as ``ablation/*``. What names neither is returned as it is.
+        name: path of a file, or name in the package, such as ``x4``, with or without ``configs/`` and ``.yaml``. It may
+            contain the wildcard ``*``, as in ``ablation/*``. Unknown names are returned unchanged.
 
     Example:
         >>> [Path(path).name for path in find_configs("data/*")]
@@ -32,7 +32,7 @@ def find_configs(name: str) -> list[str]:
 
 
 def with_found_configs(args: Iterable[str]) -> list[str]:
-    """Return arguments of a command in which what follows ``-c`` and ``--config`` is a file, where there is one.
+    """Replace the values of ``-c`` and ``--config`` in a command's arguments by the files that they refer to.
 
     Example:
         >>> verb, option, path = with_found_configs(["fit", "-c", "x4"])

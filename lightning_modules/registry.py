@@ -1,4 +1,4 @@
-"""Registry of models: the weights that come with the package, one row of ``weights/models.csv`` each."""
+"""Registry of the weights in the package, the rows of ``weights/models.csv``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from safetensors import safe_open
 
-#: how the names of weights begin that a network for films has beside those of the network for a clip
+#: prefix of the parameters that a film network has in addition to the clip network inside
 FUSION = "fusion."
 
 _FOLDER = Path(__file__).parent / "weights"
@@ -18,21 +18,21 @@ _FOLDER = Path(__file__).parent / "weights"
 
 @dataclass(frozen=True)
 class Model:
-    """Weights that come with the package.
+    """Weights in the package.
 
     Args:
-        name: what ``from_pretrained`` and ``--model.weights`` call them, such as ``"cscsr_small_x4"``.
-        file: their file in ``weights``. That of a network for films also holds the network for a clip inside it.
-        scale: super-resolution factor; None for an estimator of motion, like everything up to ``margin``.
+        name: name for ``from_pretrained`` and ``--model.weights``, such as ``"cscsr_small_x4"``.
+        file: file in the folder ``weights``. The file of a film network also serves the clip network inside.
+        scale: super-resolution factor s; None for motion estimators, as are the next four.
         pattern: Bayer phase, or ``"grey"``.
-        size: one of :data:`lightning_modules.networks.sizes.SIZES`.
-        frames: spike frames of a clip.
-        margin: how many sensor pixels around a place the network sees, measured with these weights.
-        film: whether it uses the neighbouring key frames of a film.
-        noise: whether it was trained for noisy sensors that were not calibrated.
-        macs: multiplications by sensor pixel of a picture, or of an estimate of motion.
-        kodak: PSNR in dB of Kodak's 24 stills in motion; None for an estimator.
-        vid4: PSNR in dB of Vid4's clips foliage and walk, 20 clocks a frame; None for an estimator.
+        size: name in :data:`lightning_modules.networks.sizes.SIZES`.
+        frames: number of spike frames per clip.
+        margin: radius of the receptive field in sensor pixels, measured with these weights.
+        film: the network uses the neighbouring key frames of a film.
+        noise: the network was trained for noisy sensors without calibration.
+        macs: multiplications per sensor pixel for one picture or one motion estimate.
+        kodak: PSNR in dB on Kodak's 24 stills in motion, or None.
+        vid4: PSNR in dB on foliage and walk of Vid4, with 20 clocks per source frame, or None.
     """
 
     name: str
@@ -50,23 +50,23 @@ class Model:
 
     @property
     def path(self) -> Path:
-        """Where the file is."""
+        """Path of the file."""
         return _FOLDER / self.file
 
     @property
     def parameters(self) -> int:
-        """Number of learned parameters, including those of a motion estimator inside."""
+        """Number of learned parameters, including those of a learned motion estimator."""
         with safe_open(self.path, "numpy") as file:
             own = [name for name in file.keys() if self.film or not name.startswith(FUSION)]  # noqa: SIM118
             return sum(prod(file.get_slice(name).get_shape()) for name in own)
 
 
 def list_models(scale: int | None = None, pattern: str | None = None) -> list[Model]:
-    """List the weights that come with the package, smaller scales and smaller networks first.
+    """List the weights in the package, smaller scales and smaller networks first.
 
     Args:
-        scale: only networks of this super-resolution factor; when not given, all, and the estimators of motion.
-        pattern: only networks for this Bayer phase, or for ``"grey"``; likewise.
+        scale: super-resolution factor to select. Default: any, including motion estimators.
+        pattern: Bayer phase or ``"grey"`` to select. Default: any, including motion estimators.
 
     Example:
         >>> [(model.name, model.size, model.frames, model.macs) for model in list_models(scale=4)][:2]
@@ -78,7 +78,7 @@ def list_models(scale: int | None = None, pattern: str | None = None) -> list[Mo
 
 
 def find_model(name: str) -> Model | None:
-    """Find weights that come with the package by their name.
+    """Find weights in the package by name; return None if there are none.
 
     Example:
         >>> find_model("cscsr_small_x4").scale

@@ -1,4 +1,4 @@
-"""Constructors that take the arguments of another class."""
+"""Constructors that accept the arguments of another class."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ T = TypeVar("T", bound=Callable[..., None])
 
 
 def inherit_signature(other: type, *without: str) -> Callable[[T], T]:
-    """Decorate a constructor that passes ``**settings``, and perhaps ``*args``, on to another class.
+    """Decorate a constructor that passes ``**settings``, and optionally ``*args``, to another class.
 
-    It gets the signature and the documentation of both, for ``help``, editors and the command line; its own arguments
-    win.
+    The decorator combines both signatures, for ``help``, editors and the command line. The constructor's own arguments
+    take precedence.
 
     Args:
-        other: the class, such as a dataclass.
-        without: arguments of that class that are not passed on.
+        other: the other class, such as a dataclass.
+        without: arguments of the other class to leave out.
     """
 
     def decorate(init: T) -> T:
@@ -27,7 +27,7 @@ def inherit_signature(other: type, *without: str) -> Callable[[T], T]:
         own = {one.name: one for one in own if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD)}
         passed = [one for one in inspect.signature(other).parameters.values() if one.name not in {*own, *without}]
         passed = passed if in_place else [one.replace(kind=one.KEYWORD_ONLY) for one in passed]
-        passed_hints = get_type_hints(other if is_dataclass(other) else other.__init__)  # of each base in its module
+        passed_hints = get_type_hints(other if is_dataclass(other) else other.__init__)  # resolved in the base's module
         hints = {**passed_hints, **get_type_hints(init)}
         parameters = [one.replace(annotation=hints[one.name]) for one in (*passed, *own.values())]
         init.__signature__ = inspect.Signature([first, *sorted(parameters, key=lambda one: one.kind)])

@@ -17,36 +17,38 @@ from spikekit.flow.tvl1 import tvl1_flow
 from spikekit.kernels import compiler_kept_out
 from spikekit.sensor.quantization_noise import flicker
 
-_GREY = 0.25, 0.5, 0.25  # each pixel the mean of the Bayer cells that it is part of
-_BLUR = tuple(get_gaussian_kernel1d(5, 0.5)[0].tolist())  # of the pictures of a site, in Bayer cells
-_ORDER = 3  # of the means that pictures are
-_LONGEST = 17  # their window, in frames: in longer clips more of motion blurs them than noise is averaged
-_LIGHT = 0.1  # mean firing rate of a clip below which noise harms more, and their window is longer
-_NOISE = 0.002  # standard deviation, in firing rates, of a pixel that counts half
+_GREY = 0.25, 0.5, 0.25  # kernel that averages the Bayer cells around a pixel
+_BLUR = tuple(get_gaussian_kernel1d(5, 0.5)[0].tolist())  # of a sub-stream's pictures, in Bayer cells
+_ORDER = 3  # averaging passes of TFP
+_LONGEST = 17  # longest TFP window in spike frames, beyond which motion blur outweighs the noise reduction
+_LIGHT = 0.1  # mean firing rate of a clip below which the window grows, as noise dominates
+_NOISE = 0.002  # standard deviation, in firing rates, that halves the weight of a pixel
 _RATES = 1024
-_NEAR = 2.0  # around a pixel where it is asked whether motion is linear, in pixels
-_PART = 1.25, 1.75  # how many times more different pictures are where flows begin to part, and where they have
-_UNSEEN = 1e-6  # squared difference of two pictures that says nothing, in firing rates
+_NEAR = 2.0  # standard deviation of the window of the test for linear motion, in pixels
+_PART = 1.25, 1.75  # error ratios at which the flows begin to differ, and at which they are independent
+_UNSEEN = 1e-6  # negligible squared difference of two pictures, in firing rates
 
 
 class ClassicalFlow(MotionEstimator):
-    r"""TV-L1 optical flow on decoded pictures: no weights, any device; on a CPU faster with Numba.
+    r"""TV-L1 optical flow on decoded pictures, without weights; it runs on any device, on a CPU faster with Numba.
 
-    The clip is decoded in its middle and a quarter of it before and after, by means of third order that see nearly all
-    of it, see :func:`spikekit.tfp_at`: noise harms the estimate more than what moves meanwhile. In a clip of at least
-    0.1 spikes a frame and pixel they see at most 49 frames; in one with a quarter of that light, twice as many. Motion
-    is taken to be linear, so that both flows are those of one velocity, the one that takes the earlier picture to the
-    later; from there each half of the clip finds its own, and the flows part where one velocity leaves the pictures
-    clearly more different than these two do. The joint flow is estimated on grey pictures of the sensor's size, each
-    pixel the mean of the cells that it is part of, so that the noise of the four sites is averaged *before* motion is
-    estimated; averaging four flows afterwards, as eq. (7) does with a learned estimator, was less accurate here.
+    Third-order TFP (:func:`spikekit.tfp_at`) decodes three pictures: at the middle of the clip, and a quarter of its
+    length before and after. Their windows cover nearly the whole clip, because noise harms the estimate more than
+    motion blur. They span at most 49 spike frames for a firing rate of at least 0.1 spikes per pixel and frame, and
+    twice as many for a quarter of that rate.
 
-    A dark pixel fires so rarely that a mean flickers. For an ideal sensor its rate tells by how much, and the pixel is
-    given less weight accordingly.
+    Motion is first assumed to be linear, with one velocity from the earlier picture to the later one. Each half of the
+    clip then refines its own velocity. The two flows differ only where this reduces the error clearly. The joint flow
+    is estimated on grey pictures at the sensor's resolution, each pixel the mean of the Bayer cells around it. This
+    averages the noise of the four sub-streams *before* the estimation, which was more accurate than to average four
+    flows, as eq. (7) does for a learned estimator.
+
+    Dark pixels fire so rarely that their mean flickers. They get less weight, by the variance that their firing rate
+    implies for an ideal sensor.
 
     Args:
-        attachment: how much the flow follows the pictures, in firing rates, rather than being smooth.
-        warps: times that each size of the pictures is gone through. Fewer take less time and are less exact.
+        attachment: weight of the data term for pictures in firing rates; smaller values give smoother flow.
+        warps: warping iterations per pyramid level; fewer are faster and less accurate.
 
     Shape:
         As :class:`MotionEstimator`; no gradient.
@@ -82,7 +84,7 @@ class ClassicalFlow(MotionEstimator):
             expected = f"(B, N, H, W) of at least 2 x 2 pixels, with frames before and after the middle, {middle}"
             raise ValueError(f"spikes: expected {expected}, got {tuple(spikes.shape)}")
         pattern = cfa_pattern(pattern)
-        alike = _clips_by_window(spikes)  # clips that need one window are seen at once
+        alike = _clips_by_window(spikes)  # clips with the same window form one batch
         with torch.autocast(spikes.device.type, enabled=False):
             velocities = [
                 self._of_window(spikes if len(alike) == 1 else spikes[clips], middle, window, pattern, by_site)
@@ -93,7 +95,7 @@ class ClassicalFlow(MotionEstimator):
         return before * (first - middle), after * (last - middle)
 
     def _of_window(self, spikes: Tensor, middle: int, window: int, pattern: str, by_site: bool) -> Tensor:
-        """Velocities before and after the middle, (*, B, 2, 2, h, w), by means of one window."""
+        """Return the velocities before and after the middle, (*, B, 2, 2, h, w), for one TFP window."""
         seen, clock = _moments(spikes.shape[1], middle, window)
         raw = torch.stack([tfp_at(spikes, n, window, order=_ORDER, dtype=torch.float32) for n in seen], dim=1)
         rates = (raw.mean(dim=1, keepdim=True) * _RATES).long().clamp(0, _RATES - 1)
@@ -115,7 +117,7 @@ def _filtered(planes: Tensor, weights: Sequence[float], border: str) -> Tensor:
 
 
 def _velocities(pictures: Tensor, clock: tuple[float, float, float], attachment: Tensor, warps: int) -> Tensor:
-    """Velocities before and after the middle, (B, 2, 2, h, w), in pixels a frame, of pictures (B, 3, h, w)."""
+    """Return the velocities before and after the middle, (B, 2, 2, h, w), in pixels per clock."""
     ends, span = pictures[:, ::2], clock[2] - clock[0]
     before, after = clock[0] - clock[1], clock[2] - clock[1]
     one = tvl1_flow(ends, _times(pictures, before / span, after / span), attachment, warps=warps) / span
@@ -130,12 +132,12 @@ def _velocities(pictures: Tensor, clock: tuple[float, float, float], attachment:
 
 
 def _times(pictures: Tensor, first: float, second: float) -> Tensor:
-    """(B, 2), without waiting for a GPU."""
+    """Return two times for each clip, (B, 2), without synchronising with a GPU."""
     return torch.stack([pictures.new_full((len(pictures),), time) for time in (first, second)], dim=1)
 
 
 def _clips_by_window(spikes: Tensor) -> dict[int, list[int]]:
-    """Windows of the means of clips (B, N, H, W), in frames, and which clips have each."""
+    """Group clips (B, N, H, W) by their TFP window in spike frames."""
     frames, found = spikes.shape[1], {}
     wide = torch.float32 if spikes.is_floating_point() else None
     for clip, fired in enumerate(spikes.flatten(1).sum(dim=1, dtype=wide).cpu().tolist()):
@@ -148,9 +150,9 @@ def _clips_by_window(spikes: Tensor) -> dict[int, list[int]]:
 
 @lru_cache(maxsize=16)
 def _moments(frames: int, middle: int, window: int) -> tuple[tuple[int, ...], tuple[float, ...]]:
-    """Frames in which a clip is decoded, and the times that the pictures show.
+    """Return the frames at which a clip is decoded, and the effective times of the pictures.
 
-    Where the mean is cut by the ends of the clip, it stands for a later or an earlier time.
+    The two differ where the ends of the clip truncate the window.
     """
     away = max(frames // 4, 1)
     seen = max(middle - away, 0), middle, min(middle + away, frames - 1)
@@ -160,7 +162,7 @@ def _moments(frames: int, middle: int, window: int) -> tuple[tuple[int, ...], tu
 
 @lru_cache(maxsize=16)
 def noise_by_rate(window: int, device: torch.device | str = "cpu") -> Tensor:
-    """Variance of the mean of a pixel in constant light, by its firing rate, float32."""
+    """Return the variance of a pixel's TFP in constant light, as a float32 table over its firing rate."""
     with torch.inference_mode(False), torch.device("cpu"):
         impulses = torch.eye(3 * window, dtype=torch.float64).unsqueeze(1)
         rates = (torch.arange(_RATES) + 0.5) / _RATES
@@ -169,6 +171,6 @@ def noise_by_rate(window: int, device: torch.device | str = "cpu") -> Tensor:
 
 
 def _unlike(pictures: Tensor, flows: Tensor) -> Tensor:
-    """Squared difference (B, 1, h, w) of the middle picture from both others where the flows (B, 2, 2, h, w) point."""
+    """Return the squared error (B, 1, h, w) between the middle picture and both others, warped by their flows."""
     error = flow_warp(pictures[:, ::2].unsqueeze(2), flows).squeeze(2) - pictures[:, 1:2]
     return gaussian_blur2d(error.square().sum(dim=1, keepdim=True), 17, (_NEAR, _NEAR), "replicate")

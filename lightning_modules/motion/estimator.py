@@ -10,17 +10,17 @@ from spikekit.color.cfa import GREY, cfa_sites
 
 
 class MotionEstimator(nn.Module):
-    r"""Base of the estimators; they implement :meth:`channel_flows`, and ``forward`` where they have a better one.
+    r"""Base class of motion estimators; subclasses implement :meth:`channel_flows`, and may override ``forward``.
 
-    ``forward`` averages the flows of the four sub-streams, eq. (7), and brings them to the sensor's resolution. A grey
-    sensor has one sub-stream, all of its pixels.
+    ``forward`` averages the flows of the four sub-streams, eq. (7), and enlarges the result to the sensor's resolution.
+    A grey sensor has one sub-stream, with all of its pixels.
 
     Attributes:
-        static: nothing ever moves; nobody asks for the flows then.
+        static: the flows are always zero, and networks do not call the estimator.
 
     Shape:
-        - Input: spikes :math:`(B, N, H, W)`, any real dtype; the times of the first, the middle and the last time
-          point, in spike frames; the Bayer phase, or ``"grey"``
+        - Input: spikes :math:`(B, N, H, W)` of any real dtype; the first, middle and last time points, in spike frames;
+          the Bayer phase, or ``"grey"``
         - Output: two flows :math:`(B, 2, H, W)` in sensor pixels, middle to first and middle to last
 
     Reference:
@@ -30,22 +30,22 @@ class MotionEstimator(nn.Module):
     static: bool = False
 
     def channel_flows(self, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> tuple[Tensor, Tensor]:
-        """Estimate the flows of every sub-stream by itself.
+        """Estimate the flows of each sub-stream separately.
 
         Args:
             spikes: (B, N, H, W), any real dtype.
-            times: the first, the middle and the last time point, in spike frames.
+            times: first, middle and last time points, in spike frames.
             pattern: Bayer phase, or ``"grey"``.
 
         Returns:
-            Two flows (4, B, 2, h, w), middle to first and middle to last, in pixels of the sub-streams, that is in
-            Bayer cells: h and w are half of H and W, rounded up. The sites are in the order of
-            :func:`spikekit.split_bayer`. Of a grey sensor (1, B, 2, H, W).
+            Two flows (4, B, 2, h, w), middle to first and middle to last, in pixels of the sub-streams (Bayer cells);
+            h and w are half of H and W, rounded up. Sub-streams are in the order of :func:`spikekit.split_bayer`. For
+            a grey sensor, (1, B, 2, H, W).
         """
         raise NotImplementedError
 
     def forward(self, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> tuple[Tensor, Tensor]:
-        """Estimate the two flows."""
+        """Return the two flows, from the middle to the first and last time points."""
         height, width = spikes.shape[-2:]
         to_first, to_last = self.channel_flows(spikes, times, pattern)
         _, side = cfa_sites(pattern)
@@ -53,17 +53,17 @@ class MotionEstimator(nn.Module):
 
 
 def split_any_size(raw: Tensor, pattern: str) -> Tensor:
-    """Split like :func:`spikekit.split_bayer`, with an odd side mirrored: without the border, to keep the Bayer phase.
+    """Split like :func:`spikekit.split_bayer`; odd sides are padded by reflection, which keeps the Bayer phase.
 
     Args:
-        raw: (B, T, H, W), floating, of at least 2 x 2 pixels.
+        raw: (B, T, H, W), floating point, at least 2 x 2 pixels.
         pattern: Bayer phase, or ``"grey"``.
 
     Returns:
-        (4, B, T, h, w), h and w being half of H and W, rounded up; (1, B, T, H, W) of a grey sensor.
+        (4, B, T, h, w), with h and w half of H and W, rounded up; (1, B, T, H, W) for a grey sensor.
 
     Raises:
-        ValueError: less than 2 x 2 pixels.
+        ValueError: ``raw`` has fewer than 2 x 2 pixels.
     """
     height, width = raw.shape[-2:]
     if min(height, width) < 2:

@@ -1,4 +1,4 @@
-"""The network inside Spike2Flow: features, correlations, and iterative refinement of three flows."""
+"""Network of Spike2Flow: features, correlations, and iterative refinement of three flows."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-_ALL_PAIRS = 1600  # most pixels that are correlated with each other; beyond, looking up is faster and takes less memory
+_ALL_PAIRS = 1600  # maximum number of pixels for all-pairs correlation; above, lookup is faster and saves memory
 
 
 def _convolved(inputs: int, outputs: int, size: int, stride: int = 1, *, norm: bool = False) -> list[nn.Module]:
-    """A convolution that keeps the size, or divides it by the stride; perhaps instance normalisation; ReLU."""
+    """Return a padded convolution, optional instance normalisation, and ReLU."""
     convolution = nn.Conv2d(inputs, outputs, size, stride, padding=size // 2)
     return [convolution, *([nn.InstanceNorm2d(outputs)] if norm else []), nn.ReLU(inplace=True)]
 
 
 class ResidualBlock(nn.Module):
-    """Two 3 x 3 convolutions with instance normalisation, and a shortcut."""
+    """Residual block: two 3 x 3 convolutions with instance normalisation, and a shortcut."""
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1) -> None:
         super().__init__()
@@ -34,7 +34,7 @@ class ResidualBlock(nn.Module):
 
 
 class GlobalAttention(nn.Module):
-    """Every position adds the features of all positions that resemble it; nothing at the beginning of training."""
+    """Self-attention over all positions, with a learned gain that starts at 0."""
 
     def __init__(self, width: int, values: int) -> None:
         super().__init__()
@@ -55,7 +55,7 @@ class GlobalAttention(nn.Module):
 
 
 class Encoder(nn.Sequential):
-    """From a window of frames to features; every width halves the size once."""
+    """Encoder of a window of frames; each stage halves the resolution."""
 
     def __init__(self, window: int, widths: Sequence[int], blocks: int, outputs: int, attention: int) -> None:
         layers = _convolved(window, widths[0], 7, 2, norm=True)
@@ -69,10 +69,10 @@ class Encoder(nn.Sequential):
 
 
 class Correlation:
-    """How much the features of every pixel resemble those around where its flow points, on several scales.
+    """Correlation of each pixel's features with those around the end of its flow, on several scales.
 
-    Small pictures are correlated once, all pixels with all pixels; in large ones only what is looked up is. Both give
-    the same, because pooling and interpolation are linear. The flow begins in ``features``, (B, C, h, w), and ends in
+    Small pictures store the correlations of all pairs of pixels; large ones compute only those that are looked up. Both
+    give the same result, because pooling and interpolation are linear. Flows lead from ``features``, (B, C, h, w), to
     ``others``, (B, K, C, h, w).
     """
 
@@ -80,7 +80,7 @@ class Correlation:
         self.height, self.width = features.shape[-2:]
         self.all_pairs = self.height * self.width <= _ALL_PAIRS
         features = features.flatten(2) / math.sqrt(features.shape[1])
-        wide = torch.promote_types(features.dtype, torch.float32)  # halves cannot tell the pixels of a large picture
+        wide = torch.promote_types(features.dtype, torch.float32)  # half precision is too coarse for pixel positions
         if self.all_pairs:
             level = torch.einsum("bcp,bkcq->bkpq", features, others.flatten(3)).reshape(-1, 1, self.height, self.width)
         else:
@@ -89,18 +89,18 @@ class Correlation:
         level = level.to(wide)
         self.pyramid = [level]
         for _ in range(levels - 1):
-            # what is left over at the border is a pixel by itself; one pixel stays one pixel
+            # ceil_mode keeps the last odd row and column, and at least one pixel
             level = F.avg_pool2d(level, 2, ceil_mode=True)
             self.pyramid.append(level)
         self.around = _positions(range(-radius, radius + 1), range(-radius, radius + 1), level)  # (k k, 2)
         self.here = _positions(range(self.height), range(self.width), level)  # (h w, 2)
 
     def __call__(self, flow: Tensor) -> Tensor:
-        """Look up: flow (B K, 2, h, w) to (B K, levels k k, h, w)."""
+        """Look up the correlations of a flow, (B K, 2, h, w) to (B K, levels k k, h, w)."""
         there = (self.here + flow.flatten(2).transpose(1, 2)).unsqueeze(2) + 0.5  # (B K, h w, 1, 2)
         found = []
         for number, level in enumerate(self.pyramid):
-            # align_corners=False divides by the width, not by the width less one: one pixel is wide enough
+            # align_corners=False divides by the width, not by width - 1, so a width of one pixel is valid
             size = there.new_tensor([level.shape[-1], level.shape[-2]])
             grid = (there / 2**number + self.around) * (2 / size) - 1
             if self.all_pairs:
@@ -112,13 +112,13 @@ class Correlation:
 
 
 def _positions(rows: range, columns: range, like: Tensor) -> Tensor:
-    """All (x, y), row by row: (rows columns, 2)."""
+    """Return all positions (x, y) in row-major order, (rows columns, 2)."""
     y, x = (torch.tensor(axis, dtype=like.dtype, device=like.device) for axis in (rows, columns))
     return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).flatten(0, 1)
 
 
 class MotionEncoder(nn.Module):
-    """Features of a flow and of the correlations that it points to."""
+    """Encoder of a flow and its correlations."""
 
     def __init__(self, looked_up: int, correlation: tuple[int, int], motion: int) -> None:
         super().__init__()
@@ -132,7 +132,7 @@ class MotionEncoder(nn.Module):
 
 
 class SeparableGRU(nn.Module):
-    """Gated recurrent unit of convolutions: once along the rows, once along the columns."""
+    """Convolutional gated recurrent unit, once along the rows and once along the columns."""
 
     def __init__(self, hidden: int, inputs: int) -> None:
         super().__init__()
@@ -151,13 +151,13 @@ class SeparableGRU(nn.Module):
 
 
 class RecurrentFlow(nn.Module):
-    r"""Flows from one window of frames to three later ones at equal distances, all of them refined together.
+    r"""Joint refinement of the flows from one window of frames to three later, equidistant windows.
 
-    Its arguments are described in :class:`lightning_modules.motion.Spike2Flow`.
+    For the arguments see :class:`lightning_modules.motion.Spike2Flow`.
 
     Shape:
         - Input: windows :math:`(B, 4, window, h, w)`, any h and w
-        - Output: flows :math:`(B, 3, 2, h, w)` in pixels, from the first window to the others, one for every iteration
+        - Output: flows :math:`(B, 3, 2, h, w)` in pixels, from the first window to the others, for each iteration
 
     Reference:
         Zhao et al., Learning Optical Flow from Continuous Spike Streams, NeurIPS 2022; Teed and Deng, RAFT, ECCV 2020.
@@ -189,7 +189,7 @@ class RecurrentFlow(nn.Module):
 
     def forward(self, windows: Tensor, iterations: int) -> list[Tensor]:  # noqa: D102
         batch, _, _, height, width = windows.shape
-        # two pixels of features at least: one alone has no variance to normalise
+        # at least two pixels of features, as instance normalisation needs a variance
         bottom, right = (max(-side % self.stride, 2 * self.stride - side) for side in (height, width))
         windows = F.pad(windows.flatten(0, 1), (0, right, 0, bottom), "replicate").unflatten(0, (batch, 4))
         features = self.features(windows.flatten(0, 1)).unflatten(0, (batch, 4))
@@ -203,7 +203,7 @@ class RecurrentFlow(nn.Module):
             flow = flow.detach()
             motion = self.motion(correlation(flow), flow).unflatten(0, (batch, 3))
             hidden = self.update(hidden, torch.cat([context, motion.flatten(1, 2)], dim=1))
-            # motion is nearly steady: what is wrong with it grows with time
+            # motion is nearly steady, so its error grows with time
             step = torch.stack([(k + 1) * head(hidden) for k, head in enumerate(self.heads)], dim=1)
             flow = flow + step.flatten(0, 1)
             fine = upsample_convex(flow.unflatten(0, (batch, 3)), 0.25 * self.mask(hidden), self.stride)
@@ -217,9 +217,9 @@ def _head(inputs: int, width: int, outputs: int, size: int) -> nn.Sequential:
 
 
 def upsample_convex(flow: Tensor, weights: Tensor, scale: int) -> Tensor:
-    """Bring flow, (B, K, 2, h, w), to a finer grid, every fine pixel a weighted mean of the nine coarse ones around it.
+    """Upsample flow (B, K, 2, h, w); each fine pixel is a convex combination of the nine coarse pixels around it.
 
-    The weights are (B, 9 scale scale, h, w), before the softmax over the nine.
+    The weights are (B, 9 scale scale, h, w), before the softmax over the nine pixels.
     """
     batch, count, _, height, width = flow.shape
     around = F.unfold(F.pad(flow.flatten(1, 2), (1, 1, 1, 1), "replicate"), 3)

@@ -1,4 +1,4 @@
-"""Learned motion estimation: Spike2Flow on the spike intervals of the four sub-streams."""
+"""Spike2Flow, learned motion estimation on the spike intervals of the four sub-streams."""
 
 from __future__ import annotations
 
@@ -15,47 +15,47 @@ from lightning_modules.storage.pretrained import check_weights, load_weights, re
 from spikekit import spike_interval
 from spikekit.check import check_planes
 
-_PIXELS = 1 << 17  # of streams that are worked on in one go
+_PIXELS = 1 << 17  # pixels of sub-streams per batch
 
 
 class Spike2Flow(MotionEstimator):
-    r"""Recurrent flow from the spike intervals of the four sub-streams, to both ends of the clip.
+    r"""Recurrent optical flow from the spike intervals of the four sub-streams.
 
-    Of every sub-stream, windows of intervals around four times at equal distances, the middle one first and the last
-    time point last, give three flows that are refined together; the third is the result. The flow to the first time
-    point is that of the stream reversed in time. Where a window reaches beyond the clip, the outermost intervals are
-    repeated. Sub-streams and directions are one batch, and one network for all.
+    Four equidistant windows of spike intervals, from the middle of the clip to its last time point, give three flows
+    that are refined together; the third is the result. The flow to the first time point is that of the time-reversed
+    stream. The outermost intervals are repeated beyond the ends of the clip. One network processes all sub-streams and
+    both directions as one batch.
 
-    The defaults are a small size of this project, because the network runs eight times a clip. The paper's is::
+    The default size is small, because the network runs eight times per clip. The paper's size is::
 
         Spike2Flow(window=21, widths=(64, 96, 128), blocks=2, features=216, attention=128, hidden=128,
                    correlation=(196, 160), motion=96, head=196, levels=3, radius=3, iterations=8)
 
-    with 6,501,830 parameters, those that the authors count less the 101,888 that nothing depends on.
+    with 6,501,830 parameters. The authors count 101,888 more, which do not affect the result.
 
     Args:
-        window: frames of a window, odd.
-        widths: channels of the encoders' stages; motion is estimated at a size that is halved once for each.
-        blocks: residual blocks of each stage.
-        features: channels that are correlated.
+        window: number of spike frames per window, odd.
+        widths: channels of the encoders' stages; each stage halves the resolution at which motion is estimated.
+        blocks: residual blocks per stage.
+        features: channels of the correlated features.
         attention: channels of the encoders' global attention, 0 for none.
-        hidden: channels of the recurrent state, and as many of context.
-        correlation: channels that the correlations are encoded with.
-        motion: channels of the motion features of a flow, even.
-        head: channels in front of the flow increments and of the upsampling weights.
+        hidden: channels of the recurrent state, and of the context.
+        correlation: channels of the two layers that encode the correlations.
+        motion: channels of the motion features per flow, even.
+        head: hidden channels of the flow heads and of the upsampling weights.
         levels: scales of the correlations.
-        radius: how far the correlations are looked up, in pixels of each scale.
-        iterations: how often the flows are refined; any number serves, whatever was trained with.
-        weights: ``"spike2flow"``, which comes with the package and is of the default size; a file of safetensors, or a
-            checkpoint of ``lightning fit -c configs/flow.yaml``. Random weights when not given.
-        frozen: estimate without gradient, and never learn.
+        radius: lookup radius of the correlations, in pixels of each scale.
+        iterations: number of refinements; it may differ from that of training.
+        weights: ``"spike2flow"``, in the package, of the default size; path of a safetensors file; or checkpoint of
+            ``lightning fit -c configs/flow.yaml``. Default: random weights.
+        frozen: estimate without gradient, and do not train the weights.
 
     Shape:
         As :class:`MotionEstimator`; spikes of at least 2 x 2 pixels.
 
     Raises:
-        FileNotFoundError: there are no such weights.
-        ValueError: an argument that makes no sense, a file that is damaged or of another network; the message names it.
+        FileNotFoundError: ``weights`` is neither a file nor a known name.
+        ValueError: an argument is out of range, or the file is damaged or holds another network.
 
     Example:
         >>> to_first, to_last = Spike2Flow()(torch.zeros(1, 41, 24, 20), (5, 20, 35), "RGGB")
@@ -94,9 +94,9 @@ class Spike2Flow(MotionEstimator):
         if iterations < 1 or attention < 0:
             raise ValueError(f"iterations, attention: expected 1 or more and 0 or more, got {iterations}, {attention}")
         if window < 1 or window % 2 == 0:
-            raise ValueError(f"window: expected an odd number of frames, got {window}")
+            raise ValueError(f"window: expected a positive odd number, got {window}")
         if motion < 4 or motion % 2:
-            raise ValueError(f"motion: expected an even number of at least 4 channels, got {motion}")
+            raise ValueError(f"motion: expected an even number of at least 4, got {motion}")
         self.settings: dict[str, Any] = {
             **{"window": window, "attention": attention, "motion": motion},
             **one_each,
@@ -117,30 +117,30 @@ class Spike2Flow(MotionEstimator):
         return self.refinements(spikes, times, pattern)[-1][:, :, :, 2].unbind(2)
 
     def refinements(self, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> list[Tensor]:
-        """Return all flows of every iteration, as training needs them.
+        """Return all flows of each iteration, for training.
 
         Args:
             spikes: (B, N, H, W), any real dtype.
-            times: the first, the middle and the last time point, in spike frames.
+            times: first, middle and last time points, in spike frames.
             pattern: Bayer phase.
 
         Returns:
-            A flow :math:`(4, B, 2, 3, 2, h, w)` in Bayer cells for every iteration. Its axes are the sites, the clips,
-            to the first and to the last time point, a third, two thirds and all of the way, and x and y.
+            For each iteration, flows :math:`(4, B, 2, 3, 2, h, w)` in Bayer cells. The axes are: sub-streams, clips,
+            to the first and last time points, a third, two thirds and all of the way, (x, y), height and width.
         """
         check_planes("spikes", spikes, 4, "(B, N, H, W)")
         first, middle, last = times
         end = spikes.shape[1] - 1
         backwards = self._windows(spikes.flip(1), end - middle, end - first, pattern)
         windows = torch.stack([backwards, self._windows(spikes, middle, last, pattern)], dim=2)
-        # large clips stream by stream: every position takes memory for all that is looked up
+        # large clips are split into sub-streams, as each position needs memory for its correlations
         few = max(1, _PIXELS // (windows.shape[-2] * windows.shape[-1]))
         with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):
             parts = [self.network(part, self.iterations) for part in windows.flatten(0, 2).split(few)]
         return [torch.cat(flows).unflatten(0, windows.shape[:3]) for flows in zip(*parts, strict=True)]
 
     def _windows(self, spikes: Tensor, middle: int, last: int, pattern: str) -> Tensor:
-        """Windows of intervals from the middle on, (4, B, 4, window, h, w)."""
+        """Return four windows of intervals, from the middle to the last time point, (4, B, 4, window, h, w)."""
         intervals = split_any_size(spike_interval(spikes).to(next(self.parameters()).dtype), pattern)
         centers = torch.tensor([round(middle + (last - middle) * k / 3) for k in range(4)])
         frames = centers[:, None] + torch.arange(self.window) - self.window // 2

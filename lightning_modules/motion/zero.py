@@ -1,4 +1,4 @@
-"""Zero motion, the lower bound of every comparison."""
+"""Zero motion, the lower bound in comparisons."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from spikekit.color.cfa import cfa_sites
 
 
 class ZeroFlow(MotionEstimator):
-    r"""Nothing moves.
+    r"""Estimator for scenes without motion; both flows are zero.
 
     Shape:
         As :class:`MotionEstimator`.

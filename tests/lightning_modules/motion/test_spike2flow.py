@@ -214,7 +214,7 @@ def test_weights_plug_into_cscsr(frozen, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"window": 10}, "window: expected an odd number of frames, got 10"),
+        ({"window": 10}, "window: expected a positive odd number, got 10"),
         ({"motion": 3}, "motion: expected an even number"),
     ],
 )
