@@ -77,8 +77,8 @@ def parser() -> argparse.ArgumentParser:
         type=float,
         dest="psnr_tolerance",
         metavar="DB",
-        help="skip the motion of parts that rest, as long as this costs no more PSNR; in a film without --future and "
-        "--interpolated, any but 0: ask the network only where the spikes say that something moves",
+        help="in a film: the PSNR that a picture may lose where this saves work; with any but 0 the network is asked "
+        "only where the spikes say that something moves, and no picture is interpolated",
     )
     add("--self_ensemble", type=int, metavar="N", help="2, 4 or 8: the mean over so many views of a clip")
     add("--interpolated", type=whole(0), metavar="N", help="pictures between two that the network makes")

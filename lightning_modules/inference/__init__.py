@@ -1,1 +1,1 @@
-"""Running a trained network: tiles, scene activity, self-ensembles, presets."""
+"""Running a trained network: films, tiles, self-ensembles, presets."""

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from lightning_modules.inference.clips import clips_around, film_groups
-from lightning_modules.inference.predict import check_options, predict
-from lightning_modules.inference.rest import Rest
-from lightning_modules.inference.tiles import AROUND, TILE, TILE_ON_GPU, Box, reach, tiled
+from lightning_modules.inference.predict import check_views, predict
+from lightning_modules.inference.rest import AROUND, Rest
+from lightning_modules.inference.tiles import TILE, TILE_ON_GPU, Box, reach, tiled
 from lightning_modules.networks import Network, RecurrentCSCSR
 from lightning_modules.networks.recurrent_cscsr import read_forward, read_from_end
 from spikekit import flow_warp, linear_motion, upsample_flow
@@ -150,13 +150,16 @@ class FilmMaker:
         future: key frames that a picture may wait for, of a network that carries a state on.
         interpolated: pictures between two that the network makes.
         tile: side of the tiles in sensor pixels, 0 for none; when not given, what suits the network's device.
-        how: ``psnr_tolerance``, ``self_ensemble`` and ``done`` of :func:`lightning_modules.inference.predict.predict`.
-            With any tolerance but 0, and neither ``future`` nor ``interpolated``, only what moves is computed
-            (:class:`lightning_modules.inference.rest.Rest`). A network that carries a state on has no ensemble.
+        psnr_tolerance: by how many dB the PSNR of a picture may fall where this saves work. With any but 0 the network
+            is asked only where the spikes say that something moves (:class:`lightning_modules.inference.rest.Rest`).
+            The first picture knows of nothing that rests, so a film of one is as it is without.
+        how: ``self_ensemble`` and ``done`` of :func:`lightning_modules.inference.predict.predict`. A network that
+            carries a state on has no ensemble.
 
     Raises:
         ValueError: a ``future`` for a network that takes every clip by itself; ``interpolated`` pictures by one that
-            estimates no motion; a negative number of either; what such a network does not take.
+            estimates no motion; a negative number of either; what such a network does not take; a tolerance below 0,
+            with a ``future`` or ``interpolated`` pictures, or for a network that sees the whole picture.
 
     Example:
         >>> from lightning_modules.networks import CSCSR
@@ -167,7 +170,13 @@ class FilmMaker:
     """
 
     def __init__(
-        self, network: Network, future: int = 0, interpolated: int = 0, tile: int | None = None, **how: Any
+        self,
+        network: Network,
+        future: int = 0,
+        interpolated: int = 0,
+        tile: int | None = None,
+        psnr_tolerance: float = 0.0,
+        **how: Any,
     ) -> None:
         kind = type(network).__name__
         self.carries_on = isinstance(network, RecurrentCSCSR)
@@ -180,17 +189,22 @@ class FilmMaker:
             raise ValueError(f"interpolated: expected 0, as {kind} estimates no motion of a clip, got {interpolated}")
         if self.carries_on and how.get("self_ensemble", 1) > 1:
             raise ValueError(f"self_ensemble: expected 1 for {kind}, got {how['self_ensemble']}")
-        check_options(**{name: how[name] for name in ("psnr_tolerance", "self_ensemble") if name in how})
+        check_views(how.get("self_ensemble", 1))
+        if not 0 <= psnr_tolerance < math.inf:
+            raise ValueError(f"psnr_tolerance: expected 0 dB or more, got {psnr_tolerance}")
+        if psnr_tolerance and (future or interpolated):
+            raise ValueError(f"psnr_tolerance: expected 0 with future or interpolated pictures, got {psnr_tolerance}")
+        if psnr_tolerance and network.halo is None:
+            raise ValueError(f"psnr_tolerance: expected 0 for {kind}, run on whole pictures only, got {psnr_tolerance}")
         self.network, self.future, self.interpolated, self._how = network, future, interpolated, how
         on_gpu = any(part.is_cuda for part in network.parameters())
         self.tile = (TILE_ON_GPU if on_gpu else TILE) if tile is None else tile
         self._last: _Made | None = None
         self._known: _Known | None = None
         self.rest: Rest | None = None
-        if how.get("psnr_tolerance") and network.halo is not None and not (future or interpolated):
+        if psnr_tolerance:
             settings = network.settings
             self.rest = Rest(network.scale, settings["pattern"], settings["alpha"], network.noise_level > 0)
-            self._how = {**how, "psnr_tolerance": 0.0}
 
     @property
     def warm_up(self) -> int:

@@ -1,8 +1,7 @@
-"""Predict a picture from a clip, with tiles, tolerance and self-ensemble."""
+"""Predict a picture from a clip, with tiles and self-ensemble."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from itertools import count
 
@@ -21,7 +20,6 @@ def predict(
     static: bool = False,
     *,
     tile: int = TILE,
-    psnr_tolerance: float = 0.0,
     self_ensemble: int = 1,
     exposure: float | Tensor = 1.0,
     done: Callable[[float], object] | None = None,
@@ -36,7 +34,6 @@ def predict(
         static: nothing moves, instead of a flow.
         tile: side of the tiles in sensor pixels, 0 for none, see
             :func:`lightning_modules.inference.tiles.forward_in_tiles`.
-        psnr_tolerance: by how many dB the PSNR of the picture is expected to fall at most, see there.
         self_ensemble: mean over so many views of the clip, 1, 2, 4 or 8, see
             :func:`lightning_modules.inference.self_ensemble.self_ensemble`.
         exposure: what the picture is multiplied by before it is clamped, a number or (B, 1, 1, 1).
@@ -51,13 +48,13 @@ def predict(
         >>> predict(ClassicalDecoder(scale=2), torch.ones(1, 41, 16, 16), self_ensemble=2).shape
         torch.Size([1, 3, 32, 32])
     """
-    check_options(psnr_tolerance, self_ensemble)
+    check_views(self_ensemble)
     views = count()
 
     def run(spikes: Tensor, flow: Tensor | None) -> Tensor:
         before = next(views)
         told = done and (lambda share: done((before + share) / self_ensemble))
-        rgb = forward_in_tiles(network, spikes, tile, psnr_tolerance, flow, static, told)
+        rgb = forward_in_tiles(network, spikes, tile, flow, static, told)
         if told:
             told(1)  # a small view has no tiles
         return rgb
@@ -66,13 +63,11 @@ def predict(
     return (rgb * exposure).clamp_(0, 1)
 
 
-def check_options(psnr_tolerance: float = 0.0, self_ensemble: int = 1) -> None:
-    """Refuse a tolerance or a number of views that cannot be.
+def check_views(self_ensemble: int) -> None:
+    """Refuse a number of views that cannot be.
 
     Raises:
-        ValueError: which of them it is.
+        ValueError: it is none of 1, 2, 4 and 8.
     """
-    if not 0 <= psnr_tolerance < math.inf:
-        raise ValueError(f"psnr_tolerance: expected 0 dB or more, got {psnr_tolerance}")
     if isinstance(self_ensemble, bool) or self_ensemble not in COUNTS:
         raise ValueError(f"self_ensemble: expected one of {COUNTS}, got {self_ensemble!r}")

@@ -64,7 +64,6 @@ class Preset:
         motion_weights: of that estimator.
         motion_iterations: of that estimator.
         tile: see :func:`lightning_modules.inference.predict.predict`.
-        psnr_tolerance: in dB, see there.
         self_ensemble: number of views, see there.
         interpolated: pictures of a film between two that the network makes, see
             :class:`lightning_modules.inference.film.FilmMaker`.
@@ -86,7 +85,6 @@ class Preset:
     motion_weights: str | None = None
     motion_iterations: int | None = None
     tile: int | None = None
-    psnr_tolerance: float | None = None
     self_ensemble: int | None = None
     interpolated: int | None = None
     precision: str | None = None
@@ -115,8 +113,8 @@ class Preset:
             ValueError: a cell that is no number where one is expected.
 
         Example:
-            >>> Preset.read({"weights": "cscsr_small_x4", "tile": "64", "psnr_tolerance": ""})
-            Preset(weights='cscsr_small_x4', ..., tile=64, psnr_tolerance=None, ...)
+            >>> Preset.read({"weights": "cscsr_small_x4", "tile": "64", "self_ensemble": ""})
+            Preset(weights='cscsr_small_x4', ..., tile=64, self_ensemble=None, ...)
         """
         kinds = {name: get_args(hint)[0] for name, hint in get_type_hints(cls).items()}
         return cls(**{name: kind(row[name]) for name, kind in kinds.items() if row.get(name)})
@@ -128,7 +126,7 @@ class Preset:
     def build(self) -> Network:
         """Build the network in evaluation mode, on the CPU.
 
-        Tiles, tolerance, views and precision are not its own: see
+        Tiles, views and precision are not its own: see
         :func:`lightning_modules.inference.predict.predict`.
 
         Raises:
@@ -284,7 +282,7 @@ def pace(scale: int, film: bool = False, white: float = 0.4) -> float:
     preset = Preset.read(row)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network = preset.build().to(device)
-    options = preset.given("tile", "psnr_tolerance", "self_ensemble")
+    options = preset.given("tile", "self_ensemble")
     height, width = int(row["height"]) // 2, int(row["width"]) // 2
     spikes = torch.rand(1, network.frames, height, width, device=device) < network.settings["alpha"] / 2
     timer, _ = timer_of(device, torch.get_num_threads())

@@ -116,8 +116,9 @@ def reconstruct(
         scale = scale or (1 if recording.pattern == GREY else 4)
         white = RecordingClips(recording).white if white is None else white
         speed = "balanced" if budget is None and speed is None else speed
-        preset, notes = _chosen(recording, speed, budget, scale, frame, white, noisy)
-        how = {**preset.given("tile", "psnr_tolerance", "self_ensemble", "interpolated"), **how}
+        resting = bool(how.get("psnr_tolerance"))
+        preset, notes = _chosen(recording, speed, budget, scale, frame, white, noisy, resting)
+        how = {**preset.given("tile", "self_ensemble", "interpolated"), **how}
         network = preset.build()
     elif not isinstance(network, Network):
         network = Network.from_pretrained(network)
@@ -311,6 +312,7 @@ def _chosen(
     frame: str | None,
     white: float,
     noisy: bool,
+    resting: bool,
 ) -> tuple[Preset, list[str]]:
     """Return the preset that speed or budget ask for, and lines that say what it is and costs."""
     clips = RecordingClips(recording, frame=frame)
@@ -326,7 +328,7 @@ def _chosen(
     room = max(FRAMES, recording.frames // _MANY if frame is None else around)
     asked = {"scale": scale, "size": clips.size, "film": film, "white": white, "noisy": noisy}
     choice = choose(speed=speed, budget=budget, frames=room, **asked)
-    interpolated = _interpolated(choice.preset, every, speed)
+    interpolated = 0 if resting else _interpolated(choice.preset, every, speed)
     said = [str(choice)]
     if speed not in (None, "fastest"):
         sooner = list(SPEEDS)[list(SPEEDS).index(speed) - 1]

@@ -16,13 +16,14 @@ from spikekit.color.cfa import GREY
 
 #: sensor pixels along the side of a cell, the smallest part that rests by itself
 CELL = 8
+#: sensor pixels around what moves in which motion is estimated
+AROUND = 24
 
 _RISK = 1e-5  # of calling a cell at rest moved
 _TESTS = 5  # of a cell: blocks of 1, 2 and 4 pixels, all of them, and the cell
 _PICTURES = 8  # of which a cell at rest shows the mean, before the network is no longer asked
 _LEAST = 1 / 12  # variance that is always allowed for, in spikes: light is not known exactly
 _NOISY = 0.01  # variance of a noisy sensor, for a spike, beside that of counting: photons of 100 electrons a threshold
-_AROUND = 24  # sensor pixels around a box that it costs as well, about
 
 
 class Changes(NamedTuple):
@@ -250,7 +251,7 @@ def _boxes(computed: Tensor, near: Tensor, whole: Box) -> list[tuple[Box, bool]]
         for rows, columns in find_objects(label(cells.cpu().numpy())[0]):
             box = Box(*(CELL * end for end in (rows.start, columns.start, rows.stop, columns.stop)))
             found.append((box.grown(CELL // 2, whole), static))
-    seen = [box.grown(_AROUND, whole) for box, _ in found]
+    seen = [box.grown(AROUND, whole) for box, _ in found]
     area = sum((box.bottom - box.top) * (box.right - box.left) for box in seen)
     if found and area >= 1.2 * whole.bottom * whole.right:
         return [(whole, not near.any().item())]

@@ -1,4 +1,4 @@
-"""Tiled inference: large recordings in bounded memory, and less work where the scene needs less."""
+"""Tiled inference: large recordings in bounded memory."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from lightning_modules.inference.scene_activity import CELL, expected_errors, moving_cells, scene_activity
 from lightning_modules.networks import Network
 
 #: side of a tile, in sensor pixels, where nothing else is asked for
@@ -19,8 +18,6 @@ TILE = 200
 TILE_ON_GPU = 512
 #: motion that is followed over the edge of a tile, in sensor pixels; what moves further is searched inside
 FAR = 48
-#: sensor pixels around what moves in which motion is estimated, where a tolerance is given
-AROUND = 24
 
 
 @torch.no_grad()
@@ -28,7 +25,6 @@ def forward_in_tiles(
     network: Network,
     spikes: Tensor,
     tile: int,
-    tolerance: float = 0.0,
     flow: Tensor | None = None,
     static: bool = False,
     done: Callable[[float], object] | None = None,
@@ -37,16 +33,12 @@ def forward_in_tiles(
 
     Motion, where none is given, is estimated once, on the whole clip. What a network sees around a tile, its ``halo``
     and as far as motion reaches, is computed and thrown away. A network whose ``halo`` is None is run on the whole
-    picture, whatever the tile and the tolerance.
-
-    With a tolerance the clip is looked at first, see :mod:`lightning_modules.inference.scene_activity`: motion is
-    estimated on the part around all that moves, and tiles without any get no flow and no search along it.
+    picture, whatever the tile.
 
     Args:
         network: any of :mod:`lightning_modules.networks`.
-        spikes: :math:`(B, N, H, W)`. Of several clips each part gets what the most demanding one needs.
+        spikes: :math:`(B, N, H, W)`.
         tile: side of a tile in sensor pixels, even so that the Bayer phase is kept; 0 for no tiles.
-        tolerance: by how many dB the PSNR of the picture is expected to fall at most; 0 for motion everywhere.
         flow: as the network takes it; when not given, the network's own estimate.
         static: nothing moves, instead of a flow.
         done: called after every tile, with the share of them that is done.
@@ -57,17 +49,11 @@ def forward_in_tiles(
     if network.halo is None:
         return call(network, spikes, flow, static)
     whole = Box(0, 0, *spikes.shape[-2:])
-    if tolerance and flow is None and not static and network.takes_flow and not network.motion.static:
-        flow = _flow_where_it_moves(network, spikes, tolerance, whole)
-        static = flow is None
     flow = network.resolve_flow(spikes, flow, static)
 
     def run(outer: Box) -> Tensor:
         part = None if flow is None else outer.of(flow)
-        if tolerance and part is not None and not part.any():
-            part = None
-        seen = outer.of(spikes)
-        return call(network, seen, part, part is None)
+        return call(network, outer.of(spikes), part, part is None)
 
     return tiled(run, whole, tile, lambda box: reach(flow, box, whole, network.halo), network.scale, done)
 
@@ -154,19 +140,3 @@ def reach(flow: Tensor | None, box: Box, frame: Box, halo: int) -> int:
         return halo
     near = box.grown(halo, frame).of(flow, frame[:2])
     return halo + 2 * math.ceil(near.nan_to_num().abs().amax().clamp(max=FAR).item() / 2)
-
-
-def _flow_where_it_moves(network: Network, spikes: Tensor, tolerance: float, whole: Box) -> Tensor | None:
-    """The network's estimate in the part where something moves, zeros elsewhere; None where nothing does."""
-    network.check_spikes(spikes)
-    seen = scene_activity(spikes, network.pattern, network.settings["alpha"])
-    cells = moving_cells(*expected_errors(seen, network.error_model), tolerance)
-    if not cells.any():
-        return None
-    rows, columns = (cells.any(dim=axis).nonzero() * CELL for axis in (1, 0))
-    moving = Box(int(rows[0]), int(columns[0]), int(rows[-1]) + CELL, int(columns[-1]) + CELL).grown(0, whole)
-    near = moving.grown(AROUND, whole)
-    found = network.estimate_flow(near.of(spikes))
-    flow = found.new_zeros(*found.shape[:-2], whole.bottom, whole.right)
-    moving.of(flow).copy_(moving.of(found, near[:2]))
-    return flow

@@ -14,7 +14,6 @@ from kornia.core.utils import is_exporting
 from torch import Tensor, nn
 
 from lightning_modules.motion import ESTIMATORS, ClassicalFlow, MotionEstimator
-from lightning_modules.storage.error_model import ErrorModel
 from lightning_modules.storage.pretrained import check_weights, load_weights, read_weights
 from lightning_modules.storage.settings import own_class
 from spikekit.check import check_planes
@@ -44,7 +43,6 @@ class Network(nn.Module):
             phase. None if it covers the whole picture or is unknown: such a network does not run in tiles. Shipped
             weights define their own.
         takes_flow: whether the flow affects the result.
-        error_model: predicted loss of accuracy when work is saved, used for tolerances; loaded with the weights.
         noise_level: default noise level, 0 for an ideal sensor and 1 for the sensor used in training. Networks
             trained without noise levels ignore it.
         warm_up: number of earlier key frames that visibly affect a picture of a film; 0 for independent clips.
@@ -76,7 +74,6 @@ class Network(nn.Module):
         self._settings, self._flow_times = settings, flow_times
         for name in _ALL_HAVE if settings else ():
             setattr(self, name, settings[name])
-        self.error_model = ErrorModel()
         self.motion = ClassicalFlow() if motion is None else motion
 
     @property

@@ -16,7 +16,6 @@ from torch import Tensor, nn
 
 from lightning_modules.registry import FUSION, find_model, list_models
 from lightning_modules.storage.checkpoint import check_tensors, read_checkpoint
-from lightning_modules.storage.error_model import read_error_model
 from lightning_modules.storage.settings import check_plain, check_shapes, load_state
 from spikekit.arguments import one_line
 from spikekit.io.whole_file import whole_file
@@ -231,7 +230,5 @@ def load_weights(network: nn.Module, weights: Weights, keep_motion: bool = False
     load_state(network, tensors, weights.source)
     if ratio != 1:
         network.scale_picture(ratio)
-    if hasattr(network, "error_model"):
-        network.error_model = read_error_model(weights.source)
     if weights.halo is not None:
         network.halo = weights.halo

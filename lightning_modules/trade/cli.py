@@ -32,7 +32,7 @@ def parser() -> argparse.ArgumentParser:
         description="Measure the cost and the quality of every setting, on this machine and these scenes.",
         epilog=f"""\
 A setting is arguments of `lightning test`, put behind those that all settings share. Its pictures are those of
-`lightning predict`, tiles and tolerance included, on the test clips; a network of fewer frames than the shared
+`lightning predict`, tiles included, on the test clips; a network of fewer frames than the shared
 arguments give the clips takes those in the middle. All settings are parsed and built before the first one runs. One
 that cannot run here, for want of a file, say, is reported as a row, and the others go on. Time is taken in one process
 and in turns: every setting once in every round, on the same clip.

@@ -18,12 +18,7 @@ from spikekit.decoders.methods import DECODERS
 _COLUMNS = {f"--model.network.{name}": name for name in ("method", "window", "order", "scale", "frames", "motion")}
 _COLUMNS |= {f"--model.network.motion.{name}": f"motion_{name}" for name in ("weights", "iterations")}
 _COLUMNS |= {f"--{name}": name for name in ("tile", "self_ensemble", "interpolated")}
-_COLUMNS |= {
-    "--tolerance": "psnr_tolerance",
-    "--model.weights": "weights",
-    "--model.network": "network",
-    "--trainer.precision": "precision",
-}
+_COLUMNS |= {"--model.weights": "weights", "--model.network": "network", "--trainer.precision": "precision"}
 
 
 class Setting(NamedTuple):
@@ -99,8 +94,6 @@ _VARIANTS = [
     ("bf16-mixed", "--trainer.precision bf16-mixed"),
     ("no tiles", "--tile 0"),
     ("tiles of 64", "--tile 64"),
-    ("tolerance 0.1 dB", "--tolerance 0.1"),
-    ("tolerance 0.5 dB", "--tolerance 0.5"),
 ]
 
 
@@ -133,7 +126,7 @@ def usual_settings(
     if network is not None and "motion" not in signature(type(network)).parameters:
         lacking += ("--model.network.motion",)
     if network is not None and network.halo is None:  # it is never cut into tiles
-        lacking += "--tile", "--tolerance"
+        lacking += ("--tile",)
     typed = dict(networks)
     for place, (weights, text) in enumerate(networks.items()):
         more = [_TWO_VIEWS, *(_MOST if weights == largest else []), *(_VARIANTS if place == 0 else [])]

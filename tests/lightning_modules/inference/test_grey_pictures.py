@@ -34,7 +34,6 @@ def test_tiles_and_views_of_a_grey_clip(scale):
     whole = predict(network, spikes, static=True, tile=0)
     assert whole.shape == (1, 1, 61 * scale, 70 * scale)
     torch.testing.assert_close(predict(network, spikes, static=True, tile=48), whole)
-    assert predict(network, spikes, psnr_tolerance=0.1).shape == whole.shape
     views = [predict(network, one, static=True, self_ensemble=8) for one in (spikes, spikes.mT, spikes.flip(-1))]
     torch.testing.assert_close(views[1].mT, views[0])
     torch.testing.assert_close(views[2].flip(-1), views[0])  # odd sides as well: no phase is to be kept

@@ -156,7 +156,7 @@ def test_wishes_that_cannot_be(table, arguments, message):
 
 
 def test_presets_are_read_as_they_are_written():
-    for given in ({}, WEIGHTS | {"motion": "Spike2Flow", "motion_iterations": 1, "psnr_tolerance": 0.1, "tile": 0}):
+    for given in ({}, WEIGHTS | {"motion": "Spike2Flow", "motion_iterations": 1, "self_ensemble": 2, "tile": 0}):
         preset = Preset(**given)
         assert Preset.read(preset.write()) == preset
         assert preset.given(*Preset.columns()) == given

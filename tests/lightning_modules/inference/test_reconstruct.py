@@ -127,7 +127,7 @@ def test_a_film_is_that_of_the_stream_and_parts_of_it_are_the_same(recording):
     assert [*parts[0], *parts[1]] == [*unbroken]
 
 
-def test_tiles_views_and_tolerance_reach_the_network(recording):
+def test_views_reach_the_network(recording):
     torch.manual_seed(0)
     network = CSCSR(**TINY).eval()
     ((_, plain),) = reconstruct(recording, network=network, frame="40", white=0.3)

@@ -65,6 +65,14 @@ def test_something_smaller_than_a_cell_is_seen_and_only_where_it_is():
     assert moved.nonzero().tolist() == [[2, 4]]
 
 
+@pytest.mark.parametrize(("side", "spikes"), [(1, 0.54), (2, 0.39), (4, 0.29)])
+def test_a_faint_change_of_any_fineness_is_seen(side, spikes):
+    sign = 1 - 2 * (torch.arange(4 * CELL) // side % 2)  # next to each other they cancel
+    recent = 8 + spikes * sign * sign[:, None]
+    moved = find_changes(recent, torch.full_like(recent, 160), torch.full((4, 4), 20 / 400)).moved
+    assert moved.all()
+
+
 @pytest.mark.parametrize("gain", [0.5, 0.9, 1.4])
 def test_a_lamp_that_changes_is_a_gain_and_no_motion(gain):
     light = 0.1 + 0.3 * torch.rand(SIDE, SIDE, generator=generator())
@@ -127,6 +135,16 @@ def test_a_picture_at_rest_becomes_that_of_all_its_clocks():
     assert psnr(pictures[-1], truth) > psnr(pictures[0], truth) + 15
 
 
+@pytest.mark.parametrize(("more", "pixels", "within"), [(0.08, 3, 1), (0.003, 1, 14)])
+def test_what_appears_is_seen_at_once_and_what_is_faint_in_time(more, pixels, within):
+    before, network = 44, Sensor(**{**TINY, "scale": 1, "pattern": "grey"})
+    light = torch.full((20 * (before + within) + 41, 32, 32), 0.4)
+    light[20 * before + 41 :, 8:16:pixels, 8:16:pixels] += more
+    cells = [computed for _, computed in film(light, network, psnr_tolerance=0.1)]
+    assert not any(computed.any() for computed in cells[11 : before + 1])
+    assert any(computed[1, 1] for computed in cells[before + 1 :])
+
+
 def test_a_lamp_that_flickers_leaves_the_picture_at_rest_and_its_light_is_shown():
     lamp = torch.tensor([1 + 0.3 * math.sin(2 * math.pi * clock / 200) for clock in range(541)])[:, None, None]
     network = Sensor(**{**TINY, "scale": 1, "pattern": "grey"})
@@ -136,3 +154,30 @@ def test_a_lamp_that_flickers_leaves_the_picture_at_rest_and_its_light_is_shown(
     for n in range(-6, 0):
         clock = 20 + EVERY * (len(found) + n)
         assert found[n][0].mean().item() == pytest.approx(light[clock].mean().item() / 0.4, rel=0.03)
+
+
+def test_a_film_of_one_picture_is_the_plain_one():
+    network = CSCSR(**TINY).eval()
+    ((plain, _),), ((found, computed),) = film(still(41), network), film(still(41), network, psnr_tolerance=0.1)
+    assert found.equal(plain)
+    assert computed.all()
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "how", "message"),
+    [
+        (-0.1, {}, "expected 0 dB or more, got -0.1"),
+        (math.nan, {}, "expected 0 dB or more, got nan"),
+        (0.1, {"interpolated": 1}, "expected 0 with future or interpolated pictures, got 0.1"),
+    ],
+)
+def test_tolerances_that_cannot_be(tolerance, how, message):
+    with pytest.raises(ValueError, match=f"^psnr_tolerance: {message}$"):
+        FilmMaker(CSCSR(**TINY), psnr_tolerance=tolerance, **how)
+
+
+def test_a_network_that_sees_the_whole_picture_takes_no_tolerance():
+    network = CSCSR(**TINY)
+    network.halo = None
+    with pytest.raises(ValueError, match=r"^psnr_tolerance: expected 0 for CSCSR, run on whole pictures only, got 0.1$"):
+        FilmMaker(network, psnr_tolerance=0.1)

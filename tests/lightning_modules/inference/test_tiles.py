@@ -5,7 +5,6 @@ from lightning_modules.inference.predict import predict
 from lightning_modules.inference.tiles import forward_in_tiles
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks import CSCSR, ClassicalDecoder
-from lightning_modules.storage.error_model import ErrorModel
 from spikekit.scenes.analytic import Layer, Motion, Scene
 from spikekit.sensor.simulate import simulate_spikes
 
@@ -26,16 +25,12 @@ class Counting(MotionEstimator):
 
 
 def counted(**settings):
-    """A network at the sensor's resolution that writes down the sizes it runs on, and whether it was told of motion."""
+    """A network at the sensor's resolution that writes down the sizes it runs on."""
     network = CSCSR(1, **TINY, skip=True, motion=Counting(), **settings)
-    network.error_model = ErrorModel(still=0.05, textured=1.5, moved=0.02, faint=1e-4)
     with torch.no_grad():
         network.reconstruction.rgb.weight.normal_(std=0.02, generator=torch.Generator().manual_seed(0))
     calls = []
-    network.register_forward_pre_hook(
-        lambda _, args, how: calls.append((tuple(args[0].shape[-2:]), not (how.get("static") or True in args[2:]))),
-        with_kwargs=True,
-    )
+    network.register_forward_pre_hook(lambda _, args: calls.append(tuple(args[0].shape[-2:])))
     return network, calls
 
 
@@ -59,7 +54,7 @@ def mixed():
     return clip([Layer(coarse(64, 192)), thing], 64, 192)
 
 
-def test_without_a_tolerance_nothing_is_new():
+def test_tiles_are_those_of_the_picture_cut_by_hand():
     network = CSCSR(1, **TINY, motion=Counting())
     spikes = mixed()
     flow, expected = network.estimate_flow(spikes), torch.empty(1, 3, 64, 192)
@@ -71,7 +66,6 @@ def test_without_a_tolerance_nothing_is_new():
             expected[..., left : left + 64] = part[..., left - x :][..., :64]
         whole = network(spikes)
     assert forward_in_tiles(network, spikes, 64).equal(expected)
-    assert forward_in_tiles(network, spikes, 64, 0.0).equal(expected)
     assert forward_in_tiles(network, spikes, 0).equal(whole)
 
 
@@ -96,66 +90,41 @@ def test_a_number_is_no_flow(flow):
         CSCSR(2, **TINY)(spikes, torch.zeros(1, 2, 2, 8, 8), static=True)
 
 
-def test_motion_is_only_where_something_moves():
-    network, calls = counted()
-    spikes = mixed()
-    rgb = forward_in_tiles(network, spikes, 64, 0.01)
-    assert [moves for _, moves in calls] == [False, True, True]  # the last sees where the object ends
-    ((height, width),) = network.motion.sizes  # asked once, about what moves and the part around it
-    assert height == 64
-    assert 0 < width < 192
-    with torch.no_grad():
-        still, moving = network(spikes, static=True), network(spikes, network.estimate_flow(spikes))
-    inside = ..., slice(31, 33), slice(96, 110)
-    torch.testing.assert_close(rgb[inside], moving[inside], rtol=0, atol=1e-5)
-    for others in (slice(0, 64), slice(152, None)):
-        torch.testing.assert_close(rgb[..., others], still[..., others], rtol=0, atol=1e-5)
-
-
-def test_several_parts_that_move_share_one_estimate():
-    network, calls = counted()
-    forward_in_tiles(network, clip([Layer(coarse(80, 112), Motion(velocity=(0.8, 0.4)))], 80, 112), 48, 0.05)
-    assert [moves for _, moves in calls] == [True] * 6
-    assert network.motion.sizes == [(80, 112)]
-
-
 @pytest.mark.parametrize(("size", "tile"), [((3, 5), 128), ((17, 33), 16), ((50, 70), 50), ((40, 24), 0)])
 def test_any_size_and_several_clips(size, tile):
     network, _ = counted(pattern="GBRG")
     spikes = (torch.rand(2, 41, *size, generator=torch.Generator().manual_seed(0)) < 0.3).to(torch.uint8)
-    rgb = forward_in_tiles(network, spikes, tile, 0.01)
+    rgb = forward_in_tiles(network, spikes, tile)
     with torch.no_grad():
         expected = network(spikes)
     assert rgb.shape == expected.shape
-    torch.testing.assert_close(rgb, expected, rtol=0, atol=1e-5)  # noise: everything is needed
+    torch.testing.assert_close(rgb, expected, rtol=0, atol=1e-5)
 
 
 @torch.no_grad()
-@pytest.mark.parametrize(("scale", "tolerance"), [(2, 0.01), (3, 0.0)])
-def test_a_decoder_sees_no_further_than_its_halo(scale, tolerance):
+@pytest.mark.parametrize("scale", [2, 3])
+def test_a_decoder_sees_no_further_than_its_halo(scale):
     spikes = (torch.rand(1, 41, 40, 56, generator=torch.Generator().manual_seed(0)) < 0.4).to(torch.uint8)
     decoder = ClassicalDecoder("tfi", scale, "GBRG")
-    torch.testing.assert_close(forward_in_tiles(decoder, spikes, 16, tolerance), decoder(spikes), rtol=0, atol=1e-5)
+    torch.testing.assert_close(forward_in_tiles(decoder, spikes, 16), decoder(spikes), rtol=0, atol=1e-5)
     decoder.halo -= 2
     assert (forward_in_tiles(decoder, spikes, 16) - decoder(spikes)).abs().max() > 0.01
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("tolerance", [0.0, 0.01])
-def test_a_network_that_sees_everything_is_not_run_in_tiles(tolerance):
+def test_a_network_that_sees_everything_is_not_run_in_tiles():
     network, calls = counted()
     network.halo = None
     spikes = mixed()
     expected = network(spikes)
     calls.clear()
-    assert forward_in_tiles(network, spikes, 64, tolerance).equal(expected)
-    assert [size for size, _ in calls] == [(64, 192)]
+    assert forward_in_tiles(network, spikes, 64).equal(expected)
+    assert calls == [(64, 192)]
 
 
-@pytest.mark.parametrize("tolerance", [0.0, 1e-6])
-def test_how_far_a_picture_is_is_told_tile_by_tile_and_view_by_view(tolerance):
+def test_how_far_a_picture_is_is_told_tile_by_tile_and_view_by_view():
     shares = []
-    how = {"done": shares.append, "tile": 32, "psnr_tolerance": tolerance}
+    how = {"done": shares.append, "tile": 32}
     predict(ClassicalDecoder(scale=2), clip([Layer(coarse(32, 64))], 32, 64), self_ensemble=2, **how)
     assert list(dict.fromkeys(shares)) == [0.25, 0.5, 0.75, 1.0]
     shares.clear()
@@ -163,25 +132,23 @@ def test_how_far_a_picture_is_is_told_tile_by_tile_and_view_by_view(tolerance):
     assert list(dict.fromkeys(shares)) == [0.25, 0.5, 0.75, 1.0]
 
 
-@pytest.mark.parametrize("tolerance", [0.0, 0.01])
 @pytest.mark.parametrize("tile", [0, 64])
-def test_a_motion_that_is_given_takes_the_place_of_the_estimate(tile, tolerance):
+def test_a_motion_that_is_given_takes_the_place_of_the_estimate(tile):
     network, _ = counted()
     spikes = mixed()
     flow = network.estimate_flow(spikes)
     expected = forward_in_tiles(network, spikes, tile)
     network.motion.sizes.clear()
-    assert forward_in_tiles(network, spikes, tile, tolerance, flow).equal(expected)
-    assert not forward_in_tiles(network, spikes, tile, tolerance, -flow).equal(expected)
+    assert forward_in_tiles(network, spikes, tile, flow).equal(expected)
+    assert not forward_in_tiles(network, spikes, tile, -flow).equal(expected)
     assert network.motion.sizes == []
 
 
-@pytest.mark.parametrize("tolerance", [0.0, 0.01])
-def test_static_may_be_asked_for(tolerance):
+def test_static_may_be_asked_for():
     network, _ = counted()
     spikes = mixed()
-    still = forward_in_tiles(network, spikes, 64, tolerance, static=True)
-    zeros = forward_in_tiles(network, spikes, 64, tolerance, torch.zeros(1, 2, 2, 64, 192))
+    still = forward_in_tiles(network, spikes, 64, static=True)
+    zeros = forward_in_tiles(network, spikes, 64, torch.zeros(1, 2, 2, 64, 192))
     torch.testing.assert_close(still, zeros, rtol=0, atol=1e-5)
     assert network.motion.sizes == []
 
@@ -190,12 +157,6 @@ def test_static_may_be_asked_for(tolerance):
 def test_a_gpu_gives_the_same_picture():
     network, _ = counted()
     spikes = mixed()
-    expected = forward_in_tiles(network, spikes, 64, 0.05)
-    rgb = forward_in_tiles(network.cuda(), spikes.cuda(), 64, 0.05).cpu()
+    expected = forward_in_tiles(network, spikes, 64)
+    rgb = forward_in_tiles(network.cuda(), spikes.cuda(), 64).cpu()
     torch.testing.assert_close(rgb, expected, rtol=0, atol=1e-3)
-
-
-@pytest.mark.parametrize("tolerance", [-0.1, float("nan"), float("inf")])
-def test_a_tolerance_that_is_none_is_refused(tolerance):
-    with pytest.raises(ValueError, match=f"^psnr_tolerance: expected 0 dB or more, got {tolerance}$"):
-        predict(CSCSR(2, **TINY), torch.zeros(1, 41, 8, 8), psnr_tolerance=tolerance)
