@@ -137,7 +137,7 @@ def test_a_picture_at_rest_becomes_that_of_all_its_clocks():
 
 @pytest.mark.parametrize(("more", "pixels", "within"), [(0.08, 3, 1), (0.003, 1, 14)])
 def test_what_appears_is_seen_at_once_and_what_is_faint_in_time(more, pixels, within):
-    before, network = 44, Sensor(**{**TINY, "scale": 1, "pattern": "grey"})
+    before, network = 30, Sensor(**{**TINY, "scale": 1, "pattern": "grey"})
     light = torch.full((20 * (before + within) + 41, 32, 32), 0.4)
     light[20 * before + 41 :, 8:16:pixels, 8:16:pixels] += more
     cells = [computed for _, computed in film(light, network, psnr_tolerance=0.1)]
