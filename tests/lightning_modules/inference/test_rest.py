@@ -179,5 +179,5 @@ def test_tolerances_that_cannot_be(tolerance, how, message):
 def test_a_network_that_sees_the_whole_picture_takes_no_tolerance():
     network = CSCSR(**TINY)
     network.halo = None
-    with pytest.raises(ValueError, match="^psnr_tolerance: expected 0 for CSCSR, run on whole pictures only"):
+    with pytest.raises(ValueError, match=r"^psnr_tolerance: expected 0 for CSCSR, run on whole pictures only"):
         FilmMaker(network, psnr_tolerance=0.1)
