@@ -6,9 +6,10 @@ from typing import ClassVar
 
 import torch
 from kornia.color import CFA, rgb_to_grayscale
-from torch import Tensor, nn
+from torch import Tensor
 
 from spikekit.check import check_planes, check_whole
+from spikekit.options_module import OptionsModule
 
 #: Bayer phases by name, read along the rows of the top-left 2 x 2 cell.
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
@@ -88,7 +89,7 @@ def bayer_sites(pattern: str | CFA) -> tuple[tuple[int, int, int], ...]:
     return tuple(sorted(sites, key=lambda site: site[0]))
 
 
-class PatternModule(nn.Module):
+class PatternModule(OptionsModule):
     """Base of the modules whose only option is the pattern, see :func:`bayer_pattern`."""
 
     bayer_only: ClassVar[bool] = False  #: whether a grey sensor makes no sense
@@ -96,9 +97,6 @@ class PatternModule(nn.Module):
     def __init__(self, pattern: str | CFA = "RGGB") -> None:
         super().__init__()
         self.pattern = bayer_pattern(pattern) if self.bayer_only else cfa_pattern(pattern)
-
-    def extra_repr(self) -> str:  # noqa: D102
-        return f"pattern={self.pattern!r}"
 
 
 def bayer_mask(
@@ -161,16 +159,7 @@ def bayer_mask(
     return torch.stack(planes).to(dtype or torch.get_default_dtype())  # type: ignore[arg-type]
 
 
-class _ScaledPattern(PatternModule):
-    def __init__(self, pattern: str | CFA, scale: int) -> None:
-        super().__init__(pattern)
-        self.scale = check_whole("scale", scale)
-
-    def extra_repr(self) -> str:
-        return f"{super().extra_repr()}, scale={self.scale}"
-
-
-class BayerMask(_ScaledPattern):
+class BayerMask(PatternModule):
     r"""See the Convention block on :func:`bayer_mask`.
 
     Shape:
@@ -183,7 +172,8 @@ class BayerMask(_ScaledPattern):
     """
 
     def __init__(self, pattern: str | CFA = "RGGB", *, scale: int = 1) -> None:
-        super().__init__(pattern, scale)
+        super().__init__(pattern)
+        self.scale = check_whole("scale", scale)
 
     def forward(self, raw: Tensor) -> Tensor:  # noqa: D102
         check_planes("raw", raw, 2, "(*, H, W)")
@@ -302,7 +292,7 @@ def _sum(parts: list[Tensor], dtype: torch.dtype) -> Tensor:
     return torch.stack(parts).sum(dim=0, dtype=dtype) if len(parts) > 1 else parts[0]
 
 
-class BinToSensor(_ScaledPattern):
+class BinToSensor(PatternModule):
     r"""See the Convention block on :func:`bin_to_sensor`.
 
     Shape:
@@ -315,7 +305,8 @@ class BinToSensor(_ScaledPattern):
     """
 
     def __init__(self, pattern: str | CFA = "RGGB", *, scale: int) -> None:
-        super().__init__(pattern, scale)
+        super().__init__(pattern)
+        self.scale = check_whole("scale", scale)
 
     def forward(self, rgb: Tensor) -> Tensor:  # noqa: D102
         return bin_to_sensor(rgb, self.pattern, scale=self.scale)

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from spikekit.check import check_dtype, check_planes, check_positive, check_whole, default_float
 from spikekit.kernels import operator
+from spikekit.options_module import OptionsModule
 
 
 # The loops over time are custom operators: torch.compile would unroll them.
@@ -255,7 +256,7 @@ def tfi(spikes: Tensor, max_range: float = 1.0, *, dtype: torch.dtype | None = N
     return _Tfi.apply(spikes, float(max_range), dtype or default_float(spikes))
 
 
-class Tfi(nn.Module):
+class Tfi(OptionsModule):
     r"""See the Convention block on :func:`tfi`.
 
     Shape:
@@ -271,14 +272,10 @@ class Tfi(nn.Module):
         super().__init__()
         check_positive("max_range", max_range)
         check_dtype(dtype, torch.uint8)
-        self.max_range = max_range
-        self.dtype = dtype
+        self.max_range, self.dtype = max_range, dtype
 
     def forward(self, spikes: Tensor) -> Tensor:  # noqa: D102
         return tfi(spikes, self.max_range, dtype=self.dtype)
-
-    def extra_repr(self) -> str:  # noqa: D102
-        return f"max_range={self.max_range}" + (f", dtype={self.dtype}" if self.dtype else "")
 
 
 def tfp(
@@ -344,7 +341,7 @@ def check_window(window: int) -> int:
     return window
 
 
-class Tfp(nn.Module):
+class Tfp(OptionsModule):
     r"""See the Convention block on :func:`tfp`.
 
     Shape:
@@ -364,14 +361,7 @@ class Tfp(nn.Module):
         check_whole("order", order)
         check_positive("max_range", max_range)
         check_dtype(dtype, torch.uint8)
-        self.window = window
-        self.max_range = max_range
-        self.order = order
-        self.dtype = dtype
+        self.window, self.max_range, self.order, self.dtype = window, max_range, order, dtype
 
     def forward(self, spikes: Tensor) -> Tensor:  # noqa: D102
         return tfp(spikes, self.window, self.max_range, order=self.order, dtype=self.dtype)
-
-    def extra_repr(self) -> str:  # noqa: D102
-        text = f"window={self.window}, max_range={self.max_range}, order={self.order}"
-        return text + (f", dtype={self.dtype}" if self.dtype else "")

@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spikekit.check import check_planes, check_whole
+from spikekit.options_module import OptionsModule
 
 
 def _check_flow(name: str, flow: Tensor) -> None:
@@ -119,7 +120,7 @@ def _upsample(flow: Tensor, scale: int) -> Tensor:
     return planes.reshape(*flow.shape[:-2], *planes.shape[-2:])
 
 
-class UpsampleFlow(nn.Module):
+class UpsampleFlow(OptionsModule):
     r"""See the Convention block on :func:`upsample_flow`.
 
     Shape:
@@ -133,14 +134,10 @@ class UpsampleFlow(nn.Module):
 
     def __init__(self, scale: int) -> None:
         super().__init__()
-        scale = check_whole("scale", scale)
-        self.scale = scale
+        self.scale = check_whole("scale", scale)
 
     def forward(self, flow: Tensor) -> Tensor:  # noqa: D102
         return upsample_flow(flow, self.scale)
-
-    def extra_repr(self) -> str:  # noqa: D102
-        return f"scale={self.scale}"
 
 
 def linear_motion(
@@ -228,7 +225,7 @@ def _check_times(
     return times, first, middle, last
 
 
-class LinearMotion(nn.Module):
+class LinearMotion(OptionsModule):
     r"""See the Convention block on :func:`linear_motion`.
 
     Shape:
@@ -250,14 +247,9 @@ class LinearMotion(nn.Module):
         scale: int = 1,
     ) -> None:
         super().__init__()
-        scale = check_whole("scale", scale)
         times, self.first, self.middle, self.last = _check_times(times, first, middle, last)
-        self.times = tuple(times)
-        self.scale = scale
+        self.times, self.scale = tuple(times), check_whole("scale", scale)
 
     def forward(self, flow_to_first: Tensor, flow_to_last: Tensor) -> Tensor:  # noqa: D102
         options = {name: getattr(self, name) for name in ("first", "middle", "last", "scale")}
         return linear_motion(flow_to_first, flow_to_last, self.times, **options)
-
-    def extra_repr(self) -> str:  # noqa: D102
-        return f"times={self.times}, first={self.first}, middle={self.middle}, last={self.last}, scale={self.scale}"

@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from spikekit.check import check_dtype, check_planes, check_positive
 from spikekit.kernels import operator
+from spikekit.options_module import OptionsModule
 
 
 # A custom operator, because torch.compile would unroll the loop over time and because the gradient does not need it.
@@ -120,7 +121,7 @@ def spike_integrate_fire(
     return _StraightThrough.apply(light, float(threshold), charge, dtype or light.dtype)
 
 
-class SpikeIntegrateFire(nn.Module):
+class SpikeIntegrateFire(OptionsModule):
     r"""See the Convention block on :func:`spike_integrate_fire`.
 
     Shape:
@@ -137,11 +138,7 @@ class SpikeIntegrateFire(nn.Module):
         super().__init__()
         check_positive("threshold", threshold)
         check_dtype(dtype, torch.uint8, torch.bool)
-        self.threshold = threshold
-        self.dtype = dtype
+        self.threshold, self.dtype = threshold, dtype
 
     def forward(self, light: Tensor, charge: Tensor | None = None) -> tuple[Tensor, Tensor]:  # noqa: D102
         return spike_integrate_fire(light, self.threshold, charge, dtype=self.dtype)
-
-    def extra_repr(self) -> str:  # noqa: D102
-        return f"threshold={self.threshold}" + (f", dtype={self.dtype}" if self.dtype else "")

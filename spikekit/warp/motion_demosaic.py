@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import torch
 from kornia.color import CFA
-from torch import Tensor, nn
+from torch import Tensor
 
 from spikekit.check import check_planes, check_positive
 from spikekit.color.cfa import bayer_mask, bayer_pattern
 from spikekit.color.residual_demosaic import guided_by_green, interpolate_green
+from spikekit.options_module import OptionsModule
 from spikekit.warp.neighbors import finite
 from spikekit.warp.warp import flow_warp
 
@@ -117,7 +118,7 @@ def _check_widths(sigma_space: float, sigma_range: float, tau: float) -> None:
         check_positive(name, value)
 
 
-class DemosaicAlongMotion(nn.Module):
+class DemosaicAlongMotion(OptionsModule):
     r"""See the Convention block on :func:`demosaic_along_motion`.
 
     Shape:
@@ -145,7 +146,3 @@ class DemosaicAlongMotion(nn.Module):
     def forward(self, raw: Tensor, flow: Tensor) -> Tensor:  # noqa: D102
         widths = {"sigma_space": self.sigma_space, "sigma_range": self.sigma_range, "tau": self.tau}
         return demosaic_along_motion(raw, flow, self.pattern, **widths)
-
-    def extra_repr(self) -> str:  # noqa: D102
-        widths = f"sigma_space={self.sigma_space}, sigma_range={self.sigma_range}, tau={self.tau}"
-        return f"pattern={self.pattern!r}, {widths}"

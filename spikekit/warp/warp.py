@@ -8,6 +8,7 @@ from kornia.geometry.transform import remap
 from torch import Tensor, nn
 
 from spikekit.check import check_planes, check_whole
+from spikekit.options_module import OptionsModule
 from spikekit.warp.gather import Gather
 from spikekit.warp.neighbors import finite, idw_neighbors
 
@@ -154,7 +155,7 @@ def flow_warp_idw(features: Tensor, flow: Tensor, mask: Tensor, *, neighbors: in
     return Gather.apply(values, index, weight).reshape(features.shape)
 
 
-class FlowWarpIdw(nn.Module):
+class FlowWarpIdw(OptionsModule):
     r"""See the Convention block on :func:`flow_warp_idw`.
 
     Shape:
@@ -172,6 +173,3 @@ class FlowWarpIdw(nn.Module):
 
     def forward(self, features: Tensor, flow: Tensor, mask: Tensor) -> Tensor:  # noqa: D102
         return flow_warp_idw(features, flow, mask, neighbors=self.neighbors)
-
-    def extra_repr(self) -> str:  # noqa: D102
-        return f"neighbors={self.neighbors}"
