@@ -163,7 +163,7 @@ class SensorNoise:
 
         Returns:
             One :class:`SpikeChange` for every source that is on, by the name of its field; ``dark_spread`` goes with
-            ``dark_current``.
+            ``dark_current``. A calibration is not judged, and always stays.
 
         Raises:
             ValueError: light that is negative or not finite, frames below 1.
@@ -188,20 +188,7 @@ class SensorNoise:
             changes["hot"] = SpikeChange(self.hot * (1 - rate) * frames, self.hot * (1 - rate))
         if self.dead:
             changes["dead"] = SpikeChange(self.dead * rate * frames, self.dead * rate)
-        if self.calibration is not None:
-            changes["calibration"] = self._measured_change(light, frames)
         return changes
-
-    def _measured_change(self, light: float, frames: int) -> SpikeChange:
-        """What the pixels that were measured change: the mean over them of the errors that each has."""
-        known, rate = self.calibration, min(1.0, light)
-        works = known.defects == WORKS
-        noisy = torch.where(works, (known.gain * light + known.dark).clamp(max=1), (known.defects == HOT).float())
-        error = torch.where(works, known.gain * light + known.dark, noisy).sub(light).abs()
-        most = torch.where(works, (rate + noisy).clamp(max=1), (noisy - rate).abs())
-        growing = torch.where(works, error, most)
-        share = sum(((2 * clock + 1) * growing).minimum(most).mean().item() for clock in range(frames)) / frames
-        return SpikeChange(frames * error.mean().item(), share)
 
     def required(self, light: float, frames: int, spike_tolerance: float) -> SensorNoise:
         """Leave only the sources that may change more than a share of the bits, see :meth:`spike_changes`.

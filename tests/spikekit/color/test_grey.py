@@ -51,11 +51,3 @@ def test_what_needs_a_bayer_cell_refuses_grey(operator):
     call = type(operator) if isinstance(operator, torch.nn.Module) else operator
     with pytest.raises(ValueError, match=r"pattern: expected one of RGGB.*got 'grey'"):
         call(*given, "grey")
-
-
-def test_whole_flow_copies_pixels_of_a_grey_sensor():
-    features = torch.rand(1, 3, 9, 8)
-    flow = torch.zeros(1, 2, 9, 8)
-    flow[:, 0], flow[:, 1] = 2, -1
-    moved = sk.flow_warp_idw(features, flow, sk.bayer_mask(9, 8, "grey")[0])
-    assert torch.equal(moved[..., 1:, :6], features[..., :-1, 2:])

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spikekit import Tfp, spike_integrate_fire, spike_interval, tfi, tfp
+from spikekit import Tfp, spike_interval, tfi, tfp
 
 DTYPES = [torch.float64, torch.float32, torch.bfloat16, torch.float16]
 
@@ -15,25 +15,6 @@ def streams(frames, seed=0):
     """Pixels of every density: (frames, 5, 8)."""
     spikes = torch.rand(frames, 40, generator=torch.Generator().manual_seed(seed)) < torch.linspace(0, 1, 40)
     return spikes.reshape(frames, 5, 8)
-
-
-@pytest.mark.parametrize(
-    ("fired", "expected"),
-    [
-        ("0000", [5, 5, 5, 5]),
-        ("1111", [1, 1, 1, 1]),
-        ("1000", [1, 4, 4, 4]),
-        ("0001", [4, 4, 4, 4]),
-        ("0100", [2, 2, 3, 3]),
-        ("01100000", [2, 2, 1, 6, 6, 6, 6, 6]),  # waited longer than the last interval
-        ("0100010", [4, 4, 4, 4, 4, 4, 4]),  # the nearest interval is longer than what was waited
-        ("1100010", [1, 1, 4, 4, 4, 4, 4]),
-    ],
-)
-def test_interval_by_hand(fired, expected):
-    spikes = torch.tensor([int(c) for c in fired]).reshape(-1, 1, 1)
-    assert spike_interval(spikes).flatten().tolist() == expected
-    assert brute_force.spike_interval(spikes.flatten().tolist()) == expected
 
 
 @given(st.lists(st.booleans(), min_size=1, max_size=41), st.integers(0, 50))
@@ -63,29 +44,6 @@ def test_tfp_of_higher_order_is_a_mean_of_means(order, window):
     assert torch.autograd.gradcheck(lambda s: tfp(s, window, 2.0, order=order), leaf)
 
 
-def test_tfp_of_third_order_cancels_what_pixels_round_away():
-    """Constant light, any initial charge: a third of the noise of the mean over as many frames."""
-    light = torch.linspace(0.1, 0.9, 97, dtype=torch.float64)
-    charge = torch.linspace(0, 1, 33, dtype=torch.float64)[:-1, None].expand(-1, 97)
-    spikes, _ = spike_integrate_fire(light.expand(41, 32, -1), charge=charge)
-    noise = [(tfp(spikes, window, order=order)[20] - light).square().mean() for window, order in ((37, 1), (13, 3))]
-    assert noise[1] < 0.1 * noise[0]
-
-
-@pytest.mark.parametrize("op", [tfi, lambda s, m, dtype: tfp(s, 5, m, dtype=dtype)], ids=["tfi", "tfp"])
-def test_dtype_of_the_result(op):
-    spikes = streams(41)
-    exact = op(spikes.double(), 255.0, dtype=None)
-    for came in (torch.bool, torch.uint8, torch.float32, torch.uint16, torch.uint64):
-        for dtype in DTYPES:
-            got = op(spikes.to(came), 255.0, dtype=dtype)
-            assert got.dtype == dtype
-            torch.testing.assert_close(got.double(), exact, rtol=max(torch.finfo(dtype).eps, 1e-7), atol=0)
-        assert not op(spikes.to(came).requires_grad_(came.is_floating_point), 255.0, dtype=torch.uint8).requires_grad
-    with pytest.raises(TypeError, match="dtype"):
-        op(spikes, 1.0, dtype=torch.int16)
-
-
 def test_the_gradient_of_tfi_is_its_own_adjoint():
     spikes = streams(17).double().requires_grad_()
     weight, other = torch.randn(2, *spikes.shape, dtype=torch.float64)
@@ -112,6 +70,8 @@ def test_wrong_options(wrong):
     for call in calls:
         with pytest.raises(ValueError, match=f"{name}: expected"):
             call(**{"window": 3} | wrong)
+    with pytest.raises(TypeError, match="dtype"):
+        tfp(torch.ones(3, 2, 2), 3, dtype=torch.int16)
     if name == "max_range":
         with pytest.raises(ValueError, match="max_range"):
             tfi(torch.ones(3, 2, 2), **wrong)

@@ -1,7 +1,5 @@
 """The table of decoders: each is one decoder, whichever way it is called."""
 
-import inspect
-
 import pytest
 import torch
 
@@ -27,11 +25,3 @@ def test_clip_frame_and_planes_agree(name, heading, options, frame):
     torch.testing.assert_close(decoder.frame(spikes, frame, **options), whole)
     torch.testing.assert_close(torch.from_numpy(decoder.planes(plane, frame, seen, 80, **options)), whole)
     assert asked <= set(seen)
-
-
-@pytest.mark.parametrize("name", DECODERS)
-def test_options_are_arguments(name):
-    decoder = DECODERS[name]
-    for call in (decoder.clip, decoder.frame, decoder.planes, decoder.reach):
-        assert set(decoder.options) <= set(inspect.signature(call).parameters)
-    assert all(set(options) <= set(decoder.options) for options in decoder.shown.values())

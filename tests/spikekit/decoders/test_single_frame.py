@@ -101,13 +101,6 @@ def test_mean_of_a_pixel_that_always_fires_is_exact_at_the_extremes():
     assert not tfp_at(torch.zeros(41, 1, 2), 20, 13, order=3).any()
 
 
-def test_mean_takes_no_spikes_that_it_does_not_see():
-    spikes = torch.rand(2, 41, 4, 6)
-    expected = tfp_at(spikes, 20, 13, order=3)
-    spikes[:, [0, 1, 39, 40]] = torch.nan  # 37 are seen
-    assert tfp_at(spikes, 20, 13, order=3).equal(expected)
-
-
 @pytest.mark.parametrize("op", [spike_interval_at, tfi_at, lambda spikes, frame: tfp_at(spikes, frame, 3)])
 def test_compile_and_vmap(op, capfd):
     spikes = torch.rand(3, 9, 4, 6) < 0.3

@@ -107,15 +107,6 @@ def test_any_size(size, shrink):
     assert picture.max() <= second.max()
 
 
-def test_the_simple_ones():
-    first, second = torch.rand(2, 3, 4, 5, dtype=torch.float64)
-    assert torch.allclose(Blend()(first, second).at(0.3), 0.7 * first + 0.3 * second, atol=1e-15)
-    still = Still()(first, second)
-    assert still.at(0.49).equal(first)
-    assert still.at(0.5).equal(second)
-    assert Blend()(first, second).forward is None
-
-
 # --- motion -----------------------------------------------------------------------------------------------------------
 
 

@@ -212,13 +212,6 @@ def test_what_cannot_be_written_leaves_the_old_file(tmp_path, name, spikes, erro
     assert read_spikes(tmp_path / name, 4, 5).equal(old)
 
 
-def test_where_nothing_can_be_written(tmp_path):
-    (tmp_path / "folder.dat").mkdir()
-    for name, error in (("folder.dat", OSError), ("a.png", SpikeFileError)):
-        with pytest.raises(error, match=name):
-            write_spikes(tmp_path / name, random_spikes(3, 4, 5))
-
-
 @pytest.mark.skipif(not SPIKES.is_dir(), reason="the shared recordings are not beside the repository")
 def test_the_fields_own_recordings(tmp_path):
     file = SPIKES / "reds_sim_mono_203_250x400.dat"

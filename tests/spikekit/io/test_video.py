@@ -274,17 +274,6 @@ def test_a_film_that_is_cut_off(tmp_path):
             assert cut[0].equal(frames[0])
 
 
-def test_sound_is_no_film(tmp_path):
-    av = pytest.importorskip("av")
-    with av.open(str(tmp_path / "a.mkv"), "w") as container:
-        stream = container.add_stream("pcm_s16le", rate=8000)
-        sound = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")
-        sound.sample_rate = 8000
-        container.mux(stream.encode(sound))
-        container.mux(stream.encode(None))
-    fails(tmp_path / "a.mkv", "expected a video")
-
-
 # --- written ----------------------------------------------------------------------------------------------------------
 
 

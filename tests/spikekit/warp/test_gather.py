@@ -100,13 +100,6 @@ def test_each_is_the_derivative_of_the_others(channels):
         assert gradgradcheck(function, args, fast_mode=True)  # what is linear in each is wrong in a random direction
 
 
-def test_gradient_of_what_is_asked_for_only():
-    values, grad, index, weight = draw(1, 9, 3)
-    weight.requires_grad_()
-    (got,) = torch.autograd.grad(Gather.apply(values, index, weight), weight, grad)
-    torch.testing.assert_close(got, loops(values, grad, index, weight.detach())[2])
-
-
 @pytest.mark.filterwarnings("error")  # without a rule of its own vmap loops, with a warning
 def test_vmap():
     values, grad, index, weight = (a.unflatten(0, (2, 3)) for a in draw(6, 9, 4))

@@ -77,14 +77,6 @@ def test_at_every_eighth_of_a_pixel(mask, path):
         check(eighths + torch.randint(-reach - 1, reach + 1, (64, 2, *mask.shape)), mask)
 
 
-@pytest.mark.parametrize("mask", list(masks()))
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_at_any_position(mask, dtype, path):
-    flow = (torch.randint(-8 * UNIT, 8 * UNIT, (40, 2, *mask.shape)) / UNIT).to(dtype)
-    check(flow, mask)
-    check((flow[:10] * 1000).round(), mask)
-
-
 @pytest.mark.parametrize("neighbors", [1, 3, 8, 30])
 def test_of_any_number(neighbors, path):
     for mask in (*bayer_mask(3, 4, scale=2), torch.rand(6, 8) < 0.3):

@@ -23,21 +23,6 @@ def exact(features, flow, mask, neighbors=4):
     return torch.from_numpy(brute_force.idw(*arrays, neighbors)[0])[None]
 
 
-@pytest.mark.parametrize("kind", ["bayer", "random"])
-def test_idw_reads_known_pixels_only(kind):
-    mask = bayer_mask(4, 5, scale=2, dtype=torch.bool)[0] if kind == "bayer" else torch.rand(8, 10) < 0.2
-    flow = flows(8, 10)
-    features = torch.randn(len(flow), 2, 8, 10, dtype=torch.float64, requires_grad=True)
-    warped = flow_warp_idw(features, flow, mask)
-    assert torch.equal(flow_warp_idw(features.masked_fill(~mask, float("nan")), flow, mask), warped)
-    known = features[..., mask]
-    low, high = known.amin(-1)[..., None, None], known.amax(-1)[..., None, None]
-    assert ((warped >= low - 1e-12) & (warped <= high + 1e-12)).all()
-    (grad,) = torch.autograd.grad(warped.sum(), features)
-    assert (grad[..., ~mask] == 0).all()
-    assert grad.sum().item() == pytest.approx(warped.numel())  # the weights of a pixel add up to one
-
-
 @pytest.mark.parametrize("channels", [1, 9])
 def test_idw_second_gradient_is_finite(channels):
     """On known pixels and at ties as well."""
