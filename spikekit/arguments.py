@@ -1,4 +1,4 @@
-"""Argument types that the verbs of the command line share, and errors in them."""
+"""Argument types of the command line, and their errors."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from pathlib import Path
 
 
 class UsageError(ValueError):
-    """A command line that asks for something impossible."""
+    """An invalid command line."""
 
 
 def whole(least: int) -> Callable[[str], int]:
-    """Return an argument type: a whole number, ``least`` or more."""
+    """Return an argument type for whole numbers >= ``least``."""
 
     def read(text: str) -> int:
         try:
@@ -29,7 +29,7 @@ def whole(least: int) -> Callable[[str], int]:
 
 
 def frames_of(text: str, first: int, last: int, step: int = 1) -> range:
-    """Return the frames that ``N`` or ``A:B[:STEP]`` asks for, from A to B - 1, of those from ``first`` to ``last``.
+    """Parse ``N`` or ``A:B[:STEP]``, the frames A to B - 1; all must lie within ``first`` .. ``last``.
 
     Example:
         >>> list(frames_of("20:80:20", 20, 99)), list(frames_of(":23", 20, 99))
@@ -48,7 +48,7 @@ def frames_of(text: str, first: int, last: int, step: int = 1) -> range:
 
 
 def positive(text: str) -> float:
-    """Read a finite number above 0."""
+    """Parse a finite number above 0."""
     try:
         number = float(text)
     except ValueError:
@@ -59,7 +59,7 @@ def positive(text: str) -> float:
 
 
 def ending_in(*endings: str, said: str) -> Callable[[str], Path]:
-    """Return an argument type: a file with one of some endings, which ``said`` describes in the message."""
+    """Return an argument type for files with one of ``endings``; ``said`` describes them in the error message."""
 
     def read(text: str) -> Path:
         path = home_path(text)
@@ -71,16 +71,16 @@ def ending_in(*endings: str, said: str) -> Callable[[str], Path]:
 
 
 def one_line(error: BaseException) -> str:
-    """Return an error's message on one line, without characters that a terminal would interpret."""
+    """Return an error's message on one line, without control characters."""
     text = getattr(error, "strerror", None) or str(error).strip() or type(error).__name__
     return printable(" ".join(text.split()))
 
 
 def printable(text: str) -> str:
-    """Return a line without characters that a terminal would interpret: names of files can hold any."""
+    """Replace control characters, which names of files may hold, by question marks."""
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
 def home_path(path: str | os.PathLike[str]) -> Path:
-    """Return a path with the home folder in place of ``~``, which a shell leaves alone in quotes and behind ``=``."""
+    """Expand ``~``, which a shell does not expand in quotes or after ``=``."""
     return Path(os.path.expanduser(path))

@@ -1,4 +1,4 @@
-"""Argument checks shared by all operators, so that the same mistake gives the same message everywhere."""
+"""Argument checks shared by all operators, with uniform messages."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from torch import Tensor
 
 
 def check_planes(name: str, value: Tensor, ndim: int, shape: str, *, floating: bool = False) -> None:
-    """Raise unless ``value`` is a tensor of real numbers with ``ndim`` dimensions or more, none of the last empty.
+    """Raise unless ``value`` is a real tensor with at least ``ndim`` dimensions, the last ``ndim`` not empty.
 
-    ``shape`` is the expected one for the message, such as ``"(*, T, H, W)"``.
+    ``shape`` is the expected shape for the message, such as ``"(*, T, H, W)"``.
     """
     if not isinstance(value, Tensor):
-        remedy = "; torch.from_numpy makes a tensor of it" if isinstance(value, np.ndarray) else ""
+        remedy = "; convert it with torch.from_numpy" if isinstance(value, np.ndarray) else ""
         raise TypeError(f"{name}: expected a tensor of shape {shape}, got {type(value).__name__}{remedy}")
     if value.ndim < ndim or 0 in value.shape[value.ndim - ndim :]:
         raise ValueError(f"{name}: expected a non-empty tensor of shape {shape}, got {tuple(value.shape)}")
@@ -27,14 +27,14 @@ def check_planes(name: str, value: Tensor, ndim: int, shape: str, *, floating: b
 def check_picture(
     name: str, value: Tensor, shape: str = "(3, H, W)", *, grey: bool = False, floating: bool = True
 ) -> None:
-    """Raise unless ``value`` is one picture, (3, H, W), or, if ``grey``, (H, W); not a batch."""
+    """Raise unless ``value`` is a single picture: (3, H, W), or also (H, W) if ``grey``."""
     check_planes(name, value, 2 if grey else 3, shape, floating=floating)
     if value.ndim > 3 or (value.ndim == 3 and value.shape[0] != 3):
         raise ValueError(f"{name}: expected {shape}, got {tuple(value.shape)}")
 
 
 def check_dtype(dtype: torch.dtype | None, *others: torch.dtype) -> None:
-    """Raise unless the type asked for is None, floating, or one of ``others``."""
+    """Raise unless ``dtype`` is None, floating, or one of ``others``."""
     known = dtype is None or isinstance(dtype, torch.dtype)
     if not known or not (dtype is None or dtype.is_floating_point or dtype in others):
         raise TypeError(f"dtype: expected a floating-point type{''.join(f' or {o}' for o in others)}, got {dtype!r}")
@@ -44,14 +44,14 @@ def check_positive(name: str, value: float) -> None:
     """Raise unless ``value`` is a finite number above zero."""
     try:
         good = bool(0 < value < float("inf"))
-    except (TypeError, RuntimeError, ValueError):  # a tensor of many is none of them
+    except (TypeError, RuntimeError, ValueError):  # such as a tensor with several elements
         raise TypeError(f"{name}: expected a finite number above 0, got {value!r}") from None
     if not good:
         raise ValueError(f"{name}: expected a finite number above 0, got {value}")
 
 
 def check_index(name: str, value: int) -> int:
-    """Return ``value`` as an int; raise a TypeError unless it is a whole number, such as Python's or NumPy's."""
+    """Return ``value`` as an int; raise a TypeError unless it is an integer of Python or NumPy."""
     try:
         return operator.index(value)
     except TypeError:
@@ -59,8 +59,8 @@ def check_index(name: str, value: int) -> int:
 
 
 def check_whole(name: str, value: int) -> int:
-    """Return ``value`` as an int; raise a ValueError unless it is a whole number, 1 or more; True is none."""
-    if isinstance(value, torch.SymInt):  # a size that torch.export leaves open
+    """Return ``value`` as an int; raise a ValueError unless it is a whole number >= 1 and not a bool."""
+    if isinstance(value, torch.SymInt):  # a dynamic size of torch.export
         return value
     if not isinstance(value, int) and hasattr(value, "__index__"):  # NumPy's
         value = operator.index(value)
@@ -70,10 +70,10 @@ def check_whole(name: str, value: int) -> int:
 
 
 def wide_dtype(*tensors: Tensor) -> torch.dtype:
-    """Return the dtype to compute in: float64 where one of the tensors has it, else float32."""
+    """Return the dtype to compute in: float64 if one of the tensors has it, else float32."""
     return torch.float64 if torch.float64 in [tensor.dtype for tensor in tensors] else torch.float32
 
 
 def default_float(value: Tensor) -> torch.dtype:
-    """Return the dtype of ``value`` where it is floating, else torch's default floating type."""
+    """Return the dtype of ``value`` if it is floating, else torch's default dtype."""
     return value.dtype if value.is_floating_point() else torch.get_default_dtype()

@@ -1,8 +1,8 @@
-"""What the commands import and the operators do not: the packages of the extra ``learn``."""
+"""Packages of the extra ``learn``, which the commands need and the operators do not."""
 
 from __future__ import annotations
 
-#: by the names that are imported
+#: import names of the packages
 LEARN = {
     "PIL",
     "filelock",
@@ -22,7 +22,7 @@ LEARN = {
 
 
 def remedy(error: ModuleNotFoundError) -> str | None:
-    """Return the line for a user who lacks the extra, or None where something else is missing.
+    """Return a message for a user without the extra, or None if another package is missing.
 
     Example:
         >>> remedy(ModuleNotFoundError("No module named 'PIL'", name="PIL"))

@@ -1,4 +1,4 @@
-"""Progress of long work, on a terminal and nowhere else."""
+"""Progress bars, shown on terminals only."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from spikekit.arguments import printable
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-#: seconds after which progress is shown: what takes less is over before it can be read
+#: seconds before a bar appears
 AFTER = 0.5
 
 
 def progress(things: Iterable[Any] | None = None, what: str = "", total: float | None = None, **how: Any) -> tqdm:
-    """Return a ``tqdm`` that shows how far work is, on stderr where that is a terminal, and is gone afterwards."""
+    """Return a ``tqdm`` bar that shows on stderr if that is a terminal, and is cleared at the end."""
     from tqdm import tqdm
 
     return tqdm(things, printable(what), total, **{"disable": None, "leave": False, "delay": AFTER, **how})

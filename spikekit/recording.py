@@ -1,4 +1,4 @@
-"""A recording with its metadata, from its side-car, its camera or whoever opens it."""
+"""A recording with its metadata, from its side-car, its camera or the arguments."""
 
 from __future__ import annotations
 
@@ -22,48 +22,48 @@ from spikekit.io.formats import SpikeFileError
 from spikekit.io.sidecar import find_sidecar
 from spikekit.progress import progress
 
-# Pixels that are counted at a time.
+# Pixels per chunk.
 _BLOCK = 1 << 24
 
 
 @dataclass(frozen=True)
 class Recording:
-    """A file of spikes, read as the camera saw the scene: upright, only pixels, no border."""
+    """A file of spikes, read as upright frames without border pixels."""
 
     path: Path
     frames: int
-    stored: tuple[int, int]  # (H, W) of its frames
-    flip: bool = False  # whether they are stored upside down
-    pattern: str | None = None  # Bayer phase of what is read, or "grey"; None where nobody says
-    alpha: float | None = None  # light of a white pixel per clock, where it is known
+    stored: tuple[int, int]  # (H, W) of the stored frames
+    flip: bool = False  # frames are stored upside down
+    pattern: str | None = None  # Bayer phase of the frames as read, or "grey"; None if unknown
+    alpha: float | None = None  # light of a white pixel per clock, if known
     camera: Camera | None = None
-    calibration: Calibration | None = None  # that of the pixels that are read
-    note: str = ""  # what whoever sees a picture of it should read
+    calibration: Calibration | None = None  # of the frames as read
+    note: str = ""  # a hint for the user, such as a likely wrong orientation
 
     @property
     def bayer(self) -> str | None:
-        """Bayer phase of what is read; ``None`` where it is grey, or nobody says."""
+        """Bayer phase of the frames as read; ``None`` if they are grey or it is unknown."""
         return None if self.pattern == GREY else self.pattern
 
     @property
     def size(self) -> tuple[int, int]:
-        """(H, W) of what is read."""
+        """(H, W) of the frames as read."""
         return self.camera.prepared_size if self.camera else self.stored
 
     def prepare(self, upright: Tensor) -> Tensor:
-        """Leave only the pixels of frames (*, H, W) that are upright already."""
+        """Crop upright frames (*, H, W) to the pixels of the sensor."""
         return self.camera.prepare(upright, flip=False) if self.camera else upright
 
     def read(self, start: int, frames: int) -> Tensor:
-        """Return some frames (T, H, W), uint8."""
+        """Return ``frames`` frames from ``start`` on, (T, H, W), uint8."""
         return self.prepare(read_spikes(self.path, *self.stored, flip=self.flip, start=start, frames=frames))
 
     def frames_from(self, start: int) -> Iterator[Tensor]:
-        """Read frames (H, W), uint8, one by one from a place on."""
+        """Iterate over the frames from ``start`` on, each (H, W), uint8."""
         return map(self.prepare, iter_spikes(self.path, *self.stored, flip=self.flip, start=start))
 
     def packed(self, start: int, frames: int) -> Iterator[np.ndarray]:
-        """Read frames one by one, as they are stored but upright, for :meth:`unpack`."""
+        """Iterate over packed upright frames, for :meth:`unpack`."""
         parts = iter_spikes(self.path, *self.stored, flip=self.flip, start=start, frames=frames, packed=True)
         return (part.numpy() for part in parts)
 
@@ -73,20 +73,20 @@ class Recording:
         return self.prepare(torch.from_numpy(bits)).numpy()
 
     def correct(self, raw: Tensor) -> Tensor:
-        """Return rates (*, H, W), in spikes a clock, as an ideal sensor would have them."""
+        """Return the rates (*, H, W), in spikes per clock, that an ideal sensor would give."""
         return raw if self.calibration is None else self.calibration.correct(raw, self.bayer)
 
     def correct_spikes(self, spikes: Tensor) -> Tensor:
-        """Return spikes (*, T, H, W) as an ideal sensor would have fired them."""
+        """Return the spikes (*, T, H, W) that an ideal sensor would have fired."""
         return spikes if self.calibration is None else correct_spikes(spikes, self.calibration, self.bayer)
 
     @property
     def said(self) -> str:
-        """What is corrected, in words that follow others."""
+        """A phrase about the correction, to append to a report."""
         return "" if self.calibration is None else ", pixels corrected by its calibration"
 
     def chunks(self, start: int, frames: int, what: str) -> Iterator[Tensor]:
-        """Read some frames in chunks (T_i, H, W), uint8, of up to 255 frames; show how far the work is."""
+        """Iterate over chunks (T_i, H, W), uint8, of up to 255 frames, with a progress bar."""
         height, width = self.stored
         chunk = min(max(_BLOCK // (height * width), 1), 255)
         parts = iter_spikes(self.path, height, width, flip=self.flip, start=start, frames=frames, chunk=chunk)
@@ -96,21 +96,21 @@ class Recording:
                 bar.update(len(part))
 
     def counts(self, start: int, frames: int) -> Tensor:
-        """Count the spikes of every pixel (H, W) in some frames."""
+        """Return the number of spikes of every pixel, (H, W), in some frames."""
         counts = torch.zeros(self.size, dtype=torch.int64)
         for part in self.chunks(start, frames, "frames counted"):
             counts += torch.from_numpy(part.numpy().sum(axis=0, dtype=np.uint8))  # a chunk's sum fits into a byte
         return counts
 
     def show(self, picture: Tensor, *, known: bool) -> Tensor:
-        """Return light as it is shown; the gain of the camera is for light whose white is known, not guessed."""
+        """Return light scaled for display; the camera's gain applies only if the white level is ``known``."""
         if self.camera is None:
             return picture.clamp(0, 1)
         return (self.camera if known else replace(self.camera, gain=1.0)).display(picture)
 
 
 def white_rate(rates: Tensor) -> float:
-    """Return the default for white: the rate that 99.9 per cent of the pixels do not exceed."""
+    """Return the default white level: the 99.9th percentile of the rates."""
     return float(np.quantile(rates.numpy(), 0.999)) or float(rates.max()) or 1.0
 
 
@@ -124,11 +124,12 @@ def open_recording(
     camera: str | Path | None = None,
     calibration: str | Path | None = None,
 ) -> Recording:
-    """Open a recording with all that is known of it; the arguments are those of the commands.
+    """Open a recording with its metadata. The arguments are those of the commands.
 
     Raises:
-        UsageError: a headerless file whose size nobody knows, a camera and a size as well, or an unknown pattern.
-        ValueError: a file that cannot be read, or is not of the camera; a calibration of another sensor.
+        UsageError: the size of a headerless file is unknown, a camera and a size are both given, or the pattern is
+            unknown.
+        ValueError: the file cannot be read, or does not match the camera or the calibration.
 
     Example:
         >>> import tempfile
@@ -146,12 +147,12 @@ def open_recording(
     known = read_calibration(file)
     if known.size != tuple(recording.size):
         sizes = " x ".join(map(str, recording.size)), " x ".join(map(str, known.size))
-        raise ValueError(f"{file}: expected {sizes[0]} pixels as {recording.path} has them, got {sizes[1]}")
+        raise ValueError(f"{file}: expected {sizes[0]} pixels, the size of {recording.path}, got {sizes[1]}")
     return replace(recording, calibration=known.flip() if recording.flip else known)
 
 
 def own_calibration(path: Path) -> Path:
-    """Return where the calibration of a recording lies."""
+    """Return the path of a recording's own calibration."""
     return path.with_suffix(ENDING)
 
 
@@ -164,14 +165,14 @@ def _described(
         raise UsageError(f"--{error}") from error
     if camera is not None:
         if flip or not height is width is None:
-            raise UsageError("--camera: it knows --height, --width and --flip, leave them out")
+            raise UsageError("--camera: it sets --height, --width and --flip; remove them")
         return _of_camera(path, load_camera(camera), pattern)
-    known = find_sidecar(path) if height is width is None else None  # a damaged one can be done without
+    known = find_sidecar(path) if height is width is None else None  # a damaged one does not matter with a size
     if known is not None:
         size = known.stream["height"], known.stream["width"]
         frames, *_ = spikes_shape(path, *size)
         if frames != known.stream["frames"]:
-            raise ValueError(f"{path}: expected {known.stream['frames']} frames as its side-car says, got {frames}")
+            raise ValueError(f"{path}: expected {known.stream['frames']} frames, as in its side-car, got {frames}")
         settings = known.settings
         return Recording(path, frames, size, flip, pattern or settings.get("pattern"), settings.get("alpha"))
     if path.suffix.lower() == ".dat" and path.is_file() and None in (height, width):
@@ -179,7 +180,7 @@ def _described(
     frames, *size = spikes_shape(path, height, width)
     note = "" if flip else _upside_down(*size)
     if height is width is None and _long(*size) > 3 and _long(frames, size[0]) < 2:
-        note = f"read as {frames} frames of {size[0]} x {size[1]}; if the array is (H, W, T), turn it to (T, H, W)"
+        note = f"read as {frames} frames of {size[0]} x {size[1]}; if the array is (H, W, T), transpose it to (T, H, W)"
     return Recording(path, frames, tuple(size), flip, pattern, note=note)
 
 
@@ -197,12 +198,12 @@ def _of_camera(path: Path, known: Camera, pattern: str | None) -> Recording:
 
 
 def _long(height: int, width: int) -> float:
-    """Return how much longer one side is than the other."""
+    """Return the ratio of the longer side to the shorter."""
     return max(height, width) / min(height, width)
 
 
 def _upside_down(height: int, width: int) -> str:
-    """Say that frames of this size are likely to be stored upside down; nothing where they are not."""
+    """Return a hint if frames of this size are usually stored upside down, else an empty string."""
     names = [known.name for known in usual_sizes().get((height, width), []) if known.flip]
     said = f"{height} x {width} is the size of the camera {' and '.join(names)}"
     return f"{said}, which stores frames upside down: --flip turns them" if names else ""

@@ -1,4 +1,4 @@
-"""How commands end early: standard output that is closed or on a full disk, and SIGTERM."""
+"""Early ends of commands: a closed standard output, a full disk, SIGTERM."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from typing import IO, NoReturn
 
 from spikekit.arguments import printable
 
-#: exit status of a command that was still printing when its reader went, as a shell has it: 128 + SIGPIPE
+#: exit status after a broken pipe, as in a shell: 128 + SIGPIPE
 BROKEN_PIPE = 141
 
-#: errors of a full disk, which the system reports without a name
+#: errors of a full disk, for which the system names no file
 FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)
 
 
 def say(text: str, file: IO[str] | None = None) -> None:
-    """Print lines in which names of files, which can hold any character, may stand."""
+    """Print text that may contain names of files, without their control characters."""
     print(*map(printable, text.splitlines()), sep="\n", file=file)
 
 
 def stop_printing() -> None:
-    """Drop what is still to be printed: Python would complain about it when it flushes at exit."""
-    with suppress(io.UnsupportedOperation):  # what is printed goes to no file
+    """Discard pending output, which Python would otherwise fail to flush at exit."""
+    with suppress(io.UnsupportedOperation):  # standard output is not a file
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class Terminated(BaseException):
-    """The command was asked to end, by SIGTERM."""
+    """The process received SIGTERM."""
 
 
 def _terminate(*_: object) -> NoReturn:
@@ -42,7 +42,7 @@ def _terminate(*_: object) -> NoReturn:
 
 @contextmanager
 def stopped_by_sigterm() -> Iterator[None]:
-    """Unwind on SIGTERM, so that half files go; leave alone what somebody else has set, and other threads."""
+    """Unwind on SIGTERM, to remove partial files, unless a handler is set or this is not the main thread."""
     ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     if ours:
         signal.signal(signal.SIGTERM, _terminate)

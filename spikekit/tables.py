@@ -1,4 +1,4 @@
-"""Tables as the commands print and write them."""
+"""Tables for commands and reports."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from tabulate import tabulate
 
 
 def table(heading: Sequence[str], rows: Iterable[Sequence[object]], *, markdown: bool = True) -> str:
-    """Return a table whose columns are aligned, as Markdown or as plain text; None is an empty cell.
+    """Format an aligned table as Markdown or plain text; None is an empty cell.
 
     Example:
         >>> print(table(["decoder", "PSNR (dB)"], [["TFI", "26.10"], ["TFP", None]]))

@@ -1,4 +1,4 @@
-"""Timing: how long a call takes, how much memory, and on what machine and software."""
+"""Time and memory of a call, and a description of machine and software."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ import torch
 
 Run = Callable[[], object]
 
-#: Takes a run and how often to call it; returns the seconds of one call.
+#: Takes a run and a number of calls; returns seconds per call.
 Timer = Callable[[Run, int], float]
 
 
 def duration(seconds: float) -> str:
-    """Return a time in words.
+    """Format a duration.
 
     Example:
         >>> [duration(time) for time in (0.21, 47.4, 192.0, 15_500.0)]
@@ -35,7 +35,7 @@ def duration(seconds: float) -> str:
 
 
 def cpu_timer(now: Callable[[], float]) -> Timer:
-    """Time by a clock of this process: :func:`time.process_time` for one thread, :func:`time.perf_counter` for more."""
+    """Return a timer that reads ``now``, such as :func:`time.process_time` or :func:`time.perf_counter`."""
 
     def timer(run: Run, number: int) -> float:
         begin = now()
@@ -47,7 +47,7 @@ def cpu_timer(now: Callable[[], float]) -> Timer:
 
 
 def cuda_timer(run: Run, number: int) -> float:
-    """Time by CUDA events, with nothing else under way before the first one and after the last."""
+    """Return seconds per call by CUDA events, synchronised before and after."""
     begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
     torch.cuda.synchronize()
     begin.record()
@@ -59,7 +59,7 @@ def cuda_timer(run: Run, number: int) -> float:
 
 
 def timer_of(device: torch.device, threads: int) -> tuple[Timer, str]:
-    """Return the timer for a device and a number of threads, and what it counts."""
+    """Return the timer for a device and a number of threads, and its description."""
     if device.type == "cuda":
         return cuda_timer, "CUDA events, synchronised"
     if threads == 1:
@@ -68,14 +68,14 @@ def timer_of(device: torch.device, threads: int) -> tuple[Timer, str]:
 
 
 def cpu_name() -> str:
-    """Return what the processor calls itself."""
+    """Return the model name of the processor."""
     with suppress(OSError, AttributeError):
         return re.search(r"^model name\s*:\s*(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)[1]  # type: ignore[index]
     return platform.processor() or platform.machine()
 
 
 def software() -> str:
-    """Return, as a line, what times depend on."""
+    """Return a line with the versions of the software that affects times."""
     try:
         numba = f"Numba {version('numba')}"
     except PackageNotFoundError:
@@ -84,11 +84,10 @@ def software() -> str:
 
 
 def peak_memory(run: Run, device: torch.device) -> float | None:
-    """Return by how many MiB a call raises the memory in use at its worst moment, its result included.
+    """Return the peak memory of a call, result included, in MiB above the memory in use before.
 
-    CUDA: what torch's allocator hands out. CPU: the resident memory of the process, which NumPy's and every other
-    library's share is part of; on Linux, where the kernel keeps its high-water mark and lets it be reset. Elsewhere,
-    or where that is not allowed, None.
+    CUDA: memory of torch's allocator. CPU: resident memory of the process, all libraries included; only on Linux, if
+    its high-water mark can be reset, else None.
     """
     if device.type == "cuda":
         torch.cuda.synchronize()
@@ -99,7 +98,7 @@ def peak_memory(run: Run, device: torch.device) -> float | None:
         return (torch.cuda.max_memory_allocated() - before) / 2**20
     if sys.platform != "linux":
         return None
-    with suppress(OSError, AttributeError):  # not with glibc: free pages that the heap keeps would hide a part
+    with suppress(OSError, AttributeError):  # only glibc; free pages that the heap keeps would hide a part
         ctypes.CDLL("libc.so.6").malloc_trim(0)
     try:
         Path("/proc/self/clear_refs").write_text("5")

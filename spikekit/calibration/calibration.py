@@ -1,4 +1,4 @@
-"""Calibration of one sensor: gain, dark rate and defects of every pixel, and correction by them."""
+"""Calibration of a sensor: gain, dark rate and defects of every pixel, and the correction."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from spikekit.color.cfa import bayer_sites
 from spikekit.sensor.noise import HOT, WORKS
 
 _NEIGHBORS = 4
-_LEAST_GAIN = 1e-4  # so that light is finite, in half precision as well
+_LEAST_GAIN = 1e-4  # keeps light finite, even in half precision
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    r"""How the pixels of one sensor respond to light.
+    r"""Response of a sensor's pixels to light.
 
     .. math:: r = g I + d, \qquad \hat I = \max(0, (r - d) / g)
 
     Convention:
-        r is how often a pixel fires per clock in light I, g its gain and d its dark rate, all for a threshold of 1:
-        the mean of :class:`SensorNoise`. Gains are relative: their mean is 1 over the pixels of a colour. The light of
-        a pixel that is dead or hot is taken from the four nearest pixels of its colour that work, each weighted by the
-        inverse of its distance.
+        r is the rate of a pixel in spikes per clock in light I, g its gain and d its dark rate, for a threshold of 1;
+        this is the mean of :class:`SensorNoise`. Gains are relative: their mean over the pixels of a colour is 1. The
+        light of a dead or hot pixel is the mean of the four nearest working pixels of its colour, weighted by inverse
+        distance.
 
     Args:
         gain: g, (H, W), 1e-4 to 1e4.
-        dark: d, (H, W), in spikes a clock, 0 to 1.
-        defects: (H, W), uint8: 0 for a pixel that works, 1 for a dead one, 2 for a hot one.
+        dark: d, (H, W), in spikes per clock, 0 to 1.
+        defects: (H, W), uint8: 0 for a working pixel, 1 for a dead one, 2 for a hot one.
 
     Raises:
-        ValueError: planes of other sizes or types, or values out of range; the message names them.
+        ValueError: the planes differ in size, have a wrong type, or hold values out of range.
 
     Example:
         >>> gain = torch.tensor([[1.25, 0.75, 1.0]])
@@ -77,19 +77,19 @@ class Calibration:
         return (self.gain == 1) & (self.dark == 0) & (self.defects == WORKS)
 
     def flip(self) -> Calibration:
-        """Return that of the sensor upside down."""
+        """Return the calibration of the sensor upside down."""
         return Calibration(*(plane.flip(0) for plane in (self.gain, self.dark, self.defects)))
 
     def correct(self, raw: Tensor, pattern: str | None = None) -> Tensor:
         """Return the light of an ideal sensor.
 
         Args:
-            raw: rates :math:`(*, H, W)`, in spikes a clock, as decoders give them.
+            raw: rates :math:`(*, H, W)`, in spikes per clock, as decoders return them.
             pattern: Bayer phase; ``None`` for a grey sensor.
 
         Raises:
             TypeError: ``raw`` is not a floating-point tensor.
-            ValueError: another size, or no pixel of a colour that works.
+            ValueError: ``raw`` has another size, or no pixel of a colour works.
         """
         check_planes("raw", raw, 2, "(*, H, W)", floating=True)
         if tuple(raw.shape[-2:]) != self.size:
@@ -105,7 +105,7 @@ class Calibration:
 
 
 def _nearest_that_work(bad: np.ndarray, pattern: str | None) -> tuple[Tensor, Tensor, Tensor]:
-    """For every defective pixel the nearest ones of its colour that work, and their weights, which add up to 1."""
+    """Return defective pixels, the nearest working pixels of their colour, and weights that add up to 1."""
     from scipy.spatial import cKDTree
 
     places, near, weights = [], [], []
@@ -114,7 +114,7 @@ def _nearest_that_work(bad: np.ndarray, pattern: str | None) -> tuple[Tensor, Te
         if not len(wrong):
             continue
         if not len(right):
-            raise ValueError("defects: expected pixels of every colour that work, got none of one")
+            raise ValueError("defects: expected working pixels of every colour, got none of one")
         count = min(_NEIGHBORS, len(right))
         distance, index = cKDTree(right).query(wrong, list(range(1, count + 1)))
         places.append(np.ravel_multi_index(wrong.T, bad.shape))
@@ -130,7 +130,7 @@ def _nearest_that_work(bad: np.ndarray, pattern: str | None) -> tuple[Tensor, Te
 
 
 def colors(size: tuple[int, int], pattern: str | None) -> list[np.ndarray]:
-    """Return which pixels (H, W) see each colour: R, G and B, or all of them on a grey sensor."""
+    """Return a mask (H, W) of the pixels of each colour: R, G and B, or one mask for a grey sensor."""
     if pattern is None:
         return [np.ones(size, bool)]
     masks = [np.zeros(size, bool) for _ in range(3)]

@@ -1,4 +1,4 @@
-"""Calibrations in files: safetensors beside the recordings of a sensor."""
+"""Calibration files: safetensors beside the recordings of a sensor."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from spikekit.io.failures import no_pipe
 from spikekit.io.images import MOST_PIXELS
 from spikekit.io.whole_file import whole_file
 
-#: What a recording's own calibration is called: its name with this ending.
+#: Ending of a recording's own calibration file.
 ENDING = ".calibration.safetensors"
 
 _KIND = "spikekit calibration 1"
@@ -18,14 +18,14 @@ _PLANES = {"gain": "F32", "dark": "F32", "defects": "U8"}
 
 
 def write_calibration(path: str | Path, calibration: Calibration) -> None:
-    """Write a calibration, whole or not at all.
+    """Write a calibration atomically.
 
     Args:
-        path: where to; it ends in .safetensors.
-        calibration: that of a sensor. Commands keep its rows as recordings are stored, before any flip.
+        path: the file to write; its name ends in .safetensors.
+        calibration: the calibration. The commands store its rows in the order of the recording, before any flip.
 
     Raises:
-        ValueError: another ending.
+        ValueError: the name has another ending.
         OSError: the file cannot be written.
 
     Example:
@@ -46,22 +46,22 @@ def write_calibration(path: str | Path, calibration: Calibration) -> None:
 
 
 def read_calibration(path: str | Path) -> Calibration:
-    """Read a calibration; nothing in the file is run, and no more is read than it says and holds.
+    """Read a calibration. The file cannot run code.
 
     Args:
-        path: what :func:`write_calibration` or ``spikekit calibrate`` wrote.
+        path: a file written by :func:`write_calibration` or ``spikekit calibrate``.
 
     Returns:
-        The calibration, its rows as they were written.
+        The calibration, with rows in the order of the file.
 
     Raises:
-        ValueError: the file cannot be read, is damaged, is of something else, or its values make no sense; the message
-            is one line and names the file.
+        ValueError: the file cannot be read, is damaged, or is not a valid calibration; the message is one line and
+            names the file.
 
     Example:
         >>> read_calibration("street.calibration.safetensors")
         Traceback (most recent call last):
-        ValueError: street.calibration.safetensors: not a calibration that can be read (No such file or directory...
+        ValueError: street.calibration.safetensors: not a readable calibration (No such file or directory...
     """
     from safetensors import SafetensorError, safe_open
 
@@ -79,4 +79,4 @@ def read_calibration(path: str | Path) -> Calibration:
                 raise ValueError(f"expected (H, W) of at most {MOST_PIXELS} pixels, got {size}")
             return Calibration(**{name: file.get_tensor(name) for name in _PLANES})
     except (SafetensorError, OSError, ValueError) as error:
-        raise ValueError(f"{path}: not a calibration that can be read ({one_line(error)[:300]})") from error
+        raise ValueError(f"{path}: not a readable calibration ({one_line(error)[:300]})") from error

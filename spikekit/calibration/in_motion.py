@@ -1,4 +1,4 @@
-"""Gains of the pixels of a sensor from any scene that moves across it."""
+"""Gains of a sensor's pixels, estimated from a moving scene."""
 
 from __future__ import annotations
 
@@ -20,39 +20,39 @@ from spikekit.progress import progress
 from spikekit.sensor.noise import WORKS
 from spikekit.warp.warp import flow_warp
 
-MOST_SEGMENTS = 100  #: of a recording are enough, and what memory is for
-LEAST_SEGMENTS = 12  #: in fewer, hardly anything has moved
-_SHORTEST, _LONGEST = 20, 200  # frames of a segment
-_SPIKES = 2  # that a pixel fires in a segment, at least, as far as the longest allows
+MOST_SEGMENTS = 100  #: upper limit, which bounds memory
+LEAST_SEGMENTS = 12  #: lower limit; fewer hardly contain motion
+_SHORTEST, _LONGEST = 20, 200  # frames per segment
+_SPIKES = 2  # target for the spikes of a pixel per segment
 
-_LEAST_SIDE = 3  # pixels, of a sensor that something can be seen to move across
-_FAR = 8.0  # pixels; what has moved further may look different
-_SOURCES = 16  # segments before and after one, that say what it should see
-_PATH = 4.0  # pixels of a scene that a pixel has to see before gain is told from texture
-_SHARE = 0.25  # of the pixels, at least, that have seen that much
-_AGREE = 0.4  # correlation of both halves of a recording, below which they do not say the same
-_LEAST_COUNT = 3  # segments of a half that say something about a pixel
-_AROUND = 15  # side of the window of a pixel's neighbours, in pixels
-_LEAST_GAIN = 0.1  # less is a dead pixel
+_LEAST_SIDE = 3  # smallest side of a sensor, in pixels, on which motion can be estimated
+_FAR = 8.0  # largest displacement between compared segments, in pixels
+_SOURCES = 16  # segments on each side that one is compared with
+_PATH = 4.0  # smallest displacement over the recording, in pixels, that separates gain from texture
+_SHARE = 0.25  # smallest share of pixels with enough displacement
+_AGREE = 0.4  # smallest correlation between the halves of a recording
+_LEAST_COUNT = 3  # smallest number of comparisons of a pixel in each half
+_AROUND = 15  # side of a neighbourhood, in pixels
+_LEAST_GAIN = 0.1  # pixels below this are dead
 _ROUNDS = 2
-_ATTACHMENT = 120.0  # of the flow to pictures in firing rates
-_GREY = torch.tensor([[0.25, 0.5, 0.25]])  # each pixel the mean of the Bayer cells that it is part of
+_ATTACHMENT = 120.0  # data weight of TV-L1 for pictures in spikes per frame
+_GREY = torch.tensor([[0.25, 0.5, 0.25]])  # mean over the Bayer cells that contain a pixel
 
 
 class Segments(NamedTuple):
-    """Counts of the spikes of every pixel in segments of a recording that follow each other without a gap."""
+    """Spike counts of every pixel in consecutive segments of a recording."""
 
     counts: Tensor  # (J, H, W), uint8
-    frames: int  # of each
+    frames: int  # per segment
 
 
 def segment_length(rate: float) -> int:
-    """Return how many frames a segment has where pixels fire so often in a frame."""
+    """Return the number of frames per segment for a mean rate in spikes per frame."""
     return min(max(_SHORTEST, math.ceil(_SPIKES / max(rate, 1e-9))), _LONGEST)
 
 
 def count_segments(chunks: Iterable[Tensor], frames: int) -> Segments:
-    """Count spikes of chunks (T_i, H, W) in segments of 1 to 255 frames; what is left over does not count.
+    """Count the spikes of chunks (T_i, H, W) in segments of 1 to 255 frames; an incomplete last one is dropped.
 
     Example:
         >>> count_segments([torch.ones(30, 1, 1), torch.zeros(15, 1, 1)], 20).counts.flatten().tolist()
@@ -67,26 +67,25 @@ def count_segments(chunks: Iterable[Tensor], frames: int) -> Segments:
 
 
 def calibrate_in_motion(segments: Segments, known: Calibration, pattern: str | None = None) -> Measured | None:
-    r"""Measure gains in a recording of any scene that moves.
+    r"""Measure gains in a recording of a moving scene.
 
     .. math:: e_h = \overline{r - \hat I}_h \approx (g - 1) \, \overline{\hat I}_h, \quad h = 1, 2, \qquad
         \sigma_g^2 = \frac{\mathrm{E}\, e_1 e_2}{\mathrm{E}\, \overline{\hat I}_1 \overline{\hat I}_2}
 
     Convention:
-        Where the scene moves, a pixel is told what it should see by pixels that saw the same before and after: the
-        rates of up to 16 segments on either side, demosaiced and moved along the motion, as far as that is 8 pixels at
-        most. What a pixel fires more or less than that, on average over half a recording, is its gain if it shows in
-        both halves, and the scene's texture if it shows in one. So what both halves have in common says how far gains
-        are apart, and what they differ by, how exact they are, for pixels of a brightness and for those of a
-        neighbourhood; a pixel gets the most likely gain, given both. Motion is that of TV-L1 between segments, added
-        up. All of it is done twice, the second time with the pixels corrected.
+        The expected rate of a pixel is the mean over other pixels that saw the same point: the rates of up to 16
+        segments on either side, demosaiced and warped along motion of at most 8 pixels. The mean excess of a pixel over
+        that rate is computed for each half of the recording. An excess common to both halves is due to the gain; one
+        that differs is due to texture. The covariance of the halves therefore gives the variance of the gains, and
+        their difference the error, as a function of brightness and in a neighbourhood. The gain is the maximum a
+        posteriori estimate. Motion is TV-L1 flow between segments, accumulated. A second round repeats all this with
+        corrected pixels.
 
-        Gains stay 1 where less than 4 pixels of the scene have passed a pixel, and everywhere if that is so for three
-        quarters of the pixels or if the halves correlate by less than 0.4. Dark rates are not told from gains: a pixel
-        of much leak in little light is given a larger gain.
+        A gain stays 1 if the scene has moved by less than 4 pixels at that pixel. Dark rates cannot be separated from
+        gains: a pixel with a high dark rate in a dim scene gets a larger gain.
 
-        ``known`` are the dead and hot pixels. ``None`` where too little moves or the halves of the recording do not
-        agree, as those of an ideal sensor do not.
+        ``known`` holds the dead and hot pixels. The result is ``None`` if fewer than a quarter of the pixels have seen
+        enough motion, or if the halves correlate by less than 0.4, as for an ideal sensor.
 
     Reference:
         Registration-based non-uniformity correction: Hardie, Hayat, Armstrong and Yasuda, Scene-based nonuniformity
@@ -99,7 +98,7 @@ def calibrate_in_motion(segments: Segments, known: Calibration, pattern: str | N
     measured = Measured(known)
     with progress(what="motion and gains", total=2 * _ROUNDS * len(counts)) as bar:
         for _ in range(_ROUNDS):
-            # over both halves: how often each pixel was seen, its light, and by how much more often it fires
+            # sums over both halves: number of comparisons, expected light, and excess of the rate over it
             halves = torch.zeros(3, 2, *known.size, dtype=torch.float64)
             for number, (light, seen) in enumerate(_expected(segments, measured.calibration, pattern, bar.update)):
                 excess = counts[number] / segments.frames - light
@@ -116,7 +115,7 @@ def calibrate_in_motion(segments: Segments, known: Calibration, pattern: str | N
 def _expected(
     segments: Segments, known: Calibration, pattern: str | None, done: Callable[[], object]
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """What every segment should see, (H, W), as other pixels saw it, and where anyone did."""
+    """Yield the expected rate of every segment, (H, W), from other pixels, and where it is known."""
     count, size = len(segments.counts), known.size
 
     def light(number: int) -> Tensor:
@@ -137,7 +136,7 @@ def _expected(
             if use.any():
                 seen = flow_warp(pictures[n], flow)
                 seen = use * (seen[0] if mask is None else (seen * mask).sum(0))
-                lamp = (rate * use).sum() / seen.sum().clamp(min=1e-9)  # the light of the whole scene may change
+                lamp = (rate * use).sum() / seen.sum().clamp(min=1e-9)  # the illumination may change
                 total += lamp * seen
                 sources += use
         yield (total / sources.clamp(min=1)).clamp(min=0), sources > 0
@@ -145,7 +144,7 @@ def _expected(
 
 
 def _places(light: Callable[[int], Tensor], count: int, color: bool, done: Callable[[], object]) -> Tensor:
-    """How far what each pixel sees has moved since the first segment, (J, 2, H, W), in pixels."""
+    """Return the displacement of the scene at each pixel since the first segment, (J, 2, H, W), in pixels."""
 
     def grey(number: int) -> Tensor:
         plane = light(number)
@@ -176,7 +175,7 @@ def _inside(flow: Tensor) -> Tensor:
 
 
 def _most_likely(halves: Tensor, works: Tensor, planes: list[Tensor], known: Calibration) -> Measured | None:
-    """Gains, given what both halves of a recording say."""
+    """Return the most likely gains, given the sums over both halves of a recording."""
     from scipy.optimize import nnls
 
     count = halves[0]
@@ -185,10 +184,10 @@ def _most_likely(halves: Tensor, works: Tensor, planes: list[Tensor], known: Cal
         return None
     light, excess = (part[:, used] / count[:, used] for part in halves[1:])
     common = excess.prod(0).mean()
-    if not common > _AGREE * excess.square().mean():  # nor where nothing fires
+    if not common > _AGREE * excess.square().mean():  # also false if nothing fires
         return None
     spread = common / light.prod(0).mean()
-    # dark pixels are less exact, relative to their light
+    # the relative error of dark pixels is larger
     terms = torch.stack([light.square().mean(0), torch.ones_like(light[0])], dim=1)
     weight = 1 / (terms[:, :1] + terms[:, 0].mean())
     differ = torch.zeros_like(count[0])
@@ -205,7 +204,7 @@ def _most_likely(halves: Tensor, works: Tensor, planes: list[Tensor], known: Cal
 
 
 def _mean_around(values: Tensor, where: Tensor) -> Tensor:
-    """Means (H, W) over the pixels of a window that count."""
+    """Return the mean, (H, W), over the pixels of a window where ``where`` is True."""
     total, count = (
         F.avg_pool2d(plane[None, None], _AROUND, 1, _AROUND // 2)[0, 0] for plane in (values * where, where.to(values))
     )

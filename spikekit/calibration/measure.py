@@ -1,4 +1,4 @@
-"""Measure the pixels of a sensor: from dark and flat recordings, or from a scene alone."""
+"""Measure the pixels of a sensor from dark and flat recordings, or find defects in any scene."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from spikekit.calibration.calibration import Calibration, colors
 from spikekit.calibration.pixel_rates import PixelRates
 from spikekit.sensor.noise import DEAD, HOT
 
-_LEAST_SPIKES = 10  # of a pixel's neighbours, before its silence says that it is dead
-_DEAD_GAIN = 0.1  # of that of other pixels
-_HOT_RATE = 0.5  # in the dark
-_ALWAYS = 0.99  # spikes a clock of a pixel that fires whatever the light is
+_LEAST_SPIKES = 10  # spikes of the neighbours, below which a silent pixel is not called dead
+_DEAD_GAIN = 0.1  # gain below which a pixel is dead, relative to others
+_HOT_RATE = 0.5  # dark rate from which on a pixel is hot, in spikes per clock
+_ALWAYS = 0.99  # rate of a saturated pixel, in spikes per clock
 
-_NEAR = 5  # side of the window that a pixel of a scene is compared with, in pixels of its colour
+_NEAR = 5  # side of the neighbourhood, in pixels of the same colour
 
 
 class Measured(NamedTuple):
-    """A calibration, and the standard errors of a pixel's gain and dark rate, ``None`` where they were not measured."""
+    """A calibration and the standard errors of gain and dark rate per pixel; ``None`` if not measured."""
 
     calibration: Calibration
     gain_error: float | None = None
@@ -33,20 +33,20 @@ def calibrate(
     dark: tuple[PixelRates, PixelRates] | None,
     pattern: str | None = None,
 ) -> Measured:
-    r"""Measure the pixels in even light and in the dark.
+    r"""Measure the pixels from recordings of even light and of darkness.
 
     .. math:: d = r_\text{dark}, \quad g = \frac{r_\text{flat} - d}{\mathrm{E}_C (r_\text{flat} - d)}
 
     Convention:
-        The mean is over the pixels of a colour that work. A pixel is hot if it fires in half of the dark clocks or in
-        nearly all of the flat ones, dead if its gain is less than a tenth of the others'. Without one of the
-        recordings, there is no dark current, or gains are 1.
+        The mean is over the working pixels of a colour. A pixel is hot if it fires in half of the dark clocks or in
+        nearly all of the flat ones, and dead if its gain is less than a tenth of the others'. Without a dark recording,
+        dark rates are 0; without a flat one, gains are 1.
 
-        Errors are told by the two halves of a recording: the root mean square of what they differ by, halved. That is
-        right where light or charge come in single electrons, and more than the error where they come evenly.
+        The standard error is half the root mean square difference between the two halves of a recording. This is exact
+        for shot noise, and an upper bound for light that arrives evenly.
 
     Raises:
-        ValueError: a flat recording that is no brighter than the dark one, or so bright that its pixels are saturated.
+        ValueError: the flat recording is not brighter than the dark one, or its pixels are saturated.
     """
     size = tuple((flat or dark)[0].count.shape)
     leak, gain = torch.zeros(size, dtype=torch.float64), torch.ones(size, dtype=torch.float64)
@@ -60,10 +60,10 @@ def calibrate(
         whole = flat[0] + flat[1]
         brightness = whole.rate.median().item()
         if brightness >= _ALWAYS:
-            raise ValueError(f"expected a flat recording whose pixels are not saturated, got {brightness:.3g} a clock")
+            raise ValueError(f"expected a flat recording without saturation, got {brightness:.3g} per clock")
         light = whole.rate - leak
         if light.median() <= 0:
-            raise ValueError(f"expected a flat recording brighter than the dark one, got {brightness:.3g} a clock")
+            raise ValueError(f"expected a flat recording brighter than the dark one, got {brightness:.3g} per clock")
         defects[whole.rate >= _ALWAYS] = HOT
         errors = []
         for pixels in map(torch.from_numpy, colors(size, pattern)):
@@ -84,13 +84,13 @@ def _error(one: Tensor, other: Tensor, works: Tensor) -> float:
 
 
 def find_defects(scene: PixelRates, pattern: str | None = None) -> Measured:
-    """Find dead and hot pixels by their neighbours, in a recording of any scene.
+    """Find dead and hot pixels in a recording of any scene, by comparison with their neighbours.
 
     Convention:
-        A pixel is dead if it fires less than a tenth as often as the median of the pixels of its colour around it,
-        which fire at least ten times, and hot if it fires at nearly every clock where they do so at less than half.
-        Gains stay 1: at rest they cannot be told from the texture of the scene; where it moves, see
-        :func:`spikekit.calibration.in_motion.calibrate_in_motion`.
+        A pixel is compared with the median of its neighbours of the same colour. It is dead if it fires less than a
+        tenth as often, provided that they fire at least ten times. It is hot if it fires at nearly every clock, and
+        they at less than half. Gains stay 1: in a still scene they cannot be separated from texture; for a moving one,
+        see :func:`spikekit.calibration.in_motion.calibrate_in_motion`.
     """
     size = tuple(scene.count.shape)
     defects = torch.zeros(size, dtype=torch.uint8)
@@ -104,7 +104,7 @@ def find_defects(scene: PixelRates, pattern: str | None = None) -> Measured:
 
 
 def _lattices(size: tuple[int, int], pattern: str | None) -> list[tuple[slice, slice]]:
-    """Return where neighbours of one colour lie side by side."""
+    """Return the slices of the sub-lattices, each with pixels of one colour."""
     if pattern is None:
         return [(slice(None), slice(None))]
     starts = [(row, column) for row in range(min(2, size[0])) for column in range(min(2, size[1]))]
@@ -112,7 +112,7 @@ def _lattices(size: tuple[int, int], pattern: str | None) -> list[tuple[slice, s
 
 
 def _median_around(plane: Tensor) -> Tensor:
-    """Median over a window, without the pixel in its middle."""
+    """Return the median over a window without its centre."""
     from scipy.ndimage import rank_filter
 
     others = np.arange(_NEAR**2).reshape(_NEAR, _NEAR) != _NEAR**2 // 2

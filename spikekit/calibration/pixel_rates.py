@@ -1,4 +1,4 @@
-"""How often every pixel of a recording fires, from its first to its last spike."""
+"""Firing rates of the pixels of a recording, from the first to the last spike of each."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class PixelRates:
-    r"""How often every pixel fires, counted frame by frame.
+    r"""Firing rate of every pixel.
 
     .. math:: r = \frac{n - 1}{t_n - t_1} \text{ for } n \ge 2 \text{ spikes, else } \frac{n}{T}
 
     Convention:
-        In light that does not change, n spikes are n - 1 whole thresholds, and only the two ends are rounded to clocks:
-        the error is about :math:`0.4 \, r / T`, where that of n / T is 0.4 / T.
+        In constant light, n - 1 whole thresholds lie between the first and the last of n spikes, and only these two are
+        rounded to clocks. The error is about :math:`0.4 \, r / T`; that of n / T is 0.4 / T.
 
     Example:
         >>> spikes = torch.tensor([0, 1, 0, 0, 1, 0, 0, 1, 0, 0]).reshape(10, 1, 1)
@@ -27,12 +27,12 @@ class PixelRates:
 
     frames: int  # T
     count: Tensor  # n, (H, W), int64
-    first: Tensor  # frame of the first spike; T where there is none
-    last: Tensor  # of the last one; -1 where there is none
+    first: Tensor  # frame of the first spike; T if there is none
+    last: Tensor  # frame of the last spike; -1 if there is none
 
     @classmethod
     def of(cls, chunks: Iterable[Tensor]) -> PixelRates:
-        """Count chunks (T_i, H, W) of one recording."""
+        """Return the rates of a recording given as chunks (T_i, H, W)."""
         whole = None
         for spikes in chunks:
             fired, frames = spikes != 0, len(spikes)
@@ -47,7 +47,7 @@ class PixelRates:
         return whole
 
     def __add__(self, later: PixelRates) -> PixelRates:
-        """Return the rates of a recording and of what follows it without a gap."""
+        """Return the rates of two consecutive recordings together."""
         return PixelRates(
             self.frames + later.frames,
             self.count + later.count,
@@ -57,6 +57,6 @@ class PixelRates:
 
     @property
     def rate(self) -> Tensor:
-        """Spikes a clock, (H, W), float64."""
+        """Spikes per clock, (H, W), float64."""
         span = (self.last - self.first).clamp(min=1)
         return torch.where(self.count >= 2, (self.count - 1).double() / span, self.count.double() / self.frames)

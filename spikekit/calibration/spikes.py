@@ -13,23 +13,23 @@ from spikekit.decoders.dense import tfi
 from spikekit.sensor.integrate_fire import spike_integrate_fire
 
 _GOLDEN = (math.sqrt(5) - 1) / 2
-_ROUNDING = 1e-4  # of a threshold: what sums of light may lack of one
+_ROUNDING = 1e-4  # tolerance for rounding errors in sums of light, in thresholds
 
 
 def correct_spikes(spikes: Tensor, calibration: Calibration, pattern: str | None = None) -> Tensor:
-    r"""Re-fire the spikes that an ideal sensor would have fired, for networks, which take spikes rather than light.
+    r"""Return the spikes that an ideal sensor would have fired, for networks, which take spikes rather than light.
 
     .. math:: \hat I_n = \text{corrected } 1 / \Psi_n, \quad \hat S = \text{spikes of } \hat I
 
     Convention:
-        The light at every clock is that of :func:`spikekit.tfi`, which brings one threshold between any two spikes,
-        corrected by :meth:`Calibration.correct`, and exposed by :func:`spikekit.spike_integrate_fire`. The charge at
-        the beginning is such that a pixel fires where it first did. A pixel without error keeps its spikes, bit for
-        bit, one that is dead or hot gets those of the mean light of its neighbours. No gradient.
+        The light at every clock is that of :func:`spikekit.tfi`, which integrates to one threshold between two spikes.
+        It is corrected by :meth:`Calibration.correct` and fed to :func:`spikekit.spike_integrate_fire`. The initial
+        charge reproduces the first spike of each pixel. A pixel that needs no correction keeps its spikes, bit for bit;
+        a dead or hot one fires according to the mean light of its neighbours. No gradient.
 
     Args:
         spikes: zeros and ones, :math:`(*, T, H, W)`.
-        calibration: that of the sensor.
+        calibration: the calibration of the sensor.
         pattern: Bayer phase; ``None`` for a grey sensor.
 
     Returns:
@@ -37,7 +37,7 @@ def correct_spikes(spikes: Tensor, calibration: Calibration, pattern: str | None
 
     Raises:
         TypeError: ``spikes`` is not a tensor of real numbers.
-        ValueError: fewer than three dimensions, or another size than that of the calibration.
+        ValueError: ``spikes`` has fewer than three dimensions, or not the size of the calibration.
 
     Example:
         >>> spikes = torch.tensor([0, 1, 0, 0, 1, 0, 0, 1, 0, 0]).reshape(10, 1, 1)

@@ -1,4 +1,4 @@
-"""``spikekit cameras``: the cameras that ``--camera`` knows."""
+"""``spikekit cameras``: list the cameras that ``--camera`` knows."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from spikekit.tables import table
 
 
 def run(args: argparse.Namespace) -> None:
-    """Print the cameras that --camera knows, and what it knows of them.
+    """List the cameras that --camera knows, with their properties.
 
-    Sizes are those of the pictures, after the crop; the Bayer phase is that of upright frames, before it.
+    H x W is the size of pictures after the crop. The Bayer phase is that of upright frames before the crop.
     """
     rows = []
     for one in map(camera, CAMERAS):
         height, width = one.prepared_size
         flip = "upside down" if one.flip else "upright"
         rows.append([one.name, f"{height} x {width}", one.pattern or "grey", flip, f"{one.rate:g}", one.title])
-    print(table(["camera", "H x W", "Bayer", "stored", "frames/s", "what it is"], rows, markdown=args.markdown))
+    print(table(["camera", "H x W", "Bayer", "stored", "frames/s", "description"], rows, markdown=args.markdown))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("--markdown", action="store_true", help="a Markdown table")
+    parser.add_argument("--markdown", action="store_true", help="print a Markdown table")

@@ -1,4 +1,4 @@
-"""The ``spikekit`` command: look into recordings and turn them into pictures."""
+"""The ``spikekit`` command: inspect, decode, simulate and calibrate spike recordings."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from spikekit.arguments import UsageError, one_line, printable
 from spikekit.extras import remedy
 from spikekit.standard_output import BROKEN_PIPE, Terminated, stop_printing, stopped_by_sigterm
 
-#: what every verb does, and an example; ``add_arguments`` and ``run`` are those of the module of its name
+#: summary and example of every verb; the module of the same name has its ``add_arguments`` and ``run``
 VERBS = {
-    "info": ("what a recording holds", "info street.dat --height 250 --width 400"),
+    "info": ("print statistics of a recording", "info street.dat --height 250 --width 400"),
     "decode": (
-        "the picture of one frame, or of many",
+        "write the pictures of one or more frames",
         "decode water.dat --height 1000 --width 1000 --flip --pattern BGGR -o water.png",
     ),
-    "simulate": ("a stream of a film", "simulate walk -o walk.dat --scale 4"),
+    "simulate": ("simulate a recording of a film", "simulate walk -o walk.dat --scale 4"),
     "calibrate": (
-        "gain and defects of pixels",
+        "measure gain, dark rate and defects of pixels",
         "calibrate street.dat --height 250 --width 400 --flat wall.dat --dark cap.dat",
     ),
-    "view": ("a sheet of pictures about a recording", "view walk.dat -o look.png"),
-    "cameras": ("the cameras that --camera knows", "cameras"),
+    "view": ("draw an overview of a recording", "view walk.dat -o look.png"),
+    "cameras": ("list the cameras that --camera knows", "cameras"),
 }
 
 
@@ -37,11 +37,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Returns:
-        0; 1 for a file that cannot be used, 2 for a command line that cannot, and as a shell has it 130 for Ctrl-C, 141
-        for output that nobody reads any more, 143 for SIGTERM. What was whole by then has been written.
+        The exit status: 0, 1 for an unusable file, 2 for a wrong command line, and, as in a shell, 130 after Ctrl-C,
+        141 after a broken pipe, 143 after SIGTERM. Files that were complete by then are kept.
     """
     for stream in (sys.stdout, sys.stderr):
-        with suppress(AttributeError):  # in a notebook, which shows any name
+        with suppress(AttributeError):  # a notebook's streams have no encoding
             stream.reconfigure(errors="backslashreplace")
     try:
         with stopped_by_sigterm():
@@ -60,7 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         said, status = f"{printable(str(error.filename or 'standard output'))}: {one_line(error)}", 1
         if error.filename is None:
-            stop_printing()  # nobody reads it, or it finds no room
+            stop_printing()  # a broken pipe or a full disk
         if isinstance(error, BrokenPipeError):
             return BROKEN_PIPE
     except ModuleNotFoundError as error:
@@ -77,8 +77,8 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parser(*asked: str) -> argparse.ArgumentParser:
-    """Return a parser that knows the arguments of some verbs: those of the others would take importing them."""
-    parser = _Parser(prog="spikekit", description="Look into spike recordings and turn them into pictures.")
+    """Return a parser with the arguments of the verbs in ``asked``; the modules of the others are not imported."""
+    parser = _Parser(prog="spikekit", description="Inspect, decode, simulate and calibrate spike recordings.")
     parser.add_argument("--version", action="version", version=f"spikekit {__version__}")
     verbs = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
     for name, (summary, example) in VERBS.items():

@@ -1,4 +1,4 @@
-"""``spikekit decode``: pictures of frames of a recording."""
+"""``spikekit decode``: write pictures of the frames of a recording."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from spikekit.progress import progress
 from spikekit.recording import Recording, white_rate
 from spikekit.standard_output import say
 
-#: Frames that TFP averages when nothing else is said.
+#: Default window of TFP, in frames.
 TFP_WINDOW = 41
 
-# Gives the frame of a number, its pixels unpacked.
+# Returns the unpacked frame of a given number.
 _Plane = Callable[[int], np.ndarray]
 
-# Stands for the number of the frame in the name of a picture.
+# Placeholder of the frame number in the name of a picture.
 _NUMBER = "{frame}"
 
 
 def run(args: argparse.Namespace) -> None:
-    """Write the picture of one frame, or of many, reading only as much around each as the method needs."""
+    """Write pictures of one or more frames, reading only the neighbouring frames that the method needs."""
     if args.method is None:
         args.method = "tfi" if args.window is None and args.order == 1 else "tfp"
     decoder = DECODERS[args.method]
@@ -90,72 +90,72 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--method",
         choices=DECODERS,
-        help="by the interval between the two spikes around the frame, or by the number of spikes in a window around "
-        f"it; tfi looks up to {TFI_REACH} frames to each side, and a pixel with no spike there is taken to have fired "
-        "just outside. If not given, tfi, whose window follows the light, so that it fits dim and bright recordings "
-        "alike; tfp where --window or --order is given",
+        help="tfi: from the interval between the two spikes around the frame, which adapts to dim and bright pixels; "
+        f"it searches up to {TFI_REACH} frames on each side, and assumes a spike just outside if it finds none. "
+        "tfp: from the number of spikes in a window around the frame. Default: tfp if --window or --order is given, "
+        "else tfi",
     )
     add(
         "-o",
         "--output",
         required=True,
-        # with another ending the picture library would write TIFF, over a recording as well
+        # for any other ending the library would write TIFF, even over a recording
         type=ending_in(*PICTURE_ENDINGS, said=f"a picture that ends in {', '.join(PICTURE_ENDINGS)}"),
         metavar="OUT.png",
-        help=f"the picture to write; {_NUMBER} in it becomes the number of the frame, with leading zeros",
+        help=f"picture to write; {_NUMBER} stands for the number of the frame, with leading zeros",
     )
-    add("--bits", type=int, choices=(8, 16), default=8, help="of a .png or .tif; 8 if not given")
-    add("--quality", type=whole(1), metavar="Q", help="of a .jpg, 1 to 100")
+    add("--bits", type=int, choices=(8, 16), default=8, help="bits per channel of a .png or .tif; default: 8")
+    add("--quality", type=whole(1), metavar="Q", help="quality of a .jpg, 1 to 100")
     add(
         "--frame",
         metavar="N|A:B[:STEP]",
-        help="which frame, from 0, or which frames, from A to B - 1, as in Python; the middle one if not given",
+        help="frame, counted from 0, or frames A to B - 1, as in Python; default: the middle frame",
     )
     add(
         "--window",
         type=whole(1),
         metavar="W",
-        help=f"frames that tfp averages, odd, the frame in their middle, fewer at the ends of the recording; "
-        f"{TFP_WINDOW} if not given",
+        help="window of tfp in frames, odd, centred on the frame and cut at the ends of the recording; "
+        f"default: {TFP_WINDOW}",
     )
     add(
         "--order",
         type=whole(1),
         default=1,
         metavar="K",
-        help="how often tfp takes the mean: --window 13 --order 3 sees 37 frames, with less noise and less blur than a "
-        "window of 37; 1 if not given",
+        help="how many times tfp averages: --window 13 --order 3 sees 37 frames, with less noise and less blur than a "
+        "window of 37; default: 1",
     )
     add(
         "--alpha",
         type=positive,
         metavar="A",
-        help="gain of a simulated recording (a white pixel fires A times a frame), to divide by; "
-        "if not given, the picture is scaled until the 99.9th percentile of the spike rate in the frames it is made "
-        "from is white, and many pictures all as the one in their middle",
+        help="spikes per frame of a white pixel, the gain of a simulated recording; the picture is divided by it. "
+        "Default: that of the side-car, else the 99.9th percentile of the spike rate around the frame; several "
+        "pictures share the value of the middle one",
     )
 
 
 def _white(alpha: float | None, recording: Recording, key: int, reach: int) -> tuple[float, str]:
-    """Return what becomes white, and a sentence that says so."""
+    """Return the white level, and a description of it."""
     if alpha is not None:
         return alpha, f"divided by alpha {alpha:g}"
     first, last = _span(key, reach, recording.frames)
-    # Of the rate, not of the picture: TFI makes 1 or 1/2 of a bright pixel, and its percentile is one of the two.
+    # The percentile of the rate, not of the picture: a bright pixel of TFI is 1 or 1/2, and so is its percentile.
     white = white_rate(recording.correct(recording.counts(first, last - first + 1) / (last - first + 1)))
     scale = f"multiplied by {1 / white:.4g}"
     return white, f"{scale}, so that the 99.9th percentile of the spike rate around frame {key} is white"
 
 
 def _span(frame: int, reach: int, frames: int) -> tuple[int, int]:
-    """Return the first and the last frame that the picture of one is made from."""
+    """Return the first and the last frame that contribute to a picture."""
     return max(frame - reach, 0), min(frame + reach, frames - 1)
 
 
 def _windows(recording: Recording, chosen: range, reach: int) -> Iterator[tuple[int, _Plane]]:
-    """Read forwards; yield every chosen frame and what unpacks it and its neighbours."""
+    """Yield every chosen frame and a function that unpacks it and its neighbours, reading forwards only."""
     frames, stop = recording.frames, 0
-    held: deque[np.ndarray] = deque(maxlen=min(2 * reach + 1, frames))  # packed, of which the last is frame stop - 1
+    held: deque[np.ndarray] = deque(maxlen=min(2 * reach + 1, frames))  # packed frames, the last is stop - 1
     stream = recording.packed(0, frames)
 
     def plane(n: int) -> np.ndarray:
@@ -163,7 +163,7 @@ def _windows(recording: Recording, chosen: range, reach: int) -> Iterator[tuple[
 
     for n in chosen:
         first, last = _span(n, reach, frames)
-        if stop < first and recording.path.suffix.lower() == ".dat":  # an .npz has no short cut
+        if stop < first and recording.path.suffix.lower() == ".dat":  # an .npz cannot seek
             stream, stop = recording.packed(first, frames - first), first
         while stop <= last:
             held.append(next(stream))

@@ -1,4 +1,4 @@
-"""``spikekit info``: the contents of a recording."""
+"""``spikekit info``: print statistics of a recording."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from torch import Tensor
 from spikekit.cli import recordings
 from spikekit.standard_output import say
 
-#: Clocks a second of the cameras.
+#: Clocks per second of the cameras.
 CLOCK_HZ = 20_000
 
 
 def run(args: argparse.Namespace) -> None:
-    """Print what a recording holds, in one pass over its frames."""
+    """Print the size of a recording and the statistics of its spikes, in one pass over its frames."""
     recording = recordings.opened(args)
     frames, (height, width) = recording.frames, recording.size
     counts = recording.counts(0, frames)
@@ -24,12 +24,12 @@ def run(args: argparse.Namespace) -> None:
     ending = args.file.suffix.lower()
     say(f"file         {args.file}")
     print(
-        f"format       {ending}, {'8 pixels a byte, no header' if ending == '.dat' else 'an array of zeros and ones'}"
+        f"format       {ending}, {'8 pixels per byte, no header' if ending == '.dat' else 'an array of zeros and ones'}"
     )
     print(f"size         {height} x {width} (H x W), {args.file.stat().st_size} bytes")
     print(f"frames       {frames}, {1e3 * frames / CLOCK_HZ:g} ms at {CLOCK_HZ // 1000} kHz")
     print(f"bits set     {spikes} of {pixels * frames}, {spikes / (pixels * frames):.2%}")
-    print(f"median       {rates.median():.4f} spikes a frame")
+    print(f"median       {rates.median():.4f} spikes per frame")
     print(f"darkest      {_at(rates, rates.argmin())}")
     print(f"brightest    {_at(rates, rates.argmax())}")
     print(f"never fire   {dead} of {pixels} pixels, {dead / pixels:.2%}")
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> None:
     if recording.calibration is not None:
         known = recording.calibration
         bad = int((known.defects != 0).sum())
-        print(f"calibration  gains {known.gain.std():.2%} apart, dark {known.dark.median():.2g} a frame, {bad} defects")
+        print(f"calibration  gain SD {known.gain.std():.2%}, dark {known.dark.median():.2g} per frame, {bad} defects")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,4 +47,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _at(rates: Tensor, index: Tensor) -> str:
     row, column = divmod(int(index), rates.shape[-1])
-    return f"{rates.flatten()[index]:.4f} spikes a frame, at row {row}, column {column}"
+    return f"{rates.flatten()[index]:.4f} spikes per frame, at row {row}, column {column}"

@@ -1,4 +1,4 @@
-"""The arguments that name a recording, the same for every verb that reads one."""
+"""Arguments that describe a recording, shared by every verb that reads one."""
 
 from __future__ import annotations
 
@@ -18,42 +18,41 @@ _OPTIONS = [name for name in signature(open_recording).parameters if name != "pa
 
 
 def add_arguments(parser: Any, *, calibration: bool = True) -> None:
-    """Add FILE and what is to be known of it; the calibration too, where the verb corrects pixels."""
+    """Add FILE and the options that describe it; ``calibration`` if the verb corrects pixels."""
     add = parser.add_argument
-    add("file", type=home_path, metavar="FILE", help="a recording, .dat (8 pixels a byte, no header), .npy or .npz")
-    add("--height", type=whole(1), metavar="H", help="rows of a frame; a .dat without side-car or camera needs it")
-    add("--width", type=whole(1), metavar="W", help="columns of a frame; likewise")
-    add("--flip", action="store_true", help="the frames are stored upside down, as real cameras do")
+    add("file", type=home_path, metavar="FILE", help="recording: .dat (8 pixels per byte, no header), .npy or .npz")
+    add("--height", type=whole(1), metavar="H", help="rows of a frame; required for a .dat without side-car or camera")
+    add("--width", type=whole(1), metavar="W", help="columns of a frame; required in the same cases")
+    add("--flip", action="store_true", help="frames are stored upside down, as by real cameras")
     add(
         "--pattern",
         type=pattern,
         choices=(*PATTERNS, GREY),
         metavar="P",
-        help=f"Bayer phase after the flip: {', '.join(PATTERNS)}; or {GREY}; that of the side-car or the camera if not "
-        "given",
+        help=f"Bayer phase after the flip: {', '.join(PATTERNS)}, or {GREY}; default: that of the side-car or camera",
     )
     add(
         "--camera",
         metavar="NAME",
-        help=f"what recorded it: {', '.join(CAMERAS)}, or a .json file of the same form; gives the size, the "
-        "flip, the Bayer phase, what to crop, and how pictures are shown",
+        help=f"camera of the recording: {', '.join(CAMERAS)}, or a .json file of the same form; sets size, flip, Bayer "
+        "phase, crop and the display of pictures",
     )
     if calibration:
         add(
             "--calibration",
             metavar="FILE",
-            help="gain, dark rate and defects of the pixels, from spikekit calibrate, to correct pictures by; "
-            f"the recording's own, NAME{ENDING} beside it, if not given; none for none",
+            help="gain, dark rate and defects of the pixels, measured by spikekit calibrate, to correct pictures; "
+            f"default: NAME{ENDING} beside the recording, if it exists; none: no correction",
         )
 
 
 def pattern(text: str) -> str:
-    """Read a Bayer phase in either case, or ``grey``."""
+    """Parse a Bayer phase or ``grey`` in any case."""
     return text.lower() if text.lower() == GREY else text.upper()
 
 
 def known(args: argparse.Namespace) -> dict[str, Any]:
-    """Return what is said of the recording, as :func:`spikekit.recording.open_recording` takes it."""
+    """Return the keyword arguments of :func:`spikekit.recording.open_recording`."""
     return {name: getattr(args, name) for name in _OPTIONS if hasattr(args, name)}
 
 

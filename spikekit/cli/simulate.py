@@ -1,4 +1,4 @@
-"""``spikekit simulate``: from pictures or a video to a spike stream, its ground truth and its side-car."""
+"""``spikekit simulate``: turn pictures or a video into a spike stream, its ground truth and its side-car."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from spikekit.sensor.noise import SensorNoise
 from spikekit.standard_output import say
 
 _NOISE = {
-    "photons": "electrons that make a threshold: light comes in photons",
-    "dark_current": "charge that leaks into a pixel per clock, in thresholds",
-    "dark_spread": "standard deviation of the dark current between pixels, relative to its mean",
-    "gain_spread": "standard deviation of the gain between pixels: fixed-pattern noise",
+    "photons": "threshold in electrons, for shot noise",
+    "dark_current": "dark current of a pixel per clock, in thresholds",
+    "dark_spread": "standard deviation of the dark current over the pixels, relative to its mean",
+    "gain_spread": "standard deviation of the gain over the pixels (fixed-pattern noise)",
     "hot": "share of pixels that always fire",
     "dead": "share of pixels that never fire",
 }
@@ -28,16 +28,15 @@ _NOISE = {
 def run(args: argparse.Namespace) -> None:
     """Record a film with a simulated colour spike camera.
 
-    OUT.dat gets the stream, 8 pixels a byte: a clip around one frame of the film, or all of it. OUT.png gets the
-    ground truth, that frame in 8 bits, cropped to whole cells of the sensor; with --all, the folder OUT gets every
-    frame. OUT.json, the side-car, gets every setting, what of the scene was modelled, and a hash of the stream. The
-    same settings give the same stream, bit for bit.
+    OUT.dat holds the stream, 8 pixels per byte: a clip around one frame of the film, or the whole film. OUT.png holds
+    the ground truth: that frame in 8 bits, cropped to whole cells of the sensor. With --all, the folder OUT holds every
+    frame instead. OUT.json, the side-car, records every setting, what was modelled, and a hash of the stream. The same
+    settings give the same stream, bit for bit.
 
-    All appear under their names when they are complete, the side-car last: a stream without one is not to be
-    believed.
+    Files appear under their names when they are complete, the side-car last. A stream without one may be incomplete.
     """
     if args.output.is_dir():
-        raise ValueError(f"{args.output}: expected a stream to write, got a folder")
+        raise ValueError(f"{args.output}: expected a file, got a folder")
     known = {field.name for field in (*fields(Settings), *fields(SensorNoise))}
     given = {name: value for name, value in vars(args).items() if name in known}
     noise = {name: given.pop(name) for name in _NOISE if name in given}
@@ -56,43 +55,43 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
 
     def option(name: str, kind: Callable[[str], Any], metavar: str, said: str, to: Any = parser) -> None:
-        to.add_argument(f"--{name}", type=kind, metavar=metavar, help=f"{said}; {getattr(Settings, name)} if not given")
+        to.add_argument(f"--{name}", type=kind, metavar=metavar, help=f"{said}; default: {getattr(Settings, name)}")
 
-    add("input", type=home_path, metavar="INPUT", help="a folder of pictures, a video file or a picture")
+    add("input", type=home_path, metavar="INPUT", help="folder of pictures, video or picture")
     stream = ending_in(*RECORDING_ENDINGS, said=f"a stream that ends in {', '.join(RECORDING_ENDINGS)}")
-    add("-o", "--output", required=True, type=stream, metavar="OUT.dat", help="the stream to write")
-    add("--scale", required=True, type=whole(1), metavar="S", help="pixels of a frame that a sensor pixel is wide")
-    said = f"Bayer phase of the sensor; {Settings.pattern} if not given"
+    add("-o", "--output", required=True, type=stream, metavar="OUT.dat", help="stream to write")
+    add("--scale", required=True, type=whole(1), metavar="S", help="width of a sensor pixel in pixels of a film frame")
+    said = f"Bayer phase of the sensor; default: {Settings.pattern}"
     add("--pattern", type=str.upper, choices=PATTERNS, help=said)
-    option("alpha", positive, "A", "times that a white pixel fires per clock")
-    option("clocks", whole(1), "N", "clocks from one frame to the next")
+    option("alpha", positive, "A", "spikes of a white pixel per clock")
+    option("clocks", whole(1), "N", "clocks from one film frame to the next")
     part = parser.add_mutually_exclusive_group()
-    option("frames", whole(1), "N", "frames of the stream, around one of the film", part)
-    part.add_argument("--all", dest="frames", action="store_const", const=None, help="the whole film")
-    said = "which frame of the film is in the middle, from 0; that in its middle if not given"
+    option("frames", whole(1), "N", "spike frames of the stream, centred on one frame of the film", part)
+    part.add_argument("--all", dest="frames", action="store_const", const=None, help="simulate the whole film")
+    said = "film frame at the middle of the stream, counted from 0; default: the middle of the film"
     add("--frame", type=whole(0), metavar="M", help=said)
-    option("seed", whole(0), "N", "random seed: first charge and noise")
+    option("seed", whole(0), "N", "random seed of the initial charge and the noise")
 
-    model = parser.add_argument_group("what is modelled")
-    said = "what the scene requires, every clock and all noise, or K latent frames between two frames"
+    model = parser.add_argument_group("modelling")
+    said = "scene: what the scene requires; everything: every clock and all noise; K: K latent frames per interval"
     option("plan", _plan, "scene|everything|K", said, model)
-    said = "share of the spikes that may change by not modelling more"
+    said = "share of the spikes that may differ from a full simulation"
     model.add_argument(
         "--spike-tolerance",
         dest="tolerance",
         type=positive,
         metavar="SHARE",
-        help=f"{said}; {Settings.tolerance} if not given",
+        help=f"{said}; default: {Settings.tolerance}",
     )
     option("step", positive, "PIXELS", "largest displacement between latent frames, in sensor pixels", model)
-    said = f"what makes latent frames; {Settings.interpolation} if not given"
+    said = f"method that interpolates latent frames; default: {Settings.interpolation}"
     model.add_argument("--interpolation", choices=INTERPOLATIONS, help=said)
 
-    noise = parser.add_argument_group("noise of the sensor, none if not given")
+    noise = parser.add_argument_group("sensor noise (default: none)")
     for name, said in _NOISE.items():
         noise.add_argument(f"--{name.replace('_', '-')}", type=float, metavar="X", help=said)
-    said = "instead of dark current, spreads and shares, the pixels of a sensor that spikekit calibrate has measured, "
-    noise.add_argument("--calibration", metavar="FILE", help=f"{said}their rows as the stream has them")
+    said = "pixels measured by spikekit calibrate, instead of dark current, spreads and shares; "
+    noise.add_argument("--calibration", metavar="FILE", help=f"{said}rows in the order of the stream")
 
 
 def _plan(text: str) -> str | int:

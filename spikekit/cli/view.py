@@ -1,4 +1,4 @@
-"""``spikekit view``: a recording as a sheet of pictures."""
+"""``spikekit view``: draw an overview of a recording."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from spikekit.io.whole_file import whole_file
 from spikekit.recording import Recording, white_rate
 from spikekit.standard_output import say
 
-#: Frames on each side of the one in the middle that are looked at.
+#: Frames shown on each side of the middle one.
 REACH = 200
 
 _WINDOW = 41
-_FEW, _ENOUGH = 4, 8  # spikes of a pixel in a window: below the one there is a hint at a window of the other
+_FEW, _ENOUGH = 4, 8  # spikes per pixel in a window: with fewer than _FEW, suggest a window that has _ENOUGH
 
 
 def run(args: argparse.Namespace) -> None:
-    """Draw a sheet about one moment of a recording.
+    """Draw an overview of one moment of a recording.
 
-    It shows decoded pictures, spikes over time, how often pixels fire, and what moves. Only the frames that are shown
-    are read. For pictures over time, see spikekit decode.
+    It shows decoded pictures, spikes over time, a histogram of the spike rate, and motion. Only these frames are read.
+    For pictures over time, see spikekit decode.
 
-    Size, Bayer phase and brightness can be omitted if a side-car or --camera gives them.
+    Size, Bayer phase and brightness may be omitted if a side-car or --camera gives them.
     """
     shown = recordings.opened(args)
     begin, end = _span(args.frames, shown)
@@ -47,17 +47,17 @@ def run(args: argparse.Namespace) -> None:
     data = moment.sheet()
     with whole_file(args.output) as file:
         file.write(data)
-    white = f"alpha {moment.alpha:g} is white" if moment.alpha else f"{moment.white:.3g} spikes a frame are white"
+    white = f"white: alpha {moment.alpha:g}" if moment.alpha else f"white: {moment.white:.3g} spikes per frame"
     say(f"{args.output}: frames {begin} .. {end - 1} of {shown.frames}, {white}{shown.said}")
     if moment.hint and not args.window:
         print(moment.hint)
 
 
 class Moment:
-    """Frames of a recording, from ``begin`` to before ``end``, and what can be seen around the one in their middle.
+    """Views around the middle of the frames ``begin`` .. ``end - 1`` of a recording.
 
-    ``window`` is how many frames TFP averages, ``alpha`` the light of a white pixel, where it is known, ``row`` the one
-    whose spikes are drawn, the middle one when not given.
+    ``window`` is that of TFP in frames, ``alpha`` the light of a white pixel if known, ``row`` the row whose spikes are
+    drawn (default: the middle one).
     """
 
     def __init__(
@@ -70,15 +70,15 @@ class Moment:
         first = max(near.start, frame - min(window, end - begin) // 2)
         self.averaged = range(first, min(first + window, near.stop))
         self._planes = list(recording.packed(near.start, len(near)))
-        self.rates = self._rate(near)  # spikes a frame of every pixel
+        self.rates = self._rate(near)  # (H, W), spikes per frame
         self.white = alpha or white_rate(recording.correct(self.rates))
         share = self.rates.mean().item()
         self.hint = ""
         if 0 < window * share < _FEW and window < end - begin:
             longer = min(2 * math.ceil(_ENOUGH / (2 * share)) + 1, end - begin)
             self.hint = (
-                f"{share:.1%} of the bits are set, {window * share:.1f} spikes of a pixel in {window} frames: "
-                f"--window {longer} shows less noise, and more blur where something moves"
+                f"{share:.1%} of the bits are set, {window * share:.1f} spikes per pixel in {window} frames: "
+                f"--window {longer} shows less noise, but more motion blur"
             )
 
     def _plane(self, n: int) -> np.ndarray:
@@ -89,27 +89,27 @@ class Moment:
         return torch.from_numpy(total / np.float32(len(frames)))
 
     def picture(self, raw: Tensor) -> Tensor:
-        """Return raw light as it is shown, (3, H, W) or (H, W)."""
+        """Return ``raw`` corrected, demosaiced and scaled for display, (3, H, W) or (H, W)."""
         light, pattern = self.recording.correct(raw) / self.white, self.recording.bayer
         colour = demosaic(light, pattern) if pattern and min(light.shape) >= 3 else light
         return self.recording.show(colour, known=self.alpha is not None)
 
     def tfp(self) -> Tensor:
-        """The picture of the middle by TFP."""
+        """Return the TFP picture of the middle frame."""
         return self.picture(self._rate(self.averaged))
 
     def tfi(self) -> Tensor:
-        """The picture of the middle by TFI."""
+        """Return the TFI picture of the middle frame."""
         return self.picture(torch.from_numpy(search(self._plane, self.frame, self.near)).float().reciprocal())
 
     def raster(self) -> Tensor:
-        """The spikes of one row of pixels, (W, T)."""
-        spikes = np.stack([self._plane(n)[self.row].copy() for n in self.near])  # a view would hold its frame
+        """Return the spikes of one row of pixels, (W, T)."""
+        spikes = np.stack([self._plane(n)[self.row].copy() for n in self.near])  # a view would keep the whole frame
         return torch.from_numpy(spikes).T
 
     def motion(self) -> tuple[Tensor, float, float] | None:
-        """Motion from a window before the middle to one after it: colours, longest displacement, time between."""
-        # so many frames that a cell of four pixels has a dozen spikes, or what moves is noise
+        """Return colours, largest displacement and time of the motion from a window before the middle to one after."""
+        # a cell of four pixels needs about a dozen spikes per window, else noise is taken for motion
         enough = math.ceil(3 / max(self.rates.mean().item(), 1e-6))
         length = min(max(_WINDOW // 2, enough), len(self.near) // 2)
         height, width = (side // 2 * 2 for side in self.recording.size)
@@ -118,7 +118,7 @@ class Moment:
         from skimage.filters import gaussian
         from skimage.registration import optical_flow_ilk
 
-        # whole cells of the mosaic, so that colours do not matter, and less noise
+        # average Bayer cells: no mosaic pattern, and less noise
         frame = self.frame
         rates = (self._rate(range(frame - length, frame)), self._rate(range(frame, frame + length)))
         cells = [
@@ -131,7 +131,7 @@ class Moment:
         return flow_to_rgb(flow, longest), longest, length
 
     def sheet(self) -> bytes:
-        """Everything about the middle, as the bytes of a PNG file."""
+        """Return all views as the bytes of a PNG file."""
         from matplotlib.figure import Figure
 
         figure = Figure((16, 9), layout="constrained")
@@ -144,7 +144,7 @@ class Moment:
         ]
         if moves := self.motion():
             colours, longest, frames = moves
-            pictures.append((f"motion in {frames} frames, red to the right, full colour {longest:.1f} pixels", colours))
+            pictures.append((f"motion in {frames} frames, red = right, full colour = {longest:.1f} pixels", colours))
         for place, (title, picture) in zip(axes.flat, pictures, strict=False):
             place.imshow((picture.movedim(0, -1) if picture.ndim == 3 else picture).numpy(), "gray", vmin=0, vmax=1)
             place.set_title(title)
@@ -157,7 +157,7 @@ class Moment:
         axes[1, 2].hist(self.rates.flatten().numpy(), bins=min(len(self.near), 80))
         axes[1, 2].set(
             title=f"mean {self.rates.mean():.3f}, {silent:.1%} of the pixels silent",
-            xlabel="spikes a frame",
+            xlabel="spikes per frame",
             ylabel="pixels",
         )
         file = io.BytesIO()
@@ -181,10 +181,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     recordings.add_arguments(parser)
     add = parser.add_argument
     output = ending_in(".png", said="a file that ends in .png")
-    add("-o", "--output", required=True, type=output, metavar="OUT.png", help="the sheet to write")
-    add(
-        "--alpha", type=positive, metavar="A", help="gain of a simulated recording: a white pixel fires A times a frame"
-    )
-    add("--frames", metavar="A:B", help="which frames to show, from A to B - 1; all if not given")
-    add("--window", type=whole(1), metavar="W", help=f"frames that tfp averages; {_WINDOW} if not given")
-    add("--row", type=whole(0), metavar="Y", help="row of pixels whose spikes are drawn; the middle one if not given")
+    add("-o", "--output", required=True, type=output, metavar="OUT.png", help="picture to write")
+    add("--alpha", type=positive, metavar="A", help="spikes per frame of a white pixel; default: that of the side-car")
+    add("--frames", metavar="A:B", help="frames A to B - 1 are shown; default: all")
+    add("--window", type=whole(1), metavar="W", help=f"window of tfp in frames; default: {_WINDOW}")
+    add("--row", type=whole(0), metavar="Y", help="row of pixels whose spikes are drawn; default: the middle one")

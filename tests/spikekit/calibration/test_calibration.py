@@ -78,7 +78,7 @@ def test_one_recording_alone(truth):
 
 
 @pytest.mark.parametrize(
-    ("light", "said"), [(1.0, "not saturated"), (0.0, "brighter than the dark one")], ids=["white", "black"]
+    ("light", "said"), [(1.0, "without saturation"), (0.0, "brighter than the dark one")], ids=["white", "black"]
 )
 def test_a_flat_recording_of_the_wrong_brightness(light, said):
     flat = SpikeSensor().expose(torch.full((200, 4, 4), light))
@@ -180,7 +180,7 @@ def test_values_that_make_no_sense(changed, said):
 
 
 def test_no_pixel_of_a_colour_works():
-    with pytest.raises(ValueError, match="pixels of every colour that work"):
+    with pytest.raises(ValueError, match="working pixels of every colour"):
         Calibration(*torch.ones(2, 2, 2), torch.eye(2).byte()).correct(torch.ones(2, 2), "RGGB")
 
 

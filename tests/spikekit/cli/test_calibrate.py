@@ -50,14 +50,14 @@ def measured():
 def test_it_lies_beside_the_recording_and_is_told(capsys, truth):
     measured()
     said = capsys.readouterr().out
-    assert "gain         9." in said
-    assert "dark rate    0.01 spikes a frame" in said
+    assert "gain         SD 9." in said
+    assert "dark rate    0.01 spikes per frame" in said
     assert "dead         1 of 768 pixels\nhot          1 of 768 pixels" in said
     assert "scene.calibration.safetensors: flat 300 frames, dark 500 frames" in said
     stored = read_calibration(f"scene{ENDING}")
     assert stored.flip().defects.equal(truth.defects), "rows as they are stored"
     assert main(["info", "scene.dat", "--height", "24", "--width", "32"]) == 0
-    assert "calibration  gains 9." in capsys.readouterr().out
+    assert "calibration  gain SD 9." in capsys.readouterr().out
     for flip in (False, True):
         wall = open_recording("wall.dat", height=24, width=32, flip=flip, calibration=f"scene{ENDING}")
         assert wall.calibration.defects.equal(truth.defects if flip else truth.defects.flip(0))
@@ -83,7 +83,7 @@ def test_pictures_are_corrected(command, capsys):
 def test_a_scene_alone_tells_defects(capsys, truth):
     assert main(["calibrate", "scene.dat", *HOW, "-o", "alone.safetensors"]) == 0
     assert read_calibration("alone.safetensors").flip().defects.equal(truth.defects)
-    assert "gain         not measured in 300 frames: too little moves, or gains are" in capsys.readouterr().out
+    assert "gain         not measured in 300 frames: too little motion, or gains are" in capsys.readouterr().out
 
 
 def test_a_scene_in_motion_tells_gains(capsys, truth):
@@ -96,7 +96,7 @@ def test_a_scene_in_motion_tells_gains(capsys, truth):
     sensor = SpikeSensor(SensorNoise(calibration=truth))
     write("moving.dat", sensor.expose(light.movedim(-1, 0)), flip=True)
     assert main(["calibrate", "moving.dat", *HOW]) == 0
-    assert re.search(r"^gain +\d\.\d+% apart, each known to \d\.\d+%$", capsys.readouterr().out, re.MULTILINE)
+    assert re.search(r"^gain +SD \d\.\d+%, error \d\.\d+%$", capsys.readouterr().out, re.MULTILINE)
     found, works = read_calibration(f"moving{ENDING}").flip(), truth.defects == 0
     assert found.defects.equal(truth.defects)
     assert torch.corrcoef(torch.stack([found.gain[works], truth.gain[works]]))[0, 1] > 0.8
@@ -108,9 +108,9 @@ def test_a_scene_in_motion_tells_gains(capsys, truth):
         (["scene.dat", *HOW, "--flat", "cap.dat", "--dark", "wall.dat"], 1, "cap.dat: expected a flat recording"),
         (["scene.dat", *HOW, "--flat", "none.dat"], 1, "none.dat: no such file"),
         (["scene.dat", *HOW, "-o", "a.npz"], 2, "--output: expected a name that ends in .safetensors, got a.npz"),
-        (["scene.dat", *HOW, "-o", "weights.safetensors"], 1, "weights.safetensors: would be lost, and is not a cal"),
-        (["short.npz"], 1, "short.npz: expected at least 100 frames to count, got 50"),
-        (["wide.npz", "--flat", "short.npz"], 1, "short.npz: expected 8 x 10 pixels as wide.npz has them, got 8 x 8"),
+        (["scene.dat", *HOW, "-o", "weights.safetensors"], 1, "weights.safetensors: exists and is not a calibration"),
+        (["short.npz"], 1, "short.npz: expected at least 100 frames, got 50"),
+        (["wide.npz", "--flat", "short.npz"], 1, "short.npz: expected 8 x 10 pixels, the size of wide.npz, got 8 x 8"),
     ],
 )
 def test_what_is_wrong_is_said_in_a_line(args, status, said, fails):
@@ -135,7 +135,7 @@ KIND = {"kind": "spikekit calibration 1"}
     ("tensors", "metadata", "said"),
     [
         (planes(), None, "expected spikekit calibration 1, got None"),
-        (planes((24, 30)), KIND, "expected 24 x 32 pixels as scene.dat has them, got 24 x 30"),
+        (planes((24, 30)), KIND, "expected 24 x 32 pixels, the size of scene.dat, got 24 x 30"),
         (planes((768,)), KIND, "expected (H, W) of at most"),
         (planes(dark=torch.zeros(3)), KIND, "expected gain, dark and defects of one size"),
         (planes(defects=torch.full(SIZE, 9, dtype=torch.uint8)), KIND, "defects: expected 0 to 2, got 9"),

@@ -52,8 +52,8 @@ def test_info(clip, capsys):
         "size         12 x 20 (H x W), 1800 bytes",
         "frames       60, 3 ms at 20 kHz",
         f"bits set     {read_spikes(clip, 12, 20).sum()} of 14400, ",
-        "darkest      0.0000 spikes a frame, at row 0, column 0",
-        "brightest    0.5000 spikes a frame, at row ",
+        "darkest      0.0000 spikes per frame, at row 0, column 0",
+        "brightest    0.5000 spikes per frame, at row ",
         "never fire   1 of 240 pixels, 0.42%",
         "always fire  0 of 240 pixels, 0.00%",
     ):

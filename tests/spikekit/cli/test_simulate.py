@@ -240,7 +240,7 @@ def test_nothing_of_others_is_replaced(film, fails):
         (("film/f1.png", "-o", "film/f1.dat"), "would replace the source"),
         ((film, "-o", "a.npz"), "a.npz: its side-car, a.json, would replace that of a.dat"),
         ((film, "-o", "b.dat"), "b.json: not a side-car that can be read"),
-        ((film, "-o", "c.dat"), "c.dat: expected a stream to write, got a folder"),
+        ((film, "-o", "c.dat"), "c.dat: expected a file, got a folder"),
         ((film, "-o", "d.dat"), "d.png: would be lost"),
         ((film, "-o", "e.dat", "--all"), "e: expected a folder of its own"),
     ):
