@@ -18,36 +18,35 @@ from spikekit.io.failures import no_pipe
 
 _PRESETS = files("spikekit.io") / "camera_presets"
 
-#: The names that :func:`camera` knows.
+#: Names of the presets of :func:`camera`.
 CAMERAS = tuple(sorted(preset.name[: -len(".json")] for preset in _PRESETS.iterdir() if preset.name.endswith(".json")))
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A kind of spike camera: what is needed to read its recordings and show its pictures.
+    """File layout, Bayer phase and display of a type of spike camera.
 
     Convention:
-        A recording goes through :meth:`prepare` in this order: columns that are no pixels are dropped, frames that are
-        stored upside down are turned, the border is cropped. ``pattern`` is the Bayer phase between the last two, and
-        ``prepared_pattern`` that of what comes out.
+        :meth:`prepare` drops the columns that are not pixels, flips frames that are stored upside down, and crops the
+        border, in this order. ``pattern`` is the Bayer phase after the flip, ``prepared_pattern`` that after the crop.
 
     Args:
-        name: what it is called.
-        title: what it is.
-        height: rows.
-        width: columns, without those that are dropped.
-        drop: columns of a raw stream that are no pixels, as (first, last + 1), in order.
-        rate: clocks a second.
-        flip: whether frames are stored upside down.
+        name: short name.
+        title: description.
+        height: rows of a frame.
+        width: columns of a frame, without dropped ones.
+        drop: stored columns that are not pixels, as pairs (first, last + 1) in increasing order.
+        rate: clocks per second.
+        flip: frames are stored upside down.
         pattern: Bayer phase of upright frames; ``None`` for a grey camera.
         crop: rows and columns to cut off: (top, bottom, left, right).
-        gain: what a picture is multiplied by when it is shown.
-        gamma: what its values are then encoded with.
-        source: where all this is known from.
+        gain: factor that pictures are multiplied by for display.
+        gamma: gamma of the display encoding.
+        source: origin of these values.
 
     Raises:
-        TypeError: a text, a number or a flip that is none.
-        ValueError: another value that makes no sense; the message names it.
+        TypeError: a value has the wrong type.
+        ValueError: a value is out of range; the message names it.
     """
 
     name: str
@@ -86,18 +85,18 @@ class Camera:
 
     @property
     def _edges(self) -> tuple[int, ...]:
-        """Where, in a raw stream, columns that are pixels begin and end, in turn."""
+        """Starts and ends, in turn, of the stored columns that are pixels."""
         return (0, *(edge for part in self.drop for edge in part), self.stored_width)
 
     @property
     def prepared_size(self) -> tuple[int, int]:
-        """(H, W) of what :meth:`prepare` gives."""
+        """(H, W) of the frames that :meth:`prepare` returns."""
         top, bottom, left, right = self.crop
         return self.height - top - bottom, self.width - left - right
 
     @property
     def prepared_pattern(self) -> str | None:
-        """Bayer phase of what :meth:`prepare` gives; ``None`` for a grey camera."""
+        """Bayer phase of the frames that :meth:`prepare` returns; ``None`` for a grey camera."""
         if self.pattern is None:
             return None
         pattern = bayer_pattern(self.pattern)
@@ -105,24 +104,24 @@ class Camera:
         return "".join(pattern[2 * ((top + y) % 2) + (left + x) % 2] for y in (0, 1) for x in (0, 1))
 
     def prepare(self, spikes: Tensor, *, flip: bool | None = None) -> Tensor:
-        """Turn stored frames into what the camera saw: only pixels, upright, without the border.
+        """Convert stored frames to upright frames without border and without columns that are not pixels.
 
         Args:
-            spikes: frames :math:`(*, H, W)` as they are stored, with or without the columns that are no pixels.
-            flip: turn them upside down; as the camera needs it when not given. ``False`` where reading has done it.
+            spikes: stored frames :math:`(*, H, W)`, with or without the columns that are not pixels.
+            flip: flip the rows; default: :attr:`flip` of the camera. Use ``False`` for frames that are upright already.
 
         Returns:
             Frames :math:`(*, H', W')` of :attr:`prepared_size`, in the dtype of ``spikes``.
 
         Raises:
             TypeError: ``spikes`` is not a tensor of real numbers.
-            ValueError: frames of another size.
+            ValueError: the frames have another size.
         """
         check_planes("spikes", spikes, 2, "(*, H, W)")
         height, width = spikes.shape[-2:]
         if height != self.height or width not in (self.width, self.stored_width):
             widths = " or ".join(str(w) for w in dict.fromkeys((self.width, self.stored_width)))
-            expected = f"{self.height} x {widths} of the camera {self.name}"
+            expected = f"{self.height} x {widths}, the size of the camera {self.name}"
             raise ValueError(f"spikes: expected {expected}, got {height} x {width}")
         if width != self.width:
             kept = [spikes[..., a:b] for a, b in zip(self._edges[::2], self._edges[1::2], strict=True)]
@@ -133,15 +132,15 @@ class Camera:
         return spikes[..., top : self.height - bottom, left : self.width - right]
 
     def display(self, picture: Tensor) -> Tensor:
-        r"""Return a picture as it is shown.
+        r"""Apply the gain and gamma of the camera to a picture.
 
         .. math:: \operatorname{clip}(\text{gain} \cdot I, 0, 1)^{1 / \text{gamma}}
 
         Args:
-            picture: light of a decoder or a network, white being 1; any shape, floating.
+            picture: light from a decoder or network, floating, any shape; white is 1.
 
         Returns:
-            The same shape, in [0, 1].
+            The picture for display, of the same shape, in [0, 1].
 
         Raises:
             TypeError: ``picture`` is not a floating-point tensor.
@@ -151,16 +150,16 @@ class Camera:
 
 
 def camera(name: str | Path) -> Camera:
-    """Load a camera: one of :data:`CAMERAS` by its name, or another from a file of the same form.
+    """Load one of :data:`CAMERAS` by name, or a camera from a JSON file of the same form.
 
     Args:
-        name: a name, or a path that ends in ``.json``.
+        name: name of a preset, or a path that ends in ``.json``.
 
     Returns:
         The camera.
 
     Raises:
-        ValueError: an unknown name, or a file that cannot be read or does not describe a camera.
+        ValueError: the name is unknown, or the file cannot be read or does not describe a camera.
 
     Example:
         >>> CAMERAS
@@ -191,7 +190,7 @@ def camera(name: str | Path) -> Camera:
 
 @cache
 def usual_sizes() -> dict[tuple[int, int], list[Camera]]:
-    """Return the cameras of :data:`CAMERAS` by (height, width) of their frames as they are stored."""
+    """Return the cameras of :data:`CAMERAS` by the (height, width) of their stored frames."""
     sizes: dict[tuple[int, int], list[Camera]] = {}
     for known in map(camera, CAMERAS):
         for width in dict.fromkeys((known.width, known.stored_width)):
@@ -204,7 +203,7 @@ def _frozen(value: object) -> object:
 
 
 def _are_places(values: object, count: int) -> bool:
-    """Whether these are as many whole numbers, 0 or more."""
+    """Return whether ``values`` is a tuple of ``count`` whole numbers >= 0."""
     return (
         isinstance(values, tuple)
         and len(values) == count

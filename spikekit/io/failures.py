@@ -1,4 +1,4 @@
-"""Errors with files, as one line that names the file."""
+"""File errors as one line that names the file."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from spikekit.arguments import one_line
 
 
 def no_pipe(path: str | Path) -> Path:
-    """Return the path of what is to be read; raise OSError of a pipe or a device, which would be waited for."""
+    """Return the path of a file to read; raise OSError for a pipe or a device, which could block."""
     try:
         mode = os.stat(path).st_mode
-    except (OSError, ValueError):  # whoever reads it says so
+    except (OSError, ValueError):  # reading it will raise
         return Path(path)
     if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
-        raise OSError(errno.EINVAL, "a pipe or a device, expected a file", str(path))
+        raise OSError(errno.EINVAL, "expected a file, got a pipe or a device", str(path))
     return Path(path)
 
 
 @contextmanager
 def reading(path: str | Path, kind: type[ValueError], what: str = "", otherwise: str = "{}") -> Iterator[None]:
-    """Turn any error while reading a file, or ``what`` of it, into one line; one of its kind passes as it is.
+    """Convert any error while reading a file, or its part ``what``, to a one-line ``kind``; errors of ``kind`` pass.
 
     Example:
         >>> with reading("clip.npz", ValueError, otherwise="damaged ({})"):
@@ -37,8 +37,8 @@ def reading(path: str | Path, kind: type[ValueError], what: str = "", otherwise:
         yield
     except kind:
         raise
-    except MemoryError as error:  # also what PyAV says of damaged sizes
-        raise kind(f"{path}: {what}takes more memory than there is") from error
+    except MemoryError as error:  # PyAV raises it for damaged sizes, too
+        raise kind(f"{path}: {what}does not fit into memory") from error
     except Exception as error:
         said = one_line(error).removeprefix(f"{path}: ")[:300]
         form = "cannot be read ({})" if isinstance(error, OSError) else otherwise

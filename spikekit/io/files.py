@@ -29,10 +29,10 @@ from spikekit.io.formats import (
 from spikekit.io.images import MOST_PIXELS
 from spikekit.io.whole_file import whole_file
 
-#: Endings of recordings.
+#: Endings of recording files.
 RECORDING_ENDINGS = (".dat", ".npy", ".npz")
 
-# Pixels that are written at a time, so that a tensor of any dtype needs no copy of itself as bits.
+# Pixels per write, which bounds the memory of the conversion to bits.
 _BLOCK = 1 << 22
 
 
@@ -49,31 +49,30 @@ def read_spikes(
     """Read a recording, or some frames of it.
 
     Convention:
-        ``.dat`` has no header: frame after frame, row by row, 8 neighbouring pixels a byte, the leftmost in the least
-        significant bit. Where 8 does not divide H x W, every frame is padded to whole bytes. ``.npy`` holds one array
-        (T, H, W) of zeros and ones, ``.npz`` one named ``spk`` or ``spikes``, or else its only 3-D array. One in
-        Fortran order is read whole, whatever part is asked for.
+        ``.dat`` has no header. It stores frame after frame, row by row, 8 neighbouring pixels per byte, the leftmost in
+        the least significant bit. Frames are padded to whole bytes if 8 does not divide H x W. ``.npy`` holds one array
+        (T, H, W) of zeros and ones; ``.npz`` one named ``spk`` or ``spikes``, or else its only 3-D array.
 
-        Real cameras store frames upside down, which no format records: ``flip`` turns them. Pixel (0, 0) of the
-        result is then the top left of the scene, and the Bayer phase counts from there.
+        Real cameras store frames upside down, which no format records. ``flip`` turns them, so that pixel (0, 0) of
+        the result is the top left of the scene, where the Bayer phase starts.
 
-        Of a ``.dat``, only the bytes of the frames asked for are read.
+        Only the requested frames of a ``.dat`` are read; an array in Fortran order is always read whole.
 
     Args:
         path: a file ending in ``.dat``, ``.npy`` or ``.npz``.
-        height: rows; needed for ``.dat``, checked against the file for the others.
-        width: columns; likewise.
+        height: rows of a frame; required for ``.dat``, compared with the file for other formats.
+        width: columns of a frame; required in the same cases.
         flip: turn the stored frames upside down.
         start: the first frame to read.
-        frames: how many; up to the end when not given.
-        packed: leave 8 pixels in a byte, as :func:`spikekit.pack_spikes` would make of the result.
+        frames: number of frames; default: up to the end.
+        packed: keep 8 pixels per byte, in the layout of :func:`spikekit.pack_spikes`.
 
     Returns:
-        ``spikes`` of shape (T, H, W), uint8, zeros and ones; (T, H, ceil(W / 8)) where packed.
+        ``spikes`` of shape (T, H, W), uint8, zeros and ones; (T, H, ceil(W / 8)) if ``packed``.
 
     Raises:
-        SpikeFileError: no such file, not a recording, damaged, truncated, of another size, or without these frames.
-        TypeError: a size or a number of frames that is not a whole number.
+        SpikeFileError: the file is missing, not a recording, damaged, truncated, of another size, or too short.
+        TypeError: a size or a number of frames is not a whole number.
 
     Example:
         >>> import tempfile
@@ -98,30 +97,30 @@ def iter_spikes(
     chunk: int | None = None,
     packed: bool = False,
 ) -> Iterator[Tensor]:
-    """Read a recording frame by frame, or a chunk of frames at a time, if it does not fit in memory.
+    """Read a recording frame by frame, or in chunks of frames, in bounded memory.
 
     Convention:
-        Formats and arguments as in :func:`read_spikes`. Whatever can be checked without reading the frames is checked
-        at the call, not at the first frame.
+        Formats as in :func:`read_spikes`. Everything except the frames themselves is checked at the call, not at the
+        first frame.
 
     Args:
         path: a file ending in ``.dat``, ``.npy`` or ``.npz``.
-        height: rows; needed for ``.dat``, checked against the file for the others.
-        width: columns; likewise.
+        height: rows of a frame; required for ``.dat``, compared with the file for other formats.
+        width: columns of a frame; required in the same cases.
         flip: turn the stored frames upside down.
         start: the first frame to read.
-        frames: how many; up to the end when not given.
-        chunk: frames in a chunk; the last one may be shorter. Single frames when not given.
-        packed: leave 8 pixels in a byte, as :func:`spikekit.pack_spikes` would make of the result.
+        frames: number of frames; default: up to the end.
+        chunk: frames per chunk; the last one may be shorter. Default: single frames.
+        packed: keep 8 pixels per byte, in the layout of :func:`spikekit.pack_spikes`.
 
     Returns:
-        An iterator over frames (H, W) or chunks (chunk, H, W), uint8, zeros and ones; over (H, ceil(W / 8)) or
-        (chunk, H, ceil(W / 8)) where packed.
+        An iterator over frames (H, W) or chunks (chunk, H, W), uint8, zeros and ones; if ``packed``, over
+        (H, ceil(W / 8)) or (chunk, H, ceil(W / 8)).
 
     Raises:
         SpikeFileError: as :func:`read_spikes`.
         TypeError: as :func:`read_spikes`.
-        ValueError: a chunk that is not a whole number of frames, 1 or more.
+        ValueError: ``chunk`` is not a whole number >= 1.
 
     Example:
         >>> import tempfile
@@ -141,11 +140,11 @@ def spikes_shape(path: str | Path, height: int | None = None, width: int | None 
 
     Args:
         path: a file ending in ``.dat``, ``.npy`` or ``.npz``.
-        height: rows; needed for ``.dat``, checked against the file for the others.
-        width: columns; likewise.
+        height: rows of a frame; required for ``.dat``, compared with the file for other formats.
+        width: columns of a frame; required in the same cases.
 
     Returns:
-        Frames, rows and columns.
+        Numbers of frames, rows and columns.
 
     Raises:
         SpikeFileError: as :func:`read_spikes`.
@@ -168,36 +167,36 @@ def spikes_shape(path: str | Path, height: int | None = None, width: int | None 
             raise SpikeFileError(f"{path}: no such file")
         size = path.stat().st_size
     if size == 0:
-        raise SpikeFileError(f"{path}: an empty file, 0 bytes")
+        raise SpikeFileError(f"{path}: empty file")
     shape = dat_shape(path, size, height, width) if _check_suffix(path) == ".dat" else array_shape(path, height, width)
-    if shape[1] * shape[2] > MOST_PIXELS:  # what is packed well takes little of a disk, and all memory
+    if shape[1] * shape[2] > MOST_PIXELS:  # a small compressed file could fill the memory
         raise SpikeFileError(f"{path}: expected frames of at most {MOST_PIXELS} pixels, got {shape[1]} x {shape[2]}")
     return shape
 
 
 def write_spikes(path: str | Path, spikes: Tensor | Iterable[Tensor], *, flip: bool = False) -> None:
-    """Write a recording; the folder is made when it is missing.
+    """Write a recording, and create its folder if needed.
 
     Convention:
         Formats as in :func:`read_spikes`; the array of an ``.npz`` is called ``spk``. The file appears under its name
-        once it is complete, so a run that is killed leaves no half recording.
+        when it is complete, so an interrupted run leaves no partial recording.
 
-        A recording that does not fit in memory can be passed in chunks of any lengths; one chunk is held at a time. A
-        NumPy file stores its length before its frames, so they are kept on disk, packed, until the last has arrived.
+        A recording that does not fit in memory can be passed in chunks of any length; one chunk is held at a time. A
+        NumPy file stores its length before its frames, so packed frames are buffered on disk until the last one.
 
     Args:
-        path: where to, ending in ``.dat``, ``.npy`` or ``.npz``.
-        spikes: (T, H, W), zeros and ones, any real dtype; or an iterable of such chunks, or of frames (H, W).
+        path: the file to write, ending in ``.dat``, ``.npy`` or ``.npz``.
+        spikes: (T, H, W), zeros and ones, any real dtype; or an iterable of such chunks or of frames (H, W).
         flip: store the frames upside down, as real cameras do.
 
     Raises:
-        SpikeFileError: another ending.
-        OSError: the file cannot be written; what was there before, or nothing, is then there.
-        TypeError: ``spikes`` is not a tensor of real numbers, nor an iterable of such.
-        ValueError: another shape, an empty clip, frames of several sizes, or values other than 0 and 1.
+        SpikeFileError: the name has another ending.
+        OSError: the file cannot be written; an existing file is kept.
+        TypeError: ``spikes`` is neither a tensor of real numbers nor an iterable of such tensors.
+        ValueError: ``spikes`` has another shape, is empty, has frames of several sizes, or values other than 0 and 1.
 
     Example:
-        The sensor, for as long as the light lasts:
+        Write a simulated recording chunk by chunk:
 
         >>> import tempfile
         >>> from spikekit import spike_integrate_fire
@@ -217,7 +216,7 @@ def write_spikes(path: str | Path, spikes: Tensor | Iterable[Tensor], *, flip: b
         if suffix == ".dat":
             _write_bits(file, spikes, flip)
             return
-        # the header of an array says how many frames there are
+        # the header of an array holds the number of frames
         with tempfile.TemporaryFile(dir=path.parent) as bits:
             frames, height, width = _write_bits(bits, spikes, flip)
             stored = stored_blocks(bits, Wanted(path, height, width, 0, frames, 1))
@@ -225,7 +224,7 @@ def write_spikes(path: str | Path, spikes: Tensor | Iterable[Tensor], *, flip: b
 
 
 def _write_bits(file: IO[bytes], spikes: Tensor | Iterable[Tensor], flip: bool) -> tuple[int, int, int]:
-    """Write packed frames to a file; return (T, H, W)."""
+    """Write frames in the layout of a ``.dat``; return (T, H, W)."""
     written = 0
     for chunk in _chunks(spikes):
         height, width = chunk.shape[1:]
@@ -239,7 +238,7 @@ def _write_bits(file: IO[bytes], spikes: Tensor | Iterable[Tensor], flip: bool) 
 
 
 def _chunks(spikes: Tensor | Iterable[Tensor]) -> Iterator[Tensor]:
-    """Give (T, H, W) after (T, H, W), of one size; raise for anything else, and where there is nothing."""
+    """Yield checked chunks (T, H, W) of one frame size; raise if there are none."""
     if isinstance(spikes, Tensor):
         check_planes("spikes", spikes, 3, "(T, H, W)")
         spikes = [spikes]
@@ -268,7 +267,7 @@ def _open(
     chunk: int | None,
     packed: bool,
 ) -> Iterator[np.ndarray]:
-    """Check everything but the frames themselves; return them, ``chunk`` at a time or all at once."""
+    """Check everything except the frames themselves; return an iterator over blocks of ``chunk`` or all frames."""
     path = home_path(path)
     total, height, width = spikes_shape(path, height, width)
     start = check_index("start", start)

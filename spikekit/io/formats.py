@@ -1,4 +1,4 @@
-"""The bytes of recordings: the field's packed ``.dat`` and NumPy's ``.npy`` and ``.npz``, in blocks of frames."""
+"""File formats of recordings, read and written in blocks of frames: packed ``.dat``, NumPy's ``.npy`` and ``.npz``."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from spikekit.io import failures
 from spikekit.io.cameras import usual_sizes
 from spikekit.io.quiet import quiet
 
-# What the field calls the array of a recording; without either name, the only 3-D array is taken.
+# Usual names of the array of a recording; without either, the only 3-D array is read.
 _ARRAY_NAMES = ("spk", "spikes")
 
 
-# Deflate makes at most 1,032 bytes of one.
+# Largest compression ratio of Deflate.
 _MOST_DEFLATED = 1032
 
 
 class SpikeFileError(ValueError):
-    """A recording that cannot be read, or a name that no recording has; the message is one line and names the file."""
+    """An unreadable recording or a wrong ending; the message is one line and names the file."""
 
 
 reading = partial(failures.reading, kind=SpikeFileError, otherwise="damaged ({})")
 
 
 class Wanted(NamedTuple):
-    """What to read of a file: ``frames`` from ``start`` on, ``chunk`` at a time, turned over or left packed."""
+    """A request for ``frames`` frames from ``start`` on, in blocks of ``chunk``, flipped or packed if set."""
 
     path: Path
     height: int
@@ -50,7 +50,7 @@ class Wanted(NamedTuple):
         return ((n, min(self.chunk, stop - n)) for n in range(self.start, stop, self.chunk))
 
     def assemble(self, planes: Iterable[np.ndarray], count: int) -> np.ndarray:
-        """Lay frames (H, W) of zeros and ones, as stored, behind each other."""
+        """Stack stored frames (H, W) of zeros and ones, flipped and packed as requested."""
         block = np.empty((count, self.height, -(-self.width // 8) if self.packed else self.width), np.uint8)
         for place, plane in zip(block, planes, strict=True):
             upright = plane[::-1] if self.flip else plane
@@ -83,20 +83,20 @@ def dat_shape(path: Path, size: int, height: int | None, width: int | None) -> t
     whole, rest = divmod(size, step)
     if rest:
         raise SpikeFileError(
-            f"{path}: truncated, or not {height} x {width}: {size} bytes at {step} bytes a frame make {whole} whole "
-            f"frames and {rest} bytes left over"
+            f"{path}: truncated, or not {height} x {width}: {size} bytes at {step} bytes per frame give {whole} whole "
+            f"frames and {rest} extra bytes"
         )
     return whole, height, width
 
 
 def dat_blocks(wanted: Wanted) -> Iterator[np.ndarray]:
-    """Read blocks of frames (N, H, W), uint8."""
+    """Read blocks of frames (N, H, W), uint8, from a ``.dat`` file."""
     with reading(wanted.path), open(wanted.path, "rb") as file:
         yield from stored_blocks(file, wanted)
 
 
 def stored_blocks(file: IO[bytes], wanted: Wanted) -> Iterator[np.ndarray]:
-    """Read the same from an open file."""
+    """Read blocks of frames (N, H, W), uint8, from an open ``.dat`` file."""
     path, height, width = wanted[:3]
     step = _frame_bytes(height, width)
     with reading(path):
@@ -105,11 +105,11 @@ def stored_blocks(file: IO[bytes], wanted: Wanted) -> Iterator[np.ndarray]:
             stored = np.fromfile(file, np.uint8, count * step)
             if stored.size < count * step:
                 raise SpikeFileError(f"{path}: truncated while it was read, at frame {n + stored.size // step}")
-            if width % 8:  # rows begin within a byte
+            if width % 8:  # rows may start within a byte
                 frames = stored.reshape(count, step)
                 bits = (np.unpackbits(frame, count=height * width, bitorder="little") for frame in frames)
                 yield wanted.assemble((plane.reshape(height, width) for plane in bits), count)
-            else:  # rows of bytes are turned over faster than rows of pixels
+            else:  # flipping bytes is faster than flipping pixels
                 rows = stored.reshape(count, height, width // 8)
                 rows = rows[:, ::-1].copy() if wanted.flip else rows
                 yield rows if wanted.packed else np.unpackbits(rows, axis=-1, bitorder="little")
@@ -128,7 +128,7 @@ def _frame_bytes(height: int, width: int) -> int:
 
 
 def array_shape(path: Path, height: int | None, width: int | None) -> tuple[int, int, int]:
-    """Return (T, H, W) of the recording in a file."""
+    """Return (T, H, W) of a ``.npy`` or ``.npz`` file."""
     with _array(path) as (_, shape, _, _):
         pass
     sizes = usual_sizes() if height is width is None else {(height, width)}
@@ -140,10 +140,10 @@ def array_shape(path: Path, height: int | None, width: int | None) -> tuple[int,
 
 
 def array_blocks(wanted: Wanted) -> Iterator[np.ndarray]:
-    """Read blocks of frames (N, H, W), uint8."""
+    """Read blocks of frames (N, H, W), uint8, from a ``.npy`` or ``.npz`` file."""
     path, height, width, start, frames = wanted[:5]
     with _array(path) as (stream, shape, dtype, fortran):
-        if fortran:  # no frame of which lies in one piece
+        if fortran:  # frames are not contiguous
             array = iter(np.frombuffer(stream.read(), dtype).reshape(shape, order="F")[start : start + frames])
         else:
             step = height * width * dtype.itemsize
@@ -167,7 +167,7 @@ def write_array(file: IO[bytes], ending: str, shape: tuple[int, int, int], block
 
 @contextmanager
 def _array(path: Path) -> Iterator[tuple[IO[bytes], tuple[int, int, int], np.dtype, bool]]:
-    """Open the array of a recording at its first number: the stream, shape, dtype, and whether in Fortran order."""
+    """Open the array of a recording behind its header; give the stream, shape, dtype, and whether in Fortran order."""
     with reading(path), ExitStack() as stack:
         size, name = path.stat().st_size, "the array"
         if path.suffix.lower() == ".npy":
@@ -177,7 +177,7 @@ def _array(path: Path) -> Iterator[tuple[IO[bytes], tuple[int, int, int], np.dty
             member = _member(path, archive)
             name = member.filename.removesuffix(".npy")
             if member.file_size > _MOST_DEFLATED * min(member.compress_size, size):
-                said = f"{name} claims {member.file_size} bytes of {member.compress_size}"
+                said = f"{name} claims {member.file_size} bytes in {member.compress_size}"
                 raise SpikeFileError(f"{path}: damaged, {said}")
             stream, size = stack.enter_context(archive.open(member)), member.file_size
         shape, fortran, dtype = _npy_header(stream)
@@ -186,7 +186,7 @@ def _array(path: Path) -> Iterator[tuple[IO[bytes], tuple[int, int, int], np.dty
 
 
 def _member(path: Path, archive: zipfile.ZipFile) -> zipfile.ZipInfo:
-    """Return the file of an archive that is the recording."""
+    """Return the member of an archive that holds the recording."""
     members = {
         info.filename.removesuffix(".npy"): info for info in archive.infolist() if info.filename.endswith(".npy")
     }
@@ -207,13 +207,13 @@ def _member(path: Path, archive: zipfile.ZipFile) -> zipfile.ZipInfo:
 
 
 def _check_array(path: Path, name: str, shape: tuple[int, ...], dtype: np.dtype, present: int) -> None:
-    """Raise unless an array is a recording, and its file holds as many bytes as its header promises."""
+    """Raise unless an array is a recording and as long as its header says."""
     if len(shape) != 3 or dtype.kind not in "buif":
         raise SpikeFileError(
             f"{path}: expected an array (T, H, W) of zeros and ones, got {name} {shape} of type {dtype}"
         )
     if 0 in shape:
-        raise SpikeFileError(f"{path}: an empty recording, {name} is {shape}")
+        raise SpikeFileError(f"{path}: empty recording, {name} is {shape}")
     needed = math.prod(shape) * dtype.itemsize
     if present != needed:
         raise SpikeFileError(f"{path}: truncated, {name} of {shape} takes {needed} bytes, the file holds {present}")

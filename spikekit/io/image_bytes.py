@@ -1,4 +1,4 @@
-"""Image encoding: a picture as the bytes of its file."""
+"""Image encoding to bytes."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from spikekit.io.quiet import quiet
 
 
 class PictureError(ValueError):
-    """A picture that cannot be read or written; the message is one line and names the file."""
+    """An unreadable picture; the message is one line and names the file."""
 
 
 def to_bytes(image: Tensor, bits: int = 8) -> Tensor:
     """Round an image (*, 3, H, W) or (H, W) in [0, 1] to 8 or 16 bits: (*, H, W, 3) or (H, W).
 
-    Values are clamped, NaN is black. An image that has 8 bits already keeps them.
+    Values are clamped, NaN is black. A uint8 image is not scaled.
     """
     pixels = image.detach().cpu()
     if pixels.dtype != torch.uint8:
@@ -33,7 +33,7 @@ def to_bytes(image: Tensor, bits: int = 8) -> Tensor:
 
 
 def png_bytes(image: Tensor, notes: Mapping[str, str] | None = None) -> bytes:
-    """Return the PNG file of an image, (3, H, W) or (H, W), of 8 bits; ASCII notes stand in front of the pixels."""
+    """Return an image (3, H, W) or (H, W) as an 8-bit PNG file, with ASCII notes before the pixels."""
     from PIL.PngImagePlugin import PngInfo
 
     said = PngInfo()
@@ -43,30 +43,30 @@ def png_bytes(image: Tensor, notes: Mapping[str, str] | None = None) -> bytes:
 
 
 def png_pixels(path: str | Path) -> Tensor:
-    """Return the pixels of a PNG file of 8 bits, (3, H, W), uint8: a quarter of the memory of a picture."""
+    """Return the pixels of an 8-bit PNG file, (3, H, W), uint8."""
     from PIL import Image
 
     try:
         with quiet(), Image.open(path, formats=["PNG"]) as picture:
             return torch.from_numpy(np.array(picture.convert("RGB"))).movedim(-1, 0)
     except Exception as error:
-        raise PictureError(f"{path}: not a picture that can be read ({one_line(error)})") from error
+        raise PictureError(f"{path}: not a readable picture ({one_line(error)})") from error
 
 
 def picture_bytes(image: Tensor, ending: str, *, bits: int = 8, quality: int | None = None) -> bytes:
-    """Return the file of an image in the format that an ending names, as :func:`spikekit.write_picture` takes it."""
+    """Return the bytes of an image file in the format of ``ending``; see :func:`spikekit.write_picture`."""
     from PIL import Image
 
     formats = {name: kind for name, kind in Image.registered_extensions().items() if kind in Image.SAVE}
     kind = formats.get(ending.lower())
     if kind is None:
-        raise ValueError(f"expected a name that ends like that of a picture, such as .png, got {ending or 'no ending'}")
+        raise ValueError(f"expected the ending of a picture, such as .png, got {ending or 'none'}")
     if bits not in (8, 16) or (bits == 16 and kind not in ("PNG", "TIFF")):
-        raise ValueError(f"bits: expected 8, or 16 in .png and .tif, got {bits} in {ending}")
+        raise ValueError(f"bits: expected 8, or 16 for .png and .tif, got {bits} for {ending}")
     if quality is not None and (kind not in ("JPEG", "WEBP") or not 1 <= quality <= 100):
-        raise ValueError(f"quality: expected 1 to 100, of .jpg and .webp, got {quality} of {ending}")
+        raise ValueError(f"quality: expected 1 to 100 for .jpg and .webp, got {quality} for {ending}")
     pixels = to_bytes(image, bits)
-    if bits == 16 and kind == "PNG" and pixels.ndim == 3:  # which Pillow does not write
+    if bits == 16 and kind == "PNG" and pixels.ndim == 3:  # Pillow cannot write it
         from kornia_rs.io import write_image_png_u16
 
         with tempfile.TemporaryDirectory() as folder:
@@ -85,9 +85,9 @@ def _pillow_bytes(pixels: Tensor, kind: str, **how: Any) -> bytes:
     from PIL import Image
 
     file = io.BytesIO()
-    # of PNG: a fifth of the time of Pillow's own level 6, for files that are 15 % longer
+    # PNG: a fifth of the time of Pillow's default level 6, for files 15 % longer
     try:
         Image.fromarray(pixels.numpy()).save(file, kind, compress_level=2, **how)
     except OSError as error:
-        raise ValueError(f"expected a picture that fits into a {kind}, got {tuple(pixels.shape[:2])}") from error
+        raise ValueError(f"expected a size that {kind} can store, got {tuple(pixels.shape[:2])}") from error
     return file.getvalue()

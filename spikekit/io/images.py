@@ -1,4 +1,4 @@
-"""Image files: read pictures, write PNG, lay out panels, colour-code flow."""
+"""Image files: read and write pictures, lay out panels, colour-code flow."""
 
 from __future__ import annotations
 
@@ -22,21 +22,20 @@ from spikekit.io.image_bytes import PictureError, picture_bytes
 from spikekit.io.quiet import quiet
 from spikekit.io.whole_file import whole_file
 
-#: Pixels of the largest picture that is read: a few bytes can claim more than there is memory.
+#: Largest number of pixels that is read; a small file could claim more than fits into memory.
 MOST_PIXELS = 1 << 27
 
-_ORIENTATION = 0x0112  # the tag of EXIF and TIFF
+_ORIENTATION = 0x0112  # tag of EXIF and TIFF
 _PNG = b"\x89PNG"
 _GREY_ALPHA_16 = (_PNG, 16, 4)
-_FARTHEST = 1e9  # the length of what is infinite
+_FARTHEST = 1e9  # stands for infinite flow, in pixels
 
 
 def read_picture(path: str | Path) -> Tensor:
-    """Read a picture file as a colour image, upright as its EXIF says.
+    """Read a picture file as a colour image, upright according to its EXIF orientation.
 
-    Grey pictures get three equal channels, 16-bit files keep their depth (but for CMYK and colour PNMs, which get 8
-    bits). Alpha is laid over white, as a page shows it; dropping it would bring up colours that nobody was meant to
-    see, and where it is opaque it changes nothing. Values stay gamma-encoded as in the file.
+    Grey pictures get three equal channels. 16-bit files keep their depth, except CMYK and colour PNM, which are read
+    with 8 bits. Transparent pixels are blended with white. Values stay gamma-encoded as in the file.
 
     Args:
         path: a PNG, JPEG, TIFF (its first page), PNM or any other file that Pillow reads.
@@ -45,8 +44,8 @@ def read_picture(path: str | Path) -> Tensor:
         ``rgb`` of shape (3, H, W), float32, in [0, 1].
 
     Raises:
-        FileNotFoundError: there is no such file.
-        PictureError: the file is not a picture that can be read, or has more than 2^27 pixels.
+        FileNotFoundError: the file does not exist.
+        PictureError: the file is not a readable picture, or has more than 2^27 pixels.
 
     Example:
         >>> import tempfile
@@ -56,7 +55,7 @@ def read_picture(path: str | Path) -> Tensor:
         torch.Size([3, 4, 6])
     """
     path = home_path(path)
-    if not path.is_file():  # nor a pipe, which would be waited for
+    if not path.is_file():  # a pipe could block
         raise FileNotFoundError(f"{path}: no such picture")
     try:
         with quiet():
@@ -66,7 +65,7 @@ def read_picture(path: str | Path) -> Tensor:
             raise ValueError(f"expected a grey or colour picture, got an array of shape {pixels.shape}")
     except Exception as error:
         said = one_line(error).removeprefix(f"{path}: ")[:300]
-        raise PictureError(f"{path}: not a picture that can be read ({said})") from error
+        raise PictureError(f"{path}: not a readable picture ({said})") from error
     colors = pixels.shape[-1] - 1 + pixels.shape[-1] % 2
     if colors < pixels.shape[-1]:
         alpha = pixels[..., colors:]
@@ -74,7 +73,7 @@ def read_picture(path: str | Path) -> Tensor:
     return torch.from_numpy(pixels.astype("float32")).permute(2, 0, 1).expand(3, -1, -1).contiguous()
 
 
-#: What turns rows and columns (H, W, C) upright, by the orientation of EXIF.
+#: Functions that turn pixels (H, W, C) upright, by EXIF orientation.
 _UPRIGHT = {
     2: np.fliplr,
     3: lambda pixels: pixels[::-1, ::-1],
@@ -87,14 +86,14 @@ _UPRIGHT = {
 
 
 def picture_size(path: str | Path) -> tuple[int, int] | None:
-    """Return (H, W) of a picture by its header alone, upright; ``None`` of what has no header that can be read."""
+    """Return (H, W) of an upright picture from its header alone; ``None`` if that cannot be read."""
     from PIL import Image
 
-    if not Path(path).is_file():  # a pipe would be waited for
+    if not Path(path).is_file():  # a pipe could block
         return None
     try:
         with quiet(), Image.open(path) as picture:
-            tiff = picture.tag_v2 if picture.format == "TIFF" else {}  # whose size some versions have turned already
+            tiff = picture.tag_v2 if picture.format == "TIFF" else {}  # some versions of Pillow have swapped its size
             width, height = tiff.get(256, picture.width), tiff.get(257, picture.height)
             return (width, height) if _orientation(picture) >= 5 else (height, width)
     except Exception:
@@ -102,16 +101,16 @@ def picture_size(path: str | Path) -> tuple[int, int] | None:
 
 
 def _orientation(picture: Any) -> int:
-    with suppress(Exception):  # what EXIF is damaged says nothing
+    with suppress(Exception):  # damaged EXIF is ignored
         return picture.getexif().get(_ORIENTATION, 1)
     return 1
 
 
 def _pixels(path: Path) -> tuple[np.ndarray, int]:
-    """Read the numbers of a file, (H, W, C), 0 to 1, not multiplied by alpha, and its orientation.
+    """Return the pixels of a file, (H, W, C), 0 to 1, with straight alpha, and its orientation.
 
-    By what the file says that it is, and by one library each: one that tries others would hand what no picture is to
-    FFmpeg, for which some files are lists of others to open.
+    The header selects a single library. A reader with fallbacks could pass a hostile file to FFmpeg, which follows
+    playlists to other files.
     """
     from kornia_rs.io import read_image_png_u16, read_image_tiff_u16
     from PIL import Image
@@ -122,7 +121,7 @@ def _pixels(path: Path) -> tuple[np.ndarray, int]:
     tiff = head[:2] in (b"II", b"MM")
     if tiff and (plain := _plain_tiff(path)) is not None:
         return plain
-    kind = (head[:4], *head[24:])  # of a PNG its bits and its kind of colour
+    kind = (head[:4], *head[24:])  # for PNG: signature, bit depth, colour type
     if kind == _GREY_ALPHA_16:
         file = io.BytesIO(_four_bytes(path.read_bytes()))
     with Image.open(file) as picture:
@@ -131,9 +130,9 @@ def _pixels(path: Path) -> tuple[np.ndarray, int]:
         bits = tags.get(258, (16,))
         if kind == _GREY_ALPHA_16:
             pixels = _unit(np.asarray(picture).view(">u2"), 16)
-        elif kind[:2] == (_PNG, 16) and kind[2] in (2, 6):  # 16 bits in colour, of which Pillow would keep 8
+        elif kind[:2] == (_PNG, 16) and kind[2] in (2, 6):  # 16-bit colour, which Pillow reduces to 8 bits
             pixels = _unit(read_image_png_u16(str(path), "rgb" if kind[2] == 2 else "rgba"), 16)
-        elif tiff and max(bits) > 8 and tags.get(262) == 2:  # likewise
+        elif tiff and max(bits) > 8 and tags.get(262) == 2:  # 16-bit RGB
             if len(bits) != 3 or tags.get(284, 1) != 1:
                 raise ValueError("expected the package imagecodecs for 16 bits in this packing and layout, got none")
             pixels = _unit(read_image_tiff_u16(str(path), "rgb"), 16)
@@ -146,18 +145,18 @@ def _pixels(path: Path) -> tuple[np.ndarray, int]:
             raise ValueError(f"expected 8 or 16 bits, or floating point, got {picture.format} of integers")
         else:
             pixels = _unit(np.asarray(picture.convert("RGBA" if picture.has_transparency_data else "RGB")), 8)
-        turned = _orientation(picture)  # a TIFF is upright once it is loaded
+        turned = _orientation(picture)  # after loading: Pillow turns a TIFF upright
     return pixels.reshape(*pixels.shape[:2], -1), turned
 
 
 def _four_bytes(png: bytes) -> bytes:
-    """Call the two numbers of 16 bits of a pixel, grey and alpha, four of 8, of which Pillow keeps all."""
+    """Relabel a 16-bit grey and alpha PNG as 8-bit RGBA, the only way that Pillow keeps all bits."""
     head = png[12:24] + b"\x08\x06" + png[26:29]
     return png[:12] + head + zlib.crc32(head).to_bytes(4, "big") + png[33:]
 
 
 def _plain_tiff(path: Path) -> tuple[np.ndarray, int] | None:
-    """Read the first page of a TIFF in its own depth, which Pillow would cut; ``None`` of what only Pillow reads."""
+    """Read the first page of a TIFF at full depth, which Pillow would reduce; ``None`` if only Pillow can read it."""
     from tifffile import TiffFile
 
     with TiffFile(path) as file:
@@ -169,7 +168,7 @@ def _plain_tiff(path: Path) -> tuple[np.ndarray, int] | None:
         try:
             pixels = page.asarray()
         except ValueError as error:
-            if "imagecodecs" in str(error):  # LZW, JPEG and others, for which tifffile needs another package
+            if "imagecodecs" in str(error):  # LZW, JPEG and others need that package
                 return None
             raise
         if pixels.ndim == 3 and page.planarconfig == 2:
@@ -181,41 +180,41 @@ def _plain_tiff(path: Path) -> tuple[np.ndarray, int] | None:
     colors = pixels.shape[-1] - len(extra)
     if photometric == 0:
         pixels[..., :colors] = 1 - pixels[..., :colors]
-    if extra[:1] == (1,):  # colours are multiplied by alpha
+    if extra[:1] == (1,):  # premultiplied alpha
         alpha = pixels[..., colors : colors + 1]
         pixels[..., :colors] /= np.where(alpha > 0, alpha, 1)
     return pixels[..., : colors + (extra[:1] in ((1,), (2,)))], turned
 
 
 def _unit(pixels: np.ndarray, bits: int) -> np.ndarray:
-    """Return whole numbers of so many bits as 0 to 1, float32."""
+    """Scale whole numbers of ``bits`` bits to 0 .. 1, float32."""
     if pixels.dtype.kind not in "ui" or bits > 32:
         raise ValueError(f"expected whole numbers of at most 32 bits or floating point, got {pixels.dtype}")
     if pixels.dtype.kind == "i" and pixels.min() < 0:
-        raise ValueError(f"expected numbers from 0 on, got {pixels.min()}")
+        raise ValueError(f"expected values >= 0, got {pixels.min()}")
     kind = np.float32 if bits <= 16 else np.float64
     return np.multiply(pixels, 1 / (2**bits - 1), dtype=kind).astype(np.float32, copy=False)
 
 
 def _check_pixels(count: float) -> None:
-    """A file of a few bytes can claim more pixels than there is memory."""
+    """Raise if a picture has more than ``MOST_PIXELS`` pixels."""
     if count > MOST_PIXELS:
         raise ValueError(f"expected at most {MOST_PIXELS} pixels, got {count:.0f}")
 
 
 def write_picture(path: str | Path, image: Tensor, *, bits: int = 8, quality: int | None = None) -> None:
-    """Write an image to a file; the folder is made when it is missing.
+    """Write an image to a file, and create its folder if needed.
 
     Args:
-        path: where to; the ending names the format, PNG for lossless.
-        image: (3, H, W) or (H, W), floating, [0, 1]; clamped, and rounded to ``bits``; NaN is black.
-        bits: 8, or 16 in PNG and TIFF.
-        quality: of JPEG and WebP, 1 to 100; Pillow's own when not given.
+        path: the file to write; the ending selects the format.
+        image: (3, H, W) or (H, W), floating, [0, 1]; clamped and rounded to ``bits``; NaN is black.
+        bits: bits per channel: 8, or 16 for PNG and TIFF.
+        quality: quality of JPEG and WebP, 1 to 100; default: Pillow's.
 
     Raises:
         TypeError: ``image`` is not a floating-point tensor.
-        ValueError: ``image`` has another shape, the ending is of no format, or the format has no such bits or quality.
-        OSError: the file cannot be written; what was there before, or nothing, is then there.
+        ValueError: ``image`` has another shape, or the format is unknown or does not support ``bits`` or ``quality``.
+        OSError: the file cannot be written; an existing file is kept.
 
     Example:
         >>> import tempfile
@@ -231,18 +230,18 @@ def write_picture(path: str | Path, image: Tensor, *, bits: int = 8, quality: in
 
 
 def panel(rows: Sequence[Sequence[Tensor]], gap: int = 4) -> Tensor:
-    """Lay pictures out in rows and columns on white.
+    """Arrange pictures in rows and columns on white.
 
     Args:
         rows: pictures (3, H, W), (1, H, W) or (H, W); rows may differ in length, pictures in size.
         gap: white pixels between two pictures.
 
     Returns:
-        One picture (3, H, W), float32, on the CPU; every picture stands at the top left of its cell.
+        One picture (3, H, W), float32, on the CPU; every input is aligned to the top left of its cell.
 
     Raises:
-        TypeError: a picture that is not a tensor of real numbers.
-        ValueError: no rows, a row without a picture, or a picture of another shape.
+        TypeError: a picture is not a tensor of real numbers.
+        ValueError: there are no rows, a row is empty, or a picture has another shape.
 
     Example:
         >>> panel([[torch.zeros(3, 4, 4), torch.zeros(4, 4)], [torch.zeros(3, 2, 4)]], gap=1).shape
@@ -270,17 +269,17 @@ def panel(rows: Sequence[Sequence[Tensor]], gap: int = 4) -> Tensor:
 
 
 def flow_to_rgb(flow: Tensor, max_flow: float | None = None) -> Tensor:
-    r"""Show flow as colour: the direction is the hue, the length is the saturation, white stands still.
+    r"""Colour-code flow: direction is hue, length is saturation, zero is white.
 
     .. math:: \text{hue} = \operatorname{atan2}(v, u), \quad \text{saturation} = \min(1, \sqrt{u^2 + v^2} / l)
 
     Convention:
         Flow in pixels, order (x, y), x right, y down. Red points right, and the hue turns clockwise on the screen.
-        NaN flow counts as 0, infinite flow as very far. Made for the eye: the gradient at zero flow is NaN.
+        NaN counts as 0, infinite flow as very long. For display only: the gradient at zero flow is NaN.
 
     Args:
         flow: :math:`(*, 2, H, W)`, floating.
-        max_flow: l, the length that is fully saturated, above 0; the longest of the tensor when not given.
+        max_flow: l, the length of full saturation, above 0; default: the largest length of the tensor.
 
     Returns:
         ``rgb`` of shape :math:`(*, 3, H, W)`, [0, 1].

@@ -1,4 +1,4 @@
-"""Silence libraries that print about the files they read; real problems are raised."""
+"""Silence the warnings of libraries about the files they read; errors are still raised."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import os
 import threading
 import warnings
 
-# an application that logs still gets its lines
+# applications that configure logging still get the records
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 
 class _Quiet:
-    """Warnings are off while anybody is inside: those of :mod:`warnings` are a process's, not a thread's."""
+    """Context that disables warnings while at least one thread is inside; their filters belong to the process."""
 
     def __init__(self) -> None:
         self.lock, self.inside = threading.Lock(), 0
@@ -38,7 +38,7 @@ if hasattr(os, "register_at_fork"):  # another thread of the parent may have hel
 
 
 def quiet() -> _Quiet:
-    """Return a context that keeps warnings and log lines about a file from stderr.
+    """Return a context that suppresses warnings and log lines about a file.
 
     Example:
         >>> with quiet():

@@ -18,20 +18,20 @@ from spikekit.color.cfa import PATTERNS
 from spikekit.io.failures import no_pipe
 from spikekit.io.whole_file import flush_folder, hidden_name
 
-#: What the first line of a side-car says it is.
+#: Kind and version of the format, stored in the file.
 KIND = "spikekit simulation 1"
 
 
 @dataclass(frozen=True)
 class Sidecar:
-    """What is known about a simulated stream; the values are those of JSON."""
+    """Description of a simulated stream, in JSON types. Paths are relative to the side-car."""
 
-    stream: dict[str, Any]  # file, frames, height, width and sha256, that of the frames as a .dat holds them
-    truth: dict[str, float]  # pictures, by their path from the side-car: the frame of the stream at which each was seen
-    source: dict[str, Any]  # path, and the names of the frames that were looked at
-    settings: dict[str, Any]  # all that was asked for, or left at its default
+    stream: dict[str, Any]  # file, frames, height, width, and sha256 of the frames in the layout of a .dat
+    truth: dict[str, float]  # path of each ground truth: its frame in the stream
+    source: dict[str, Any]  # path, and names of the frames that were read
+    settings: dict[str, Any]  # all settings, defaults included
     plan: dict[str, Any]  # what was modelled
-    versions: dict[str, str]  # of what computed it
+    versions: dict[str, str]  # of the software
 
     def dumps(self) -> str:
         """Return the text of the file."""
@@ -39,7 +39,7 @@ class Sidecar:
 
 
 def read_sidecar(path: Path) -> Sidecar:
-    """Read a side-car; raise ValueError, which names it, where it cannot be read or is something else."""
+    """Read a side-car; raise a ValueError that names it if it is unreadable or another file."""
     try:
         sidecar = Sidecar(**_data(path))
         _check(sidecar)
@@ -47,7 +47,7 @@ def read_sidecar(path: Path) -> Sidecar:
         raise ValueError(f"{path}: cannot be read ({error.strerror or error})") from error
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         said = f"lacks {error}" if isinstance(error, KeyError) else one_line(error)[:300]
-        raise ValueError(f"{path}: not a side-car that can be read ({said})") from error
+        raise ValueError(f"{path}: not a readable side-car ({said})") from error
     return sidecar
 
 
@@ -59,7 +59,7 @@ def _data(path: Path) -> dict[str, Any]:
 
 
 def _check(sidecar: Sidecar) -> None:
-    """Raise unless the values are of the kinds that those who read them count on."""
+    """Raise unless all values have the expected types."""
     for part, values in vars(sidecar).items():
         if not isinstance(values, dict):
             raise ValueError(f"{part}: expected names and values, got {values!r}")
@@ -69,13 +69,13 @@ def _check(sidecar: Sidecar) -> None:
 
 
 def _is_whole(value: Any) -> bool:
-    return type(value) is int and 1 <= value < 1 << 31  # True is an int, and JSON's have no end
+    return type(value) is int and 1 <= value < 1 << 31  # excludes True, and the unbounded integers of JSON
 
 
 _TEXT = ("a text", lambda value: isinstance(value, str))
 _WHOLE = ("a whole number, 1 or more", _is_whole)
 
-# What to expect of what is read again, and whether a value is that.
+# Description and test of each value that is read.
 _VALUES: dict[str, dict[str, tuple[str, Callable[[Any], bool]]]] = {
     "stream": {"file": _TEXT, "sha256": _TEXT, "frames": _WHOLE, "height": _WHOLE, "width": _WHOLE},
     "settings": {
@@ -89,10 +89,10 @@ _VALUES: dict[str, dict[str, tuple[str, Callable[[Any], bool]]]] = {
 
 
 def find_sidecar(stream: Path) -> Sidecar | None:
-    """Return the side-car of a stream: the JSON file of the same name, where it speaks of this file.
+    """Return the side-car of a stream: the JSON file of the same name, if it describes this stream.
 
     Raises:
-        ValueError: it speaks of this file, but not as a side-car does; the message names it.
+        ValueError: the file names this stream but is not a valid side-car.
     """
     path, ours = stream.with_suffix(".json"), False
     with suppress(OSError, ValueError, TypeError, LookupError, RecursionError):
@@ -101,7 +101,7 @@ def find_sidecar(stream: Path) -> Sidecar | None:
 
 
 def check_unclaimed(outputs: Iterable[Path], stream: Path) -> None:
-    """Refuse to write over what a side-car names, that of the stream or one beside an output: a ValueError says so."""
+    """Raise a ValueError if an output would overwrite a stream or a ground truth named by a side-car nearby."""
     wanted = {output.resolve(): output for output in outputs}
     near = (place for output in wanted for place in (output, output.parent) if place.name)
     for path in dict.fromkeys(place.with_suffix(".json") for place in (stream.resolve(), *near)):
@@ -113,29 +113,28 @@ def check_unclaimed(outputs: Iterable[Path], stream: Path) -> None:
             output = wanted.get((path.parent / name).resolve())
             if output is not None:
                 kind = "ground truth" if name in sidecar.truth else "stream"
-                raise ValueError(f"{output}: the {kind} of {path.name} would be lost; choose another name")
+                raise ValueError(f"{output}: would overwrite the {kind} of {path.name}; choose another name")
 
 
 @contextmanager
 def published(output: Path) -> Iterator[Path]:
-    """Give a folder to write to; when all is written, put everything under its final name, the side-car last.
+    """Yield a temporary folder; at the end, move its files to their final names, the side-car last.
 
     Convention:
-        The folder lies beside ``output``, hidden. Its contents move to where ``output`` is, each by one renaming, and
-        the side-car, ``output`` with the ending ``.json``, after all others. One that is there already goes first. So a
-        stream beside its side-car is complete, whenever the process was killed. What remains of one that was is a
-        hidden folder that ends in ``.part``, which the next one empties. Processes that write the same output do so one
-        after the other.
+        The temporary folder is hidden and lies beside ``output``. Its files are renamed one by one, and last the
+        side-car, which is ``output`` with the ending ``.json``. An old side-car is removed first. A stream with a
+        side-car is therefore complete, even if a process was killed. A killed process leaves a hidden folder that ends
+        in ``.part``; the next run empties it. Processes with the same output run one after the other.
 
     Raises:
-        ValueError: the place of the side-car or of a picture is taken by something else.
-        OSError: something cannot be written; it names the output.
+        ValueError: another file has the name of the side-car or of a picture.
+        OSError: a file cannot be written; the error names the output.
     """
     target, sidecar = output.parent, output.with_suffix(".json")
     if sidecar.exists():
-        stream = read_sidecar(sidecar).stream["file"]  # raises where the file is something else
+        stream = read_sidecar(sidecar).stream["file"]  # raises if it is not a side-car
         if stream != output.name:
-            raise ValueError(f"{output}: its side-car, {sidecar}, would replace that of {stream}; choose another name")
+            raise ValueError(f"{output}: its side-car {sidecar} would overwrite that of {stream}; choose another name")
     target.mkdir(parents=True, exist_ok=True)
     with _owned(target / f"{hidden_name(sidecar.name)}.part") as part:
         try:
@@ -149,7 +148,7 @@ def published(output: Path) -> Iterator[Path]:
 
 @contextmanager
 def _owned(place: Path) -> Iterator[Path]:
-    """Give an empty folder in one that nobody else has, as soon as whoever has it is done; remove both at the end."""
+    """Wait for the lock of ``place``, yield an empty folder in it, and remove both at the end."""
     with ExitStack() as stack:
         while True:
             place.mkdir(exist_ok=True)
@@ -160,19 +159,19 @@ def _owned(place: Path) -> Iterator[Path]:
                 stack.callback(os.close, handle)
                 fcntl.flock(handle, fcntl.LOCK_EX)
                 if os.path.samestat(os.fstat(handle), os.stat(place)):
-                    for left in place.iterdir():  # by a process that was killed
+                    for left in place.iterdir():  # leftovers of a killed process
                         shutil.rmtree(left)
                     break
-            except FileNotFoundError:  # somebody was done
+            except FileNotFoundError:  # another process has just removed it
                 pass
-            except (OSError, ImportError):  # not every system and not every file system has locks
+            except (OSError, ImportError):  # no locks on this system or file system
                 break
         folder = Path(tempfile.mkdtemp(dir=place))
         try:
             yield folder
         finally:
             shutil.rmtree(folder, ignore_errors=True)
-            with suppress(OSError):  # others are waiting, or at work
+            with suppress(OSError):  # other processes use it
                 place.rmdir()
 
 
@@ -180,19 +179,19 @@ def _publish(part: Path, target: Path, last: str) -> None:
     sidecar = target / last
     files = sorted((path for path in part.rglob("*") if path.is_file()), key=lambda path: path == part / last)
     known = read_sidecar(sidecar).truth if sidecar.is_file() else {}
-    for path in files:  # pictures of others are not replaced; what a killed process has left is the same
+    for path in files:  # do not overwrite other pictures, unless they are equal, as after a killed process
         name = path.relative_to(part)
         final = target / name
-        if name.parent.name and final.parent.is_symlink():  # whoever made the folder chose where it leads
-            raise ValueError(f"{final.parent}: expected a folder of its own, got a link; choose another name")
+        if name.parent.name and final.parent.is_symlink():  # could lead anywhere
+            raise ValueError(f"{final.parent}: expected a folder, got a link; choose another name")
         taken = name.suffix == ".png" and name.as_posix() not in known and final.exists()
         if taken and not (final.is_file() and final.read_bytes() == path.read_bytes()):
-            raise ValueError(f"{final}: would be lost, and is no ground truth of {last}; choose another name")
+            raise ValueError(f"{final}: exists and is not a ground truth of {last}; choose another name")
     sidecar.unlink(missing_ok=True)
     for path in files:
         final = target / path.relative_to(part)
         final.parent.mkdir(exist_ok=True)
-        if path == part / last:  # the others have to be on the disk before it says that they are
+        if path == part / last:  # all other files must be on disk before the side-car
             for folder in {(target / other.relative_to(part)).parent for other in files}:
                 flush_folder(folder)
         os.replace(path, final)

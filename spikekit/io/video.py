@@ -21,37 +21,37 @@ from spikekit.check import check_whole
 from spikekit.io.failures import no_pipe, reading
 from spikekit.io.images import MOST_PIXELS, picture_size, read_picture
 
-#: Endings of pictures, which may stand for frames.
+#: Endings of pictures in a folder of frames.
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".pnm")
 
-#: Endings of video files, which PyAV reads.
+#: Endings of video files, read with PyAV.
 VIDEO_ENDINGS = (".mp4", ".m4v", ".mkv", ".webm", ".avi", ".mov", ".y4m", ".mpg", ".mpeg", ".ts", ".wmv", ".flv")
 
-# What FFmpeg calls the formats of such files.
+# FFmpeg's names of their formats.
 _FORMATS = "mov,mp4,matroska,webm,avi,yuv4mpegpipe,mpeg,mpegvideo,mpegts,asf,flv,h264,hevc,m4v"
 
-# Frames of a video file that stay decoded, so that a step back needs no second start.
+# Decoded frames that are kept, for short steps back.
 _KEPT = 8
 
 
 class VideoError(ValueError):
-    """Frames that cannot be read; the message is one line and names the file."""
+    """Unreadable frames; the message is one line and names the file."""
 
 
 _reading = partial(reading, kind=VideoError)
 
 
 class VideoFrames(Sequence[Tensor]):
-    """The frames of a folder of pictures or of a video file, each read when it is asked for; see :func:`read_video`.
+    """Lazy sequence of the frames of a folder of pictures or a video file; see :func:`read_video`.
 
     Convention:
-        A slice is again a lazy sequence. Threads can share the object, which decodes for one after the other. It can be
-        pickled and used in other processes; each opens the files for itself.
+        A slice is a lazy sequence, too. The object is thread-safe. It can be pickled and used in other processes; each
+        opens the files again.
 
     Attributes:
         height: rows of a frame.
         width: columns of a frame.
-        fps: frames a second, of a video file that says so; ``None`` for a folder.
+        fps: frames per second of a video file; ``None`` for a folder or if unknown.
     """
 
     def __init__(self, source: _Pictures | _Film, chosen: range) -> None:
@@ -61,7 +61,7 @@ class VideoFrames(Sequence[Tensor]):
 
     @property
     def names(self) -> list[str]:
-        """Names of the files in a folder, or numbers of the frames in a video file."""
+        """Names of the files of a folder, or numbers of the frames of a video."""
         return list(map(self._source.name, self._chosen))
 
     def __len__(self) -> int:
@@ -84,31 +84,30 @@ def read_video(path: str | Path, *, start: int = 0, count: int | None = None) ->
     """Open a folder of pictures or a video file.
 
     Convention:
-        A frame is ``rgb`` (3, H, W), float32, in [0, 1], gamma-encoded as it was stored and upright as the file says.
-        Grey pictures get three equal channels, alpha is laid over white (an opaque one changes nothing), 16-bit files
-        keep their depth; see :func:`spikekit.read_picture`. All frames have the size of the first.
+        A frame is ``rgb`` (3, H, W), float32, in [0, 1], gamma-encoded as in the file, and upright. Grey, transparent
+        and 16-bit pictures are converted as by :func:`spikekit.read_picture`. All frames must have one size.
 
-        In a folder the pictures are the PNG, JPEG, BMP, TIFF and PNM files, told by their endings, in natural order
-        (``f2`` before ``f10``); folders, hidden files and files with other endings are left out. A single picture is a
-        film of one frame.
+        The frames of a folder are its PNG, JPEG, BMP, TIFF and PNM files, recognised by their endings, in natural order
+        (``f2`` before ``f10``). Folders, hidden files and other files are ignored. A single picture is a film of one
+        frame.
 
-        Video files need PyAV (``pip install '.[video]'``). Frames are counted without decoding them. Reading on
-        is cheap, a few frames back too; further back the file is decoded from its start again, so that frame n is
-        always the same one.
+        Video files need PyAV (``pip install '.[video]'``). Frames are counted without decoding. Reading forwards, or a
+        few frames back, is cheap; further back, decoding starts again at the beginning of the file, so that frame
+        numbers are exact.
 
     Args:
         path: a folder, a picture or a video file.
         start: the first frame.
-        count: how many; up to the end when not given.
+        count: number of frames; default: up to the end.
 
     Returns:
-        The frames, none of which is read yet.
+        The lazy sequence of frames.
 
     Raises:
-        VideoError: no such file, no pictures in it, pictures of several sizes, PyAV is missing, or there are fewer
-            frames. A frame that is damaged raises it when it is asked for.
+        VideoError: the file is missing, a folder has no pictures or pictures of several sizes, PyAV is missing, or
+            there are too few frames. A damaged frame raises it when it is read.
         TypeError: ``start`` is not a whole number.
-        ValueError: ``count`` is not a whole number, 1 or more.
+        ValueError: ``count`` is not a whole number >= 1.
 
     Example:
         >>> import tempfile
@@ -151,7 +150,7 @@ def _open(path: Path) -> _Pictures | _Film:
 
 
 def _natural(path: Path) -> tuple[list[str | int], str]:
-    """Sort digits by their number: text and numbers take turns, so that like is compared with like."""
+    """Return a key of natural order: alternating text and numbers, then the name."""
     parts = re.split(r"([0-9]+)", path.name)
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
 
@@ -167,13 +166,13 @@ def _pictures_of(folder: Path) -> list[Path]:
 
 
 class _Pictures:
-    """Pictures in a folder; their sizes are compared from the headers, before any of them is read."""
+    """Pictures of a folder, with sizes checked from their headers."""
 
     fps = None
 
     def __init__(self, path: Path, files: list[Path]) -> None:
         self.path, self.files, self.count = path, files, len(files)
-        # what has no header that can be read is damaged, and raises when it is its turn
+        # a picture with an unreadable header raises when it is read
         sizes = {file: size for file in files if (size := picture_size(file))}
         if not sizes:
             sizes = {files[0]: tuple(_load(files[0]).shape[1:])}
@@ -184,7 +183,7 @@ class _Pictures:
     def _check_size(self, file: Path, size: tuple[int, ...]) -> None:
         if size != self.size:
             (h, w), (height, width) = size, self.size
-            raise VideoError(f"{file}: expected {height} x {width} (H x W) as in {self.like}, got {h} x {w}")
+            raise VideoError(f"{file}: expected {height} x {width} (H x W) as {self.like}, got {h} x {w}")
 
     def name(self, index: int) -> str:
         return self.files[index].name
@@ -207,11 +206,11 @@ def _load(file: Path) -> Tensor:
 # --- video files ------------------------------------------------------------------------------------------------------
 
 
-_of_parents: list[Any] = []  # decoders whose threads a fork has not got: they are let be
+_of_parents: list[Any] = []  # decoders inherited by a fork without their threads; must not be closed
 
 
 class _Film:
-    """A video file, decoded on from the frame that was asked for last."""
+    """A video file, decoded sequentially."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -222,9 +221,9 @@ class _Film:
         with _reading(path), _container(path) as container:
             stream = next(iter(container.streams.video), None)
             if stream is None or stream.codec_context is None:
-                raise VideoError(f"{path}: expected a video, got none that can be decoded")
+                raise VideoError(f"{path}: expected a video stream that can be decoded, got none")
             total = sum(packet.size > 0 and not packet.is_discard for packet in container.demux(stream))
-            total = max(total, stream.frames)  # what the header promises and the file lacks is told when it is reached
+            total = max(total, stream.frames)  # missing frames raise when they are read
             self.turns = _turns(path)
             self.stored = stream.height, stream.width
             self.size = self.stored[:: -1 if self.turns % 2 else 1]
@@ -238,7 +237,7 @@ class _Film:
 
     def _begin(self) -> None:
         self._process = os.getpid()
-        self._lock = threading.Lock()  # of a decoder that two threads would crash, and that a fork may leave held
+        self._lock = threading.Lock()  # the decoder is not thread-safe; a fork may have copied a held lock
         self._forget()
 
     def _forget(self) -> None:
@@ -280,31 +279,31 @@ class _Film:
                         sizes = " x ".join(map(str, self.stored)), f"{frame.height} x {frame.width}"
                         raise VideoError(f"{self.path}: frame {self._next}: expected {sizes[0]}, got {sizes[1]}")
             except VideoError:
-                self._forget()  # whoever asks for an earlier frame again gets it
+                self._forget()  # earlier frames can still be read
                 raise
             self._kept.append(frame)
             self._next += 1
         if self._next == self.count:
-            self._decoder = None  # whose file is closed with it
+            self._decoder = None  # closes the file
         with _reading(self.path, what=f"frame {index}: "):
             return _rgb(self._kept[index - self._next])
 
 
 def _turns(path: Path) -> int:
-    """Return by how many quarter turns, counterclockwise, the first frame has to be turned to be upright."""
-    with suppress(Exception):  # a frame that is damaged says so when it is asked for
+    """Return the number of counterclockwise quarter turns that make the first frame upright."""
+    with suppress(Exception):  # a damaged frame raises when it is read
         return round(next(_decoded(path)).rotation / 90) % 4
     return 0
 
 
 def _decoded(path: Path) -> Iterator[Any]:
-    """Decode a file; no method, so that the file is closed when the frames are let go, without a garbage collector."""
+    """Decode a file. Not a method: without a reference cycle, the file is closed as soon as the iterator is freed."""
     with _container(path) as container:
         yield from container.decode(container.streams.video[0])
 
 
 def _container(path: Path) -> Any:
-    """Open a video file, and nothing that it names: to FFmpeg, a list of other files is a video as well."""
+    """Open a video file, but no playlist, which would make FFmpeg open other files."""
     import av
 
     return av.open(str(path), options={"format_whitelist": _FORMATS, "protocol_whitelist": "file"})

@@ -1,4 +1,4 @@
-"""Video output: frames to a film file, one after the other."""
+"""Video output: write frames to a film file."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from spikekit.io.image_bytes import to_bytes
 from spikekit.io.video import VideoError
 from spikekit.io.whole_file import whole_file
 
-#: Endings of the films that are written, and what FFmpeg calls their formats.
+#: Endings of films, and FFmpeg's names of their formats.
 FILM_FORMATS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska", ".gif": "gif"}
 
-# x264 looks hardly ahead, and in one thread, as it holds a dozen frames otherwise
+# little look-ahead and one thread, else x264 holds a dozen frames
 _H264 = {"crf": "17", "preset": "faster", "bf": "0", "rc-lookahead": "2", "threads": "1"}
 _BT709, _NARROW, _WIDE = 1, 1, 2  # matrix and primaries of HD; levels 16 to 235, 0 to 255
 
 
 def check_film(path: str | Path) -> None:
-    """Raise at once for what would keep a film from being written: another ending, or PyAV is missing."""
+    """Raise if a film cannot be written because of its ending or a missing PyAV."""
     if Path(path).suffix.lower() not in FILM_FORMATS:
         raise VideoError(f"{path}: expected a film that ends in {', '.join(FILM_FORMATS)}")
     try:
@@ -36,29 +36,28 @@ def check_film(path: str | Path) -> None:
     except ImportError as error:
         raise VideoError(f"{path}: writing a film needs PyAV, pip install '.[video]'") from error
     if "libx264" not in av.codecs_available and not _is_gif(path):
-        raise VideoError(f"{path}: expected a PyAV with libx264, as pip install '.[video]' brings, got none")
+        raise VideoError(f"{path}: expected a PyAV with libx264, such as that of pip install '.[video]', got none")
 
 
 def write_video(path: str | Path, frames: Iterable[Tensor], fps: float = 25.0) -> None:
-    """Write frames as a film; the folder is made when it is missing.
+    """Write frames as a film, and create its folder if needed.
 
     Convention:
-        ``.mp4``, ``.mov`` and ``.mkv`` are H.264 (CRF 17, 4:2:0, BT.709 at limited levels); odd sides repeat their last
-        row or column, as colours are stored two by two. ``.gif`` has 256 colours a frame and counts time in hundredths
-        of a second. One frame after the other is asked for, and few are held. The film appears under its name once it
-        is complete.
+        ``.mp4``, ``.mov`` and ``.mkv`` are H.264 (CRF 17, 4:2:0, BT.709 at limited levels). An odd side repeats its
+        last row or column, as 4:2:0 needs even sides. ``.gif`` has 256 colours per frame and frame times in hundredths
+        of a second. Frames are consumed one by one. The film appears under its name when it is complete.
 
     Args:
-        path: where to, ending in one of these.
-        frames: (3, H, W) or (H, W) each, all of one size, such as :func:`spikekit.read_video` returns: floating,
-            [0, 1], clamped, and rounded to 8 bits; or uint8.
-        fps: frames shown in a second.
+        path: the file to write, with one of these endings.
+        frames: frames (3, H, W) or (H, W) of one size, such as those of :func:`spikekit.read_video`: floating, in
+            [0, 1], clamped and rounded to 8 bits; or uint8.
+        fps: frames per second.
 
     Raises:
-        VideoError: another ending, no frames, frames of several sizes, or PyAV is missing.
-        OSError: the file cannot be written; what was there before, or nothing, is then there.
-        TypeError: a frame that is neither floating nor uint8, or an ``fps`` that is not a number.
-        ValueError: a frame of another shape, or an ``fps`` that is not above 0.
+        VideoError: the ending is unknown, there are no frames or frames of several sizes, or PyAV is missing.
+        OSError: the file cannot be written; an existing file is kept.
+        TypeError: a frame is neither floating nor uint8, or ``fps`` is not a number.
+        ValueError: a frame has another shape, or ``fps`` is not above 0.
 
     Example:
         >>> import tempfile, torch
@@ -92,7 +91,7 @@ def _is_gif(path: str | Path) -> bool:
 
 
 def _pictures(path: str | Path, frames: Iterable[Tensor]) -> Iterator[np.ndarray]:
-    """Frames as (H, W, 3), uint8."""
+    """Yield checked frames as (H, W, 3), uint8."""
     size = None
     for frame in frames:
         check_picture("frames", frame, "(3, H, W) or (H, W)", grey=True, floating=frame.dtype != torch.uint8)
@@ -124,7 +123,7 @@ def _gif(container: Any, pictures: Iterable[np.ndarray], shape: tuple[int, ...],
     from av import VideoFrame
     from av.filter import Graph
 
-    # every frame has a palette of its own, so that none waits for the others
+    # one palette per frame, so that no frames are buffered
     height, width = shape[:2]
     stream = container.add_stream("gif", rate=fps)
     stream.width, stream.height, stream.pix_fmt = width, height, "pal8"
@@ -141,7 +140,7 @@ def _gif(container: Any, pictures: Iterable[np.ndarray], shape: tuple[int, ...],
 
     def reduce(frame: VideoFrame | None) -> None:
         graph.push(frame)
-        with suppress(BlockingIOError, EOFError):  # none is ready, none is left
+        with suppress(BlockingIOError, EOFError):  # no frame is ready, or none is left
             while True:
                 container.mux(stream.encode(graph.pull()))
 

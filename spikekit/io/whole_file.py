@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Atomic writing of files."""
 
 from __future__ import annotations
 
@@ -15,29 +15,28 @@ from spikekit.standard_output import FULL
 
 try:
     import fcntl
-except ImportError:  # Windows, which removes no file that is open
+except ImportError:  # Windows, where an open file cannot be removed
     fcntl = None
 
-_SIDE_BY_SIDE = 8  # writers of one file whose leftovers are found
+_SIDE_BY_SIDE = 8  # largest number of leftovers of one file that are removed
 
 
 @contextmanager
 def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[Any]]:
-    """Open a file for writing that appears under its name when it is complete, or not at all.
+    """Open a file for atomic writing: it appears under its name when it is complete.
 
     Convention:
-        What is written goes to a hidden file beside the target, which is flushed to the disk and then takes the
-        target's place by one renaming. So a full disk, an error or ``kill -9`` leaves the file that was there before,
-        or none. The hidden file is removed where the writing fails; that of a killed process ends in ``.part``, and the
-        next writing of the same name removes it. Two processes that write the same name do not disturb each other: the
-        last one wins.
+        The data goes to a hidden file beside the target, which is flushed to disk and then renamed. A full disk, an
+        error or ``kill -9`` therefore leaves the old file, or none. After an error the hidden file is removed. That of
+        a killed process ends in ``.part``, and is removed the next time the same file is written. If several processes
+        write the same file, the last one wins.
 
-        The file keeps the mode of the one that it replaces. A link of that name is replaced, and what it points at
-        stays as it is: a folder from a stranger may have links in it. A device, such as ``/dev/stdout``, is written
-        directly, and so is a pipe that somebody reads.
+        The file keeps the mode of the one that it replaces. A symbolic link is replaced and not followed, as folders
+        from other people may contain links. A device, such as ``/dev/stdout``, is written directly, and so is a pipe
+        with a reader.
 
     Args:
-        path: the file; its folder is made when it is missing.
+        path: the file to write; its folder is created if needed.
         mode: ``"wb"`` or ``"w"``.
         how: further arguments of ``open``, such as ``encoding``.
 
@@ -45,7 +44,7 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
         A context that yields the open file.
 
     Raises:
-        OSError: the file or its folder cannot be written; it names the file.
+        OSError: the file or its folder cannot be written; the error names the file.
 
     Example:
         >>> import tempfile
@@ -57,9 +56,9 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
         (False, 'all of it')
     """
     path = home_path(path)
-    chosen = path.is_dir() or not path.is_symlink() or path.parent == Path("/dev")  # no stranger's way to a device
+    chosen = path.is_dir() or not path.is_symlink() or path.parent == Path("/dev")  # no other links to devices
     if chosen and path.exists() and not path.is_file():
-        with open(path, mode, opener=_to_a_reader if path.is_fifo() else None, **how) as file:  # a folder says so
+        with open(path, mode, opener=_to_a_reader if path.is_fifo() else None, **how) as file:  # raises for a folder
             yield file
         return
     target = Path(os.path.realpath(path.parent), path.name)
@@ -73,7 +72,7 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
         yield file
         file.flush()
         os.fsync(file.fileno())
-        with suppress(OSError):  # not every file system has modes
+        with suppress(OSError):  # some file systems have no modes
             if target.is_file() and not target.is_symlink():
                 os.chmod(part, target.stat().st_mode & 0o7777)
         if fcntl is None:
@@ -87,28 +86,25 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
         with suppress(OSError):
             part.unlink(missing_ok=True)
         raise
-    file.close()  # so late, because the lock that says that somebody is at work ends here
+    file.close()  # only now, as this releases the lock
     flush_folder(target.parent)
 
 
 def _to_a_reader(path: str, flags: int) -> int:
-    """Open a pipe; one that nobody reads, which would be waited for without end, is an error."""
+    """Open a pipe; raise instead of blocking if it has no reader."""
     file = os.open(path, flags | os.O_NONBLOCK)
     os.set_blocking(file, True)
     return file
 
 
 def hidden_name(name: str) -> str:
-    """Return the beginning of a hidden file's name, which leaves room for an ending within the 255 bytes of a name."""
+    """Return the stem of a hidden file's name, short enough for an ending within 255 bytes."""
     raw = os.fsencode(name)
     return f".{name}" if len(raw) < 230 else f".{hashlib.sha256(raw).hexdigest()}"
 
 
 def _open_part(target: Path, mode: str, **how: Any) -> tuple[Path, IO[Any]]:
-    """Open a file beside the target, and lock it; remove what killed processes have left of others.
-
-    Names are counted, so that leftovers are found without a look at the whole folder.
-    """
+    """Open and lock a numbered file beside the target, and remove the leftovers of killed processes."""
     hidden = hidden_name(target.name)
     for n in range(_SIDE_BY_SIDE):
         leftover = target.with_name(f"{hidden}.{n}.part")
@@ -119,16 +115,16 @@ def _open_part(target: Path, mode: str, **how: Any) -> tuple[Path, IO[Any]]:
     while True:
         part = target.with_name(f"{hidden}.{n}.part")
         with suppress(FileExistsError):
-            file = open(part, mode.replace("w", "x"), **how)  # noqa: SIM115 - closed when it is complete
+            file = open(part, mode.replace("w", "x"), **how)  # noqa: SIM115 - closed by the caller
             with suppress(OSError):
                 if _lock(file) is not False and os.path.samestat(os.fstat(file.fileno()), os.stat(part)):
                     return part, file
-            file.close()  # another process took it for a leftover before it was locked
+            file.close()  # another process removed it as a leftover before it was locked
         n += 1
 
 
 def _lock(file: IO[Any]) -> bool | None:
-    """Hold the lock of a file until it is closed; return False where somebody else does, None where there are none."""
+    """Lock a file until it is closed; return False if another process holds the lock, None if locks are unsupported."""
     if fcntl is None:
         return True
     try:
@@ -141,7 +137,7 @@ def _lock(file: IO[Any]) -> bool | None:
 
 
 def flush_folder(folder: Path) -> None:
-    """Make the renaming last through a loss of power, where the system can."""
+    """Flush a folder to disk, if the system can, so that a renaming survives a power failure."""
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:

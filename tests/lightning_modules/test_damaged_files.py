@@ -139,7 +139,7 @@ def test_escape_sequences_do_not_reach_the_terminal(tmp_path, name):
 
 def test_a_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "a.yaml")
-    with pytest.raises(ValueError, match=r"a.yaml: a pipe or a device, expected a file$"):
+    with pytest.raises(ValueError, match=r"a.yaml: expected a file, got a pipe or a device$"):
         with_network_of_weights(["fit", "-c", str(tmp_path / "a.yaml")])
     with pytest.raises(InputError, match=r"a.yaml: .*a pipe"):
         read_yaml(tmp_path / "a.yaml")

@@ -87,7 +87,7 @@ def test_the_truth_of_a_simulated_recording_is_not_written_over(words, tmp_path,
     truth = (tmp_path / "a.png").read_bytes()
     words[1] = str(tmp_path / "a.dat")
     refused([*words, str(tmp_path / "a.png"), "--frame", "20"], 2)
-    assert "a.png: the ground truth of a.json would be lost" in capsys.readouterr().err
+    assert "a.png: would overwrite the ground truth of a.json" in capsys.readouterr().err
     assert (tmp_path / "a.png").read_bytes() == truth
 
 

@@ -160,7 +160,7 @@ def test_a_sidecar_edited_by_hand(tmp_path, monkeypatch, fails, capsys, part, va
     }
     section, _, name = part.partition(".")
     Path("a.json").write_text(json.dumps(known | {section: known[section] | {name: value} if name else value}))
-    expected = f"spikekit: a.json: not a side-car that can be read ({said}"
+    expected = f"spikekit: a.json: not a readable side-car ({said}"
     for words in (["info"], ["decode", "-o", "a.png"], ["view", "-o", "a.png"]):
         assert main([words[0], "a.dat", *words[1:]]) == 1
         assert capsys.readouterr().err.startswith(expected)
@@ -238,11 +238,11 @@ def test_nothing_of_others_is_replaced(film, fails):
     for words, said in (
         ((film, "-o", "film.dat", "--all"), "its ground truth, film/f0.png, would replace the source"),
         (("film/f1.png", "-o", "film/f1.dat"), "would replace the source"),
-        ((film, "-o", "a.npz"), "a.npz: its side-car, a.json, would replace that of a.dat"),
-        ((film, "-o", "b.dat"), "b.json: not a side-car that can be read"),
+        ((film, "-o", "a.npz"), "a.npz: its side-car a.json would overwrite that of a.dat"),
+        ((film, "-o", "b.dat"), "b.json: not a readable side-car"),
         ((film, "-o", "c.dat"), "c.dat: expected a file, got a folder"),
-        ((film, "-o", "d.dat"), "d.png: would be lost"),
-        ((film, "-o", "e.dat", "--all"), "e: expected a folder of its own"),
+        ((film, "-o", "d.dat"), "d.png: exists and is not a ground truth"),
+        ((film, "-o", "e.dat", "--all"), "e: expected a folder, got a link"),
     ):
         assert said in fails(1, *words, *QUICK)
 
@@ -265,7 +265,7 @@ def test_nothing_of_others_is_replaced(film, fails):
         (["film", "--scale", "2", "--plan", "20"], 2, "0 to 19 latent frames in 20 clocks, got 20"),
         (["film", "--scale", "2", "--dark-current", "-1"], 2, "--dark-current: expected 0 to 1, got -1.0"),
         (["film/f0.png", "--scale", "2", "--all"], 2, "one picture without an end"),
-        (["damaged", "--scale", "2"], 1, "damaged/0.png: not a picture that can be read"),
+        (["damaged", "--scale", "2"], 1, "damaged/0.png: not a readable picture"),
         (["nothing", "--scale", "2"], 1, "nothing: no such file or folder"),
     ],
 )

@@ -174,5 +174,5 @@ def test_what_a_sidecar_names_is_not_written_over(still, capsys, words):
     size = ["--height", "32", "--width", "48"]
     for given in (size,) if words[1] == "b.dat" else (size, []):
         assert main([*words, *given, "-o", "a.png"]) == 1
-        assert "a.png: the ground truth of a.json would be lost" in capsys.readouterr().err
+        assert "a.png: would overwrite the ground truth of a.json" in capsys.readouterr().err
     assert Path("a.png").read_bytes() == truth

@@ -179,8 +179,8 @@ def test_pngs_carry_notes_and_quality_makes_jpegs_larger(tmp_path):
         ("a.png", (3, 4, 6), {"bits": 12}, "bits: expected"),
         ("a.png", (3, 4, 6), {"quality": 90}, "quality: expected"),
         ("a.jpg", (3, 4, 6), {"quality": 101}, "quality: expected"),
-        ("a.jpg", (1, 70_000), {}, "expected a picture that fits into a JPEG"),
-        ("a.xyz", (3, 4, 6), {}, "expected a name that ends like that of a picture"),
+        ("a.jpg", (1, 70_000), {}, "expected a size that JPEG can store"),
+        ("a.xyz", (3, 4, 6), {}, "expected the ending of a picture"),
         *(("a.png", shape, {}, "image") for shape in ((4,), (1, 4, 4), (2, 3, 4, 4))),
     ],
 )
