@@ -1,4 +1,4 @@
-"""Sampling where flow points to, and demosaicing along it."""
+"""Warping by optical flow, and demosaicing along motion."""
 
 from spikekit.warp.motion_demosaic import DemosaicAlongMotion, demosaic_along_motion
 from spikekit.warp.warp import FlowWarp, FlowWarpIdw, flow_warp, flow_warp_idw

@@ -1,4 +1,4 @@
-"""The warp of the pixels of one colour of a Bayer filter in plain tensor operations, as exported networks need it."""
+"""Warping of one colour of a Bayer mosaic in plain tensor operations, for exported networks."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from torch import Tensor
 from spikekit.color.cfa import cfa_sites
 from spikekit.warp.neighbors import finite
 
-_FLAT = 1 << 31  # above every flat index: a distance and an index make one number
+_FLAT = 1 << 31  # exceeds every flat index; combines a distance and an index in one integer
 
 
 def bayer_warp_idw(
     features: Tensor, flow: Tensor, pattern: str | CFA, color: int, scale: int, steps: int, neighbors: int = 4
 ) -> Tensor:
-    """Do what :func:`spikekit.flow_warp_idw` does with the mask of one colour.
+    """Compute :func:`spikekit.flow_warp_idw` for the mask of one colour.
 
-    No operator of our own, no table that depends on the size: what ``torch.export`` makes of it takes any even height
-    and width of the sensor, of 8 pixels or more. It takes several times the time.
+    It uses neither custom operators nor tables that depend on the size, so ``torch.export`` accepts any even height and
+    width of the sensor from 8 pixels on. It takes several times as long.
 
-    Features are (B, C, s H, s W), flow (B, 2, s H, s W); colours 0, 1, 2 are R, G, B, and 0 is grey. Flow is rounded to
-    one of ``steps`` positions per pixel and axis, an even number; at most 4 neighbours are weighed.
+    Features are (B, C, s H, s W), flow is (B, 2, s H, s W); colours 0, 1, 2 are R, G, B, and 0 is grey. Flow is rounded
+    to ``steps`` positions per pixel and axis, an even number. At most 4 neighbours are supported.
     """
     height, width = features.shape[-2:]
     x, y = (
@@ -36,12 +36,12 @@ def bayer_warp_idw(
         rows = _nearest_on_axis(y, height, row, side, scale, steps, neighbors)
         columns = _nearest_on_axis(x, width, column, side, scale, steps, neighbors)
         for i in range(neighbors):
-            for j in range(neighbors // (i + 1)):  # so many pixels of these rows and columns are at least as near
+            for j in range(neighbors // (i + 1)):  # (i + 1)(j + 1) pixels are at least as near
                 square = (steps * rows[i] - y).square() + (steps * columns[j] - x).square()
                 keys.append(square * _FLAT + rows[i] * width + columns[j])
     nearest = torch.stack(keys, dim=-1).topk(neighbors, largest=False, sorted=True).values
     distance = (nearest // _FLAT).to(flow.dtype).sqrt()
-    # relative to the nearest: nothing for the others on a known pixel
+    # relative to the nearest: on a known pixel the other weights are 0
     others = distance[..., :1] / distance[..., 1:]
     weight = torch.cat([torch.ones_like(distance[..., :1]), others], dim=-1)
     weight = (weight / weight.sum(dim=-1, keepdim=True)).to(features.dtype)
@@ -54,7 +54,7 @@ def bayer_warp_idw(
 
 
 def _rounded(flow: Tensor, pixel: Tensor, length: int, steps: int) -> Tensor:
-    """Where flow (B, s H, s W) points to on an axis, in steps: rounded, and at most half a pixel beyond the picture."""
+    """Return the positions of flow (B, s H, s W) on an axis, in steps, clamped to half a pixel outside the picture."""
     moved = pixel * steps + (finite(flow).double() * steps).round().long()
     return moved.clamp(min=-(steps // 2)).minimum(torch.full_like(pixel, length - 1) * steps + steps // 2)
 
@@ -62,9 +62,9 @@ def _rounded(flow: Tensor, pixel: Tensor, length: int, steps: int) -> Tensor:
 def _nearest_on_axis(
     position: Tensor, length: int, site: int, side: int, scale: int, steps: int, neighbors: int
 ) -> list[Tensor]:
-    """The known pixels nearest to each position on an axis, nearest first, the lower one among equals."""
-    reach = 2 * scale + 8  # as far as the fourth can be, at a border as well
-    half = torch.arange(2 * length, device=position.device)  # order does not change between half pixels
+    """Return the known pixels nearest to each position on an axis, nearest first, the lower of equally near ones."""
+    reach = 2 * scale + 8  # largest distance of the fourth, also at a border
+    half = torch.arange(2 * length, device=position.device)  # the order is constant between half pixels
     candidates = (half // 2).unsqueeze(1) + torch.arange(-reach, reach + 1, device=position.device)
     known = (candidates >= 0) & (candidates < length) & (candidates.clamp(min=0) // scale % side == site)
     away = 2 * candidates - half.unsqueeze(1)

@@ -4,8 +4,8 @@
     scatter  out[b, c, p] = sum of weight[b, k, q] grad[b, c, q] over all k, q with index[b, k, q] = p
     dot      out[b, k, q] = sum_c values[b, c, index[b, k, q]] grad[b, c, q]
 
-With them a warp can be differentiated as often as one likes. Sums run in float32 or wider. Where the channels of
-``values`` (of ``grad``, for scatter) lie side by side in memory, those of the result do too.
+They make warps differentiable to any order. Sums are computed in float32 or wider. The memory layout follows ``values``
+(``grad`` for scatter): channels last stays channels last.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from spikekit.check import wide_dtype
 from spikekit.kernels import cpu_warp, custom_operator, gpu_kernel, register_kernel, register_on_gpu
 from spikekit.kernels.layout import empty_like_layout, is_channels_last
 
-_FEW = 8  # channels: of fewer planes, a CPU gathers one after the other faster than rows of all
+_FEW = 8  # channels; with fewer, a CPU is faster plane by plane
 
 
 def _gather(values: Tensor, index: Tensor, weight: Tensor) -> Tensor:
-    """(B, C, P), (B, K, Q) and (B, K, Q) to (B, C, Q), in the dtype of ``values``."""
+    """Map (B, C, P), (B, K, Q) and (B, K, Q) to (B, C, Q), in the dtype of ``values``."""
     total = values.new_zeros(*values.shape[:2], index.shape[2], dtype=wide_dtype(values, weight))
     for index_k, weight_k in zip(index.split(1, dim=1), weight.split(1, dim=1), strict=True):
         total += values.gather(2, index_k.expand(-1, values.shape[1], -1)) * weight_k
@@ -33,7 +33,7 @@ def _gather(values: Tensor, index: Tensor, weight: Tensor) -> Tensor:
 
 
 def _scatter(grad: Tensor, index: Tensor, weight: Tensor, size: int) -> Tensor:
-    """(B, C, Q), (B, K, Q) and (B, K, Q) to (B, C, size), in the dtype of ``grad``."""
+    """Map (B, C, Q), (B, K, Q) and (B, K, Q) to (B, C, size), in the dtype of ``grad``."""
     dtype = wide_dtype(grad, weight)
     total = grad.new_zeros(*grad.shape[:2], size, dtype=dtype)
     for index_k, weight_k in zip(index.split(1, dim=1), weight.split(1, dim=1), strict=True):
@@ -42,7 +42,7 @@ def _scatter(grad: Tensor, index: Tensor, weight: Tensor, size: int) -> Tensor:
 
 
 def _dot(values: Tensor, grad: Tensor, index: Tensor) -> Tensor:
-    """(B, C, P), (B, C, Q) and (B, K, Q) to (B, K, Q), in float32 or wider."""
+    """Map (B, C, P), (B, C, Q) and (B, K, Q) to (B, K, Q), in float32 or wider."""
     dtype = wide_dtype(values, grad)
     result = values.new_empty(index.shape, dtype=dtype)
     for k, index_k in enumerate(index.split(1, dim=1)):
@@ -52,7 +52,7 @@ def _dot(values: Tensor, grad: Tensor, index: Tensor) -> Tensor:
 
 
 def fold_into_batch(op: Any, count: int) -> None:
-    """Let ``torch.func.vmap`` give its axis to the first ``count`` arguments of an operator as a larger batch."""
+    """Register a ``torch.func.vmap`` rule that folds the mapped axis of the first ``count`` arguments into a batch."""
 
     def rule(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Any, Any]:
         if any(dim is not None for dim in in_dims[count:]):
@@ -94,7 +94,7 @@ weighted_dot = _operator(
 
 
 class _Weighted(torch.autograd.Function):
-    """What the three have in common: their first three arguments are what derivatives are made of."""
+    """Base of the three operators, whose derivatives depend on the first three arguments."""
 
     generate_vmap_rule = True
 
@@ -104,7 +104,7 @@ class _Weighted(torch.autograd.Function):
 
 
 class Gather(_Weighted):
-    """:func:`weighted_gather` with derivatives in values and weight."""
+    """:func:`weighted_gather`, differentiable in values and weight."""
 
     @staticmethod
     def forward(values: Tensor, index: Tensor, weight: Tensor) -> Tensor:  # noqa: D102
@@ -122,7 +122,7 @@ class Gather(_Weighted):
 
 
 class Scatter(_Weighted):
-    """:func:`weighted_scatter` with derivatives in grad and weight."""
+    """:func:`weighted_scatter`, differentiable in grad and weight."""
 
     @staticmethod
     def forward(grad: Tensor, index: Tensor, weight: Tensor, size: int) -> Tensor:  # noqa: D102
@@ -141,7 +141,7 @@ class Scatter(_Weighted):
 
 
 class Dot(_Weighted):
-    """:func:`weighted_dot` with derivatives in values and grad."""
+    """:func:`weighted_dot`, differentiable in values and grad."""
 
     @staticmethod
     def forward(values: Tensor, grad: Tensor, index: Tensor) -> Tensor:  # noqa: D102

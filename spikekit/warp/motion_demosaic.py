@@ -1,4 +1,4 @@
-"""Demosaicing along motion: residual interpolation, improved by what other times saw of the same places."""
+"""Demosaicing along motion: residual interpolation, corrected with samples from other times."""
 
 from __future__ import annotations
 
@@ -23,43 +23,43 @@ def demosaic_along_motion(
     sigma_range: float = 0.5,
     tau: float = 5.0,
 ) -> Tensor:
-    r"""Demosaic the middle one of several mosaics with the samples that the others have along the motion.
+    r"""Demosaic the middle one of several mosaics, using samples of the others along the motion.
 
-    The missing colours are first estimated in the middle mosaic, as by :func:`spikekit.demosaic_residual`. Then every
-    time says by how much its samples r of that colour deviate from the estimate, moved there, and the estimate is
-    corrected by a weighted mean of the deviations near the pixel's trajectory:
+    The missing colours are first estimated in the middle mosaic, as by :func:`spikekit.demosaic_residual`. The estimate
+    is then warped to every time t and compared with the samples r of that colour there. Finally it is corrected by a
+    weighted mean of these deviations near the pixel's trajectory:
 
     .. math::
         \hat I(x) = E(x) + \frac{\sum_{t, k} w_{tk} \, (r_t(k) - E_t(k))}{\sum_{t, k} w_{tk}}, \quad
         w_{tk} = e^{-\frac{|k - x - o_t(x)|^2}{2 \sigma_s^2}} e^{-\frac{|t - j|}{\tau}}
         e^{-\frac{(r_t(k) - E_t(k))^2}{2 \sigma_r^2}}
 
-    Green is corrected first, then guides red and blue, which are corrected likewise.
+    Green is corrected first, and then guides red and blue, which are corrected in the same way.
 
     Convention:
-        The picture is that of the middle time j, the mosaic T // 2; times are counted in mosaics. Flow in sensor
-        pixels, order (x, y), backward sampling: the pixel x of the picture is found at x + o_t(x) in the mosaic t, as
-        :func:`spikekit.linear_motion` gives it. The samples k are those of the colour among the 3 x 3 pixels around
-        that place; pixels outside the sensor are not used. E is moved to the time t by the opposite flow, which is
-        right where motion is smooth; its errors, like occlusions, are kept out by sigma_range. NaN flow counts as 0.
-        Unlike in :func:`spikekit.demosaic_residual` known values change, as other times contribute.
-        Differentiable almost everywhere, in mosaics and flow. Computed in float32 or wider.
+        The result is the picture at the middle time j, the mosaic T // 2; times are counted in mosaics. Flow in sensor
+        pixels, order (x, y), backward sampling: pixel x of the picture is at x + o_t(x) in mosaic t, as returned by
+        :func:`spikekit.linear_motion`. The samples k are those of the colour among the 3 x 3 pixels around that
+        position; pixels outside the sensor are not used. E is warped to time t by the opposite flow, which assumes
+        smooth motion; its errors and occlusions are suppressed by sigma_range. NaN flow counts as 0. Unlike in
+        :func:`spikekit.demosaic_residual`, known values change, as other times contribute. Differentiable almost
+        everywhere, in mosaics and flow. Computed in float32 or wider.
 
     Args:
         raw: mosaics :math:`(*, T, H, W)`, floating, white near 1, T odd, H and W at least 3.
-        flow: :math:`(*, T, 2, H, W)`, from the middle to each of the times.
+        flow: :math:`(*, T, 2, H, W)`, from the middle to each time.
         pattern: Bayer phase, see :func:`spikekit.bayer_pattern`.
-        sigma_space: how near to the trajectory a sample counts, in pixels.
-        sigma_range: how much a sample may deviate from the estimate, white being 1.
-        tau: how many mosaics away one counts 1 / e.
+        sigma_space: standard deviation of the weight by distance from the trajectory, in pixels.
+        sigma_range: standard deviation of the weight by deviation from the estimate; white is 1.
+        tau: time, in mosaics, after which the weight drops to 1 / e.
 
     Returns:
         The picture :math:`(*, 3, H, W)`, in the dtype of ``raw``.
 
     Raises:
-        TypeError: not floating-point tensors, or a width that is no number.
-        ValueError: sizes that do not fit each other, an even T, smaller than 3 x 3, an unknown pattern, or a width
-            that is not above 0.
+        TypeError: ``raw`` or ``flow`` is not a floating-point tensor, or a width is not a number.
+        ValueError: the sizes do not match, T is even, the mosaics are smaller than 3 x 3, the pattern is unknown, or a
+            width is not above 0.
 
     Example:
         >>> raw, flow = torch.full((5, 4, 6), 0.25), torch.zeros(5, 2, 4, 6)
@@ -67,9 +67,9 @@ def demosaic_along_motion(
         [0.25]
 
     Reference:
-        After the abstract of 3DRI, all that is public of it (3D residual interpolation for spike camera demosaicing,
-        ICIP 2022): missing pixels are estimated along motion trajectories, residuals with green as the guide. How the
-        samples are weighed, and the defaults, are ours; so this is 3DRI-like, not 3DRI.
+        Follows the abstract of 3DRI (3D residual interpolation for spike camera demosaicing, ICIP 2022): missing pixels
+        are estimated along motion trajectories, from residuals guided by green. Only the abstract is public. The
+        weights and the defaults are our own, so this is 3DRI-like, not 3DRI.
     """
     check_planes("raw", raw, 3, "(*, T, H, W)", floating=True)
     check_planes("flow", flow, 4, "(*, T, 2, H, W)", floating=True)
@@ -81,7 +81,7 @@ def demosaic_along_motion(
         raise ValueError(f"flow: expected {expected} for raw {tuple(raw.shape)}, got {tuple(flow.shape)}")
     _check_widths(sigma_space, sigma_range, tau)
     wide = torch.promote_types(torch.promote_types(raw.dtype, flow.dtype), torch.float32)
-    # contiguous, so that sums have one order
+    # contiguous, so that the order of sums is fixed
     known = raw.reshape(-1, frames, height, width).to(wide).contiguous()
     flow = finite(flow.reshape(-1, frames, 2, height, width).to(wide)).contiguous()
     index, near = _along(flow, sigma_space, tau)
@@ -101,7 +101,7 @@ def demosaic_along_motion(
 
 
 def _along(flow: Tensor, sigma_space: float, tau: float) -> tuple[Tensor, Tensor]:
-    """Flat places of the 3 x 3 pixels around the trajectories, and weights by distance and time: (B, T, 9, H, W)."""
+    """Return flat indices of 3 x 3 pixels around trajectories, and weights by distance and time: (B, T, 9, H, W)."""
     _, frames, _, height, width = flow.shape
     x = torch.arange(width, device=flow.device) + flow[:, :, :1]
     y = torch.arange(height, device=flow.device)[:, None] + flow[:, :, 1:]

@@ -1,6 +1,6 @@
-"""The known pixels nearest to where flow points to, and their weights by inverse distance.
+"""Nearest known pixels at the positions of a flow, and their inverse-distance weights.
 
-Everything that warps with the same flow and mask can share them::
+Several warps with the same flow and mask can share them::
 
     index, weight = idw_neighbors(flow, mask)
     warped = Gather.apply(features.flatten(2), index, weight).reshape(features.shape)
@@ -20,27 +20,27 @@ from spikekit.kernels import custom_operator, gpu_kernel, register_kernel, regis
 from spikekit.kernels.loops import import_loops
 from spikekit.warp.gather import fold_into_batch
 
-_FARTHEST = 2.0**30  # flow beyond it is cut: positions must fit an integer
-_CHUNK = 1 << 15  # positions searched at a time: in the cache, and by one thread, without waiting for another
+_FARTHEST = 2.0**30  # flow is clamped to it, so that positions fit an integer
+_CHUNK = 1 << 15  # positions per search: fits in the cache of one thread
 
-# The tables of the rows and of the columns of a product, (k, 2 H) and (k, 2 W), see _nearest_on_axis.
+# Tables of the rows and the columns of a product, (k, 2 H) and (k, 2 W), see _nearest_on_axis.
 Product = tuple[Tensor, Tensor]
 
 
 def finite(flow: Tensor) -> Tensor:
-    """Count NaN as 0 and cut what is too far; the gradient is 0 there."""
+    """Replace NaN by 0 and clamp large values, both with gradient 0."""
     return flow.nan_to_num(0.0).clamp(-_FARTHEST, _FARTHEST)
 
 
 def _nearest_on_axis(known: np.ndarray, length: int, neighbors: int) -> np.ndarray:
-    """Positions of the nearest known indices, nearest first, for every interval ((h - 1) / 2, h / 2].
+    """Return the nearest known indices, nearest first, for every interval ((h - 1) / 2, h / 2].
 
-    Between two half-integers the order of whole numbers by distance does not change; at h / 2 itself two may be
-    equally far, and the lower one wins. So the order at q depends on ceil(2 q) alone, and beyond the axis it does not
-    change any more: 2 * length rows are enough for every q.
+    Between two half-integers, the order of whole numbers by distance is constant. At h / 2 two may be equally far; the
+    lower one wins. The order at q therefore depends on ceil(2 q) only, and is constant outside the axis, so
+    2 * length rows cover every q.
     """
     h = np.arange(2 * length)
-    # known positions that can be among the nearest: as many to the left of h / 2 as to the right
+    # candidates: equally many on both sides of h / 2
     start = np.searchsorted(known, h / 2)[:, None] + np.arange(-neighbors, neighbors)
     outside = (start < 0) | (start >= len(known))
     position = known[start.clip(0, len(known) - 1)]
@@ -49,14 +49,14 @@ def _nearest_on_axis(known: np.ndarray, length: int, neighbors: int) -> np.ndarr
     return np.take_along_axis(position, order, axis=1)
 
 
-# What was seen of a mask, as (bits, height, width, device). By identity: a WeakKeyDictionary would compare with ==.
+# Content of a mask: (bits, height, width, device). Keyed by identity: a WeakKeyDictionary would compare with ==.
 _Key = tuple[bytes, int, int, str]
 _key_of_mask = WeakTensorKeyDictionary()
 
 
 def _key(mask: Tensor) -> _Key:
-    """Return what to look up the tables of a mask by; a GPU is waited for only where it is new or has changed."""
-    # inference tensors do not count their changes, and memory on the CPU may be another's, such as NumPy's
+    """Return the content of a mask, without synchronising a GPU unless the mask is new or has changed."""
+    # inference tensors have no version counter, and CPU memory may be shared, for example with NumPy
     uncounted = mask.is_inference() or mask.device.type == "cpu"
     version = None if uncounted else mask._version
     kept, key = _key_of_mask.get(mask, (None, None))
@@ -69,10 +69,10 @@ def _key(mask: Tensor) -> _Key:
 
 @lru_cache(maxsize=32)
 def _products(key: _Key, neighbors: int) -> list[Product]:
-    """Write a mask as products of known rows and known columns, and return the tables of each.
+    """Decompose a mask into products of known rows and known columns, and return the tables of each.
 
-    Rows with the same known columns belong together, so that every mask is a union of such products: one for red and
-    for blue of a Bayer filter, two for green.
+    Rows with the same known columns form one product, so every mask is a union of products. Red and blue of a Bayer
+    filter need one, green needs two.
     """
     bits, height, width, device = key
     rows_of_pattern: dict[bytes, list[int]] = {}
@@ -91,25 +91,25 @@ def _products(key: _Key, neighbors: int) -> list[Product]:
 
 
 def products_of(mask: Tensor, neighbors: int) -> list[Product]:
-    """Return the tables of a mask, kept between calls."""
+    """Return the tables of a mask, cached between calls."""
     return _products(_key(mask), neighbors)
 
 
 def _on_axis(table: Tensor, cell: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
-    """Nearest positions on one axis, and their squared distance less that of a common reference: both (k, n)."""
+    """Return the nearest positions on an axis and their squared distances relative to a common reference: (k, n)."""
     top = table.shape[1] - 1
     half = (2 * cell + torch.ceil(2 * part).long()).clamp(0, top)
     position = table.index_select(1, half)
     reference = cell.clamp(0, top // 2)
     step = (position - reference).to(part.dtype)
-    # (p - q)^2 - (r - q)^2 without squaring what is far away; q = cell + part
+    # (p - q)^2 - (r - q)^2 without squaring large numbers; q = cell + part
     return position, step * (step + 2 * ((reference - cell).to(part.dtype) - part))
 
 
 def _search(products: list[Product], neighbors: int, width: int, cell: Tensor, part: Tensor) -> Tensor:
-    """Flat indices (neighbors, n) of the known pixels nearest to cell + part, (2, n): the nearest again where none is.
+    """Return flat indices (neighbors, n) of the known pixels nearest to cell + part, (2, n).
 
-    Nearest first, exact, row-major order among equals.
+    They are exact, nearest first, in row-major order among equals. If too few exist, the nearest is repeated.
     """
     best: list[tuple[Tensor, Tensor]] = []
     for rows, columns in products:
@@ -117,14 +117,14 @@ def _search(products: list[Product], neighbors: int, width: int, cell: Tensor, p
         column, column_distance = _on_axis(columns, cell[0], part[0])
         for i in range(len(row)):
             for j in range(min(len(column), neighbors // (i + 1))):
-                before = (i + 1) * (j + 1) - 1  # so many pixels of this product are at least as near
+                before = (i + 1) * (j + 1) - 1  # pixels of this product that are at least as near
                 _insert(best, row_distance[i] + column_distance[j], row[i] * width + column[j], before, neighbors)
     best += best[:1] * (neighbors - len(best))
     return torch.stack([index for _, index in best]).long()
 
 
 def _insert(best: list[tuple[Tensor, Tensor]], distance: Tensor, index: Tensor, before: int, most: int) -> None:
-    """Keep the smallest (distance, index), in order; the new one cannot be among the first ``before``."""
+    """Insert into the sorted list of the smallest (distance, index), not among the first ``before``."""
     for slot in range(before, len(best)):
         other, other_index = best[slot]
         closer = (distance < other) | ((distance == other) & (index < other_index))
@@ -138,34 +138,34 @@ def _insert(best: list[tuple[Tensor, Tensor]], distance: Tensor, index: Tensor, 
 def search_and_weigh(
     products: list[Product], neighbors: int, width: int, cell: Tensor, part: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Flat indices of the known pixels nearest to cell + part, (2, n), and their weights: both (neighbors, n)."""
+    """Return indices and weights, (neighbors, n), of the known pixels nearest to cell + part, (2, n)."""
     index = _search(products, neighbors, width, cell, part)
     return index, _weigh(index, width, cell, part)
 
 
 def _weigh(index: Tensor, width: int, cell: Tensor, part: Tensor) -> Tensor:
-    """Weights by inverse distance, of sum 1, that pixels (neighbors, n) have at cell + part, (2, n)."""
+    """Return inverse-distance weights, of sum 1, of pixels (neighbors, n) at cell + part, (2, n)."""
     row = index // width
     dx = (index - row * width - cell[0]).to(part.dtype) - part[0]
     dy = (row - cell[1]).to(part.dtype) - part[1]
     distance = (dx * dx + dy * dy).sqrt()
-    # 1 / d, relative to the nearest: no overflow next to a known pixel, and nothing for the others on it
+    # 1 / d relative to the nearest: no overflow near a known pixel; on it the other weights are 0
     weight = torch.where(index[1:] == index[0], 0, distance[0] / distance[1:])
     weight = torch.cat([torch.ones_like(distance[:1]), weight])
     return weight / weight.sum(dim=0)
 
 
 def _nearest_known(flow: Tensor, mask: Tensor, neighbors: int) -> tuple[Tensor, Tensor]:
-    """Do what :func:`idw_neighbors` does with flow that is float32 or float64, finite and less than 2^30."""
+    """Compute :func:`idw_neighbors` for float32 or float64 flow that is finite and below 2^30."""
     count, _, height, width = flow.shape
     products = products_of(mask, neighbors)
-    # double, so that what is nearer does not depend on rounding
+    # double, so that the choice of neighbours does not depend on rounding
     double = torch.float32 if flow.device.type == "mps" else torch.float64
     plane = height * width
     flat = flow.movedim(1, 0).reshape(2, -1)
     index = flow.new_empty(neighbors, count * plane, dtype=torch.int64)
     weight = flow.new_empty(neighbors, count * plane)
-    size = _CHUNK if flow.device.type == "cpu" else 128 * _CHUNK  # elsewhere a launch costs more than the cache saves
+    size = _CHUNK if flow.device.type == "cpu" else 128 * _CHUNK  # on a GPU fewer launches matter more than the cache
     for begin in range(0, count * plane, size):
         moved = flat[:, begin : begin + size].to(double)
         whole = moved.round()
@@ -203,7 +203,7 @@ fold_into_batch(nearest_known, 1)
 
 
 class NearestKnown(torch.autograd.Function):
-    """:func:`nearest_known` with the derivative of the weights in the flow."""
+    """:func:`nearest_known`, with weights differentiable in the flow."""
 
     generate_vmap_rule = True
 
@@ -223,7 +223,7 @@ class NearestKnown(torch.autograd.Function):
 
     @staticmethod
     def of_flow(flow: Tensor, index: Tensor, weight: Tensor, grad: Tensor) -> Tensor:
-        """Derivative in the flow, from that in the weights."""
+        """Return the gradient of the flow from that of the weights."""
         _, _, height, width = flow.shape
         whole = flow.detach().round()
         part = (flow - whole).flatten(2)
@@ -233,7 +233,7 @@ class NearestKnown(torch.autograd.Function):
         dx = (index - row * width - cell_x).to(flow.dtype) - part[:, :1]
         dy = (row - cell_y).to(flow.dtype) - part[:, 1:]
         square = dx * dx + dy * dy
-        # sum over i of w_i (g_i - mean g) (p_i - q) / d_i^2; for the nearest, whose d may be tiny, without cancellation
+        # sum over i of w_i (g_i - mean g) (p_i - q) / d_i^2; without cancellation for the nearest, whose d may be tiny
         first, others = weight.split([1, weight.shape[1] - 1], dim=1)
         near = first * (others * (grad[:, :1] - grad[:, 1:])).sum(dim=1, keepdim=True)
         far = others * (grad[:, 1:] - (weight * grad).sum(dim=1, keepdim=True))
@@ -242,16 +242,16 @@ class NearestKnown(torch.autograd.Function):
 
 
 def idw_neighbors(flow: Tensor, mask: Tensor, neighbors: int = 4) -> tuple[Tensor, Tensor]:
-    """Known pixels nearest to where flow points to, and their weights by inverse distance.
+    """Return the known pixels nearest to the positions of a flow, and their inverse-distance weights.
 
     Args:
         flow: (N, 2, H, W), floating.
         mask: (H, W); a pixel is known where it is not 0.
-        neighbors: how many known pixels to weigh, K.
+        neighbors: number of neighbours, K.
 
     Returns:
-        Flat indices, int64, and weights, in the dtype of ``flow`` but float32 at least: both (N, K, H W). The weights
-        are differentiable in the flow. Where fewer pixels are known, the nearest is repeated with weight 0.
+        Flat indices, int64, and weights, in the dtype of ``flow`` but at least float32; both (N, K, H W). The weights
+        are differentiable in the flow. If fewer pixels are known, the nearest is repeated with weight 0.
     """
     flow = finite(flow.to(torch.promote_types(flow.dtype, torch.float32)))
     return NearestKnown.apply(flow, mask, neighbors)

@@ -1,15 +1,15 @@
-r"""The temporal pixel search of eq. (9)-(10), a sensor pixel at a time: a table in place of a search.
+r"""The temporal pixel search of eq. (9)-(10) by table look-up, one sensor pixel at a time.
 
-Flow is taken once for every sensor pixel, a *site*, and rounded to ``1 / STEPS`` of it. Bilinear enlargement and
-:func:`spikekit.flow_warp_idw` then make the s x s temporal pixels of a site from a few features around the place that
-flow points to. They are linear in these features, and their weights depend on three things alone: on the place in the
-Bayer cell, on the rounded fraction of the flow, and, near a border, on how far away that is. So they are looked up.
+One flow vector is used per sensor pixel, called a *site*, rounded to ``1 / STEPS`` pixel. The s x s temporal pixels of
+a site, which bilinear upsampling and :func:`spikekit.flow_warp_idw` would compute, are then linear in a few features
+around the position that the flow points to. Their weights depend only on the position in the Bayer cell, on the rounded
+fraction of the flow and, near a border, on the distance to it. They are looked up in a table:
 
 .. math:: z_{s y + j,\, s x + i} = \sum_k w_{c k}^{i j} \, x_{b + o_{c k}}, \qquad
     b = \lfloor (x, y) + \text{flow} \rfloor
 
-with the class c of the place, offsets o and weights w. At borders, where fewer known pixels are near, classes are kept
-at half the resolution of the rounding.
+where c is the class of the position, o are offsets and w weights. Classes near a border have half the resolution of the
+rounding.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from spikekit.warp.neighbors import finite, products_of, search_and_weigh
 _loops = import_loops("spikekit.kernels.cpu_sites")
 
 STEPS = 32  #: positions per sensor pixel and axis that flow is rounded to
-SMALLEST = 12  #: sensor pixels along an axis from which on both borders have classes of their own
-_SIDE = 16  # of the sensor that classes are found on
-_AROUND = 4, 6  # sensor pixels around the base among which the known ones are; where scale is 1, they are further apart
-_CHUNK = 1 << 13  # positions searched at a time: in the cache
+SMALLEST = 12  #: smallest side of a sensor, in pixels, on which the borders have separate classes
+_SIDE = 16  # side of the sensor on which the table is computed
+_AROUND = 4, 6  # radius, in sensor pixels, that contains the known ones; the second if scale is 1
+_CHUNK = 1 << 13  # positions per search: fits in the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +44,10 @@ class SiteTable:
 
     Args:
         scale: temporal pixels along each side of a site, s.
-        low: smallest offset from the base of the features that a site away from both borders of an axis is made of.
-        high: the largest.
-        most: features of a class at most.
-        start: (C + 1,), int32: where the features of every class begin.
+        low: smallest offset of a feature from the base, for sites away from the borders.
+        high: largest offset.
+        most: largest number of features of a class.
+        start: (C + 1,), int32: first feature of every class.
         offset: (n, 2), int32: offsets (y, x) from the base.
         weight: (n, s^2), float32.
     """
@@ -62,7 +62,7 @@ class SiteTable:
 
     @property
     def places(self) -> int:
-        """Number of places on an axis: two inside, for even and odd pixels, then those near either border."""
+        """Number of places on an axis: two inside, for even and odd pixels, and those near the borders."""
         return 4 - self.low + self.high
 
     def place(self, base: Tensor, length: int) -> Tensor:
@@ -74,10 +74,10 @@ class SiteTable:
         """Return bases and classes of positions in steps.
 
         Args:
-            y: rows, whole, from ``-STEPS`` to ``STEPS * height``.
-            x: columns likewise.
-            height: of the sensor.
-            width: of the sensor.
+            y: rows, integer, from ``-STEPS`` to ``STEPS * height``.
+            x: columns, integer, from ``-STEPS`` to ``STEPS * width``.
+            height: height of the sensor.
+            width: width of the sensor.
 
         Returns:
             Rows and columns of the bases, and the classes, in the shape of ``y``.
@@ -92,7 +92,7 @@ class SiteTable:
 
     @property
     def arguments(self) -> tuple[Any, ...]:
-        """What kernels take of it."""
+        """Arguments of the kernels."""
         return self.start, self.offset, self.weight, self.scale, self.low, self.high, self.most, STEPS
 
     def to(self, device: torch.device) -> SiteTable:
@@ -102,29 +102,29 @@ class SiteTable:
 
 
 def _steps_to(moved: Tensor, length: int, axis: int) -> Tensor:
-    """Round where every site is moved to, (T, H, W), in steps; one site beyond a border is like any further."""
+    """Return the rounded target of every site, (T, H, W), in steps, clamped to one site outside the sensor."""
     at = torch.arange(length, device=moved.device) * STEPS
     at = at.unsqueeze(-1) if axis == -2 else at
     moved = moved.clamp(-2.0 * length, 2.0 * length)
     return ((moved * STEPS).round().long() + at).clamp(-STEPS, STEPS * length)
 
 
-@compiler_kept_out  # which would make the table anew, and cannot
+@compiler_kept_out  # torch.compile cannot trace it, and would ignore the cache
 @lru_cache(maxsize=24)
 def site_table(
     pattern: str, color: int, scale: int, odd: tuple[bool, bool], device: torch.device, neighbors: int = 4
 ) -> SiteTable:
-    """Make the table of one colour, or return the one that was made before.
+    """Return the table of one colour, cached.
 
     Args:
         pattern: Bayer phase, or ``"grey"``.
         color: 0, 1, 2 for R, G, B; 0 for grey.
         scale: super-resolution factor s.
-        odd: whether height and width of the sensor are odd, as the border at the end is then of another phase.
-        device: where the table is needed.
-        neighbors: known temporal pixels that are weighed, 4 at most.
+        odd: whether height and width of the sensor are odd, which changes the phase at the far border.
+        device: device of the table.
+        neighbors: number of known temporal pixels that are weighted, at most 4.
     """
-    with torch.inference_mode(False), torch.device("cpu"):  # what is made in inference mode has no gradient later
+    with torch.inference_mode(False), torch.device("cpu"):  # tensors of inference mode cannot be used in training
         if device.type == "cpu":
             return _make_table(pattern, color, scale, odd, neighbors)
         return site_table(pattern, color, scale, odd, torch.device("cpu"), neighbors).to(device)
@@ -135,7 +135,7 @@ def _make_table(pattern: str, color: int, scale: int, odd: tuple[bool, bool], ne
     mask = bayer_mask(*size, pattern, scale=scale, dtype=torch.bool)[color]
     inside, step = [_SIDE // 2, _SIDE // 2 + 1], torch.arange(STEPS)
     ends = step[[0, 1, STEPS // 2 - 1, STEPS // 2, STEPS // 2 + 1, -2, -1]]
-    # away from both borders of an axis, however near one of the other axis is: there known pixels lie further apart
+    # offsets of sites inside on one axis and near a border on the other, where known pixels lie further apart
     near = [[*inside, -1, 0, 1, length, length - 1, length - 2] for length in size]
     wide = _weights(mask, neighbors, scale, _steps(near[0], ends), _steps(inside, ends))[1][:, 1]
     high_ones = _weights(mask, neighbors, scale, _steps(inside, ends), _steps(near[1], ends))[1][:, 0]
@@ -151,26 +151,26 @@ def _make_table(pattern: str, color: int, scale: int, odd: tuple[bool, bool], ne
 
 
 def _steps(bases: list[int], steps: Tensor) -> Tensor:
-    """(bases, steps) positions on an axis, in steps."""
+    """Return positions (bases, steps) on an axis, in steps."""
     return torch.tensor(bases)[:, None] * STEPS + steps
 
 
 def _weights(mask: Tensor, neighbors: int, scale: int, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Weights of all pairs of places on both axes and of all fractions.
+    """Compute the weights for all pairs of places on both axes and all fractions.
 
     Args:
-        mask: (s H, s W), known temporal pixels.
-        neighbors: how many of them are weighed.
-        scale: s.
-        rows: (I, S), positions in steps.
-        columns: (J, S).
+        mask: known temporal pixels, (s H, s W).
+        neighbors: number of known pixels that are weighted.
+        scale: super-resolution factor s.
+        rows: positions in steps, (I, S).
+        columns: positions in steps, (J, S).
 
     Returns:
-        Of the I J S^2 classes: the number of features, (classes,), their offsets, (n, 2), and weights, (n, s^2).
+        For the I J S^2 classes: number of features, (classes,), their offsets, (n, 2), and weights, (n, s^2).
     """
     height, width = (length // scale for length in mask.shape)
     sub = torch.arange(scale)
-    # of every temporal pixel of the site, where it is moved to: (I, S, s) and (J, S, s), in temporal pixels
+    # target of every temporal pixel of the site: (I, S, s) and (J, S, s), in temporal pixels
     y = (rows[..., None] * (scale / STEPS) + sub).double().clamp(-0.5, scale * height - 0.5)
     x = (columns[..., None] * (scale / STEPS) + sub).double().clamp(-0.5, scale * width - 0.5)
     places = len(rows), len(columns), rows.shape[1], columns.shape[1]
@@ -190,7 +190,7 @@ def _weights(mask: Tensor, neighbors: int, scale: int, rows: Tensor, columns: Te
         index, weight = search_and_weigh(products, neighbors, scale * width, cell.long(), at - cell)
         chunk_y, chunk_x = base_y[begin : begin + classes], base_x[begin : begin + classes]
         dense = torch.zeros(len(chunk_y), per_site, side * side)
-        # a known temporal pixel is a bilinear mixture of features, as torch.nn.functional.interpolate makes it
+        # a known temporal pixel is a bilinear mixture of features, as in torch.nn.functional.interpolate
         row, column = index // (scale * width), index % (scale * width)
         for i, weight_y in _mixture(row, scale, height):
             for j, weight_x in _mixture(column, scale, width):
@@ -198,7 +198,7 @@ def _weights(mask: Tensor, neighbors: int, scale: int, rows: Tensor, columns: Te
                 away_x = j.unflatten(1, (-1, per_site)) - chunk_x[:, None] + around
                 amount = (weight * weight_y * weight_x).unflatten(1, (-1, per_site))
                 for k in range(neighbors):
-                    # where a mixture has no part in a feature, that may lie outside
+                    # features of weight 0 may lie outside
                     where = (away_y[k] * side + away_x[k]).where(amount[k] != 0, 0)
                     dense.scatter_add_(2, where.unsqueeze(-1), amount[k].float().unsqueeze(-1))
         used = dense.amax(dim=1) > 1e-7
@@ -210,7 +210,7 @@ def _weights(mask: Tensor, neighbors: int, scale: int, rows: Tensor, columns: Te
 
 
 def _mixture(pixel: Tensor, scale: int, length: int) -> list[tuple[Tensor, Tensor]]:
-    """The two features on an axis, and their weights, that a temporal pixel is a mixture of."""
+    """Return the two features on an axis that a temporal pixel is interpolated from, and their weights."""
     at = ((pixel + 0.5) / scale - 0.5).clamp(0, length - 1)
     first = at.floor()
     share = at - first
@@ -218,7 +218,7 @@ def _mixture(pixel: Tensor, scale: int, length: int) -> list[tuple[Tensor, Tenso
 
 
 def _taps(flow: Tensor, shares: Tensor, table: SiteTable) -> Iterator[tuple[Tensor, Tensor]]:
-    """Where the features of all sites lie, (B T, H W), and their weights, (B T, H W, s^2), one after another."""
+    """Yield, feature by feature, the indices for all sites, (B T, H W), and the weights, (B T, H W, s^2)."""
     height, width = flow.shape[-2:]
     moved = torch.einsum("tk,bkchw->btchw", shares.to(flow.dtype), flow).flatten(0, 1)
     y, x = _steps_to(moved[:, 1], height, -2), _steps_to(moved[:, 0], width, -1)
@@ -235,7 +235,7 @@ def _search_sites(
     features: Tensor, flow: Tensor, shares: Tensor, start: Tensor, offset: Tensor, weight: Tensor,
     scale: int, low: int, high: int, most: int, steps: int,
 ) -> Tensor:  # fmt: skip
-    """:func:`search_sites` in plain torch; kernels take the same arguments."""
+    """Compute :func:`search_sites` in plain torch; kernels take the same arguments."""
     batch, *_, height, width = features.shape
     table = SiteTable(scale, low, high, most, start, offset, weight)
     planes = features.flatten(0, 1).flatten(2)
@@ -251,7 +251,7 @@ def _spread_sites(
     grad: Tensor, flow: Tensor, shares: Tensor, start: Tensor, offset: Tensor, weight: Tensor,
     scale: int, low: int, high: int, most: int, steps: int,
 ) -> Tensor:  # fmt: skip
-    """Its derivative in the features, (B, T F s^2, H, W) to (B, T, F, H, W), float32 or wider."""
+    """Return its derivative in the features, (B, T F s^2, H, W) to (B, T, F, H, W), float32 or wider."""
     height, width = grad.shape[-2:]
     times = len(shares)
     table = SiteTable(scale, low, high, most, start, offset, weight)
@@ -311,15 +311,15 @@ class _SearchSites(torch.autograd.Function):
 
 
 def search_sites(features: Tensor, flow: Tensor, shares: Tensor, table: SiteTable) -> Tensor:
-    """Temporal pixels of all sites, one time point after another, as channels.
+    """Return the temporal pixels of all sites and time points as channels.
 
     Args:
-        features: of every time point, (B, T, F, H, W), floating, H and W at least :data:`SMALLEST`.
-        flow: from the middle to the first and to the last time point, (B, 2, 2, H, W), in sensor pixels.
-        shares: of both flows in the motion to every time point, float32, (T, 2).
-        table: of the colour, on the device of the features.
+        features: features of every time point, (B, T, F, H, W), floating, H and W at least :data:`SMALLEST`.
+        flow: flow from the middle to the first and the last time point, (B, 2, 2, H, W), in sensor pixels.
+        shares: factors of both flows for the motion to every time point, float32, (T, 2).
+        table: table of the colour, on the device of the features.
 
     Returns:
-        (B, T F s^2, H, W), channels last, in the dtype of ``features``; differentiable in these, not in ``flow``.
+        (B, T F s^2, H, W), channels last, in the dtype of ``features``; differentiable in ``features`` only.
     """
     return _SearchSites.apply(features, finite(flow.detach().float()), shares, table)

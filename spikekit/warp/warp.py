@@ -1,4 +1,4 @@
-"""Warping: sample a picture, or the known pixels of one, where flow points to."""
+"""Warping of dense images and of sparse known pixels by optical flow."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ def _check_warp(name: str, image: Tensor, flow: Tensor) -> None:
 
 
 def flow_warp(image: Tensor, flow: Tensor) -> Tensor:
-    r"""Sample an image where flow points to, bilinearly.
+    r"""Warp an image by optical flow, with bilinear sampling.
 
     .. math:: O(x, y) = I(x + u(x, y), y + v(x, y))
 
     Convention:
         Flow in pixels, order (x, y), x right, y down. Pixel centres are at whole numbers; positions outside the image
-        are moved to its border. Coordinates are computed in float32 or wider. NaN flow counts as 0, infinite flow as
-        very far, both with gradient 0. Built on :func:`kornia.geometry.transform.remap`; on a GPU, under
-        ``torch.use_deterministic_algorithms(True)``, on a gather instead: the same up to rounding, with gradients that
-        are the same every time, and those of second order also where ``grid_sample`` of PyTorch has none.
+        are clamped to its border. Coordinates are computed in float32 or wider. NaN flow counts as 0, infinite flow as
+        very large, both with gradient 0. Built on :func:`kornia.geometry.transform.remap`. On a GPU, under
+        ``torch.use_deterministic_algorithms(True)``, a gather is used instead: the result is the same up to rounding,
+        gradients are deterministic, and second derivatives exist even if PyTorch's ``grid_sample`` lacks them.
 
     Args:
         image: :math:`(*, C, H, W)`, floating.
         flow: :math:`(*, 2, H, W)`.
 
     Returns:
-        As ``image``.
+        The warped image, of the shape and dtype of ``image``.
 
     Raises:
-        TypeError: not floating-point tensors.
-        ValueError: sizes that do not fit each other.
+        TypeError: ``image`` or ``flow`` is not a floating-point tensor.
+        ValueError: the sizes do not match.
 
     Example:
         >>> image = torch.tensor([[[[0.0, 1.0, 2.0, 3.0]]]])
@@ -63,7 +63,7 @@ def flow_warp(image: Tensor, flow: Tensor) -> Tensor:
 
 
 def _bilinear(planes: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Do what ``remap`` does, with derivatives of any order that are the same every time."""
+    """Compute the same as ``remap``, with deterministic derivatives of any order."""
     height, width = planes.shape[-2:]
     (left, right, share), (top, bottom, part) = _between(x, width), _between(y, height)
     index = torch.stack([row * width + column for row in (top, bottom) for column in (left, right)], dim=1)
@@ -72,9 +72,9 @@ def _bilinear(planes: Tensor, x: Tensor, y: Tensor) -> Tensor:
 
 
 def _between(position: Tensor, length: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the pixels before and after a position on an axis, and the share of the latter."""
+    """Return the pixels before and after a position on an axis, and the weight of the latter."""
     inside = (position > 0) & (position < length - 1)
-    position = torch.where(inside, position, position.detach().clamp(0, length - 1))  # at the border no gradient
+    position = torch.where(inside, position, position.detach().clamp(0, length - 1))  # no gradient at the border
     before = position.detach().floor()
     first = before.long()
     return first, (first + 1).clamp(max=length - 1), position - before
@@ -97,7 +97,7 @@ class FlowWarp(nn.Module):
 
 
 def flow_warp_idw(features: Tensor, flow: Tensor, mask: Tensor, *, neighbors: int = 4) -> Tensor:
-    r"""Sample features where flow points to, from the nearest known pixels, weighted by inverse distance.
+    r"""Warp sparse features by optical flow, interpolating the nearest known pixels by inverse distance.
 
     .. math::
         T(x, y) = \sum_{i=1}^{n} \frac{\phi_i}{\sum_j \phi_j} F(x_i, y_i), \quad
@@ -105,33 +105,33 @@ def flow_warp_idw(features: Tensor, flow: Tensor, mask: Tensor, *, neighbors: in
 
     Convention:
         Flow in pixels, order (x, y), x right, y down. The neighbours are the exact nearest known pixels of any mask,
-        also for positions outside the image; among equally distant ones the first in row-major order wins. Where
-        fewer than ``neighbors`` pixels are known, all of them count. A position that hits a known pixel gives that
-        pixel. Positions are kept as a whole and a fractional part in float32 or wider, so that they are as exact at
-        column 4000 as at column 0, in half precision too.
+        also for positions outside the image; among equally distant ones the first in row-major order wins. If fewer
+        than ``neighbors`` pixels are known, all are used. At a known pixel the result is that pixel. Positions are kept
+        as a whole and a fractional part in float32 or wider, so they are as exact at column 4000 as at column 0, even
+        in half precision.
 
-        Unknown pixels are never read; known ones are to be finite, or what hits another known pixel may be NaN. NaN
-        flow counts as 0, infinite flow as very far.
+        Unknown pixels are never read. Known pixels must be finite; otherwise results may be NaN even at other known
+        pixels. NaN flow counts as 0, infinite flow as very large.
 
-        Differentiable in the features and in the flow, twice; the neighbours themselves are constants. On a known
-        pixel the gradient with respect to the flow, a cone's tip, is 0, and so it is where the flow is not finite.
+        Twice differentiable in the features and in the flow; the choice of neighbours is constant. At a known pixel,
+        where the distance has a cone's tip, and at flow that is not finite, the gradient in the flow is 0.
 
-        A CPU searches by Numba where it is installed (``pip install 'spikekit[fast]'``), a GPU by Triton, any other
-        device by PyTorch: the same neighbours everywhere.
+        The search runs in Numba on a CPU, if installed (``pip install 'spikekit[fast]'``), in Triton on a GPU, and else
+        in PyTorch. The neighbours are the same everywhere.
 
     Args:
         features: :math:`(*, C, H, W)`, floating.
         flow: :math:`(*, 2, H, W)`.
-        mask: :math:`(H, W)`; a pixel is known where it is not 0. What is made of a mask is kept between calls; on a GPU
-            it is made anew where the mask counts a change, which one through ``mask.data`` does not.
-        neighbors: how many known pixels to weigh.
+        mask: :math:`(H, W)`; a pixel is known where it is not 0. Tables of a mask are cached; on a GPU they are renewed
+            when the version counter of the mask changes, which writing to ``mask.data`` does not do.
+        neighbors: number of neighbours.
 
     Returns:
-        As ``features``, also in memory: channels-last features give a channels-last result.
+        The warped features, of the shape, dtype and memory layout of ``features``.
 
     Raises:
-        TypeError: features or flow are not floating-point tensors.
-        ValueError: sizes that do not fit each other, ``neighbors`` below 1, a mask without a known pixel.
+        TypeError: ``features`` or ``flow`` is not a floating-point tensor.
+        ValueError: the sizes do not match, ``neighbors`` is below 1, or the mask has no known pixel.
 
     Example:
         >>> features = torch.tensor([[[[1.0, 0.0, 5.0, 0.0]]]])
