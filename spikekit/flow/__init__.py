@@ -1,4 +1,4 @@
-"""Motion fields, latent frames between two frames, and optical flow."""
+"""Motion fields, frame interpolation and optical flow."""
 
 from spikekit.flow.fields import JointFlow, LinearMotion, UpsampleFlow, joint_flow, linear_motion, upsample_flow
 from spikekit.flow.interpolate import Between, Blend, FlowInterpolation, Still

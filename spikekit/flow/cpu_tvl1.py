@@ -1,4 +1,4 @@
-"""One level of :func:`spikekit.flow.tvl1.tvl1_flow` on a CPU, in loops that Numba compiles."""
+"""One level of :func:`spikekit.flow.tvl1.tvl1_flow` on a CPU, compiled by Numba."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from spikekit.kernels.compiled import compiled, in_threads
 
 @compiled
 def _warp(image, time, flow, out):
-    """Sample an image where the flow, times ``time``, points to; bilinear, the border continued."""
+    """Warp an image by ``time`` times the flow, bilinearly, with replicated borders."""
     height, width = image.shape
     zero, one = image.dtype.type(0), image.dtype.type(1)
     for y in range(height):
         for x in range(width):
             at_x, at_y = x + time * flow[0, y, x], y + time * flow[1, y, x]
-            at_x = min(at_x, width - one) if at_x > 0 else zero  # NaN as well
+            at_x = min(at_x, width - one) if at_x > 0 else zero  # also for NaN
             at_y = min(at_y, height - one) if at_y > 0 else zero
             left, top = min(int(at_x), width - 2), min(int(at_y), height - 2)
             right_share, low_share = image.dtype.type(at_x - left), image.dtype.type(at_y - top)
@@ -28,7 +28,7 @@ def _warp(image, time, flow, out):
 
 @compiled
 def _linearize(moved, times, flow, slope, rest):
-    """Derivative of the difference of two warped pictures by the flow, and what it is where there is no flow."""
+    """Linearize the difference of two warped pictures in the flow: slope, and value at zero flow."""
     height, width = rest.shape
     for y in range(height):
         above, below = max(y - 1, 0), min(y + 1, height - 1)
@@ -45,7 +45,7 @@ def _linearize(moved, times, flow, slope, rest):
 
 @compiled
 def _follow(flow, slope, rest, limit, near):
-    """The data term: the flow, moved along the slope until the pictures agree, by no more than the limit."""
+    """Data step: move the flow along the slope until the pictures agree, at most by the limit."""
     height, width = rest.shape
     tiny = rest.dtype.type(1e-30)
     for y in range(height):
@@ -59,7 +59,7 @@ def _follow(flow, slope, rest, limit, near):
 
 @compiled
 def _primal(near, dual, flow, y):
-    """A row of the flow, from the dual variable: ``dual[k, y + 1, x + 1]`` is that of pixel (x, y), zero around."""
+    """Compute a row of the flow from the dual variable, ``dual[k, y + 1, x + 1]`` at pixel (x, y), padded by zeros."""
     for x in range(flow.shape[1]):
         to_x = dual[0, y + 1, x + 1] - dual[0, y + 1, x]
         flow[y, x] = near[y, x] + to_x + dual[1, y + 1, x + 1] - dual[1, y, x + 1]
@@ -67,7 +67,7 @@ def _primal(near, dual, flow, y):
 
 @compiled
 def _smooth(near, dual, flow, step, damping):
-    """One step towards the flow of least variation near ``near``, in one pass: a row behind that of the flow."""
+    """Take one step of total-variation denoising of ``near``, in one pass; the dual follows one row behind."""
     height, width = flow.shape
     zero, one = near.dtype.type(0), near.dtype.type(1)
     _primal(near, dual, flow, 0)
@@ -102,7 +102,7 @@ def _level(pictures, times, limit, flow, warps, step, damping):
 
 
 def refine(pictures: Tensor, times: Tensor, limit: Tensor, flow: Tensor, warps: int) -> Tensor:
-    """Return the flow (B, 2, H, W) of pictures (B, 2, H, W), as :func:`spikekit.flow.tvl1.refine` does."""
+    """Return the flow (B, 2, H, W) of pictures (B, 2, H, W), like :func:`spikekit.flow.tvl1.refine`."""
     flow = flow.contiguous().clone()
     arrays = (part.contiguous().numpy() for part in (pictures, times.to(pictures), limit, flow))
     real = pictures.numpy().dtype.type

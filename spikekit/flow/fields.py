@@ -19,15 +19,14 @@ def _check_flow(name: str, flow: Tensor) -> None:
 
 
 def joint_flow(flows: Tensor | Sequence[Tensor]) -> Tensor:
-    r"""Average the flows that were estimated from the sub-streams R, G1, G2, B.
+    r"""Average the flows estimated from the sub-streams R, G1, G2 and B.
 
     .. math:: w = \frac{1}{4} \sum_{C \in \{R, G_1, G_2, B\}} w^C
 
     Convention:
-        The colours are the **first** axis, as :func:`spikekit.split_bayer` leaves them; any number of flows is averaged
-        alike. The result has the resolution of the input flows, and is in their pixels. The four phases of a Bayer cell
-        average to the centre of the cell, which is where :func:`upsample_flow` expects them. Linear: every flow gets
-        its share of the gradient.
+        The colours are the **first** axis, as in :func:`spikekit.split_bayer`; any number of flows is accepted. The
+        result has the resolution of the input flows, and is in their pixels. The four positions in a Bayer cell average
+        to its centre, where :func:`upsample_flow` expects them. Linear, and differentiable as such.
 
     Args:
         flows: (C, \*, 2, H, W), or a sequence of C flows (\*, 2, H, W); any C of at least one.
@@ -36,8 +35,8 @@ def joint_flow(flows: Tensor | Sequence[Tensor]) -> Tensor:
         (\*, 2, H, W), in the dtype of ``flows``.
 
     Raises:
-        TypeError: not floating-point tensors.
-        ValueError: no flow at all, sizes that differ, no two channels.
+        TypeError: a flow is not a floating-point tensor.
+        ValueError: there are no flows, their sizes differ, or they do not have two channels.
 
     Example:
         >>> joint_flow([torch.zeros(1, 2, 4, 4), torch.ones(1, 2, 4, 4)]).unique().item()
@@ -80,26 +79,26 @@ class JointFlow(nn.Module):
 
 
 def upsample_flow(flow: Tensor, scale: int) -> Tensor:
-    r"""Bring flow to a finer grid: bilinear in space, and ``scale`` times as many pixels long.
+    r"""Upsample flow bilinearly to a finer grid, and multiply it by ``scale``.
 
     .. math:: w'(x, y) = s \, w \Bigl(\frac{x + 1/2}{s} - \frac{1}{2}, \frac{y + 1/2}{s} - \frac{1}{2}\Bigr)
 
     Convention:
         A coarse pixel is the block of ``scale`` x ``scale`` fine ones that begins at (scale x, scale y)
-        (``align_corners=False``), as in :func:`spikekit.bayer_mask` and :func:`spikekit.bin_to_sensor`. Beyond the
-        outermost coarse centres the flow is that of the nearest. Linear in the flow, and differentiable as such. Scale
-        1 returns the input flow.
+        (``align_corners=False``), as in :func:`spikekit.bayer_mask` and :func:`spikekit.bin_to_sensor`. Outside the
+        outermost coarse centres the nearest flow is repeated. Linear in the flow, and differentiable as such. Scale 1
+        returns the input flow.
 
     Args:
         flow: :math:`(*, 2, H, W)`, floating.
-        scale: how much finer.
+        scale: upsampling factor.
 
     Returns:
         :math:`(*, 2, scale \cdot H, scale \cdot W)`, in the dtype of ``flow``.
 
     Raises:
         TypeError: ``flow`` is not a floating-point tensor.
-        ValueError: no two channels, or a scale that is not a whole number, 1 or more.
+        ValueError: ``flow`` does not have two channels, or ``scale`` is not a whole number >= 1.
 
     Example:
         >>> upsample_flow(torch.ones(1, 2, 2, 2), 4).unique().item()
@@ -111,11 +110,11 @@ def upsample_flow(flow: Tensor, scale: int) -> Tensor:
 
 
 def _upsample(flow: Tensor, scale: int) -> Tensor:
-    """In float32 or wider, so that halves are rounded once, at the end of everything."""
+    """Upsample in float32 or wider, so that half precision is rounded only once, at the end."""
     planes = flow.reshape(-1, *flow.shape[-3:]).to(torch.promote_types(flow.dtype, torch.float32))
     if scale > 1:
         height, width = planes.shape[-2:]
-        size = scale * height, scale * width  # torch.compile takes no factor that is open
+        size = scale * height, scale * width  # torch.compile does not accept a dynamic scale factor
         planes = F.interpolate(scale * planes, size=size, mode="bilinear", align_corners=False)
     return planes.reshape(*flow.shape[:-2], *planes.shape[-2:])
 
@@ -150,7 +149,7 @@ def linear_motion(
     last: float | None = None,
     scale: int = 1,
 ) -> Tensor:
-    r"""How far every pixel of the middle frame has moved at each time, if motion is linear on both sides of it.
+    r"""Displacement of every pixel of the middle frame at each time, if motion is linear on both sides of it.
 
     .. math::
         o_t = s \cdot \begin{cases}
@@ -159,28 +158,28 @@ def linear_motion(
         \end{cases}
 
     Convention:
-        i, j, k are the times of the first, the middle and the last frame that the flows were estimated between; the
-        offset at j is zero, and times before i or after k are extrapolated. With ``scale`` the flow is brought to the
-        finer grid first, see :func:`upsample_flow`. Linear in both flows, and differentiable as such.
-        Backward sampling: the pixel (x, y) of the middle frame is found at (x, y) + offset at time t, as
-        :func:`spikekit.flow_warp` and :func:`spikekit.flow_warp_idw` read it.
+        i, j, k are the times of the first, the middle and the last frame between which the flows were estimated. The
+        offset at j is zero; times before i or after k are extrapolated. The flow is first upsampled by ``scale``, see
+        :func:`upsample_flow`. Linear in both flows, and differentiable as such. Backward sampling, as in
+        :func:`spikekit.flow_warp` and :func:`spikekit.flow_warp_idw`: the pixel (x, y) of the middle frame is at
+        (x, y) + offset at time t.
 
     Args:
         flow_to_first: :math:`w_{j,i}`, :math:`(*, 2, H, W)`.
         flow_to_last: :math:`w_{j,k}`, of the same size.
-        times: the T times that are asked for, in the unit of ``first`` and ``last`` (spike frames, say).
-        first: i; the first of ``times`` when not given.
-        middle: j; half way between ``first`` and ``last`` when not given.
-        last: k; the last of ``times`` when not given.
+        times: T times, in the unit of ``first`` and ``last``, such as spike frames.
+        first: i; default: the first of ``times``.
+        middle: j; default: half way between ``first`` and ``last``.
+        last: k; default: the last of ``times``.
         scale: super-resolution factor s.
 
     Returns:
         The offsets :math:`(*, T, 2, s \cdot H, s \cdot W)` in pixels of the fine grid, in the dtype of the flows.
 
     Raises:
-        TypeError: the flows are not floating-point tensors, or the times no numbers.
-        ValueError: the flows differ in size or have no two channels, no times, not first < middle < last, or a scale
-            below 1.
+        TypeError: the flows are not floating-point tensors, or the times are not numbers.
+        ValueError: the flows differ in size or do not have two channels, there are no times, first < middle < last does
+            not hold, or ``scale`` is below 1.
 
     Example:
         >>> to_first, to_last = torch.full((1, 2, 1, 1), -2.0), torch.full((1, 2, 1, 1), 4.0)
@@ -210,7 +209,7 @@ def linear_motion(
 def _check_times(
     times: Sequence[float], first: float | None, middle: float | None, last: float | None
 ) -> tuple[list[float], float, float, float]:
-    """Return all times, those that were not given as well."""
+    """Return the checked times, with defaults filled in."""
     try:
         times = [float(t) for t in times]
     except (TypeError, ValueError):
@@ -221,7 +220,7 @@ def _check_times(
     last = times[-1] if last is None else last
     middle = (first + last) / 2 if middle is None else middle
     if not first < middle < last:
-        raise ValueError(f"first, middle, last: expected rising times, got {first}, {middle}, {last}")
+        raise ValueError(f"first, middle, last: expected increasing times, got {first}, {middle}, {last}")
     return times, first, middle, last
 
 

@@ -1,4 +1,4 @@
-"""Frame interpolation: the latent frames between two frames of a film."""
+"""Frame interpolation: latent frames between two frames of a film."""
 
 from __future__ import annotations
 
@@ -10,37 +10,37 @@ from torch import Tensor
 from spikekit.check import check_picture, check_planes, check_whole
 from spikekit.flow.fields import upsample_flow
 
-# Pixels around a pixel that are compared with it.
+# Radius, in pixels, of the window in which frames are compared.
 _REACH = 2
 
-# How much less a pixel counts per unit of difference between the frames that it connects.
+# Decay of a pixel's weight per unit of difference between the frames.
 _DISTRUST = 20.0
 
-# Smallest picture, in pixels, that motion is searched in.
+# Smallest side, in pixels, for flow estimation; smaller pictures are padded.
 _SMALLEST = 16
 
-# A pixel has no counterpart in the other frame where the way there and back does not end near it, and what is found
-# there differs by this much. Where this holds for more than half of the pixels, the film was cut.
+# A pixel has no counterpart in the other frame if forward and backward flow disagree and the frames differ by more than
+# this. If this holds for more than half of the pixels, there is a cut.
 _DIFFERS = 0.04
 
 
 class Between:
-    """Base of interpolations between two frames, which subclasses define in ``between``.
+    """Base class of interpolations between two frames; subclasses implement ``between``.
 
     Args:
         first: ``rgb`` (3, H, W), floating.
         second: the next frame, in the same size and dtype.
 
     Attributes:
-        first: the frame at 0.
-        second: the frame at 1.
-        forward: flow (2, H, W) in pixels, order (x, y), from the first to the second frame, where it is known.
-        backward: the same from the second to the first.
-        cut: the two frames have nothing to do with each other.
+        first: the frame at time 0.
+        second: the frame at time 1.
+        forward: flow (2, H, W) in pixels, order (x, y), from the first to the second frame, or ``None``.
+        backward: flow from the second to the first frame, or ``None``.
+        cut: whether there is a cut between the frames.
 
     Raises:
-        TypeError: not floating-point tensors.
-        ValueError: sizes or dtypes that do not fit.
+        TypeError: a frame is not a floating-point tensor.
+        ValueError: the frames differ in size or dtype.
     """
 
     forward: Tensor | None = None
@@ -56,16 +56,16 @@ class Between:
         self.first, self.second = first, second
 
     def at(self, tau: float) -> Tensor:
-        """Return the picture at a time.
+        """Return the picture at time ``tau``.
 
         Args:
-            tau: 0 is the first frame and 1 the second, both bit for bit.
+            tau: time in [0, 1]; 0 returns the first frame and 1 the second, bit for bit.
 
         Returns:
             ``rgb`` (3, H, W), in the dtype of the frames.
 
         Raises:
-            ValueError: a time outside [0, 1].
+            ValueError: ``tau`` is outside [0, 1].
         """
         if not 0 <= tau <= 1:
             raise ValueError(f"tau: expected 0 to 1, got {tau}")
@@ -74,7 +74,7 @@ class Between:
         return self.between(tau)
 
     def between(self, tau: float) -> Tensor:
-        """Return the picture at a time above 0 and below 1."""
+        """Return the picture at a time strictly between 0 and 1."""
         raise NotImplementedError
 
 
@@ -89,7 +89,7 @@ class _Blend(Between):
 
 
 class Still:
-    """The nearer of the two frames, the second at half way, as a projector shows them.
+    """Nearest frame: the first before half way, the second from there on.
 
     Example:
         >>> between = Still()(torch.zeros(3, 4, 4), torch.ones(3, 4, 4))
@@ -103,7 +103,7 @@ class Still:
 
 
 class Blend:
-    r"""The mean of the two frames, weighted by time: right where nothing moves and the light changes.
+    r"""Mean of the two frames, weighted by time: exact for still scenes with changing light.
 
     .. math:: I_\tau = (1 - \tau) I_0 + \tau I_1
 
@@ -118,38 +118,38 @@ class Blend:
 
 
 class FlowInterpolation:
-    r"""Motion-compensated frames from optical flow in both directions, without weights.
+    r"""Motion-compensated frames from optical flow in both directions, without learned weights.
 
     .. math::
         I_\tau(x) = w \, I_0(x - \tau v) + (1 - w) \, I_1(x + (1 - \tau) v), \quad w = 1 - \tau
 
-    where the motion v (x, tau), in pixels per frame, is carried to the time :math:`\tau` by the flows themselves.
+    where the motion v (x, tau), in pixels per frame, is obtained by splatting the flows to the time :math:`\tau`.
 
     Convention:
-        Motion is straight and even between the two frames. Flow in pixels, order (x, y), x right, y down;
-        ``forward`` (x) says where the pixel x of the first frame is in the second.
+        Motion between the two frames is assumed to be linear. Flow in pixels, order (x, y), x right, y down; pixel x of
+        the first frame is at x + ``forward`` (x) in the second.
 
-        Flow is estimated once a pair, on luma, by two estimators of scikit-image whose weaknesses differ (TV-L1 and
-        iterative Lucas-Kanade); of both, each pixel keeps the one under which its surroundings match better. For every
-        time, each frame's flow is splatted to where its pixels are then; among pixels that meet, those that match
-        across the frames prevail, so that the foreground covers the background. The three candidates that a pixel
-        gets, from both frames and from either one, are told apart by how well the frames match around it. What comes
-        from outside of one frame is taken from the other alone. Frames are compared at the same mean brightness and
-        sampled bicubically, and the result is kept in the range of the two frames.
+        Flow is estimated once per pair, on luma, by two estimators of scikit-image with different weaknesses (TV-L1 and
+        iterative Lucas-Kanade); each pixel keeps the flow under which its neighbourhood matches better. For every time,
+        the flow of each frame is splatted to the positions of its pixels at that time. Pixels that match across the
+        frames get larger weights there, so that the foreground covers the background. Every pixel has three candidates,
+        from both frames and from each one, and keeps the one under which the frames match best around it. Content from
+        outside one frame is taken from the other. Frames are compared at the same mean brightness and sampled
+        bicubically, and the result is clamped to the range of the two frames.
 
-        Where more than half of the pixels have no counterpart in the other frame, the film was cut, or motion was too
-        large to be followed: ``cut`` is true, there is no flow, and the nearer frame is shown.
+        If more than half of the pixels have no counterpart in the other frame, there is a cut, or motion is too large:
+        ``cut`` is true, there is no flow, and the result is the nearest frame.
 
-        No gradient. Flow is estimated on the CPU, the rest runs where the frames are. On the CPU the same frames give
-        the same pictures, bit for bit.
+        No gradient. Flow is estimated on the CPU; the rest runs on the device of the frames. On the CPU, results are
+        reproducible bit for bit.
 
     Args:
-        shrink: how many times smaller the pictures are that flow is estimated on. 2 takes a quarter of the time of 1
-            and makes the frames of two films as well, within 0.1 dB; small objects in front lose up to 0.8 dB
+        shrink: factor by which pictures are reduced for flow estimation. 2 takes a quarter of the time of 1. The frames
+            of two films are as good, within 0.1 dB; small objects in front lose up to 0.8 dB
             (``python benchmarks/interpolation.py``).
 
     Raises:
-        ValueError: ``shrink`` is not a whole number, 1 or more.
+        ValueError: ``shrink`` is not a whole number >= 1.
 
     Example:
         >>> from spikekit.scenes.analytic import Layer, Motion, Scene
@@ -204,14 +204,14 @@ class FlowInterpolation:
 
 
 class _Carried(Between):
-    """Frames with their flows, which are carried to any time between them."""
+    """Interpolation of two frames by their flows."""
 
     def __init__(self, first: Tensor, second: Tensor, pair: Tensor, light: Tensor, flows: Tensor) -> None:
         super().__init__(first, second)
         self.forward, self.backward = flows.to(first.dtype)
         self._pair, self._light = pair, light
         match = torch.exp(-_DISTRUST * (pair - _sample(pair.flip(0), flows)).abs().mean(dim=1, keepdim=True))
-        # Motion from the first to the second frame as either of them sees it, and how far it can be trusted.
+        # Motion from the first to the second frame, estimated from each, and its weight.
         self._motion = flows * flows.new_tensor([1, -1]).reshape(2, 1, 1, 1)
         self._trust = match + 1e-4
 
@@ -229,10 +229,10 @@ class _Carried(Between):
         return picture.clamp(low, high).to(self.first.dtype)
 
     def _candidates(self, shares: Tensor) -> Tensor:
-        """Return what the motion may be at every pixel of the picture at a time, (3, 2, H, W)."""
+        """Return the candidates for the motion at every pixel of a picture, (3, 2, H, W)."""
         carried = _splat(torch.cat([self._motion * self._trust, self._trust], dim=1), -shares * self._motion)
         motion, trust = carried[:, :2], carried[:, 2:]
-        nothing = 1e-6  # nothing arrived here
+        nothing = 1e-6  # total weight below which nothing was splatted
         anywhere = self._motion.mean(dim=0)
         both = torch.where(trust.sum(dim=0) > nothing, motion.sum(dim=0) / (trust.sum(dim=0) + 1e-12), anywhere)
         either = torch.where(trust > nothing, motion / (trust + 1e-12), both)
@@ -240,7 +240,7 @@ class _Carried(Between):
 
 
 def _light(pair: Tensor) -> Tensor:
-    """Return how bright each frame is beside both, (2, 1, 1, 1), so that light that changes is not taken for motion."""
+    """Return the relative brightness of the frames, (2, 1, 1, 1), to separate changing light from motion."""
     means = pair.mean(dim=(1, 2, 3), keepdim=True)
     return means / means.mean() if (means > 0).all() else torch.ones_like(means)
 
@@ -250,7 +250,7 @@ def _luma(rgb: Tensor) -> np.ndarray:
 
 
 def _estimates(luma: np.ndarray) -> Tensor:
-    """Return what each estimator makes of two pictures (2, H, W): (estimator, direction, 2, H, W)."""
+    """Return the flow of two pictures (2, H, W) by each estimator: (estimator, direction, 2, H, W)."""
     from skimage.registration import optical_flow_ilk, optical_flow_tvl1
 
     height, width = luma.shape[-2:]
@@ -267,7 +267,7 @@ def _estimates(luma: np.ndarray) -> Tensor:
 
 
 def _sample(planes: Tensor, flow: Tensor, mode: str = "bilinear") -> Tensor:
-    """Sample planes (B, C, H, W) where flow (B, 2, H, W) points to, at the border where it points out."""
+    """Warp planes (B, C, H, W) by flow (B, 2, H, W), with replicated borders."""
     height, width = planes.shape[-2:]
     x, y = _positions(flow)
     grid = torch.stack([(2 * x + 1) / width - 1, (2 * y + 1) / height - 1], dim=-1)
@@ -282,30 +282,30 @@ def _positions(flow: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _inside(flow: Tensor) -> Tensor:
-    """Say where flow (B, 2, H, W) ends inside of the picture: (B, 1, H, W)."""
+    """Return a mask (B, 1, H, W) of the pixels whose flow (B, 2, H, W) ends inside the picture."""
     x, y = _positions(flow)
     height, width = flow.shape[-2:]
     return ((x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5))[:, None]
 
 
 def _around(error: Tensor) -> Tensor:
-    """Average an error (B, H, W) over the surroundings of every pixel."""
+    """Average an error (B, H, W) over the window around every pixel."""
     return F.avg_pool2d(F.pad(error, (_REACH,) * 4, "replicate"), 2 * _REACH + 1, 1)
 
 
 def _mismatch(pair: Tensor, candidates: Tensor) -> Tensor:
-    """Say how badly the frames match under each candidate for both flows (K, 2, 2, H, W): (K, 2, H, W)."""
+    """Return the mismatch (K, 2, H, W) of the frames under each candidate for both flows, (K, 2, 2, H, W)."""
     return torch.stack([_around((pair - _sample(pair.flip(0), flows)).abs().mean(dim=1)) for flows in candidates])
 
 
 def _best(candidates: Tensor, errors: Tensor) -> Tensor:
-    """Choose, pixel by pixel, of candidates (K, *, 2, H, W) the one of the least error (K, *, H, W)."""
+    """Choose at every pixel the candidate (K, *, 2, H, W) with the smallest error (K, *, H, W)."""
     index = errors.argmin(dim=0).unsqueeze(-3)
     return candidates.gather(0, index.unsqueeze(0).expand(1, *candidates.shape[1:]))[0]
 
 
 def _splat(values: Tensor, flow: Tensor) -> Tensor:
-    """Add values (B, C, H, W) up where flow (B, 2, H, W) takes them, spread over the four pixels around."""
+    """Splat values (B, C, H, W) along flow (B, 2, H, W), bilinearly, and sum them."""
     height, width = values.shape[-2:]
     x, y = _positions(flow)
     left, top = x.floor(), y.floor()
@@ -319,7 +319,7 @@ def _splat(values: Tensor, flow: Tensor) -> Tensor:
 
 
 def _lost(pair: Tensor, flows: Tensor) -> Tensor:
-    """Say which pixels have no counterpart in the other frame: (2, H, W)."""
+    """Return a mask (2, H, W) of the pixels without a counterpart in the other frame."""
     back = _sample(flows.flip(0), flows)
     gap, length = (flows + back).square().sum(dim=1), (flows.square() + back.square()).sum(dim=1)
     return (gap > 0.01 * length + 0.5) & (_mismatch(pair, flows[None])[0] > _DIFFERS)

@@ -1,4 +1,4 @@
-"""TV-L1 optical flow between two moments, for pictures whose noise is known."""
+"""TV-L1 optical flow between two times, for pictures of known noise."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from spikekit.kernels import gpu_kernel, loops
 from spikekit.kernels.graphs import Replayed
 from spikekit.warp import flow_warp
 
-SMOOTHINGS, ROUNDS = 2, 10  # steps towards a smooth flow in a round, and rounds in a warp
-COUPLING = 0.25  # how far the flow that the pictures want and the smooth one may part
-STEP = 0.15  # of the dual variable; converges up to a quarter
+SMOOTHINGS, ROUNDS = 2, 10  # smoothing steps per round, and rounds per warp
+COUPLING = 0.25  # theta, which couples the data term and the smooth flow
+STEP = 0.15  # step of the dual variable; must be below 1/4 to converge
 
-_SMALLEST = 16  # pixels, the shorter side of the smallest picture that motion is looked for in
+_SMALLEST = 16  # shorter side of the coarsest level, in pixels
 
 
 @torch.no_grad()
@@ -27,19 +27,19 @@ def tvl1_flow(
     start: Tensor | None = None,
     warps: int = 5,
 ) -> Tensor:
-    r"""Estimate the motion v between two moments of a scene: :math:`I_0(x + t_0 v) = I_1(x + t_1 v)`.
+    r"""Estimate the motion v between two times of a scene: :math:`I_0(x + t_0 v) = I_1(x + t_1 v)`.
 
-    Least :math:`\int |\nabla v_x| + |\nabla v_y| + \lambda |I_1(x + t_1 v) - I_0(x + t_0 v)|`, from coarse pictures to
-    fine ones, linearized around what is known of v and solved alternately, :math:`\theta = 0.25` coupling the flow that
-    follows the pictures to the smooth one. With the times 0 and 1 that is optical flow from the first picture to the
-    second, with -1/2 and 1/2 that of the moment between.
+    It minimises :math:`\int |\nabla v_x| + |\nabla v_y| + \lambda |I_1(x + t_1 v) - I_0(x + t_0 v)|` from coarse to
+    fine. The data term is linearized around the current v, and both terms are solved alternately, coupled by
+    :math:`\theta = 0.25`. The times 0 and 1 give optical flow from the first picture to the second, -1/2 and 1/2 the
+    motion at the time between.
 
     Args:
         pictures: (B, 2, H, W), finite, of at least 2 x 2 pixels, float32 or wider.
-        times: (B, 2), :math:`t_0` and :math:`t_1`, about 1 apart: the units of the other arguments are of them.
-        attachment: (B, H, W), the weight :math:`\lambda` of the difference of the pictures.
-        start: (B, 2, H, W) to begin with at full size; without it 0, at the coarsest size.
-        warps: times that every level is linearized around what is known by then.
+        times: (B, 2), :math:`t_0` and :math:`t_1`, about 1 apart.
+        attachment: (B, H, W), the weight :math:`\lambda` of the data term.
+        start: initial flow (B, 2, H, W), refined at full size only; default: 0 at the coarsest size.
+        warps: number of linearizations per level.
 
     Returns:
         (B, 2, H, W), in pixels per unit of the times, order (x, y).
@@ -68,7 +68,7 @@ def _estimate(warps: int, pictures: Tensor, times: Tensor, attachment: Tensor, s
     return flow
 
 
-#: a GPU waits for the launches of an estimate, not for its work
+#: on a GPU, launches take longer than the work, so they are replayed
 _replayed = Replayed(_estimate)
 
 
@@ -81,10 +81,10 @@ def _improve(pictures: Tensor, times: Tensor, limit: Tensor, flow: Tensor, warps
 
 
 def refine(pictures: Tensor, times: Tensor, limit: Tensor, flow: Tensor, warps: int) -> Tensor:
-    """Improve the flow (B, 2, H, W) of a level; a round follows its pictures by ``limit`` (B, H, W) slopes at most."""
+    """Refine the flow (B, 2, H, W) of a level; ``limit`` (B, H, W) bounds each data step, in slopes."""
     time = times.to(pictures)[..., None, None, None]
     height, width = flow.shape[-2:]
-    # by component and direction: what to add to the right and below, kept with a zero on the other side
+    # dual variable per component and direction, padded by zeros at the top and left
     dual = flow.new_zeros(*flow.shape[:2], 2, height + 1, width + 1)
     inner, ahead = dual[..., 1:, 1:], torch.zeros_like(dual[..., 1:, 1:])
     for _ in range(warps):

@@ -92,7 +92,7 @@ def test_errors(error, call):
         (5, TypeError, "times: expected numbers, got 5"),
         (["soon"], TypeError, "times: expected numbers"),
         ([], ValueError, "times: expected at least one time, got none"),
-        ([2, 1, 0], ValueError, r"first, middle, last: expected rising times, got 2.0, 1.0, 0.0"),
+        ([2, 1, 0], ValueError, r"first, middle, last: expected increasing times, got 2.0, 1.0, 0.0"),
     ],
 )
 def test_times_that_are_none(times, error, message):
