@@ -1,4 +1,4 @@
-"""From spikes back to light."""
+"""Decoders: from spikes to light."""
 
 from spikekit.decoders.chunked import decode_in_chunks
 from spikekit.decoders.dense import SpikeInterval, Tfi, Tfp, spike_interval, tfi, tfp

@@ -1,4 +1,4 @@
-"""Decode streams that do not fit in memory, chunk by chunk, with the same result as decoding the whole."""
+"""Decoding of streams that do not fit in memory, chunk by chunk."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from spikekit.check import check_index, check_planes
 
 
 def decode_in_chunks(decode: Callable[[Tensor], Tensor], chunks: Iterable[Tensor], overlap: int) -> Iterator[Tensor]:
-    r"""Decode a stream that arrives in chunks, in bounded memory, as if it arrived at once.
+    r"""Decode a stream that arrives in chunks, in bounded memory, with the result of decoding it at once.
 
     Convention:
         Every frame is decoded with at least ``overlap`` frames before and after it, as far as the recording has them.
-        So the pieces, laid behind each other, equal ``decode`` of the whole stream, however it is cut, wherever frame
-        n of the result depends on frames n - overlap .. n + overlap and on the ends of the recording alone:
+        The concatenated pieces therefore equal ``decode`` of the whole stream wherever frame n of the result depends
+        only on the frames n - overlap .. n + overlap and on the ends of the recording:
 
         * :func:`spikekit.tfp`: everywhere, with an overlap of ``window // 2``;
         * :func:`spikekit.tfi` and :func:`spikekit.spike_interval`: at every pixel and frame n for which the frames
-          n - overlap .. n + overlap hold the last spike before n and the first at or after n. Where the recording
-          has none on one side, they must reach its end there, and hold the two nearest spikes of the other side, or
-          all there are. In particular everywhere, if no pixel is silent for ``overlap // 2`` frames on end. A pixel
-          that is silent for longer is decoded as if the recording ended with the frames that were at hand.
+          n - overlap .. n + overlap contain the last spike before n and the first at or after n. If the recording has
+          none on one side, these frames must reach its end there, and contain the two nearest spikes of the other side,
+          or all there are. This holds everywhere if no pixel is silent for ``overlap // 2`` consecutive frames. A pixel
+          that is silent for longer is decoded as if the recording ended with the frames in memory.
 
-        Pieces are as long as the chunks allow, and not shorter than the overlap but for the last: at most two thirds
+        Pieces are as long as the chunks allow, and at least as long as the overlap, except the last. At most two thirds
         of the work is done twice. At most 3 overlap + 1 chunk frames are held.
 
     Args:
@@ -38,10 +38,10 @@ def decode_in_chunks(decode: Callable[[Tensor], Tensor], chunks: Iterable[Tensor
         An iterator over consecutive pieces of the result; together they have as many frames as the chunks.
 
     Raises:
-        TypeError: ``overlap`` is not a whole number; when iterated, a chunk that is not a tensor of real numbers, or a
-            ``decode`` that returns no tensor.
-        ValueError: an overlap below 0; when iterated, an empty chunk, chunks that do not fit each other, or a
-            ``decode`` that changes the number of frames.
+        TypeError: ``overlap`` is not a whole number; on iteration, a chunk is not a tensor of real numbers, or
+            ``decode`` does not return a tensor.
+        ValueError: ``overlap`` is below 0; on iteration, a chunk is empty, chunks differ in size, dtype or device, or
+            ``decode`` changes the number of frames.
 
     Example:
         >>> from spikekit import tfp
@@ -61,7 +61,7 @@ def decode_in_chunks(decode: Callable[[Tensor], Tensor], chunks: Iterable[Tensor
 
 def _pieces(decode: Callable[[Tensor], Tensor], chunks: Iterable[Tensor], overlap: int) -> Iterator[Tensor]:
     held: list[Tensor] = []
-    length = past = 0  # frames held, and how many of them are decoded already
+    length = past = 0  # frames held, and how many of them are already decoded
     for chunk in chunks:
         check_planes("chunks", chunk, 3, "(*, T, H, W)")
         kinds = [((*part.shape[:-3], "T", *part.shape[-2:]), part.dtype, part.device) for part in (*held[:1], chunk)]
@@ -88,5 +88,5 @@ def _decoded(decode: Callable[[Tensor], Tensor], span: Tensor, past: int, count:
     if not isinstance(result, Tensor):
         raise TypeError(f"decode: expected a function that returns a tensor, got {type(result).__name__}")
     if result.ndim < 3 or result.shape[-3] != span.shape[-3]:
-        raise ValueError(f"decode: expected {span.shape[-3]} frames as given, got a result of {tuple(result.shape)}")
+        raise ValueError(f"decode: expected {span.shape[-3]} frames, as many as given, got {tuple(result.shape)}")
     return result[..., past : past + count, :, :]

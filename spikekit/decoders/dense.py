@@ -1,4 +1,4 @@
-"""The decoders: from spikes to light, by the interval between spikes (TFI) or by their number (TFP)."""
+"""Decoders from spikes to light: by the interval between spikes (TFI), or by their number in a window (TFP)."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from spikekit.kernels import operator
 from spikekit.options_module import OptionsModule
 
 
-# The loops over time are custom operators: torch.compile would unroll them.
+# The loops over time are custom operators, as torch.compile would unroll them.
 @operator(lambda spikes: torch.empty_like(spikes, dtype=interval_dtype(spikes.shape[-3])))
 def _spike_interval(spikes: Tensor) -> Tensor:
     fired, frames = spikes != 0, spikes.shape[-3]
     interval = torch.empty_like(fired, dtype=interval_dtype(frames))
     planes = list(zip(fired.unbind(-3), interval.unbind(-3), strict=True))
 
-    # Backwards: the next spike, T where there is none; what remains in `first` is the first complete interval.
+    # Backwards: the next spike, T if there is none; `first` ends as the first complete interval.
     following = torch.full_like(planes[0][1], frames)
     first = torch.zeros_like(following)
     for n in reversed(range(frames)):
@@ -28,7 +28,7 @@ def _spike_interval(spikes: Tensor) -> Tensor:
         following = following.masked_fill(fired_n, n)
         next_n.copy_(following)
 
-    # Forwards: the last spike before n, -1 where there is none; `last` is the latest complete interval.
+    # Forwards: the last spike before n, -1 if there is none; `last` is the latest complete interval.
     previous = torch.full_like(following, -1)
     last = torch.zeros_like(following)
     for n, (fired_n, interval_n) in enumerate(planes):
@@ -40,7 +40,7 @@ def _spike_interval(spikes: Tensor) -> Tensor:
 
 
 def interval_dtype(frames: int) -> torch.dtype:
-    """Return the smallest type that holds every interval of a clip."""
+    """Return the smallest dtype that holds every interval of a clip."""
     return torch.int16 if frames < 32767 else torch.int32
 
 
@@ -50,20 +50,20 @@ def _tfi(spikes: Tensor, max_range: float, dtype: torch.dtype) -> Tensor:
 
 
 def rate_of(interval: Tensor, max_range: float, dtype: torch.dtype) -> Tensor:
-    """Divide a range by intervals."""
-    # a tensor over a tensor: torch divides a number by a tensor through the inverse, and 255 / 5 is not 51 then
+    """Return ``max_range / interval``."""
+    # tensor / tensor: torch computes number / tensor by the reciprocal, so that 255 / 5 is not 51
     most = torch.full_like(interval, max_range, dtype=torch.promote_types(dtype, torch.float32))
     return cast_light(most / interval, dtype)
 
 
 def cast_light(value: Tensor, dtype: torch.dtype) -> Tensor:
-    """Cast; to uint8 by rounding to the nearest whole number, and cutting what is beyond."""
+    """Cast to ``dtype``; uint8 is rounded to the nearest whole number and clamped."""
     return value.round().clamp(0, 255).to(dtype) if dtype is torch.uint8 else value.to(dtype)
 
 
 @operator(lambda grad, spikes, rate: torch.empty_like(spikes))
 def _tfi_grad(grad: Tensor, spikes: Tensor, rate: Tensor) -> Tensor:
-    """Sum the gradient over (last spike before n, first spike at or after n], spread it there, weigh it by the rate."""
+    """Sum the gradient over (last spike before n, first spike at or after n], and multiply it by the rate there."""
     result = torch.empty_like(spikes)
     planes = list(zip(grad.unbind(-3), (spikes != 0).unbind(-3), rate.unbind(-3), result.unbind(-3), strict=True))
     running = torch.zeros_like(planes[0][0], dtype=torch.promote_types(spikes.dtype, torch.float32))
@@ -96,7 +96,7 @@ class _Tfi(torch.autograd.Function):
 
 
 class _SumOnIntervals(torch.autograd.Function):
-    """The gradient of TFI, which is linear in the one that comes, and its own adjoint."""
+    """Gradient of TFI, which is linear in the incoming gradient and self-adjoint."""
 
     generate_vmap_rule = True
 
@@ -122,14 +122,14 @@ def _tfp(spikes: Tensor, window: int, max_range: float, dtype: torch.dtype) -> T
 
 @operator(lambda grad, window, max_range, dtype: torch.empty_like(grad, dtype=dtype))
 def _tfp_grad(grad: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Tensor:
-    """The adjoint of TFP: every frame shares its gradient among the frames of its window."""
+    """Adjoint of TFP: distribute the gradient of every frame over the frames of its window."""
     wide = torch.promote_types(torch.promote_types(dtype, torch.float32), grad.dtype)
     share = grad.to(wide) * max_range / _window_sizes(grad, window)
     return _inside(share, window, wide).to(dtype)
 
 
 def _ends(values: Tensor, window: int) -> tuple[Tensor, Tensor]:
-    """First frame of the window around every frame, and the first after it."""
+    """Return the first frame of the window around every frame, and the first one after it."""
     n, half = torch.arange(values.shape[-3], device=values.device), window // 2
     return (n - half).clamp(min=0), (n + half + 1).clamp(max=values.shape[-3])
 
@@ -147,7 +147,7 @@ def _inside(values: Tensor, window: int, dtype: torch.dtype) -> Tensor:
 
 
 class _Tfp(torch.autograd.Function):
-    """TFP or its adjoint: each is the gradient of the other."""
+    """TFP or its adjoint; each is the gradient of the other."""
 
     generate_vmap_rule = True
 
@@ -171,21 +171,21 @@ def spike_interval(spikes: Tensor) -> Tensor:
     .. math:: \Psi_n = \min\{k \mid S_k = 1, k \ge n\} - \max\{k \mid S_k = 1, k < n\}
 
     Convention:
-        Time is axis -3; the spike at n itself closes the interval of frame n. Where one of the two spikes is missing,
-        the estimate is the nearest complete interval of the pixel, but never less than the time already waited,
-        counted from a virtual spike just outside the clip (at -1 or T). So the result is finite and at least 1; a
-        pixel without spikes gives T + 1. Any value but 0 is a spike. No gradient.
+        Time is axis -3; a spike at n itself ends the interval of frame n. If one of the two spikes is missing, the
+        estimate is the nearest complete interval of the pixel, but at least the time already waited, counted from a
+        virtual spike just outside the clip (at -1 or T). The result is therefore finite and at least 1; a pixel without
+        spikes gives T + 1. Any value but 0 is a spike. No gradient.
 
     Args:
         spikes: :math:`(*, T, H, W)`, zeros and ones, any real dtype.
 
     Returns:
-        The intervals in frames, :math:`(*, T, H, W)`: in the dtype of ``spikes`` where that is floating, else int16
-        (int32 from T = 32767 on). float16 counts to 2048 exactly and ends at 65504.
+        The intervals in frames, :math:`(*, T, H, W)`, in the dtype of ``spikes`` if that is floating, else int16
+        (int32 from T = 32767 on). float16 is exact up to 2048 and limited to 65504.
 
     Raises:
         TypeError: ``spikes`` is not a tensor of real numbers.
-        ValueError: fewer than three dimensions, or an empty clip.
+        ValueError: ``spikes`` has fewer than three dimensions or is empty.
 
     Example:
         >>> spikes = torch.tensor([0, 1, 0, 0, 1, 0], dtype=torch.uint8).reshape(6, 1, 1)
@@ -222,25 +222,25 @@ def tfi(spikes: Tensor, max_range: float = 1.0, *, dtype: torch.dtype | None = N
     .. math:: R_n = \delta / \Psi_n
 
     Convention:
-        Time is axis -3, intervals as in :func:`spike_interval`. A pixel that fires at every clock gives ``max_range``;
-        light of a simulated scene with gain alpha is the result divided by alpha.
+        Time is axis -3, intervals as in :func:`spike_interval`. A pixel that fires at every clock gives ``max_range``.
+        For a scene simulated with gain alpha, divide the result by alpha.
 
-        The gradient treats TFI as TFP with the window that the spikes themselves chose:
+        The gradient treats TFI as TFP over the interval between the two spikes:
         :math:`\partial R_n / \partial S_k = \delta / \Psi_n` for k in (last spike before n, first spike at or after
         n], 0 outside.
 
     Args:
         spikes: :math:`(*, T, H, W)`, zeros and ones, any real dtype.
         max_range: :math:`\delta`, the value of a pixel that fires at every clock.
-        dtype: that of the result; that of ``spikes`` where it is floating, else torch's default type. ``torch.uint8``
-            makes pictures: rounded to the nearest whole number, cut to 0 .. 255, without a gradient.
+        dtype: dtype of the result; default: that of ``spikes`` if floating, else torch's default. ``torch.uint8`` is
+            rounded to the nearest whole number and clamped to 0 .. 255, without a gradient.
 
     Returns:
         Raw intensities :math:`(*, T, H, W)`.
 
     Raises:
-        TypeError: ``spikes`` is not a tensor of real numbers, ``dtype`` neither floating nor uint8.
-        ValueError: fewer than three dimensions, an empty clip, ``max_range`` not above 0.
+        TypeError: ``spikes`` is not a tensor of real numbers, or ``dtype`` is neither floating nor uint8.
+        ValueError: ``spikes`` has fewer than three dimensions or is empty, or ``max_range`` is not above 0.
 
     Example:
         >>> spikes = torch.tensor([0, 1, 0, 1]).reshape(4, 1, 1)
@@ -286,29 +286,28 @@ def tfp(
     .. math:: R_n = \frac{\delta}{w} \sum_{|i - n| \le (w - 1) / 2} S_i
 
     Convention:
-        Time is axis -3; the window is centred. Near the ends of the clip it is cut, and the mean is over the frames
-        that exist, so a window longer than the clip is legal. Linear in the spikes, and differentiable as such; sums
-        run in float32 or wider.
+        Time is axis -3; the window is centred, and cut at the ends of the clip. A window longer than the clip is legal.
+        Linear in the spikes, and differentiable as such; sums are computed in float32 or wider.
 
-        An integrate-and-fire pixel is a delta-sigma modulator of first order: a rounding error now is added later.
-        A plain mean makes no use of that. Means of means do: three of 13 frames see 37 and leave far less noise than
-        one of 41, and less motion blur, since the frames far from n count for little.
+        An integrate-and-fire pixel is a delta-sigma modulator of first order: its rounding errors cancel over time. A
+        repeated mean uses this. Three means over 13 frames see 37 frames, and have far less noise than one mean over
+        41, and less motion blur, since frames far from n have small weights.
 
     Args:
         spikes: :math:`(*, T, H, W)`, zeros and ones, any real dtype.
         window: number of frames, odd.
         max_range: :math:`\delta`, the value of a pixel that fires at every clock.
-        order: how often the mean is taken; the result then sees ``order * (window - 1) + 1`` frames.
-        dtype: that of the result; that of ``spikes`` where it is floating, else torch's default type. ``torch.uint8``
-            makes pictures: rounded to the nearest whole number, cut to 0 .. 255, without a gradient.
+        order: how many times the mean is taken; the result sees ``order * (window - 1) + 1`` frames.
+        dtype: dtype of the result; default: that of ``spikes`` if floating, else torch's default. ``torch.uint8`` is
+            rounded to the nearest whole number and clamped to 0 .. 255, without a gradient.
 
     Returns:
         Raw intensities :math:`(*, T, H, W)`.
 
     Raises:
-        TypeError: ``spikes`` is not a tensor of real numbers, ``dtype`` neither floating nor uint8.
-        ValueError: fewer than three dimensions, an empty clip, an even window or one below 1, an order below 1,
-            ``max_range`` not above 0.
+        TypeError: ``spikes`` is not a tensor of real numbers, or ``dtype`` is neither floating nor uint8.
+        ValueError: ``spikes`` has fewer than three dimensions or is empty, ``window`` is even or below 1, ``order`` is
+            below 1, or ``max_range`` is not above 0.
 
     Example:
         >>> spikes = torch.tensor([1, 0, 0, 1]).reshape(4, 1, 1)
@@ -319,14 +318,14 @@ def tfp(
 
     Reference:
         Dong et al., CVPR 2024, eq. (6); Zhu et al., ICME 2019. ``order``: the sinc^k filter of Candy, IEEE
-        Transactions on Communications, 1986, which wants one order more than the modulator has.
+        Transactions on Communications, 1986, which recommends one order more than that of the modulator.
     """
     check_planes("spikes", spikes, 3, "(*, T, H, W)")
     window, order = check_window(window), check_whole("order", order)
     check_positive("max_range", max_range)
     check_dtype(dtype, torch.uint8)
     dtype = dtype or default_float(spikes)
-    window = min(window, 2 * spikes.shape[-3] - 1)  # which sees all frames from either end
+    window = min(window, 2 * spikes.shape[-3] - 1)  # sees all frames from both ends
     between = torch.float64 if dtype == torch.float64 else torch.float32
     for _ in range(order - 1):
         spikes = _Tfp.apply(spikes, window, 1.0, between, False)
@@ -334,7 +333,7 @@ def tfp(
 
 
 def check_window(window: int) -> int:
-    """Return a window, checked."""
+    """Return ``window`` as an int; raise a ValueError unless it is odd and >= 1."""
     window = check_whole("window", window)
     if window % 2 == 0:
         raise ValueError(f"window: expected an odd number of frames, got {window}")

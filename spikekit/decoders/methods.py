@@ -1,4 +1,4 @@
-"""The decoders by name, a list shared by the commands, the baseline network and its tables."""
+"""Registry of the decoders, shared by the commands and the baselines."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from spikekit.decoders.single_frame import search, tfi_at, tfp_at, tfp_weights
 
 @dataclass(frozen=True)
 class Decoder:
-    """A way back from spikes to light, for a clip in memory and for a recording that is read frame by frame.
+    """A decoder from spikes to light, for clips in memory and for recordings that are read frame by frame.
 
     Attributes:
-        clip: makes raw intensities (*, T, H, W) of spikes of that shape, given its options as keywords.
-        frame: the same at one frame of a clip, (*, H, W), given spikes and the number of the frame.
-        planes: the same of a recording, as an array (H, W), given what returns the plane of a number, the number,
-            the range of frames that it may look at, and how many there are.
-        reach: how many frames on each side it looks at in a recording.
-        options: names of its options.
+        clip: decodes spikes (*, T, H, W) to raw intensities of that shape; takes the options as keywords.
+        frame: decodes one frame of a clip to (*, H, W); takes spikes and the frame number.
+        planes: decodes one frame of a recording to an array (H, W); takes a function that returns a frame, the frame
+            number, the range of frames to use, and the number of frames.
+        reach: returns the number of frames used on each side in a recording.
+        options: names of the options.
         shown: options by heading, for tables that compare methods.
     """
 
@@ -35,8 +35,8 @@ class Decoder:
     shown: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
-#: Frames that TFI looks at on each side in a recording; a pixel that fires more rarely is decoded as if it fired once
-#: in all of them.
+#: Frames that TFI searches on each side in a recording; a pixel that fires more rarely is decoded as if spikes lay just
+#: outside.
 TFI_REACH = 200
 
 

@@ -43,24 +43,24 @@ def _(packed: Tensor, width: int) -> Tensor:
 
 
 def pack_spikes(spikes: Tensor) -> Tensor:
-    r"""Put 8 neighbouring pixels of a row into a byte.
+    r"""Pack 8 neighbouring pixels of a row into a byte.
 
     .. math:: P_{y, j} = \sum_{i=0}^{7} 2^i S_{y, 8 j + i}
 
     Convention:
-        The leftmost pixel is the least significant bit, as in a ``.dat``. Every row begins with a byte of its own:
-        where 8 does not divide W, the last bits of a row are 0. Packing is lossless, so values other than 0 and 1 are
-        an error; on a GPU, checking this requires a synchronisation. No gradient.
+        The leftmost pixel is the least significant bit, as in a ``.dat``. Every row starts at a new byte; if 8 does not
+        divide W, the last bits of a row are 0. Packing is lossless, so values other than 0 and 1 are an error; on a
+        GPU, checking this requires a synchronisation. No gradient.
 
     Args:
-        spikes: :math:`(*, H, W)`, zeros and ones, any real dtype; mostly :math:`(T, H, W)`.
+        spikes: :math:`(*, H, W)`, zeros and ones, any real dtype; usually :math:`(T, H, W)`.
 
     Returns:
         Bytes :math:`(*, H, \lceil W / 8 \rceil)`, uint8, on the device of ``spikes``.
 
     Raises:
         TypeError: ``spikes`` is not a tensor of real numbers.
-        ValueError: fewer than two dimensions, no pixels, or values other than 0 and 1.
+        ValueError: ``spikes`` has fewer than two dimensions, no pixels, or values other than 0 and 1.
 
     Example:
         >>> pack_spikes(torch.tensor([[1, 0, 0, 0, 0, 0, 0, 0, 1, 1]]))
@@ -71,22 +71,22 @@ def pack_spikes(spikes: Tensor) -> Tensor:
 
 
 def unpack_spikes(packed: Tensor, width: int, *, dtype: torch.dtype = torch.uint8) -> Tensor:
-    r"""Undo :func:`pack_spikes`: one pixel a value.
+    r"""Unpack bytes to one value per pixel.
 
     Convention:
         The inverse of :func:`pack_spikes`, bit for bit. Bits of a row beyond ``width`` are ignored.
 
     Args:
-        packed: bytes :math:`(*, H, \lceil W / 8 \rceil)`, uint8; mostly :math:`(T, H, \lceil W / 8 \rceil)`.
+        packed: bytes :math:`(*, H, \lceil W / 8 \rceil)`, uint8; usually :math:`(T, H, \lceil W / 8 \rceil)`.
         width: W, pixels in a row.
-        dtype: of the result; any real type.
+        dtype: dtype of the result; any real type.
 
     Returns:
         Zeros and ones :math:`(*, H, W)` on the device of ``packed``.
 
     Raises:
         TypeError: ``packed`` is not a tensor of bytes.
-        ValueError: fewer than two dimensions, no bytes, or a width that takes another number of bytes.
+        ValueError: ``packed`` has fewer than two dimensions or no bytes, or ``width`` needs another number of bytes.
 
     Example:
         >>> packed = torch.tensor([[1, 3]], dtype=torch.uint8)

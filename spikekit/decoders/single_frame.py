@@ -1,4 +1,4 @@
-"""The decoders at a single frame, which read only the few frames that determine it."""
+"""Decoders of a single frame, which read only the frames that determine it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _operator = operator(
 
 
 def _look(fired: Tensor) -> tuple[Tensor, Tensor]:
-    """Count the planes before the first spike, all where there is none; and from it to the second, 0 if none."""
+    """Count the planes before the first spike (all if there is none), and from it to the second (0 if none)."""
     planes = fired.shape[-3]
     if planes == 0:
         none = fired.new_zeros(fired.shape[:-3] + fired.shape[-2:], dtype=torch.int64)
@@ -50,16 +50,17 @@ def _(spikes: Tensor, frame: int) -> Tensor:
 
 
 def search(plane: Callable[[int], np.ndarray], frame: int, clip: range) -> np.ndarray:
-    """Find the intervals at one frame of a clip whose frames are made when they are needed.
+    """Find the intervals at one frame, loading only the frames that are needed.
 
-    ``plane`` gives the frame of a number, uint8, anything but 0 being a spike; ``clip`` has the numbers of all frames.
+    ``plane`` returns the frame of a given number, uint8, where any value but 0 is a spike. ``clip`` holds the numbers
+    of all frames.
     """
     size = plane(frame).shape
     onwards, backwards = range(frame, clip.stop), range(frame - 1, clip.start - 1, -1)
     after, none_after = _silence(map(plane, onwards), size, len(clip))
     before, none_before = _silence(map(plane, backwards), size, len(clip))
     interval = after + before + 1
-    # where one of the two spikes is missing, the nearest complete interval lies on the other side
+    # if one of the two spikes is missing, the nearest complete interval lies on the other side
     for order, alone in ((onwards, none_before & ~none_after), (backwards, none_after & ~none_before)):
         if alone.any():
             np.maximum(interval, _first_interval(map(plane, order), alone, len(clip)), out=interval)
@@ -67,7 +68,7 @@ def search(plane: Callable[[int], np.ndarray], frame: int, clip: range) -> np.nd
 
 
 def _silence(planes: Iterable[np.ndarray], size: tuple[int, ...], most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Count the planes before the first spike of every pixel, all where there is none; and say where there is none."""
+    """Count the planes before the first spike of every pixel (all if there is none); also return which have none."""
     silent, count = np.ones(size, bool), np.zeros(size, _counter(most))
     for plane in planes:
         np.greater(silent.view(np.uint8), plane, out=silent)
@@ -78,7 +79,7 @@ def _silence(planes: Iterable[np.ndarray], size: tuple[int, ...], most: int) -> 
 
 
 def _first_interval(planes: Iterable[np.ndarray], wanted: np.ndarray, most: int) -> np.ndarray:
-    """Count the planes from the first spike to the second, at the wanted pixels; 0 where there is no second."""
+    """Count the planes from the first spike to the second at the ``wanted`` pixels; 0 if there is no second."""
     waiting, once, count = wanted.copy(), np.zeros_like(wanted), np.zeros(wanted.shape, _counter(most))
     for plane in planes:
         fired = plane != 0
@@ -100,19 +101,20 @@ def spike_interval_at(spikes: Tensor, frame: int) -> Tensor:
     .. math:: \Psi_n = \min\{k \mid S_k = 1, k \ge n\} - \max\{k \mid S_k = 1, k < n\}
 
     Convention:
-        ``spike_interval(spikes)[..., frame, :, :]``, ends of the clip and all, for the work of a few frames: on the
-        CPU, frames are read outwards from this one until every pixel has fired on both sides. No gradient.
+        Equals ``spike_interval(spikes)[..., frame, :, :]``, also near the ends of the clip, at the cost of a few
+        frames: on the CPU, frames are read outwards from this one until every pixel has fired on both sides. No
+        gradient.
 
     Args:
         spikes: :math:`(*, T, H, W)`, zeros and ones, any real dtype.
         frame: n, from 0 to T - 1.
 
     Returns:
-        The intervals in frames, :math:`(*, H, W)`, in the dtype that :func:`spikekit.spike_interval` gives.
+        The intervals in frames, :math:`(*, H, W)`, in the dtype of :func:`spikekit.spike_interval`.
 
     Raises:
-        TypeError: ``spikes`` is not a tensor of real numbers, or ``frame`` no whole number.
-        ValueError: fewer than three dimensions, an empty clip, or a frame that is not in it.
+        TypeError: ``spikes`` is not a tensor of real numbers, or ``frame`` is not a whole number.
+        ValueError: ``spikes`` has fewer than three dimensions or is empty, or ``frame`` is out of range.
 
     Example:
         >>> spikes = torch.tensor([0, 1, 0, 0, 1, 0], dtype=torch.uint8).reshape(6, 1, 1)
@@ -132,21 +134,21 @@ def tfi_at(spikes: Tensor, frame: int, max_range: float = 1.0, *, dtype: torch.d
     .. math:: R_n = \delta / \Psi_n
 
     Convention:
-        ``tfi(spikes, max_range, dtype=dtype)[..., frame, :, :]``, bit for bit, for the work of a few frames; see
+        Equals ``tfi(spikes, max_range, dtype=dtype)[..., frame, :, :]``, bit for bit, at the cost of a few frames; see
         :func:`spike_interval_at`. No gradient.
 
     Args:
         spikes: :math:`(*, T, H, W)`, zeros and ones, any real dtype.
         frame: n, from 0 to T - 1.
         max_range: :math:`\delta`, the value of a pixel that fires at every clock.
-        dtype: of the result, floating or uint8; that of ``spikes`` where it is floating, else torch's default type.
+        dtype: dtype of the result, floating or uint8; default: that of ``spikes`` if floating, else torch's default.
 
     Returns:
         Raw intensities :math:`(*, H, W)`.
 
     Raises:
-        TypeError: as :func:`spike_interval_at`, or another dtype.
-        ValueError: as :func:`spike_interval_at`, or ``max_range`` not above 0.
+        TypeError: as :func:`spike_interval_at`, or ``dtype`` is neither floating nor uint8.
+        ValueError: as :func:`spike_interval_at`, or ``max_range`` is not above 0.
 
     Example:
         >>> tfi_at(torch.tensor([0, 1, 0, 1]).reshape(4, 1, 1), 2)
@@ -169,30 +171,30 @@ def tfp_at(
     order: int = 1,
     dtype: torch.dtype | None = None,
 ) -> Tensor:
-    r"""Texture from playback at one frame, the key frame: one weighted sum of the frames that it sees.
+    r"""Texture from playback at one frame, the key frame: a weighted sum of the frames in its window.
 
     .. math:: R_n = \delta \sum_k w_k S_{n + k}, \quad \sum_k w_k = 1
 
     Convention:
-        ``tfp(spikes, window, max_range, order=order, dtype=dtype)[..., frame, :, :]``, to rounding; sums run in
-        float32 or wider. Linear in the spikes, and differentiable as such.
+        Equals ``tfp(spikes, window, max_range, order=order, dtype=dtype)[..., frame, :, :]`` up to rounding; sums are
+        computed in float32 or wider. Linear in the spikes, and differentiable as such.
 
     Args:
         spikes: :math:`(*, T, H, W)`, zeros and ones, any real dtype.
         frame: n, from 0 to T - 1.
         window: number of frames of the mean, odd.
         max_range: :math:`\delta`, the value of a pixel that fires at every clock.
-        order: how often the mean is taken, see :func:`spikekit.tfp`.
-        dtype: of the result, floating or uint8; that of ``spikes`` where it is floating, else torch's default type.
+        order: how many times the mean is taken, see :func:`spikekit.tfp`.
+        dtype: dtype of the result, floating or uint8; default: that of ``spikes`` if floating, else torch's default.
 
     Returns:
         Raw intensities :math:`(*, H, W)`.
 
     Raises:
-        TypeError: ``spikes`` is not a tensor of real numbers, ``frame`` no whole number, ``dtype`` neither floating
-            nor uint8.
-        ValueError: fewer than three dimensions, an empty clip, a frame that is not in it, an even window or one below
-            1, an order below 1, ``max_range`` not above 0.
+        TypeError: ``spikes`` is not a tensor of real numbers, ``frame`` is not a whole number, or ``dtype`` is neither
+            floating nor uint8.
+        ValueError: ``spikes`` has fewer than three dimensions or is empty, ``frame`` is out of range, ``window`` is
+            even or below 1, ``order`` is below 1, or ``max_range`` is not above 0.
 
     Example:
         >>> tfp_at(torch.tensor([0, 1, 0, 1]).reshape(4, 1, 1), 2, 3)
@@ -209,13 +211,13 @@ def tfp_at(
     first, weights = tfp_weights(spikes.shape[-3], frame, window, order)
     between = torch.float64 if torch.float64 in (dtype, spikes.dtype) else torch.float32
     light = spikes[..., first, :, :].to(between) * (max_range * weights[0])
-    for n, weight in enumerate(weights[1:], first + 1):  # frame by frame: what is larger than the result costs more
+    for n, weight in enumerate(weights[1:], first + 1):  # frame by frame, as larger buffers are slower
         light.add_(spikes[..., n, :, :], alpha=max_range * weight)
     return cast_light(light, dtype)
 
 
 def tfp_weights(frames: int, frame: int, window: int, order: int) -> tuple[int, list[float]]:
-    """First frame that counts in the mean of means at one frame of a clip, and weights of it and those after it."""
+    """Return the first frame that contributes to the repeated mean at ``frame``, and the weights from it on."""
     half = window // 2
     first, last = max(frame - order * half, 0), min(frame + order * half, frames - 1)
     seen = range(first, last + 1)
@@ -229,7 +231,7 @@ def tfp_weights(frames: int, frame: int, window: int, order: int) -> tuple[int, 
 
 def _interval(spikes: Tensor, frame: int) -> Tensor:
     frame = _check_frame(spikes, frame)
-    # other programs know no operator of ours
+    # exported models cannot use custom operators
     find = _spike_interval_at if is_exporting() else _operator
     return find(spikes.detach(), frame)
 

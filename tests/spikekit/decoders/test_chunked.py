@@ -90,7 +90,7 @@ def test_pieces_come_as_soon_as_they_can():
             2,
             lambda part: part[:1],
             ValueError,
-            "decode: expected 7 frames as given, got a result",
+            "decode: expected 7 frames, as many as given, got",
         ),
         ([torch.ones(7, 4, 5)], 2, lambda _: None, TypeError, "decode: expected a function that returns a tensor"),
     ],
