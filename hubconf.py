@@ -1,7 +1,7 @@
-"""Entry points of ``torch.hub``: a network with each of the weights in the package, which needs no network.
+"""Entry points of ``torch.hub``, one for each network in the package; they work offline.
 
-``torch.hub.load(FOLDER, "cscsr_small_x4", source="local")`` from a clone; ``lightning models``
-lists them. Arguments are those of ``CSCSR.from_pretrained``.
+Use ``torch.hub.load(FOLDER, "cscsr_small_x4", source="local")`` in a clone. ``lightning models`` lists the names.
+Arguments are those of ``CSCSR.from_pretrained``.
 """
 
 from functools import partial

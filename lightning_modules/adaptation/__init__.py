@@ -1,1 +1,1 @@
-"""Fine-tuning on a recording, without truth: ``lightning adapt``, and what it is worth."""
+"""Fine-tuning on a recording without ground truth, ``lightning adapt``."""

@@ -24,7 +24,7 @@ from spikekit.cli import recordings
 from spikekit.recording import Recording
 from spikekit.timing import duration
 
-#: dB by which the held-out pictures have to come nearer to the teacher's
+#: required gain on the held-out pictures, in dB of PSNR to the teacher's
 LEAST_GAIN = 0.1
 
 _WRITTEN = "adapted.safetensors"
@@ -34,21 +34,21 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the verb."""
     made = VerbParser(
         prog="lightning adapt",
-        description="Fine-tune fast weights on a recording of your camera, without ground truth: they learn from the "
-        "pictures that slower weights make of it. The end of the recording is held out, and decides whether the new "
-        "weights are kept. lightning predict --weights OUT/adapted.safetensors uses them; those of a noisy "
-        "camera also serve its other recordings.",
+        description="Fine-tune fast weights on a recording of your camera without ground truth. They learn from the "
+        "pictures of slower weights. The new weights are written if they improve the end of the recording, which is "
+        "held out. Use them with lightning predict --weights OUT/adapted.safetensors; for a noisy camera, also on "
+        "its other recordings.",
     )
     recordings.add_arguments(made)
     add = made.add_argument
-    add("--weights", default="cscsr_small_x4", help="what to begin with; cscsr_small_x4 if not given")
+    add("--weights", default="cscsr_small_x4", help="weights to fine-tune (default: cscsr_small_x4)")
     add(
         "--teacher",
-        help="weights to learn from; if not given, the slowest of the package that the recording has room for, those "
-        "for a noisy sensor where the sensor was not measured",
+        help="weights to learn from (default: the slowest weights in the package whose clips fit the recording; those "
+        "for noisy sensors if the sensor was not calibrated)",
     )
-    add("--steps", type=whole(1), default=100, help="how long to learn; 100 if not given")
-    add("-o", "--output", type=Path, required=True, metavar="OUT", help="folder of what is written")
+    add("--steps", type=whole(1), default=100, help="training steps (default: 100)")
+    add("-o", "--output", type=Path, required=True, metavar="OUT", help="output folder")
     return made
 
 
@@ -56,10 +56,10 @@ def adapt(args: Sequence[str]) -> None:
     """Fine-tune weights on a recording.
 
     Args:
-        args: what was typed after ``lightning adapt``.
+        args: arguments after ``lightning adapt``.
 
     Raises:
-        InputError: a recording that is too short or cannot be read, unusable weights, or nothing was gained.
+        InputError: the recording is unreadable or too short, the weights are unusable, or the gain is too small.
     """
     asked = parser().parse_args(args)
     weights = asked.weights
@@ -76,10 +76,10 @@ def adapt(args: Sequence[str]) -> None:
             lessons = make_lessons(student, teacher.to(device).eval(), clips)
             precision = precision_of(torch.device(device)) if device == "cuda" else "32-true"
             before, after = learn(student, lessons, asked.steps, precision)
-            held_out = f"dB from the held-out pictures of {name}"
+            held_out = f"dB PSNR to the held-out pictures of {name}"
             said = f"{before:.2f} {held_out} before, {after:.2f} dB after {asked.steps} steps"
             if not after >= before + LEAST_GAIN:
-                raise InputError(f"{said}: expected {LEAST_GAIN} dB more; nothing written, go on using {weights}")
+                raise InputError(f"{said}: expected a gain of {LEAST_GAIN} dB; nothing written, keep using {weights}")
             tensors = student.cpu().state_dict()
             write_weights(Weights(written, settings_of(student), motion_of(student), tensors), written)
     print(f"{said}\n{written}: in {duration(perf_counter() - begin)}; for lightning predict --weights {written}")
@@ -88,30 +88,30 @@ def adapt(args: Sequence[str]) -> None:
 def _student(weights: str) -> Network:
     student = Network.from_pretrained(weights)
     if isinstance(student, RecurrentCSCSR) or student.settings.get("motion_fusion", "joint") != "joint":
-        raise UsageError(f"--weights: expected a network that learns from single clips and one flow, got {weights}")
+        raise UsageError(f"--weights: expected a network for single clips with one flow, got {weights}")
     return student.eval()
 
 
 def clips_and_teacher(
     recording: Recording, student: Network, teacher: str | None, noisy: bool = True
 ) -> tuple[RecordingClips, str, Network]:
-    """Return clips as long as the longer of both networks wants them, the name of the teacher, and the teacher.
+    """Return clips of the recording, the name of the teacher, and the teacher.
 
     Args:
-        recording: what is learned from.
-        student: what learns.
-        teacher: what was asked for.
-        noisy: whether the sensor may be noisy.
+        recording: recording to learn from.
+        student: network to fine-tune.
+        teacher: weights of the teacher, or None for the slowest suitable weights.
+        noisy: the sensor may be noisy.
 
     Raises:
-        ValueError: the recording is too short or too small, or the teacher does not fit.
+        ValueError: the recording is too short or too small, or the teacher does not match the student.
     """
     name = teacher or _slowest(recording, student, noisy)
     network = Network.from_pretrained(name)
     for setting in ("scale", "pattern"):
         here, there = student.settings[setting], network.settings[setting]
         if here != there:
-            raise UsageError(f"--teacher: expected {setting} {here} of the weights that learn, got {there} of {name}")
+            raise UsageError(f"--teacher: expected {setting} {here}, as in --weights, got {there} of {name}")
     frames = max(student.frames, network.frames)
     if recording.frames < ROOM * frames:
         raise ValueError(_too_short(recording, frames))
@@ -119,7 +119,7 @@ def clips_and_teacher(
 
 
 def _slowest(recording: Recording, student: Network, noisy: bool) -> str:
-    """Return the weights that make the best pictures of this recording, as far as one can know."""
+    """Return the name of the slowest weights for this recording, which are expected to give the best pictures."""
     room = recording.frames // ROOM
     models = list_models(student.scale, student.pattern)
     fit = [one for one in models if not one.film and one.frames and one.frames <= room]

@@ -1,4 +1,4 @@
-"""Train a network on lessons of a recording, and judge it by those that are held out."""
+"""Fine-tuning of a network on lessons from a recording, and its evaluation on held-out lessons."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from spikekit.color.cfa import GREY
 from spikekit.progress import progress
 
 _PATCH, _BATCH, _RATE = 40, 4, 1e-3
-_RISING = 10  # steps until the rate is reached; then it falls to 0
+_RISING = 10  # warm-up steps of the learning rate, which then falls linearly to 0
 
 
 def patch_of(lessons: Lessons, pattern: str, scale: int, index: int) -> dict[str, Tensor]:
-    """Return a patch of a lesson, with its picture and its motion; which one, only the index says."""
+    """Return a random patch of a lesson, with its picture and flow; the index is the random seed."""
     rng = np.random.default_rng(index)
     one, sides = int(rng.integers(len(lessons))), lessons.spikes.shape[-2:]
     size = min(*sides, _PATCH)
@@ -30,9 +30,9 @@ def patch_of(lessons: Lessons, pattern: str, scale: int, index: int) -> dict[str
     patch = {"spikes": lessons.spikes[one][..., *here], "rgb": lessons.rgb[one][..., *there].float()}
     if lessons.flow is not None:
         patch["flow"] = lessons.flow[one][..., *here]
-    if rng.uniform() < 0.5:  # backwards in time
+    if rng.uniform() < 0.5:  # reversed in time
         patch |= {name: patch[name].flip(0) for name in ("spikes", "flow") if name in patch}
-    if pattern in ("RGGB", "BGGR", GREY) and rng.uniform() < 0.5:  # transposed, these begin with the same colours
+    if pattern in ("RGGB", "BGGR", GREY) and rng.uniform() < 0.5:  # transposition keeps these patterns
         patch = {name: value.mT for name, value in patch.items()}
         if "flow" in patch:
             patch["flow"] = patch["flow"].flip(-3)
@@ -41,7 +41,7 @@ def patch_of(lessons: Lessons, pattern: str, scale: int, index: int) -> dict[str
 
 @torch.no_grad()
 def likeness(network: Network, lessons: Lessons) -> float:
-    """Return the PSNR in dB of pictures by a network to those of the teacher, as they would be shown."""
+    """Return the PSNR in dB of a network's pictures with respect to the teacher's, normalised to white and clamped."""
     values, device = [], next(network.parameters()).device
     for number in range(len(lessons)):
         one = lessons.part(slice(number, number + 1))
@@ -60,13 +60,13 @@ def learn(student: Network, lessons: Lessons, steps: int, precision: str = "32-t
     """Train a network on lessons.
 
     Args:
-        student: what learns, in evaluation mode.
-        lessons: those that are held out last.
-        steps: how long.
+        student: network to train, in evaluation mode.
+        lessons: lessons; the last ones are held out.
+        steps: training steps.
         precision: ``"32-true"`` or ``"bf16-mixed"``.
 
     Returns:
-        Likeness of the held-out pictures to the teacher's before and after, in dB.
+        PSNR in dB of the held-out pictures with respect to the teacher's, before and after.
     """
     taught, held_out = lessons.part(slice(-HELD_OUT)), lessons.part(slice(-HELD_OUT, None))
     before = likeness(student, held_out)

@@ -1,4 +1,4 @@
-"""What a network can learn from a recording: the pictures that a slower one makes of it."""
+"""Lessons from a recording: clips, and pictures of them by a slower network, the teacher."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from lightning_modules.inference.tiles import TILE, forward_in_tiles
 from lightning_modules.networks import Network
 from spikekit.progress import progress
 
-#: lessons, and how many of them are held out: pictures of the end of the recording
+#: number of lessons, and how many of them, at the end of the recording, are held out
 LESSONS, HELD_OUT = 16, 4
-#: clips of the longer of both networks that a recording has to have room for
+#: minimum length of a recording, in clips of the network with the longer clips
 ROOM = 3
 
-_SIDE = 160  # of what a lesson shows, in sensor pixels
+_SIDE = 160  # side of a lesson in sensor pixels
 
 
 @dataclass(frozen=True)
 class Lessons:
-    """Clips of a recording, and what the teacher sees in them.
+    """Clips of a recording, and the teacher's pictures of them.
 
     Args:
-        spikes: (L, N, H, W) uint8, as the student takes them.
-        rgb: pictures of the teacher, (L, 3, s H, s W) float16, in the student's units.
-        flow: motion as the student's estimator sees it; None where it needs none.
-        white: what the student's picture of a white pixel would be.
+        spikes: clips of the student's length, (L, N, H, W), uint8.
+        rgb: pictures of the teacher, (L, 3, s H, s W), float16, in the student's units.
+        flow: flow by the student's motion estimator, or None if it needs none.
+        white: value of a white pixel in the student's pictures.
     """
 
     spikes: Tensor
@@ -41,17 +41,17 @@ class Lessons:
         return len(self.spikes)
 
     def part(self, which: slice) -> Lessons:
-        """Return some of them."""
+        """Return a slice of the lessons."""
         flow = None if self.flow is None else self.flow[which]
         return Lessons(self.spikes[which], self.rgb[which], flow, self.white)
 
 
 def chosen_frames(total: int, frames: int) -> list[int]:
-    """Return which frames lessons are about; no clip of the last ones, which are held out, overlaps another's.
+    """Return the middle frames of the lessons; clips of held-out lessons do not overlap with the others.
 
     Args:
-        total: frames of the recording, at least ``ROOM`` clips.
-        frames: of the longest clip.
+        total: number of spike frames of the recording, at least ``ROOM`` clips.
+        frames: number of spike frames of the longest clip.
 
     Example:
         >>> chosen_frames(1000, 101)[-5:]
@@ -64,12 +64,12 @@ def chosen_frames(total: int, frames: int) -> list[int]:
 
 
 def make_lessons(student: Network, teacher: Network, clips: RecordingClips) -> Lessons:
-    """Let the teacher look at a recording.
+    """Create lessons from clips of a recording.
 
     Args:
-        student: what is to learn.
-        teacher: of the same scale and Bayer phase.
-        clips: of the recording, of as many frames as the network with the longer ones takes.
+        student: network to train.
+        teacher: network of the same scale and Bayer phase.
+        clips: clips of the recording, of the length of the network with the longer clips.
     """
     chosen = chosen_frames(clips.recording.frames, clips.frames)
     ratio = teacher.settings["alpha"] / student.settings["alpha"]

@@ -1,1 +1,1 @@
-"""Metrics of pictures, of films and of optical flow."""
+"""Metrics for pictures, films and optical flow."""

@@ -1,4 +1,4 @@
-"""Metric of films: flicker."""
+"""Flicker, a metric for films."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from spikekit import flow_warp
 
 
 def film_flicker(rgb: Tensor, then: Tensor, truth: Tensor, truth_then: Tensor, flow: Tensor) -> Tensor:
-    r"""Error of the difference of two pictures of a film, the later warped onto the earlier by the true flow.
+    r"""Measure flicker: the change in error between two pictures of a film, after warping along the true flow.
 
     .. math:: d = \sqrt{\operatorname{mean} \bigl( (W(\hat I_{then}) - \hat I) - (W(I_{then}) - I) \bigr)^2}
 
-    An error that moves with the scene, such as blur that stays the same, is none; one that comes and goes is. Pixels
-    whose flow ends outside of the picture do not count.
+    Errors that move with the scene, such as constant blur, do not count; errors that come and go do. Pixels whose flow
+    ends outside the picture are ignored.
 
     Args:
         rgb: pictures, :math:`(B, 3, H, W)`, in [0, 1].
-        then: the next ones, or those before.
-        truth: of ``rgb``.
-        truth_then: of ``then``.
-        flow: the true one from ``rgb`` to ``then``, :math:`(B, 2, H, W)`, in pixels of the pictures.
+        then: the next or previous pictures, :math:`(B, 3, H, W)`.
+        truth: ground truth of ``rgb``.
+        truth_then: ground truth of ``then``.
+        flow: true flow from ``rgb`` to ``then``, :math:`(B, 2, H, W)`, in pixels of the pictures.
 
     Returns:
-        Steps of 8 bits, root mean square, :math:`(B)`; less is better; NaN where all flow ends outside.
+        Root mean square in steps of 8 bits, :math:`(B)`; lower is better. NaN if all flow ends outside the picture.
 
     Example:
         >>> truth, flow = torch.rand(1, 3, 8, 8), torch.zeros(1, 2, 8, 8)

@@ -1,4 +1,4 @@
-"""Metrics of optical flow: end-point error and outliers."""
+"""Metrics for optical flow: end-point error and outliers."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from torch import Tensor
 
 
 def end_point_error(flow: Tensor, truth: Tensor) -> Tensor:
-    r"""Distance between where a flow and the true one end, pixel by pixel.
+    r"""Return the distance between the end points of a flow and the true flow, per pixel.
 
     .. math:: e = \sqrt{(u - u^*)^2 + (v - v^*)^2}
 
     Args:
-        flow: (\*, 2, H, W), in any pixels.
-        truth: of the same size, in the same pixels.
+        flow: estimated flow, (\*, 2, H, W), in pixels.
+        truth: true flow of the same shape, in the same pixels.
 
     Returns:
-        (\*, H, W), in those pixels.
+        Error (\*, H, W), in the same pixels.
 
     Raises:
-        ValueError: sizes that differ.
+        ValueError: the shapes differ.
 
     Example:
         >>> import torch
@@ -29,19 +29,19 @@ def end_point_error(flow: Tensor, truth: Tensor) -> Tensor:
         Baker et al., A Database and Evaluation Methodology for Optical Flow, IJCV 2011.
     """
     if flow.shape != truth.shape:
-        raise ValueError(f"flow, truth: expected one size, got {tuple(flow.shape)} and {tuple(truth.shape)}")
+        raise ValueError(f"flow, truth: expected equal shapes, got {tuple(flow.shape)} and {tuple(truth.shape)}")
     return (flow - truth).norm(dim=-3)
 
 
 def outliers(error: Tensor, truth: Tensor) -> Tensor:
-    r"""Where flow is wrong as KITTI counts it: by more than three pixels and more than five per cent of the truth.
+    r"""Return the outliers as KITTI defines them: errors above three pixels and five per cent of the true flow.
 
     Args:
-        error: :func:`end_point_error`, (\*, H, W).
-        truth: (\*, 2, H, W), in the same pixels.
+        error: end-point error, (\*, H, W), see :func:`end_point_error`.
+        truth: true flow, (\*, 2, H, W), in the same pixels.
 
     Returns:
-        (\*, H, W), bool.
+        Boolean mask (\*, H, W).
 
     Example:
         >>> import torch

@@ -1,4 +1,4 @@
-"""Metrics of pictures: PSNR, SSIM, and LPIPS where its weights are at hand."""
+"""Metrics for pictures: PSNR, SSIM, and LPIPS if its weights are installed."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from spikekit import psnr, ssim
 
 
 class Measure(NamedTuple):
-    """A measure of pictures.
+    """Metric for pictures.
 
     Args:
-        name: column of a CSV.
-        heading: of a table.
-        digits: how many a table shows.
-        of: from pictures and the truth, :math:`(B, 3, H, W)` each, to a value for every picture, :math:`(B)`.
+        name: column in CSV files.
+        heading: heading in tables.
+        digits: decimal places in tables.
+        of: function of pictures and ground truth, :math:`(B, 3, H, W)`, which returns a value per picture,
+            :math:`(B)`.
     """
 
     name: str
@@ -28,7 +29,7 @@ class Measure(NamedTuple):
 
 
 def measures() -> list[Measure]:
-    """Return the measures that are available here.
+    """Return the available metrics.
 
     Example:
         >>> [measure.name for measure in measures()][:2]
@@ -39,13 +40,13 @@ def measures() -> list[Measure]:
 
 
 def score(rgb: Tensor, truth: Tensor) -> dict[str, Tensor]:
-    """Return all measures of pictures (B, ..., 3, H, W) by name: a value (B) each, the mean of those of a film."""
+    """Return all metrics of pictures (B, ..., 3, H, W) by name, as values (B), averaged over the pictures of a film."""
     flat, known = (planes.reshape(-1, *planes.shape[-3:]) for planes in (rgb, truth))
     return {measure.name: measure.of(flat, known).reshape(len(truth), -1).mean(dim=1) for measure in measures()}
 
 
 def why_no_lpips() -> str | None:
-    """Return in one line what LPIPS lacks here, or None."""
+    """Return a one-line reason why LPIPS is not available, or None if it is."""
     try:
         find_weights()
     except FileNotFoundError as error:

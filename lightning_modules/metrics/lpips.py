@@ -1,4 +1,4 @@
-"""LPIPS: how alike two pictures look, by AlexNet's features."""
+"""LPIPS, the perceptual distance of pictures by features of AlexNet."""
 
 from __future__ import annotations
 
@@ -13,40 +13,39 @@ from torch import Tensor
 
 from spikekit.arguments import one_line
 
-#: environment variable: a file of all weights, ``.safetensors`` or of torch
+#: environment variable with the path of a file of all weights, of safetensors or torch
 VARIABLE = "SPIKEKIT_LPIPS"
 
-# AlexNet's convolutions: stride, padding, and whether a pooling comes before
+# AlexNet's convolutions: stride, padding, and whether pooling comes before
 _LAYERS = (4, 2, False), (1, 2, True), (1, 1, True), (1, 1, False), (1, 1, False)
-# where they are in torchvision's file
+# their names in torchvision's file
 _TORCHVISION, _FEATURES = "alexnet-owt-7be5be79.pth", (0, 3, 6, 8, 10)
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-_SMALLEST = 31  # pixels along a side, below which nothing is left for the last layer
+_SMALLEST = 31  # smallest side in pixels for which the last layer has an output
 
 
 def lpips(rgb: Tensor, truth: Tensor, weights: str | Path | None = None) -> Tensor:
-    r"""Learned perceptual image patch similarity, version 0.1 with AlexNet; lower is better.
+    r"""Return the learned perceptual image patch similarity, version 0.1 with AlexNet; lower is better.
 
     .. math:: d = \sum_l \operatorname{mean}_{y, x} \sum_c w_{lc} \bigl( \hat f_{lc} - \hat f^*_{lc} \bigr)^2
 
-    with the features :math:`f_l` after every ReLU, each pixel's divided by their norm.
+    with the features :math:`f_l` after each ReLU, normalised per pixel.
 
     Convention:
-        Pictures of 0 .. 1 are brought to -1 .. 1, as the metric was trained. The programs of CSCSR's authors give it
-        pictures of 0 .. 1 as they are: the values of the paper are of another scale.
+        Pictures are rescaled from [0, 1] to [-1, 1], as in the training of the metric. The programs of CSCSR's authors
+        do not rescale them, so the values in the paper are on another scale.
 
     Args:
-        rgb: :math:`(B, 3, H, W)`, cut to 0 .. 1.
-        truth: likewise.
-        weights: a file of them; :func:`find_weights` when not given.
+        rgb: pictures :math:`(B, 3, H, W)`, clamped to [0, 1].
+        truth: ground truth of the same shape, clamped to [0, 1].
+        weights: path of the weights. Default: the result of :func:`find_weights`.
 
     Returns:
-        A value for every picture, :math:`(B)`, float32; NaN for pictures below 31 pixels a side, of which AlexNet's
-        last layer sees nothing.
+        A value per picture, :math:`(B)`, float32; NaN if a side is below 31 pixels, too small for AlexNet.
 
     Raises:
         FileNotFoundError: there are no weights; the message says how to get them.
-        ValueError: a file of something else; the message names it.
+        ValueError: the file does not hold weights of LPIPS.
 
     Reference:
         Zhang et al., The Unreasonable Effectiveness of Deep Features as a Perceptual Metric, CVPR 2018.
@@ -54,24 +53,24 @@ def lpips(rgb: Tensor, truth: Tensor, weights: str | Path | None = None) -> Tens
     found = _weights(tuple(map(str, [weights] if weights else find_weights())), rgb.device)
     if min(rgb.shape[-2:]) < _SMALLEST:
         return rgb.new_full(rgb.shape[:1], torch.nan, dtype=torch.float32)
-    pairs = zip(rgb.split(1), truth.split(1), strict=True)  # one by one: features take far more memory than pictures
+    pairs = zip(rgb.split(1), truth.split(1), strict=True)  # one at a time, to limit the memory of the features
     with torch.autocast(rgb.device.type, enabled=False):
         return torch.cat([_distance(torch.cat(pair).float().clamp(0, 1), found) for pair in pairs])
 
 
 def find_weights() -> list[Path]:
-    """Return the files that hold the weights of LPIPS here; nothing is downloaded.
+    """Return the local files of the weights of LPIPS; nothing is downloaded.
 
-    They are the file that the environment variable ``SPIKEKIT_LPIPS`` names, with tensors conv0 .. conv4 (weight and
-    bias) and lin0 .. lin4 (weight); or else AlexNet from torchvision's cache, and the heads from torchmetrics.
+    These are the file in the environment variable ``SPIKEKIT_LPIPS``, with tensors conv0 .. conv4 (weight and bias) and
+    lin0 .. lin4 (weight); or else AlexNet in torchvision's cache, and the heads in torchmetrics.
 
     Raises:
-        FileNotFoundError: there are none; the message is one line.
+        FileNotFoundError: there are no weights.
     """
     named = os.environ.get(VARIABLE)
     if named:
         if not Path(named).expanduser().is_file():
-            raise FileNotFoundError(f"{VARIABLE}: expected a file of weights, got {named}, which is none")
+            raise FileNotFoundError(f"{VARIABLE}: expected a file of weights, got {named}, which is not a file")
         return [Path(named).expanduser()]
     alexnet = Path(torch.hub.get_dir()) / "checkpoints" / _TORCHVISION
     metrics = find_spec("torchmetrics")
@@ -79,7 +78,7 @@ def find_weights() -> list[Path]:
     if alexnet.is_file() and heads.is_file():
         return [alexnet, heads]
     raise FileNotFoundError(
-        f"expected the weights of LPIPS in a file that {VARIABLE} names, or AlexNet, torchvision's {alexnet}, got none"
+        f"expected the weights of LPIPS, as a file named in {VARIABLE} or as torchvision's {alexnet}, got none"
     )
 
 
@@ -94,7 +93,7 @@ def _weights(paths: tuple[str, ...], device: torch.device) -> dict[str, Tensor]:
                 tensors |= load_file(path)
             else:
                 tensors |= torch.load(path, map_location="cpu", weights_only=True)
-        except Exception as error:  # what is raised depends on the file
+        except Exception as error:  # the type depends on the file
             raise ValueError(f"{path}: not the weights of LPIPS ({one_line(error)[:200]})") from error
     for n, feature in enumerate(_FEATURES):
         renamed = {f"conv{n}.{part}": f"features.{feature}.{part}" for part in ("weight", "bias")}
@@ -105,13 +104,13 @@ def _weights(paths: tuple[str, ...], device: torch.device) -> dict[str, Tensor]:
             if name not in tensors or channels not in tensors[name].shape[:2]:
                 got = tuple(tensors[name].shape) if name in tensors else "none"
                 raise ValueError(
-                    f"{paths[0]}: not the weights of LPIPS: {name} of {channels} channels expected, got {got}"
+                    f"{paths[0]}: not the weights of LPIPS: expected {name} with {channels} channels, got {got}"
                 )
     return {name: value.to(device, torch.float32) for name, value in tensors.items()}
 
 
 def _distance(pair: Tensor, weights: dict[str, Tensor]) -> Tensor:
-    """The distance (1) of two pictures (2, 3, H, W)."""
+    """Return the distance (1) of two pictures (2, 3, H, W)."""
     shift, scale = (pair.new_tensor(values)[:, None, None] for values in (_SHIFT, _SCALE))
     features, distance = (2 * pair - 1 - shift) / scale, pair.new_zeros(1)
     for n, (stride, padding, pooled) in enumerate(_LAYERS):

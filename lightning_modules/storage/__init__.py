@@ -1,1 +1,1 @@
-"""Weights, checkpoints and their settings in files; nothing in a file is run."""
+"""Files of weights, checkpoints and settings; no code in a file is executed."""

@@ -1,4 +1,4 @@
-"""Checkpoints of ``lightning fit``, read without running or building anything."""
+"""Safe reading of checkpoints of ``lightning fit``."""
 
 from __future__ import annotations
 
@@ -15,28 +15,27 @@ from lightning_modules.storage.settings import check_plain
 from spikekit.arguments import one_line
 
 _NUMBERS = {torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.int64, torch.int32, torch.bool}
-#: what Lightning would build something from
+#: keys from which Lightning would build objects
 _NOT_TAKEN = ("hyper_parameters", "datamodule_hyper_parameters", "hparams_name", "datamodule_hparams_name")
 
 
 class DivergedError(ValueError):
-    """A training whose weights are no longer finite."""
+    """The weights of a training are no longer finite."""
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """Read a checkpoint; nothing in it is run, and no class that it names is built.
+    """Read a checkpoint without executing its code or building its classes.
 
     Args:
-        path: the file.
+        path: file of the checkpoint.
 
     Returns:
-        A dictionary on the CPU, without hyper-parameters, that holds ``state_dict``, and ``network``, ``motion`` and
+        A dictionary on the CPU, without hyper-parameters. It holds ``state_dict``, and ``network``, ``motion`` and
         ``recipe`` as plain values.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: no checkpoint, a damaged one, or one whose weights are not finite; the message is one line and names
-            the file.
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged, no checkpoint, or its weights are not finite.
     """
     path = Path(path)
     if not path.is_file():
@@ -44,29 +43,29 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     try:
         with zipfile.ZipFile(path) as archive:
             if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
-                raise ValueError("compressed, as no checkpoint is")  # a few bytes could become all memory
+                raise ValueError("expected no compression")  # a few bytes could fill all memory
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(checkpoint, dict) or not isinstance(checkpoint.get("state_dict"), dict):
             raise TypeError("expected a dictionary with a state_dict")
-        for key in ("network", "motion", "recipe"):  # older ones lack the last
+        for key in ("network", "motion", "recipe"):  # older checkpoints have no recipe
             if not isinstance(checkpoint.setdefault(key, {}), dict):
                 raise TypeError(f"{key}: expected a dictionary, got a {type(checkpoint[key]).__name__}")
             check_plain(key, checkpoint[key])
         check_tensors(checkpoint["state_dict"])
-    except Exception as error:  # what torch raises depends on the damage
+    except Exception as error:  # the type depends on the damage
         reason = one_line(error)[:300]
-        if isinstance(error, pickle.UnpicklingError):  # torch would advise to run what is there
-            reason = "expected tensors and plain values, got something else, which is not run"
+        if isinstance(error, pickle.UnpicklingError):  # torch's message would recommend unsafe loading
+            reason = "expected tensors and plain values, got other objects, which are not loaded"
         raise ValueError(f"{path}: not a checkpoint of lightning fit ({type(error).__name__}: {reason})") from error
     return {key: value for key, value in checkpoint.items() if key not in _NOT_TAKEN}
 
 
 def check_tensors(tensors: Mapping[str, Tensor]) -> None:
-    """Refuse weights that are not finite: a network would return black pictures without any explanation.
+    """Check that weights are finite, as a network would otherwise return black pictures.
 
     Raises:
-        TypeError: something else than dense tensors of ordinary numbers.
-        ValueError: NaN or Inf; the message names the weight.
+        TypeError: a value is not a dense tensor of an ordinary dtype.
+        ValueError: a tensor contains NaN or Inf.
     """
     for name, value in tensors.items():
         if not isinstance(name, str) or not isinstance(value, Tensor):
@@ -76,6 +75,6 @@ def check_tensors(tensors: Mapping[str, Tensor]) -> None:
         if value.layout is not torch.strided or value.is_meta or value.dtype not in _NUMBERS:
             raise TypeError(f"{name}: expected a dense tensor of numbers, got {value.dtype}, {value.layout}")
         if value.numel() * value.element_size() > value.untyped_storage().nbytes():
-            raise TypeError(f"{name}: {tuple(value.shape)} is more than the file holds")
+            raise TypeError(f"{name}: expected data for shape {tuple(value.shape)}, got a shorter storage")
         if not value.isfinite().all():
             raise ValueError(f"{name}: expected finite weights, got NaN or Inf")

@@ -1,4 +1,4 @@
-"""Files of weights: shipped ones, safetensors, and checkpoints of ``lightning fit``."""
+"""Reading and writing of weights: those in the package, safetensors, and checkpoints of ``lightning fit``."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ from spikekit.arguments import one_line
 from spikekit.io.whole_file import whole_file
 
 _MOTION = "motion."
-_COMPILED = "_orig_mod."  # how the names of a network begin that torch.compile returned
-_ADAPTED = "alpha", "motion_fusion"  # settings that weights serve any value of
+_COMPILED = "_orig_mod."  # prefix of parameter names after torch.compile
+_ADAPTED = "alpha", "motion_fusion"  # settings that do not affect the weights
 
 
 class CheckpointMismatchError(ValueError):
-    """Weights of a different network than the one they are meant for."""
+    """The weights belong to a different network."""
 
 
 @dataclass(frozen=True)
 class Weights:
-    """The contents of a file of weights.
+    """Contents of a weights file.
 
     Args:
-        source: the file.
-        settings: class of the network, as ``"class"``, and the arguments that it was built with; empty where the file
-            does not say.
-        motion: likewise of the learned estimator of motion inside the network, empty where it has none, or where the
-            file does not say.
+        source: path of the file.
+        settings: class of the network, as ``"class"``, and arguments of its constructor; empty if the file does not
+            store them.
+        motion: class and arguments of the learned motion estimator inside the network; empty if there is none, or if
+            the file does not store them.
         tensors: weights by name.
-        halo: how far the network sees with them, where that was measured.
+        halo: radius of the receptive field in sensor pixels, if measured.
     """
 
     source: Path
@@ -51,22 +51,21 @@ class Weights:
 
 
 def read_weights(source: str | Path) -> Weights:
-    """Read weights; nothing in the file is run.
+    """Read weights without executing code in the file.
 
     Args:
-        source: the name of weights that come with the package, such as ``"cscsr_small_x4"``; a file of safetensors; or
-            a checkpoint of ``lightning fit``.
+        source: name of weights in the package, such as ``"cscsr_small_x4"``; path of a safetensors file; or checkpoint
+            of ``lightning fit``.
 
     Raises:
-        FileNotFoundError: neither a file nor the name of one.
-        ValueError: a file that is damaged or of something else, weights that are not finite, or settings that this
-            package cannot have written or that do not fit the weights; the message is one line and names the file.
+        FileNotFoundError: ``source`` is neither a file nor a known name.
+        ValueError: the file is damaged or of another type, weights are not finite, or settings are invalid.
     """
     model = find_model(str(source))
     path = model.path if model else Path(source)
     if not path.is_file():
         names = ", ".join(model.name for model in list_models())
-        raise FileNotFoundError(f"{source}: neither a file of weights nor the name of those in the package ({names})")
+        raise FileNotFoundError(f"{source}: expected a file of weights or a name in the package ({names})")
     found = _read_safetensors(path) if path.suffix == ".safetensors" else _read_checkpoint(path)
     if model and not model.film and found.settings["class"] == "RecurrentCSCSR":
         found = _of_a_clip(found)
@@ -74,7 +73,7 @@ def read_weights(source: str | Path) -> Weights:
 
 
 def _of_a_clip(weights: Weights) -> Weights:
-    """Return the weights of the CSCSR that a network for films contains, which came first and shares its file."""
+    """Return the weights of the clip network (CSCSR) inside a film network."""
     added = ("fusion_width", "fusion_blocks", "memory")
     settings = {name: value for name, value in weights.settings.items() if name not in added} | {"class": "CSCSR"}
     tensors = {name: value for name, value in weights.tensors.items() if not name.startswith(FUSION)}
@@ -82,14 +81,14 @@ def _of_a_clip(weights: Weights) -> Weights:
 
 
 def check_weights(weights: Weights, kinds: Mapping[str, type[nn.Module]]) -> None:
-    """Compare weights with the network that their file names, before anything is built or takes memory.
+    """Check that weights fit the network and estimator that their file names, without allocating memory for them.
 
     Args:
-        weights: as they were read.
-        kinds: networks and estimators of this package, by name; weights of others are compared when they are loaded.
+        weights: contents of the file.
+        kinds: classes of this package by name; weights of other classes are checked when they are loaded.
 
     Raises:
-        ValueError: as :func:`lightning_modules.storage.settings.check_shapes`.
+        ValueError: settings or weights do not fit, see :func:`lightning_modules.storage.settings.check_shapes`.
     """
     inside = {name.removeprefix(_MOTION): value for name, value in weights.tensors.items() if name.startswith(_MOTION)}
     outside = {name: value for name, value in weights.tensors.items() if not name.startswith(_MOTION)}
@@ -105,12 +104,12 @@ def _read_safetensors(path: Path) -> Weights:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         check_tensors(tensors)
     except (SafetensorError, OSError, AttributeError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: not a file of safetensors, or a damaged one ({one_line(error)[:300]})") from error
+        raise ValueError(f"{path}: not a safetensors file, or damaged ({one_line(error)[:300]})") from error
     try:
         settings, motion = json.loads(said["network"]), json.loads(said["motion"])
         return Weights(path, {"class": settings["class"], **_named(settings)}, _named(motion), tensors)
     except (KeyError, TypeError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: does not say what network it is of, as lightning export would") from error
+        raise ValueError(f"{path}: expected metadata of the network, as written by lightning export") from error
 
 
 def _read_checkpoint(path: Path) -> Weights:
@@ -125,24 +124,24 @@ def _read_checkpoint(path: Path) -> Weights:
 
 
 def _named(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return settings that are plain, and whose class is a name and no path."""
+    """Check that settings are plain values and that their class is a plain name, and return a copy."""
     settings = dict(settings)
     check_plain("settings", settings)
     if not str(settings.get("class", "none")).isidentifier():
-        raise ValueError(f"class: expected a name, got {settings['class']!r}")
+        raise ValueError(f"class: expected the name of a class, got {settings['class']!r}")
     return settings
 
 
 def write_weights(weights: Weights, path: str | Path) -> None:
-    """Write weights as a safetensors file that also stores which network they belong to.
+    """Write a safetensors file of weights and the settings of their network.
 
     Raises:
-        ValueError: the name does not end in .safetensors.
+        ValueError: the name of the file does not end in .safetensors.
     """
     path = Path(path)
     if path.suffix != ".safetensors":
         raise ValueError(f"{path}: expected a name that ends in .safetensors")
-    # copies, as tensors that share memory cannot be saved
+    # copied, as safetensors rejects tensors that share memory
     tensors = {
         name.removeprefix(_COMPILED): value.clone(memory_format=torch.contiguous_format)
         for name, value in weights.tensors.items()
@@ -153,7 +152,7 @@ def write_weights(weights: Weights, path: str | Path) -> None:
 
 
 def _same_every_time(data: bytes) -> bytes:
-    """Sort the metadata of a safetensors file, which its writer shuffles."""
+    """Sort the metadata of a safetensors file, whose order is random."""
     length = int.from_bytes(data[:8], "little")
     header = json.loads(data[8 : 8 + length])
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
@@ -161,28 +160,28 @@ def _same_every_time(data: bytes) -> bytes:
 
 
 def settings_of(network: nn.Module) -> dict[str, Any]:
-    """Return the class of a network, which may be compiled, and its arguments; none of one that does not say."""
+    """Return the class of a network, which may be compiled, and its ``settings``, if it has any."""
     network = getattr(network, "_orig_mod", network)
     return {"class": type(network).__name__, **getattr(network, "settings", {})}
 
 
 def motion_of(network: nn.Module) -> dict[str, Any]:
-    """Return the same for the motion estimator of a network, if it has one with weights."""
+    """Return class and settings of a network's motion estimator; empty if it has no weights."""
     motion = getattr(network, "motion", None)
     learned = motion is not None and bool(motion.state_dict())
     return settings_of(motion) if learned else {}
 
 
 def check_settings(network: nn.Module, settings: dict[str, Any], source: str | Path) -> None:
-    """Refuse weights of another network: a different scale, for example, changes no parameter and would go unnoticed.
+    """Check that a network has the settings stored with weights, as parameters alone would not show another scale.
 
-    Empty settings are those of weights that do not say what they are of.
+    Empty settings, of files that store none, are accepted.
 
     Raises:
-        CheckpointMismatchError: there are differences; the message names them.
+        CheckpointMismatchError: settings differ; the message lists them.
     """
     here = settings_of(network)
-    # an argument that is younger than the weights had the effect of its default
+    # arguments added after the weights were written have their default values
     defaults = {name: parameter.default for name, parameter in signature(type(network)).parameters.items()}
     there = {**defaults, **(settings or here)}
     differing = [key for key in here if here[key] != there.get(key)]
@@ -196,10 +195,10 @@ def check_settings(network: nn.Module, settings: dict[str, Any], source: str | P
 def with_own_motion(
     tensors: dict[str, Tensor], motion: nn.Module, prefix: str = "", keep: bool = False
 ) -> dict[str, Tensor]:
-    """Replace the weights of another kind of estimator by an estimator's own.
+    """Replace the motion estimator's weights in ``tensors`` by those of ``motion``, unless both have the same shapes.
 
-    Estimators are exchanged freely: a network is trained with one and used with all of them. Those of the same kind
-    are replaced as well where the network is to ``keep`` its own.
+    A network trained with one estimator can be used with any other. With ``keep``, weights of the same shapes are
+    replaced as well.
     """
     prefix += _MOTION
     ours = {f"{prefix}{name}": value for name, value in motion.state_dict().items()}
@@ -211,15 +210,14 @@ def with_own_motion(
 
 
 def load_weights(network: nn.Module, weights: Weights, keep_motion: bool = False) -> None:
-    """Load weights into a network of the same kind.
+    """Load weights into a network of the same class and settings.
 
-    Weights belong to the gain alpha that they were trained with. If the network was built for another, its picture is
-    multiplied by the ratio of the gains. How the motion of the colours is joined may differ as well: it has no weights.
-    The network may keep its estimator of motion where the weights have one of the same kind.
+    The settings ``alpha`` and ``motion_fusion`` may differ. If alpha differs, the network's output is scaled by the
+    ratio of the gains. With ``keep_motion``, the network keeps the weights of its own motion estimator.
 
     Raises:
-        CheckpointMismatchError: they are of another network.
-        ValueError: the file says that they fit, and they do not.
+        CheckpointMismatchError: the weights belong to another network.
+        ValueError: the weights do not fit their settings.
     """
     network = getattr(network, "_orig_mod", network)
     exchanged = {name: network.settings[name] for name in _ADAPTED if name in network.settings}

@@ -1,4 +1,4 @@
-"""Settings stored with weights: known classes, known arguments, plain values with bounds."""
+"""Checks of settings stored with weights: known classes, known arguments, bounded plain values."""
 
 from __future__ import annotations
 
@@ -17,20 +17,19 @@ from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from spikekit.arguments import one_line, printable
 
-_LONGEST = 1000  # characters of a text
-_LARGEST = 4096  # of numbers
-_ITEMS = 16  # of a list of whole numbers
-_NOT_STORED = ("weights",)  # would make one file read another
+_LONGEST = 1000  # maximum length of a string
+_LARGEST = 4096  # maximum absolute value of a number
+_ITEMS = 16  # maximum length of a list
+_NOT_STORED = ("weights",)  # a file must not make the package read another file
 
 
 def own_class(
     settings: Mapping[str, Any], source: str | Path, kinds: Mapping[str, type[nn.Module]]
 ) -> tuple[type[nn.Module], dict[str, Any]]:
-    """Return the class that settings out of a file name, one of ``kinds``, and the arguments to build it with.
+    """Return the class, one of ``kinds``, and the constructor arguments that settings of a file describe.
 
     Raises:
-        ValueError: another class, an argument that it does not take, or a value that is not of the argument's type or
-            too large; the message is one line and names the file.
+        ValueError: the class or an argument is unknown, or a value has the wrong type or is too large.
     """
     name = settings.get("class")
     kind = kinds.get(name) if isinstance(name, str) else None
@@ -42,7 +41,7 @@ def own_class(
     for key, value in arguments.items():
         if key not in known:
             hint = "written by another version of this package?"
-            raise ValueError(f"{source}: {name} takes no {_short(key)} out of a file ({hint})")
+            raise ValueError(f"{source}: {name} accepts no argument {_short(key)} from a file ({hint})")
         if not _fits(value, known[key]):
             expected = f"{_said(known[key])}, at most {_LARGEST}"
             raise ValueError(f"{source}: {key} of {name}: expected {expected}, got {_short(value)}")
@@ -55,33 +54,32 @@ def check_shapes(
     source: str | Path,
     kinds: Mapping[str, type[nn.Module]],
 ) -> None:
-    """Compare weights with the network that their settings describe, before it takes any memory.
+    """Check that weights fit the network that their settings describe, without allocating memory for it.
 
     Raises:
-        ValueError: as :func:`own_class`, settings that contradict each other, or other names, shapes or kinds of
-            numbers; the message is one line and names the file.
+        ValueError: settings are invalid, see :func:`own_class`, or inconsistent; or names, shapes or dtypes differ.
     """
     kind, arguments = own_class(settings, source, kinds)
     try:
         with torch.device("meta"), _at_most(2 * len(tensors) + 1000):
             network = kind(**arguments)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"{source}: settings that do not make a {kind.__name__} ({one_line(error)[:300]})") from error
+        raise ValueError(f"{source}: invalid settings of a {kind.__name__} ({one_line(error)[:300]})") from error
     load_state(network, tensors, source, assign=True)
 
 
 def load_state(network: nn.Module, tensors: Mapping[str, Tensor], source: str | Path, assign: bool = False) -> None:
-    """Load weights, or say in one line that those of the file do not fit."""
+    """Load weights; raise a one-line ValueError if they do not fit."""
     try:
         network.load_state_dict(tensors, assign=assign)
     except RuntimeError as error:
         _, *reasons = str(error).splitlines()
-        raise ValueError(f"{source}: weights that do not fit ({printable(' '.join(reasons).strip())[:200]})") from error
+        raise ValueError(f"{source}: weights do not fit ({printable(' '.join(reasons).strip())[:200]})") from error
 
 
 @contextmanager
 def _at_most(parameters: int) -> Iterator[None]:
-    """Stop the building of modules in this thread that have many more parameters than a file: it would take hours."""
+    """Limit the number of parameter tensors built in this thread, as hostile settings could take hours to build."""
     left, here = parameters, get_ident()
 
     def count(*_: Any) -> None:
@@ -98,10 +96,10 @@ def _at_most(parameters: int) -> Iterator[None]:
 
 
 def check_plain(name: str, value: Any) -> None:
-    """Refuse anything but finite numbers, texts, and lists and dictionaries of them.
+    """Check that a value consists of finite numbers, strings, and lists and dictionaries of them.
 
     Raises:
-        ValueError: something else; the message is one line.
+        ValueError: the value contains anything else.
     """
     try:
         json.dumps(value, allow_nan=False)
@@ -110,9 +108,9 @@ def check_plain(name: str, value: Any) -> None:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Say whether a value is of the type of an argument, and no larger than it may be."""
+    """Return whether a value has the type of an argument and is within the bounds."""
     origin, inner = get_origin(hint), get_args(hint)
-    if hint is Parameter.empty:  # of a user's own class; what a file says is plain
+    if hint is Parameter.empty:  # user-defined classes may lack annotations; values are plain
         return True
     if origin in (Union, types.UnionType):
         return any(_fits(value, choice) for choice in inner)
@@ -132,7 +130,7 @@ def _said(hint: Any) -> str:
 
 
 def _short(value: Any) -> str:
-    """Return a value for a message of one line; a tensor or a long list would fill pages."""
+    """Return a short representation of a value, for one-line messages."""
     if not isinstance(value, (str, int, float, bool, types.NoneType)):
         return f"a {type(value).__name__}"
     if isinstance(value, int) and value.bit_length() > 200:

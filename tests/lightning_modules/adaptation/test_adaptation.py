@@ -99,7 +99,7 @@ def test_the_command(recording, tmp_path, capsys):
     main(typed(recording, tmp_path / "out", "--teacher", "cscsr_small_x4", "--steps", "8"))
     written = tmp_path / "out" / "adapted.safetensors"
     said = capsys.readouterr().out
-    assert "dB from the held-out pictures of cscsr_small_x4 before, " in said
+    assert "dB PSNR to the held-out pictures of cscsr_small_x4 before, " in said
     assert f"lightning predict --weights {written}" in said
     adapted, shipped = CSCSR.from_pretrained(written), CSCSR.from_pretrained("cscsr_tiny_x4")
     assert adapted.settings == shipped.settings
@@ -112,7 +112,7 @@ def test_the_command(recording, tmp_path, capsys):
 def test_what_gains_nothing_is_not_kept(recording, tmp_path, monkeypatch, after):
     monkeypatch.setattr(cli, "learn", lambda *_: (30.0, after))
     monkeypatch.setattr(cli, "make_lessons", lambda *_: None)
-    with pytest.raises(SystemExit, match=r"expected 0\.1 dB more; nothing written, go on using cscsr_tiny_x4"):
+    with pytest.raises(SystemExit, match=r"expected a gain of 0\.1 dB; nothing written, keep using cscsr_tiny_x4"):
         main(typed(recording, tmp_path))
     assert [path.name for path in tmp_path.iterdir()] == ["lock"]
 
@@ -120,9 +120,9 @@ def test_what_gains_nothing_is_not_kept(recording, tmp_path, monkeypatch, after)
 @pytest.mark.parametrize(
     ("more", "expected"),
     [
-        (["--teacher", "cscsr_base_x2"], "--teacher: expected scale 4 of the weights that learn, got 2"),
+        (["--teacher", "cscsr_base_x2"], "--teacher: expected scale 4, as in --weights, got 2"),
         (["--teacher", "cscsr_huge_long_x4"], "expected at least 303 frames, 3 clips of 101, got 160"),
-        (["--weights", "cscsr_large_film_x4"], "--weights: expected a network that learns"),
+        (["--weights", "cscsr_large_film_x4"], "--weights: expected a network for single clips"),
         (["-o", "out.safetensors"], "-o: expected a folder, got out.safetensors, which ends like a file"),
     ],
 )
