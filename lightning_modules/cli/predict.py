@@ -20,7 +20,6 @@ from lightning_modules.inference.reconstruct import Reconstruction, reconstruct
 from lightning_modules.inference.tiles import TILE, TILE_ON_GPU
 from spikekit.arguments import positive, whole
 from spikekit.cli import recordings
-from spikekit.decoders.methods import DECODERS
 from spikekit.io.sidecar import check_unclaimed
 from spikekit.io.video_output import check_film
 from spikekit.progress import progress
@@ -87,7 +86,7 @@ def parser() -> argparse.ArgumentParser:
     add("--precision", choices=["32-true", "bf16-mixed"], help="bf16-mixed where the device has it, if not given")
     add = made.add_argument_group("the output").add_argument
     add("--fps", type=positive, default=25.0, help="pictures shown in a second of a film; 25 if not given")
-    add("--beside", choices=list(DECODERS), help="show what this decoder makes of the clip left of every picture")
+    add("--beside", choices=("tfi", "tfp"), help="show what this decoder makes of the clip left of every picture")
     add("--engine", choices=["local", "ray"], default="local", help="make them here, or in parts on a Ray cluster")
     add("--jobs", type=whole(1), help="parts at once on the cluster; one a GPU, or a node, if not given")
     return made

@@ -7,10 +7,12 @@ from torch import Tensor
 
 from lightning_modules.motion import ZeroFlow
 from lightning_modules.networks.network import Network
-from spikekit import demosaic
+from spikekit import demosaic, tfi_at, tfp_at
 from spikekit.check import check_planes, check_positive, check_whole
 from spikekit.color.cfa import cfa_pattern
-from spikekit.decoders.methods import DECODERS
+
+#: The decoders by name.
+METHODS = ("tfi", "tfp")
 
 
 class ClassicalDecoder(Network):
@@ -50,8 +52,8 @@ class ClassicalDecoder(Network):
     ) -> None:
         scale = check_whole("scale", scale)
         check_positive("alpha", alpha)
-        if method not in DECODERS:
-            raise ValueError(f"method: expected {' or '.join(map(repr, DECODERS))}, got {method!r}")
+        if method not in METHODS:
+            raise ValueError(f"method: expected {' or '.join(map(repr, METHODS))}, got {method!r}")
         if min(frames, window) < 1 or frames % 2 == 0 or window % 2 == 0:
             raise ValueError(f"frames, window: expected odd numbers, got {frames} and {window}")
         settings = {
@@ -70,8 +72,7 @@ class ClassicalDecoder(Network):
         """Return rgb; the flow is ignored."""
         check_planes("spikes", spikes, 4, "(B, N, H, W)")
         n = spikes.shape[1] // 2
-        decoder = DECODERS[self.method]
-        raw = decoder.frame(spikes, n, **{name: getattr(self, name) for name in decoder.options})
+        raw = tfi_at(spikes, n) if self.method == "tfi" else tfp_at(spikes, n, self.window, order=self.order)
         rgb = demosaic(raw / self.alpha, self.pattern)
         if self.scale > 1:
             rgb = F.interpolate(rgb, scale_factor=self.scale, mode="bicubic", align_corners=False)

@@ -15,11 +15,11 @@ from lightning_modules.inference.film import FilmMaker
 from lightning_modules.inference.predict import predict
 from lightning_modules.metrics.image import score
 from lightning_modules.networks import ClassicalDecoder, Network, RecurrentCSCSR
+from lightning_modules.networks.classical import METHODS
 from lightning_modules.storage.pretrained import load_weights, read_weights, with_own_motion
 from lightning_modules.tasks.base import BaseTask, step_schedule
 from lightning_modules.tasks.callbacks import TestReport, ValidationPictures, middle_clip, middle_half
 from spikekit import psnr, ssim
-from spikekit.decoders.methods import DECODERS
 
 
 # no lambda, so that a module can be pickled
@@ -147,7 +147,7 @@ class SuperResolution(BaseTask):
         if film:
             judged = middle_half(batch)
             clips, truth = spikes[:, judged].flatten(0, 1), truth[:, judged]
-        pictures = {method.upper(): ClassicalDecoder(method, *decoder)(clips) for method in DECODERS}
+        pictures = {method.upper(): ClassicalDecoder(method, *decoder)(clips) for method in METHODS}
         pictures[f"{name}, single clips" if film else name] = self(clips)
         if film:
             pictures = {method: rgb.unflatten(0, truth.shape[:2]) for method, rgb in pictures.items()}

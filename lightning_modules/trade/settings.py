@@ -12,7 +12,6 @@ from lightning_modules.cli.errors import UsageError
 from lightning_modules.inference.presets import Preset
 from lightning_modules.networks import Network
 from lightning_modules.registry import Model, list_models
-from spikekit.decoders.methods import DECODERS
 
 #: columns of a table, by the options that say the same
 _COLUMNS = {f"--model.network.{name}": name for name in ("method", "window", "order", "scale", "frames", "motion")}
@@ -79,6 +78,9 @@ def read_setting(text: str) -> Setting:
     return Setting(named[1].strip() if named else shlex.join(args), args)
 
 
+#: options of the decoders that stand beside the networks
+_DECODERS = {"TFI": {}, "TFP 41": {"window": 41}, "TFP 13, order 3": {"window": 13, "order": 3}}
+
 #: what is tried on every network: behind its name, and what is typed for it
 _NO_MOTION, _TWO_VIEWS = ("no motion", "--model.network.motion ZeroFlow"), ("self-ensemble of 2", "--self_ensemble 2")
 
@@ -134,9 +136,8 @@ def usual_settings(
             if not changes.startswith(lacking):
                 typed[f"{weights}, {name}"] = f"{text} {changes}"
     decoders = {
-        name: {"method": method, "scale": scale, **({"frames": 41} if frames > 41 else {}), **options}
-        for method, decoder in DECODERS.items()
-        for name, options in decoder.shown.items()
+        name: {"method": name[:3].lower(), "scale": scale, **({"frames": 41} if frames > 41 else {}), **options}
+        for name, options in _DECODERS.items()
     }
     if frames > 41:  # in little light a decoder, too, gains by what it sees of a longer clip
         window = 2 * ((frames - 1) // 6) + 1

@@ -13,7 +13,7 @@ import torch
 from spikekit.arguments import UsageError, ending_in, frames_of, positive, whole
 from spikekit.cli import recordings
 from spikekit.color.demosaic import demosaic
-from spikekit.decoders.methods import DECODERS, TFI_REACH
+from spikekit.decoders.single_frame import search, tfp_weights
 from spikekit.io.images import write_picture
 from spikekit.io.sidecar import check_unclaimed
 from spikekit.io.video import PICTURE_ENDINGS
@@ -23,6 +23,9 @@ from spikekit.standard_output import say
 
 #: Default window of TFP, in frames.
 TFP_WINDOW = 41
+
+#: Frames that TFI looks at on each side; a pixel that fires more rarely is decoded as if it fired once in all of them.
+TFI_REACH = 200
 
 # Returns the unpacked frame of a given number.
 _Plane = Callable[[int], np.ndarray]
@@ -35,12 +38,11 @@ def run(args: argparse.Namespace) -> None:
     """Write pictures of one or more frames, reading only the neighbouring frames that the method needs."""
     if args.method is None:
         args.method = "tfi" if args.window is None and args.order == 1 else "tfp"
-    decoder = DECODERS[args.method]
-    if args.window is not None and ("window" not in decoder.options or args.window % 2 == 0):
-        methods = _with_option("window")
-        raise UsageError(f"--window: expected an odd number, with {methods}, got {args.window} with {args.method}")
-    if args.order > 1 and "order" not in decoder.options:
-        raise UsageError(f"--order: expected {_with_option('order')}, got {args.order} with {args.method}")
+    window = args.window or TFP_WINDOW
+    if window % 2 == 0 or (args.window and args.method == "tfi"):
+        raise UsageError(f"--window: expected an odd number, with --method tfp, got {window} with {args.method}")
+    if args.order > 1 and args.method == "tfi":
+        raise UsageError(f"--order: expected --method tfp, got {args.order} with tfi")
     recording = recordings.opened(args)
     frames = recording.frames
     try:
@@ -55,17 +57,20 @@ def run(args: argparse.Namespace) -> None:
     paths = {n: Path(str(args.output).replace(_NUMBER, f"{n:0{len(str(frames - 1))}}")) for n in chosen}
     check_unclaimed(paths.values(), args.file)
 
-    given = {**vars(args), "window": args.window or TFP_WINDOW}
-    options = {name: given[name] for name in decoder.options}
-    reach = decoder.reach(**options)
+    reach = TFI_REACH if args.method == "tfi" else args.order * (window // 2)
     key = chosen[len(chosen) // 2]
     alpha = args.alpha or recording.alpha
     white, scaling = _white(alpha, recording, key, reach)
     scaling += recording.said
     for n, plane in progress(_windows(recording, chosen, reach), "pictures", len(chosen)):
         first, last = _span(n, reach, frames)
-        raw = torch.from_numpy(decoder.planes(plane, n, range(first, last + 1), frames, **options))
-        raw = recording.correct(raw) / white
+        seen = range(first, last + 1)
+        if args.method == "tfi":
+            light = np.reciprocal(search(plane, n, seen), dtype=np.float32)
+        else:
+            _, weights = tfp_weights(frames, n, window, args.order)
+            light = sum(map(np.multiply, map(plane, seen), weights)).astype(np.float32)
+        raw = recording.correct(torch.from_numpy(light)) / white
         picture = raw if recording.bayer is None else demosaic(raw, recording.bayer)
         picture = recording.show(picture, known=alpha is not None)
         write_picture(paths[n], picture, bits=args.bits, quality=args.quality)
@@ -79,17 +84,13 @@ def run(args: argparse.Namespace) -> None:
         )
 
 
-def _with_option(name: str) -> str:
-    return f"--method {' or '.join(method for method, decoder in DECODERS.items() if name in decoder.options)}"
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     recordings.add_arguments(parser)
     add = parser.add_argument
     add(
         "--method",
-        choices=DECODERS,
+        choices=("tfi", "tfp"),
         help="tfi: from the interval between the two spikes around the frame, which adapts to dim and bright pixels; "
         f"it searches up to {TFI_REACH} frames on each side, and assumes a spike just outside if it finds none. "
         "tfp: from the number of spikes in a window around the frame. Default: tfp if --window or --order is given, "

@@ -27,7 +27,6 @@ from spikekit.standard_output import say
 REACH = 200
 
 _WINDOW = 41
-_FEW, _ENOUGH = 4, 8  # spikes per pixel in a window: with fewer than _FEW, suggest a window that has _ENOUGH
 
 
 def run(args: argparse.Namespace) -> None:
@@ -41,30 +40,22 @@ def run(args: argparse.Namespace) -> None:
     shown = recordings.opened(args)
     begin, end = _span(args.frames, shown)
     check_unclaimed([args.output], args.file)
-    if args.row is not None and args.row >= shown.size[0]:
-        raise UsageError(f"--row: expected 0 .. {shown.size[0] - 1}, got {args.row}")
-    moment = Moment(shown, begin, end, args.window or _WINDOW, args.alpha or shown.alpha, args.row)
+    moment = Moment(shown, begin, end, args.window or _WINDOW, args.alpha or shown.alpha)
     data = moment.sheet()
     with whole_file(args.output) as file:
         file.write(data)
     white = f"white: alpha {moment.alpha:g}" if moment.alpha else f"white: {moment.white:.3g} spikes per frame"
     say(f"{args.output}: frames {begin} .. {end - 1} of {shown.frames}, {white}{shown.said}")
-    if moment.hint and not args.window:
-        print(moment.hint)
 
 
 class Moment:
     """Views around the middle of the frames ``begin`` .. ``end - 1`` of a recording.
 
-    ``window`` is that of TFP in frames, ``alpha`` the light of a white pixel if known, ``row`` the row whose spikes are
-    drawn (default: the middle one).
+    ``window`` is that of TFP in frames, ``alpha`` the light of a white pixel if known.
     """
 
-    def __init__(
-        self, recording: Recording, begin: int, end: int, window: int, alpha: float | None, row: int | None
-    ) -> None:
-        self.recording, self.alpha = recording, alpha
-        self.row = recording.size[0] // 2 if row is None else row
+    def __init__(self, recording: Recording, begin: int, end: int, window: int, alpha: float | None) -> None:
+        self.recording, self.alpha, self.row = recording, alpha, recording.size[0] // 2
         self.frame = frame = (begin + end) // 2
         self.near = near = range(max(begin, frame - REACH), min(end, frame + REACH + 1))
         first = max(near.start, frame - min(window, end - begin) // 2)
@@ -72,14 +63,6 @@ class Moment:
         self._planes = list(recording.packed(near.start, len(near)))
         self.rates = self._rate(near)  # (H, W), spikes per frame
         self.white = alpha or white_rate(recording.correct(self.rates))
-        share = self.rates.mean().item()
-        self.hint = ""
-        if 0 < window * share < _FEW and window < end - begin:
-            longer = min(2 * math.ceil(_ENOUGH / (2 * share)) + 1, end - begin)
-            self.hint = (
-                f"{share:.1%} of the bits are set, {window * share:.1f} spikes per pixel in {window} frames: "
-                f"--window {longer} shows less noise, but more motion blur"
-            )
 
     def _plane(self, n: int) -> np.ndarray:
         return self.recording.unpack(self._planes[n - self.near.start])
@@ -103,7 +86,7 @@ class Moment:
         return self.picture(torch.from_numpy(search(self._plane, self.frame, self.near)).float().reciprocal())
 
     def raster(self) -> Tensor:
-        """Return the spikes of one row of pixels, (W, T)."""
+        """Return the spikes of the middle row of pixels, (W, T)."""
         spikes = np.stack([self._plane(n)[self.row].copy() for n in self.near])  # a view would keep the whole frame
         return torch.from_numpy(spikes).T
 
@@ -185,4 +168,3 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--alpha", type=positive, metavar="A", help="spikes per frame of a white pixel; default: that of the side-car")
     add("--frames", metavar="A:B", help="frames A to B - 1 are shown; default: all")
     add("--window", type=whole(1), metavar="W", help=f"window of tfp in frames; default: {_WINDOW}")
-    add("--row", type=whole(0), metavar="Y", help="row of pixels whose spikes are drawn; default: the middle one")
