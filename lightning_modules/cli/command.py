@@ -199,7 +199,7 @@ class Command(LightningCLI):
                 chosen = self.config_dump["model"]["init_args"]
                 self.model.recipe = {name: chosen.get(name) for name in ("optimizer", "lr_scheduler")}
                 if config.ckpt_path:
-                    _check_continuation(config.ckpt_path, self.model, self.trainer)
+                    _check_continuation(config.ckpt_path, self.model)
         except (OSError, ValueError, ModuleNotFoundError) as error:
             # jsonargparse wraps what a class of a class says into pages about its own types
             said = reason(str(error))
@@ -213,7 +213,7 @@ class Command(LightningCLI):
         if config.get("logger") is None:
             # the tables and pictures of the other commands are files of their own
             kwargs["logger"] = TensorBoardLogger(output, name="", version="") if self.subcommand == "fit" else False
-        kwargs["plugins"] = [Checkpoints(), *_listed(config.get("plugins"))]
+        kwargs["plugins"] = [Checkpoints(output), *_listed(config.get("plugins"))]
         if config.get("precision") is None:
             gpu = config.get("accelerator") in ("auto", "gpu", "cuda") and torch.cuda.is_available()
             kwargs["precision"] = precision_of(torch.device("cuda")) if gpu else "32-true"
@@ -268,7 +268,7 @@ def _listed(value: Any) -> list[Any]:
     return value if isinstance(value, list) else [] if value is None else [value]
 
 
-def _check_continuation(path: str, model: BaseTask, trainer: Trainer | None) -> None:
+def _check_continuation(path: str, model: BaseTask) -> None:
     """Refuse to go on with another network, optimizer or schedule: the checkpoint's would win without a word."""
     checkpoint = read_checkpoint(path)
     check_settings(model.network, checkpoint["network"], path)
@@ -279,8 +279,7 @@ def _check_continuation(path: str, model: BaseTask, trainer: Trainer | None) -> 
             name, expected = key.replace(".init_args", ""), f"{there.get(key)}, as {path} was trained with"
             anew = "--model.weights starts anew with other settings"
             raise UsageError(f"model.{name}: expected {expected}, got {here.get(key)}; {anew}")
-    if trainer is not None:  # a rehearsal has none
-        check_resume(path, model, trainer)
+    check_resume(path, model)
 
 
 def without_chatter() -> None:

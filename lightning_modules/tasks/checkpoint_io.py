@@ -15,10 +15,6 @@ from pytorch_lightning.utilities.exceptions import SIGTERMException
 from lightning_modules.storage.checkpoint import DivergedError, check_tensors, read_checkpoint
 from spikekit.io.whole_file import whole_file
 
-#: of the state of a ModelCheckpoint: files that it may go on to remove
-_PATHS = ("best_model_path", "kth_best_model_path", "last_model_path")
-
-
 #: weights that forked or spawned processes of Lightning hand on to the one that started them
 _HANDED_ON = ".temp.ckpt"
 
@@ -44,6 +40,10 @@ def requeued_checkpoint(output: str | Path) -> str | None:
 class Checkpoints(TorchCheckpointIO):
     """How Lightning reads, writes and removes checkpoints: without running code, whole, and nothing else than them."""
 
+    def __init__(self, folder: str | Path) -> None:
+        super().__init__()
+        self._folder, self._saved = Path(os.path.abspath(folder)), set()
+
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
         """Write a checkpoint; one that was there stays until the new one is complete.
 
@@ -62,41 +62,16 @@ class Checkpoints(TorchCheckpointIO):
                 if isinstance(error.__context__, OSError):
                     raise error.__context__ from None
                 raise
+        self._saved.add(Path(os.path.abspath(path)))
 
     def load_checkpoint(self, path: str | Path, *_: Any, **__: Any) -> dict[str, Any]:
-        """Read a checkpoint; its callbacks may name files of their own folder, and no others."""
+        """Read a checkpoint."""
         if Path(path).name == _HANDED_ON:
             return torch.load(path, map_location="cpu", weights_only=True)
-        checkpoint = read_checkpoint(path)
-        states = checkpoint.get("callbacks", {})
-        if isinstance(states, dict):
-            checkpoint["callbacks"] = {
-                key: _without_foreign_files(state) if isinstance(state, dict) else state
-                for key, state in states.items()
-            }
-        return checkpoint
+        return read_checkpoint(path)
 
     def remove_checkpoint(self, path: str | Path) -> None:
-        """Remove a checkpoint; anything else stays."""
-        path = Path(path)
-        if path.suffix == ".ckpt" and path.is_file():
+        """Remove a checkpoint of this run; anything else that a checkpoint may name as one of its own stays."""
+        path = Path(os.path.abspath(path))
+        if path.suffix == ".ckpt" and path.is_file() and (path in self._saved or self._folder in path.parents):
             path.unlink()
-
-
-def _without_foreign_files(state: dict[str, Any]) -> dict[str, Any]:
-    """Return the state of a callback that names only checkpoints in the folder that it says it writes to."""
-    folder = state.get("dirpath")
-    own = {name: _own_file(state[name], folder) for name in _PATHS if name in state}
-    best = state.get("best_k_models")
-    if isinstance(best, dict):
-        own["best_k_models"] = {_own_file(path, folder): score for path, score in best.items() if path}
-        own["best_k_models"].pop("", None)
-    return {**state, **own}
-
-
-def _own_file(path: Any, folder: Any) -> str:
-    """Return a path without detours, or nothing where it is not that of a checkpoint in a folder."""
-    if not (isinstance(path, str) and isinstance(folder, str) and path.endswith(".ckpt")):
-        return ""
-    path, folder = Path(os.path.abspath(path)), Path(os.path.abspath(folder))
-    return str(path) if folder in path.parents else ""

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from pytorch_lightning.callbacks import ModelCheckpoint
 
 from lightning_modules.cli.arguments import with_network_of_weights
 from lightning_modules.cli.errors import InputError
@@ -23,7 +22,6 @@ from lightning_modules.inference import presets
 from lightning_modules.sweep.state import RESULT, read_result, read_yaml
 from lightning_modules.sweep.table import collect, markdown, write_csv
 from lightning_modules.sweep.trials import Trial
-from lightning_modules.tasks.resume import check_resume
 
 WEIGHTS = Path(presets.__file__).parents[1] / "weights"
 
@@ -153,85 +151,3 @@ def test_values_of_a_configuration_beside_the_weights(tmp_path):
         with_network_of_weights(["fit", "-c", str(config)])
     config.write_text("model: {weights: cscsr_tiny_x4, network: {alpha: 2020-01-01}}")
     assert '"alpha": "2020-01-01"' in with_network_of_weights(["fit", "-c", str(config)])[4]  # for the parser to refuse
-
-
-@pytest.fixture(name="training")
-def _training():
-    """A module, its trainer, and a checkpoint of one step."""
-    from pytorch_lightning import Trainer
-
-    from lightning_modules.networks import CSCSR
-    from lightning_modules.tasks.super_resolution import SuperResolution
-
-    torch.manual_seed(0)
-    small = {"scale": 2, "width": 4, "representation_width": 4, "features": 1, "stages": 1, "end_blocks": 1}
-    model = SuperResolution(CSCSR(**small))
-    trainer = Trainer(
-        max_steps=3, logger=False, accelerator="cpu", enable_progress_bar=False, enable_model_summary=False
-    )
-    made = model.configure_optimizers()
-    for parameter in model.network.parameters():
-        parameter.grad = torch.ones_like(parameter)
-    made["optimizer"].step()
-    made["lr_scheduler"]["scheduler"].step()
-    [saves] = [callback for callback in trainer.callbacks if isinstance(callback, ModelCheckpoint)]
-    content = {
-        "epoch": 0,
-        "global_step": 1,
-        "state_dict": model.state_dict(),
-        "loops": {"fit_loop": trainer.fit_loop.state_dict()},
-        "callbacks": {saves.state_key: {**saves.state_dict(), "best_model_score": torch.tensor(1.0)}},
-        "optimizer_states": [made["optimizer"].state_dict()],
-        "lr_schedulers": [made["lr_scheduler"]["scheduler"].state_dict()],
-    }
-    model.on_save_checkpoint(content)
-    return model, trainer, content
-
-
-def test_states_of_a_training(fuzz, training, tmp_path):
-    """What is let through can be trained on with."""
-    model, trainer, content = training
-    parts = [name for name in content if name not in ("state_dict", "network", "motion", "recipe")]
-
-    def read(path):
-        checkpoint = check_resume(path, model, trainer)
-        made = model.configure_optimizers()
-        made["optimizer"].load_state_dict(checkpoint["optimizer_states"][0])
-        made["lr_scheduler"]["scheduler"].load_state_dict(checkpoint["lr_schedulers"][0])
-        made["optimizer"].step()
-        made["lr_scheduler"]["scheduler"].step()
-
-    def make(rng):
-        name = rng.choice(parts)
-        value = content[name]
-        if name == "optimizer_states" and rng.random() < 0.7:  # which is large, and its parts seldom met
-            state, key = value[0]["state"], rng.randrange(len(value[0]["state"]))
-            odd = rng.choice((torch.ones(3), torch.ones(0), torch.tensor(float("nan")), "a", None, 5, torch.ones(2, 2)))
-            value = [{**value[0], "state": {**state, key: {**state[key], rng.choice(list(state[key])): odd}}}]
-        else:
-            value = fuzz.values(value, rng)
-        torch.save({**content, name: value}, file := io.BytesIO())
-        return file.getvalue()
-
-    torch.save(content, tmp_path / "good.ckpt")
-    read(tmp_path / "good.ckpt")
-    assert fuzz(read, make, "bad.ckpt", cases=16) > 4
-
-
-def _resumes(training, folder, **changes):
-    model, trainer, content = training
-    torch.save({**content, "pytorch-lightning_version": "2.6.0", **changes}, folder / "a.ckpt")
-    check_resume(folder / "a.ckpt", model, trainer)
-
-
-def test_settings_of_an_optimizer_that_are_not_there(training, tmp_path):
-    [state] = training[2]["optimizer_states"]
-    [group] = state["param_groups"]
-
-    def without(name):
-        left = {key: value for key, value in group.items() if key != name}
-        return [{**state, "param_groups": [left]}]
-
-    with pytest.raises(ValueError, match=r"a.ckpt: .*param_groups: expected weight_decay, got none$"):
-        _resumes(training, tmp_path, optimizer_states=without("weight_decay"))
-    _resumes(training, tmp_path, optimizer_states=without("amsgrad"))  # older versions of torch did not have it

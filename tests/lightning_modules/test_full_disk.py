@@ -33,7 +33,10 @@ def program(path):
 @pytest.mark.parametrize(
     ("name", "write"),
     [
-        ("a.ckpt", lambda path: Checkpoints().save_checkpoint({"state_dict": {"a": torch.rand(9999)}}, path)),
+        (
+            "a.ckpt",
+            lambda path: Checkpoints(path.parent).save_checkpoint({"state_dict": {"a": torch.rand(9999)}}, path),
+        ),
         ("a.safetensors", lambda path: write_weights(Weights(path, {}, {}, {"a": torch.rand(9999)}), path)),
         ("a.pt2", program),
     ],

@@ -4,7 +4,6 @@ import json
 import os
 import sys
 import zipfile
-from pathlib import Path
 
 import pytest
 import torch
@@ -73,7 +72,7 @@ def test_hyper_parameters_of_a_checkpoint_build_nothing(verb, kinds, content, tr
         with pytest.raises(SystemExit):
             main([verb, *words, *wrong])
         assert not trap.exists()
-        assert "hyper_parameters" not in Checkpoints().load_checkpoint(tmp_path / f"{name}.ckpt")
+        assert "hyper_parameters" not in Checkpoints(tmp_path).load_checkpoint(tmp_path / f"{name}.ckpt")
 
 
 def test_code_in_a_checkpoint_is_not_run_by_lightning(content, tmp_path, monkeypatch):
@@ -84,7 +83,7 @@ def test_code_in_a_checkpoint_is_not_run_by_lightning(content, tmp_path, monkeyp
     torch.save({**content(), "callbacks": Harmful()}, tmp_path / "a.ckpt")
     monkeypatch.setenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "1")
     with pytest.raises(ValueError, match=r"a.ckpt: not a checkpoint of lightning fit \(UnpicklingError") as refused:
-        Checkpoints().load_checkpoint(tmp_path / "a.ckpt", weights_only=False)
+        Checkpoints(tmp_path).load_checkpoint(tmp_path / "a.ckpt", weights_only=False)
     assert "weights_only" not in str(refused.value)  # what torch advises would run it
     assert not (tmp_path / "harmed").exists()
 
@@ -179,14 +178,14 @@ def test_weights_that_are_not_finite_are_refused(bad, suffix, tmp_path):
 
 def test_a_training_that_has_diverged_leaves_its_last_good_checkpoint(content, tmp_path):
     path = tmp_path / "last.ckpt"
-    Checkpoints().save_checkpoint(content(), path)
+    Checkpoints(tmp_path).save_checkpoint(content(), path)
     before, bad = path.read_bytes(), content()
     next(iter(bad["state_dict"].values()))[0] = float("nan")
     with (
         pytest.raises(SystemExit, match=r"^lightning: .*last.ckpt: not written, as the training has diverged"),
         as_one_line(),
     ):
-        Checkpoints().save_checkpoint(bad, path)
+        Checkpoints(tmp_path).save_checkpoint(bad, path)
     assert path.read_bytes() == before
 
 
@@ -226,34 +225,17 @@ def test_plain_values():
         assert "\n" not in str(refused.value)
 
 
-def test_a_checkpoint_removes_only_checkpoints_of_its_own_folder(content, tmp_path):
-    folder, other = tmp_path / "run" / "checkpoints", tmp_path / "other"
-    folder.mkdir(parents=True)
-    other.mkdir()
-    victims = [other / "a.ckpt", other / "notes.txt", tmp_path / "b.ckpt", folder / "notes.txt"]
-    for victim in victims:
-        victim.touch()
-    detour = str(folder / ".." / ".." / "other" / "a.ckpt")
-    own = str(folder / "old.ckpt")
-    state = {
-        "dirpath": str(folder),
-        "best_model_path": detour,
-        "kth_best_model_path": str(folder / "notes.txt"),
-        "last_model_path": 5,
-        "best_k_models": {detour: torch.ones(1), "s3://bucket/a.ckpt": torch.ones(1), own: torch.ones(1)},
-    }
-    torch.save({**content(), "callbacks": {"ModelCheckpoint{}": state, "Other": {"a": 1}}}, tmp_path / "a.ckpt")
-    found = Checkpoints().load_checkpoint(tmp_path / "a.ckpt")["callbacks"]
-    assert found["Other"] == {"a": 1}
-    found = found["ModelCheckpoint{}"]
-    assert [found[name] for name in ("best_model_path", "kth_best_model_path", "last_model_path")] == ["", "", ""]
-    assert list(found["best_k_models"]) == [own]
-    for path in (other / "notes.txt", folder / "notes.txt", other, folder / "nothing.ckpt"):
-        Checkpoints().remove_checkpoint(str(path))
-    assert all(victim.exists() for victim in victims)
-    Path(own).touch()
-    Checkpoints().remove_checkpoint(own)
-    assert not Path(own).exists()
+def test_only_checkpoints_of_the_own_run_are_removed(content, tmp_path):
+    """A ModelCheckpoint that resumes removes what its state names."""
+    own, saved, other, notes = (tmp_path / name for name in ("run/a.ckpt", "b.ckpt", "other.ckpt", "run/notes.txt"))
+    checkpoints = Checkpoints(tmp_path / "run")
+    checkpoints.save_checkpoint(content(), saved)
+    own.parent.mkdir()
+    for path in (own, other, notes):
+        path.touch()
+    for path in (own, saved, other, notes, tmp_path, own.parent / ".." / "other.ckpt", own.parent / "nothing.ckpt"):
+        checkpoints.remove_checkpoint(str(path))
+    assert [path.exists() for path in (own, saved, other, notes)] == [False, False, True, True]
 
 
 @pytest.mark.parametrize("ending", [".ckpt", ".safetensors"])
