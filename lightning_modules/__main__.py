@@ -24,11 +24,7 @@ _OURS = {
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Run the command.
-
-    Args:
-        args: arguments after ``lightning``. Default: those of ``sys.argv``.
-    """
+    """Run the command, given the arguments after ``lightning``. Default: those of ``sys.argv``."""
     typed = sys.argv[1:] if args is None else list(args)
     with errors.as_one_line():
         verb, *rest = typed or [""]

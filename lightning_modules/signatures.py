@@ -14,11 +14,7 @@ def inherit_signature(other: type, *without: str) -> Callable[[T], T]:
     """Decorate a constructor that passes ``**settings``, and optionally ``*args``, to another class.
 
     The decorator combines both signatures, for ``help``, editors and the command line. The constructor's own arguments
-    take precedence.
-
-    Args:
-        other: the other class, such as a dataclass.
-        without: arguments of the other class to leave out.
+    take precedence, and the arguments ``without`` of the other class are left out.
     """
 
     def decorate(init: T) -> T:

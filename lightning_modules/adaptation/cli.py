@@ -53,14 +53,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def adapt(args: Sequence[str]) -> None:
-    """Fine-tune weights on a recording.
-
-    Args:
-        args: arguments after ``lightning adapt``.
-
-    Raises:
-        InputError: the recording is unreadable or too short, the weights are unusable, or the gain is too small.
-    """
+    """Fine-tune weights on a recording, given the arguments after ``lightning adapt``."""
     asked = parser().parse_args(args)
     weights = asked.weights
     begin, written = perf_counter(), asked.output / _WRITTEN
@@ -95,17 +88,7 @@ def _student(weights: str) -> Network:
 def clips_and_teacher(
     recording: Recording, student: Network, teacher: str | None, noisy: bool = True
 ) -> tuple[RecordingClips, str, Network]:
-    """Return clips of the recording, the name of the teacher, and the teacher.
-
-    Args:
-        recording: recording to learn from.
-        student: network to fine-tune.
-        teacher: weights of the teacher, or None for the slowest suitable weights.
-        noisy: the sensor may be noisy.
-
-    Raises:
-        ValueError: the recording is too short or too small, or the teacher does not match the student.
-    """
+    """Return clips of the recording, the name of the teacher, and the teacher: the slowest suitable one if not given."""
     name = teacher or _slowest(recording, student, noisy)
     network = Network.from_pretrained(name)
     for setting in ("scale", "pattern"):

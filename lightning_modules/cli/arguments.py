@@ -26,13 +26,6 @@ def with_network_of_weights(args: Sequence[str]) -> list[str]:
 
     It stands behind all configurations, where other arguments still override it. Of these, the motion estimator and the
     gain that they name are kept.
-
-    Args:
-        args: verb and arguments of ``lightning``.
-
-    Raises:
-        FileNotFoundError: there are no such weights.
-        ValueError: the file is damaged, of something else, or of a network or estimator that is not of this package.
     """
     asked, kept, place = None, {}, 1
     for end, option, value in options(args):

@@ -82,11 +82,7 @@ class Configuration(SaveConfigCallback):
 
 
 class Command(LightningCLI):
-    """The ``lightning`` command.
-
-    Args:
-        typed: verb and arguments.
-    """
+    """The ``lightning`` command, given its verb and arguments."""
 
     def __init__(self, typed: Sequence[str]) -> None:
         self.typed = with_found_configs("--help" if word == "--help=all" else word for word in typed)
@@ -220,6 +216,7 @@ class Command(LightningCLI):
         kwargs["callbacks"] = [*_listed(config.get("callbacks")), *self._callbacks(output)]
         if self.subcommand != "fit":
             self.save_config_callback = None  # config.yaml is the record of the training
+            kwargs["devices"] = 1  # several would share the clips, and judge some twice where they do not divide
         try:
             return super().instantiate_trainer(**kwargs)
         except TypeError as error:  # such as of -1 devices, of a CPU

@@ -26,9 +26,6 @@ def configured_network(
         configs: files, later ones over earlier ones; of each, what it says of the model.
         weights: the name of weights, or a file of them, over those that a configuration names.
         checkpoint: instead, a checkpoint.
-
-    Raises:
-        InputError: no network, no weights, or weights of another network.
     """
     chosen, named = None, weights
     parser = ArgumentParser(exit_on_error=False)
@@ -62,16 +59,7 @@ def configured_network(
 
 
 def checkpoint_of(asked: str | None, configs: Sequence[str], output: Path) -> Path | None:
-    """Return the file of ``--ckpt_path``: a checkpoint, or the best or the last of a run.
-
-    Args:
-        asked: what was typed.
-        configs: those of the run, which may say where it is.
-        output: where it may be as well.
-
-    Raises:
-        InputError: there is no such file; the message says which there are.
-    """
+    """Return the file of ``--ckpt_path``; best and last are of a run of a configuration, or in ``output``."""
     if asked not in ("best", "last"):
         return None if asked is None else Path(asked).expanduser()
     said = [read_config(config).get("output") for config in configs]
@@ -84,11 +72,7 @@ def checkpoint_of(asked: str | None, configs: Sequence[str], output: Path) -> Pa
 
 
 def run_checkpoint(folder: Path, asked: str) -> Path:
-    """Return the best or the last checkpoint of a run.
-
-    Raises:
-        InputError: there is none; the message says which there are.
-    """
+    """Return the best or the last checkpoint of a run."""
     path = folder / f"{asked}.ckpt"
     if not path.is_file():
         there = sorted(other.name for other in folder.glob("*.ckpt"))

@@ -44,14 +44,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def export(args: Sequence[str]) -> None:
-    """Write a network as a file for other programs.
-
-    Args:
-        args: what was typed after ``lightning export``.
-
-    Raises:
-        InputError: no such weights, or damaged ones; a name of another kind of file; a network that cannot be exported.
-    """
+    """Write a network as a file for other programs, given what was typed after ``lightning export``."""
     asked = parser().parse_args(args)
     begin = perf_counter()
     ending = FORMATS.get(asked.format, ".safetensors")

@@ -16,11 +16,7 @@ _FILE_ENDINGS = (*PICTURE_ENDINGS, *VIDEO_ENDINGS, ".gif", ".html", ".npz", ".da
 
 
 def check_folder(output: str | Path) -> None:
-    """Refuse an output that cannot be a folder, or would be a folder that looks like a file.
-
-    Raises:
-        InputError: it is a file, or inside one, or new and ends like a picture, a film or another file.
-    """
+    """Refuse an output that is a file, or inside one, or would be a folder that looks like a file."""
     ending = Path(output).suffix.lower()
     if ending in _FILE_ENDINGS and not Path(output).is_dir():
         raise UsageError(f"-o: expected a folder, got {output}, which ends like a file, in {ending}")
@@ -33,16 +29,8 @@ def check_folder(output: str | Path) -> None:
 def locked_folder(folder: str | Path, what: str, name: str = "lock") -> Iterator[None]:
     """Keep other runs out of a folder; the lock is released when the process ends, however it ends.
 
-    On a file system without locks there is no lock.
-
-    Args:
-        folder: where; made when it is missing.
-        what: the kind of run, for the message.
-        name: of the file that is locked, and stays; runs that lock different files are no trouble to each other.
-
-    Raises:
-        InputError: another process, or another run of this one, is at work there.
-        OSError: it cannot be written to.
+    On a file system without locks there is no lock. ``what`` is the kind of run, for the message, and ``name`` that of
+    the file, which stays; runs that lock different files are no trouble to each other.
     """
     path = Path(folder) / name
     if path.is_symlink() or (path.exists() and not path.is_file()):  # it would be emptied, or waited for

@@ -24,11 +24,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def models(args: Sequence[str]) -> None:
-    """Print the weights that come with the package.
-
-    Args:
-        args: what was typed after ``lightning models``.
-    """
+    """Print the weights that come with the package."""
     parser().parse_args(args)
     rows = []
     for one in list_models():

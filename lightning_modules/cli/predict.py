@@ -93,14 +93,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def predict(args: Sequence[str]) -> None:
-    """Make pictures of a recording.
-
-    Args:
-        args: what was typed after ``lightning predict``.
-
-    Raises:
-        InputError: a recording, weights or an output that cannot be used.
-    """
+    """Make pictures of a recording, given what was typed after ``lightning predict``."""
     asked, begin = parser().parse_args(args), perf_counter()
     output = Path(asked.output).expanduser()
     if is_film(output):

@@ -17,17 +17,6 @@ from spikekit.arguments import one_line
 _A_MOMENT = 0.2  # seconds
 
 
-def run_commands_on_ray(commands: dict[Path, Sequence[str]], jobs: int | None) -> Iterator[dict[Path, str | None]]:
-    """Run Python in processes of its own on a Ray cluster, as :func:`calls_on_ray` says.
-
-    Args:
-        commands: arguments of Python by the file that a command's output goes to.
-        jobs: commands at once; as many as there are GPUs, or else nodes, if ``None``.
-    """
-    calls = {log: (_run_to_end, log, words, os.getcwd()) for log, words in commands.items()}
-    return calls_on_ray(lambda _: calls, jobs)
-
-
 def calls_on_ray(
     calls: Callable[[int], dict[Any, tuple[Any, ...]]], jobs: int | None
 ) -> Iterator[dict[Any, str | None]]:
@@ -38,9 +27,6 @@ def calls_on_ray(
     Args:
         calls: given how many run at once, functions and their arguments by name.
         jobs: calls at once; as many as there are GPUs, or else nodes, if ``None``.
-
-    Raises:
-        InputError: Ray is not installed, or does not start.
     """
     try:
         import ray
@@ -81,7 +67,8 @@ def _share(nodes: Sequence[dict[str, float]], jobs: int | None) -> dict[str, Any
     return {"num_cpus": max(1, int(min(node["CPU"] for node in nodes) // on_each))}
 
 
-def _run_to_end(log: Path, words: Sequence[str], there: str) -> str | None:
+def run_to_end(log: Path, words: Sequence[str], there: str) -> str | None:
+    """Run Python in a process of its own and in a folder, see :func:`start`; return what :func:`reason` does."""
     os.chdir(there)
     process = start(log, words, {})
     try:

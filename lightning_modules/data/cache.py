@@ -95,13 +95,7 @@ def pack_clip(clip: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
 
 
 def unpack_clip(packed: Mapping[str, np.ndarray], part: tuple[int, int, int, int], scale: int) -> dict[str, Tensor]:
-    """Undo :func:`pack_clip` for a rectangle of the sensor.
-
-    Args:
-        packed: what it returned.
-        part: first row, first column, rows and columns.
-        scale: pixels of the picture for a sensor pixel.
-    """
+    """Undo :func:`pack_clip` for a part of the sensor: its first row, first column, rows and columns."""
     top, left, height, width = part
     rows, first = slice(top, top + height), left // 8
     bits = np.ascontiguousarray(packed["spikes"][:, rows, first : -(-(left + width) // 8)])

@@ -30,12 +30,9 @@ _REDS = ("{0}/{0}_orig", "{0}_orig", "{0}_orig_part*/{0}/{0}_orig", "{0}_orig_pa
 
 @dataclass(frozen=True)
 class SequenceFiles:
-    """A frame sequence as files.
+    """A frame sequence as files: its name, such as ``walk`` or ``00001/0266``, its folder, and the names of its frames.
 
     Args:
-        name: what it is called, such as ``walk`` or ``00001/0266``.
-        folder: where its frames lie.
-        frames: the names of its files, in order.
         truth: folder of pictures that are sharper than the frames, under the same names; ``None`` where the frames are
             the truth.
         shrink: by how much the frames must be reduced before the sensor sees them.
@@ -52,13 +49,9 @@ class SequenceFiles:
 
 @dataclass(frozen=True)
 class Collection:
-    """The contents of a folder.
+    """The contents of a folder: the name of the data set, and its sequences.
 
     Args:
-        name: the data set.
-        train: sequences to learn from.
-        val: sequences to choose by.
-        test: sequences to judge by.
         clips: clips of a sequence, as the paper has it.
         scale: the only super-resolution factor that the sequences are for, if there is only one.
     """

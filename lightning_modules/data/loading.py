@@ -1,4 +1,4 @@
-"""Data loaders for clips: fresh ones every epoch, made by workers of one thread each."""
+"""Data loaders for clips: fresh ones every epoch, made by workers."""
 
 from __future__ import annotations
 
@@ -48,23 +48,6 @@ class FreshClips(DistributedSampler[int]):
             yield from range(start, start + self.batch_size)
 
 
-class OwnPart(DistributedSampler[int]):
-    """Indices of one process: all of them, or one part behind the other, where several processes share them."""
-
-    def __init__(self, data: LightningDataModule, length: int) -> None:
-        super().__init__(range(length), 1, 0, shuffle=False)
-        rank, processes = process(data)
-        if length < processes:
-            raise ValueError(f"devices: expected at most {length}, a clip for every process, got {processes}")
-        self.part = range(length * rank // processes, length * (rank + 1) // processes)
-
-    def __len__(self) -> int:
-        return len(self.part)
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(self.part)
-
-
 def process(data: LightningDataModule) -> tuple[int, int]:
     """Return which process this is, and of how many."""
     trainer = data.trainer
@@ -86,25 +69,22 @@ class ClipScenes(LightningDataModule):
         return load_clips(self.train_set, self.batch_size, self.workers, sampler=clips, drop_last=True)
 
     def val_dataloader(self) -> DataLoader:  # noqa: D102
-        return self._every_clip(self.val_set)
+        return load_clips(self.val_set, self.val_batch_size, self.workers)
 
     def test_dataloader(self) -> DataLoader:  # noqa: D102
-        return self._every_clip(self.test_set)
-
-    def _every_clip(self, clips: Dataset) -> DataLoader:
-        return load_clips(clips, self.val_batch_size, self.workers, sampler=OwnPart(self, len(clips)))
+        return load_clips(self.test_set, self.val_batch_size, self.workers)
 
 
 def cut_key_frames(clip: dict[str, Tensor], key_frames: int, frames: int, every: int) -> dict[str, Tensor]:
-    """Cut the spikes (T, H, W) of several key frames into a clip of each, (K, N, H, W), ``every`` clocks apart."""
+    """Cut the spikes of several key frames, (*, T, H, W), into clips ``every`` clocks apart, (*, K, N, H, W)."""
     if key_frames == 1:
         return clip
-    spikes = clip["spikes"].unfold(0, frames, every).movedim(-1, 1).contiguous()
+    spikes = clip["spikes"].unfold(-3, frames, every).movedim(-1, -3).contiguous()
     return {**clip, "spikes": spikes, "every": torch.tensor(every)}
 
 
 def load_clips(clips: Dataset, batch_size: int, workers: int, **options: object) -> DataLoader:
-    """Return a loader of clips, which are dictionaries of tensors; its workers have one thread each."""
+    """Return a loader of clips, which are dictionaries of tensors."""
     workers = min(workers, math.ceil(len(clips) / batch_size))
     return _ClipLoader(
         clips,
@@ -145,7 +125,6 @@ def _to_arrays(clips: list[dict[str, Tensor]]) -> dict[str, np.ndarray]:
 
 def start_worker(_: int) -> None:
     """Begin a process that makes clips."""
-    torch.set_num_threads(1)
     # schedulers send it to all processes of a run: training ends its step and saves, for which it needs its workers
     signal.signal(signal.SIGTERM, lambda *_: threading.Timer(_GRACE, os._exit, (0,)).start())
     end_when_orphaned()  # torch's own watch does not reach a worker that waits for its clip to leave a full pipe

@@ -41,12 +41,7 @@ def existing_folder(root: str | Path, what: str) -> Path:
 
 
 def folder_pictures(root: str | Path) -> list[Path]:
-    """List the pictures of a folder and of all folders in it, linked ones too, sorted; hidden ones are left out.
-
-    Raises:
-        FileNotFoundError: there is no such folder, or no picture in it.
-        NotADirectoryError: it is a file.
-    """
+    """List the pictures of a folder and of all folders in it, linked ones too, sorted; hidden ones are left out."""
     root = existing_folder(root, "pictures")
     found, seen = [], set()
     for folder, folders, names in os.walk(root, followlinks=True):

@@ -164,25 +164,18 @@ class ScenePool:
                 parts.setdefault(name, []).append(part.half() if name in ("rgb", "flow") else part)
         made = {name: torch.cat(part) for name, part in parts.items()}
         if estimate := _estimator(self.data):
-            spikes = self._of_key_frames(kind, made["spikes"])
+            spikes = clips.cut(made)["spikes"]
             flow = estimate(spikes.flatten(0, -4)).unflatten(0, spikes.shape[:-3])
             made["motion"] = trim(flow, clips.margin).half()
             made["spikes"] = trim(made["spikes"], clips.margin).contiguous()
         return made
 
-    def _of_key_frames(self, kind: int, spikes: Tensor) -> Tensor:
-        """Spikes (B, T, H, W) as clips of key frames (B, K, N, H, W), of a film."""
-        clips = self.kinds[kind]
-        if clips.key_frames == 1:
-            return spikes
-        return spikes.unfold(1, clips.frames, clips.every).movedim(-1, 2).contiguous()
-
     def _turned(self, kind: int, batch: dict[str, Tensor], turns: np.ndarray) -> dict[str, Tensor]:
         clips, film = self.kinds[kind], self.kinds[kind].key_frames > 1
         backwards = turns[0] and sum(clips.flow_times) == clips.frames - 1
-        batch["spikes"] = self._of_key_frames(kind, batch["spikes"])
+        batch = clips.cut(batch)
         for name, part in batch.items():
-            if name in ("alpha", "noise"):
+            if name in ("alpha", "noise", "every"):
                 continue
             if backwards:
                 keys, times = ([1] if film else []), {"spikes": [-3], "flow": [-4], "motion": [-4]}.get(name, [])
@@ -191,8 +184,7 @@ class ScenePool:
                 part = part.mT
                 part = part.flip(-3) if name in ("flow", "motion") else part
             batch[name] = part if name == "spikes" else part.float()
-        # on the host, where it is asked for
-        return batch | {"every": torch.full((len(batch["rgb"]),), clips.every)} if film else batch
+        return batch | {"every": batch["every"].expand(len(batch["rgb"]))} if film else batch
 
 
 def _as_it_is(item: Any) -> Any:

@@ -89,18 +89,11 @@ def _is_grey(picture: Tensor) -> bool:
 def draw_cut(
     side: int, size: tuple[int, int], rng: np.random.Generator, mirror: float, least: float = 0.5
 ) -> np.ndarray:
-    """Draw a square at a random place and size of a picture; where the picture ends, it is mirrored.
+    """Draw a square of so many pixels at a random place and size of a picture; where that ends, it is mirrored.
 
-    Args:
-        side: of the square, in pixels.
-        size: of the picture.
-        rng: where chance comes from.
-        mirror: the square is at most so many times as long as the picture, where that needs no enlarging.
-        least: how far the picture is shrunk at most.
-
-    Returns:
-        Of rows and of columns, (2, 4): first line of the picture and how many are taken, to how many they are
-        resampled, and where the square begins in those.
+    The square is at most ``mirror`` times as long as the picture, where that needs no enlarging, and the picture is
+    shrunk to ``least`` at most. Returned is, of rows and of columns, (2, 4): the first line of the picture, how many
+    are taken, to how many they are resampled, and where the square begins in those.
     """
     # Shrinking makes grain small and edges sharp. Enlarging blurs: only a picture below half the square's side is.
     shortest = min(size)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import inspect
 import pickle
 import zlib
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -47,7 +45,7 @@ class ClipRecipe:
             these frames, and there is no flow.
         flow_times: spike frames to which the flow from the middle is given; empty for no flow.
         interpolation: what makes frames between two source frames, by its class path; motion-compensated, without
-            weights, when null.
+            weights, when null. Delete the cache where the code of one of your own changes.
         noise: what the sensor adds, such as ``{photons: 1000}``; nothing when null.
         seed: random seed.
 
@@ -99,7 +97,7 @@ class ClipRecipe:
             simulator=SIMULATOR_VERSION,
             files=[file_digest(path) for path in self.files(sequence, middle)],
             shrink=sequence.shrink,
-            interpolation=_interpolation_digest(self.interpolation),
+            interpolation=hashlib.sha256(pickle.dumps(self.interpolation)).hexdigest(),
             noise=asdict(self.noise),
             pattern=self.pattern,
             flow_times=list(self.flow_times),
@@ -149,10 +147,6 @@ class ClipRecipe:
         )
         return seen.clip(self.reach[0], self.frames + (self.key_frames - 1) * self.clocks)
 
-    def cut(self, clip: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Cut what :meth:`clip` returned into the clips of its key frames, (K, N, H, W), ``every`` clocks apart."""
-        return cut_key_frames(clip, self.key_frames, self.frames, self.clocks)
-
     def _flow(self, clip: SequenceClip, time: int) -> Tensor:
         try:
             return clip.flow(time)
@@ -164,16 +158,6 @@ class ClipRecipe:
     def _chance(self, paths: list[Path]) -> int:
         """A seed for the sensor that depends on what the frames show, not on where they lie."""
         return int(clip_key(seed=self.seed, files=[file_digest(path) for path in paths])[:15], 16)
-
-
-def _interpolation_digest(interpolation: Callable[[Tensor, Tensor], Any]) -> str:
-    """Digest of an interpolation and, where it is somebody's own, of the file that it is written in."""
-    digest = hashlib.sha256(pickle.dumps(interpolation))
-    kind = interpolation if inspect.isroutine(interpolation) else type(interpolation)
-    if kind.__module__.partition(".")[0] != "spikekit":  # which SIMULATOR_VERSION covers
-        with suppress(OSError, TypeError):  # no file: typed at a prompt, or compiled
-            digest.update(file_digest(Path(inspect.getfile(kind))).encode())
-    return digest.hexdigest()
 
 
 def _shrunk(rgb: Tensor, factor: int) -> Tensor:
@@ -292,7 +276,8 @@ class SequenceClips(Dataset):
             part = *corner, side, side
         clip = unpack_clip(packed, part, scale)
         inner = {"rgb": scale * margin, "flow": margin}
-        return self.recipe.cut({name: trim(planes, inner.get(name, 0)) for name, planes in clip.items()})
+        clip = {name: trim(planes, inner.get(name, 0)) for name, planes in clip.items()}
+        return cut_key_frames(clip, self.recipe.key_frames, self.recipe.frames, self.recipe.clocks)
 
 
 class FilmScenes(ClipScenes):

@@ -35,6 +35,7 @@ _CODE = [Path(__file__).with_name(f"{name}.py") for name in ("stills", "renderin
 ]
 _TEXTURES = 0.3  # share of procedural pictures among embedded ones
 _ANGLES = 256  # at which an outline is known
+_MOVES = "motion", "bend", "rotation", "zoom"
 
 
 @dataclass(eq=False, repr=False)
@@ -124,10 +125,10 @@ class StillClips(Dataset):
 
     def _clip(self, index: int) -> dict[str, Tensor]:
         if self.cache is None:
-            return self._cut(self._make(index))
-        packed = self.cache.packed(clip_key(source=self._source, index=index), lambda: self._make(index))
+            return self.cut(self.whole(index))
+        packed = self.cache.packed(clip_key(source=self._source, index=index), lambda: self.whole(index))
         side = self.patch + 2 * self.margin
-        return self._cut(unpack_clip(packed, (0, 0, side, side), self.scale))
+        return self.cut(unpack_clip(packed, (0, 0, side, side), self.scale))
 
     @cached_property
     def _source(self) -> str:
@@ -138,8 +139,8 @@ class StillClips(Dataset):
         files = [file_digest(path) for path in (*_CODE, *self.pictures)]
         return clip_key(simulator=SIMULATOR_VERSION, files=files, **options)
 
-    def _make(self, index: int) -> dict[str, Tensor]:
-        """Spikes of all key frames, (T, H, W), and truth, or flow and truth of the one."""
+    def whole(self, index: int) -> dict[str, Tensor]:
+        """Return a clip whose ``spikes`` are those of all key frames, (T, H, W), not cut into a clip of each."""
         drawn, gallery = self._alone(index)
         return {name: part[0] for name, part in self.render(drawn, gallery).items()}
 
@@ -176,13 +177,9 @@ class StillClips(Dataset):
         drawn = self._sensor(index) if self._told else {}
         return {name: torch.tensor(drawn[name]) for name in self._told}
 
-    def _cut(self, clip: dict[str, Tensor]) -> dict[str, Tensor]:
+    def cut(self, clip: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Cut what :meth:`whole` or :meth:`render` returned into a clip of each key frame."""
         return cut_key_frames(clip, self.key_frames, self.frames, self.every)
-
-    def spikes(self, index: int, scene: Scene) -> Tensor:
-        """Return what the sensor of a clip makes of a scene, uint8 (clocks, H, W)."""
-        drawn = {name: np.asarray(part)[None] for name, part in self._sensor(index).items()}
-        return see(scene.light(self.pattern, scale=self.scale, alpha=1.0)[None], drawn, self.noise)[0]
 
     def scene(self, index: int) -> Scene:
         """Return the scene of a clip, to look at other clocks or sizes than the clip has."""
@@ -299,31 +296,19 @@ _NONE = {
 
 
 def _check(clips: StillClips) -> None:
-    clips.scale = check_whole("scale", clips.scale)
+    for name in ("scale", "patch", "frames", "key_frames", "every", "length"):
+        setattr(clips, name, check_whole(name, getattr(clips, name)))
     check_positive("alpha", clips.alpha)
     clips.pattern = cfa_pattern(clips.pattern)
-    low, high = clips.brightness
+    at_least_0 = {name: 0 <= getattr(clips, name) < math.inf for name in (*_MOVES, "objects", "seed")}
+    (low, high), gains = clips.brightness, clips.gains
     for name, good, expected in (
+        *((name, good, "0 or more") for name, good in at_least_0.items()),
         ("pictures", len(clips.pictures) > 0, "at least one"),
-        ("patch", clips.patch >= 1, "at least 1"),
-        ("frames", clips.frames >= 1, "at least 1"),
-        ("motion", 0 <= clips.motion < math.inf, "0 or more"),
-        ("bend", 0 <= clips.bend < math.inf, "0 or more"),
-        ("rotation", 0 <= clips.rotation < math.inf, "0 or more degrees"),
-        ("zoom", 0 <= clips.zoom < math.inf, "0 or more"),
-        ("objects", clips.objects >= 0, "0 or more"),
         ("brightness", 0 <= low <= high < math.inf, "two numbers 0 <= low <= high"),
-        ("key_frames", clips.key_frames >= 1, "at least 1"),
-        ("every", clips.every >= 1, "at least 1 clock"),
         ("flow_times", all(0 <= t < clips.frames for t in clips.flow_times), f"clocks in [0, {clips.frames})"),
-        (
-            "gains",
-            clips.gains is None or (len(clips.gains) == 2 and 0 < clips.gains[0] <= clips.gains[1] < math.inf),
-            "two numbers 0 < low <= high, or null",
-        ),
+        ("gains", gains is None or 0 < gains[0] <= gains[1] < math.inf, "two numbers 0 < low <= high, or null"),
         ("noise", getattr(clips.noise, "calibration", None) is None, "no calibration, which is of one size of sensor"),
-        ("seed", clips.seed >= 0, "0 or more"),
-        ("length", clips.length >= 1, "at least 1 clip"),
     ):
         if not good:
             raise ValueError(f"{name}: expected {expected}, got {getattr(clips, name)}")

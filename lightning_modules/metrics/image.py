@@ -12,14 +12,9 @@ from spikekit import psnr, ssim
 
 
 class Measure(NamedTuple):
-    """Metric for pictures.
+    """Metric for pictures: column in CSV files, heading and decimal places in tables.
 
-    Args:
-        name: column in CSV files.
-        heading: heading in tables.
-        digits: decimal places in tables.
-        of: function of pictures and ground truth, :math:`(B, 3, H, W)`, which returns a value per picture,
-            :math:`(B)`.
+    ``of`` maps pictures and ground truth, :math:`(B, 3, H, W)`, to a value per picture, :math:`(B)`.
     """
 
     name: str

@@ -55,15 +55,8 @@ class MotionEstimator(nn.Module):
 def split_any_size(raw: Tensor, pattern: str) -> Tensor:
     """Split like :func:`spikekit.split_bayer`; odd sides are padded by reflection, which keeps the Bayer phase.
 
-    Args:
-        raw: (B, T, H, W), floating point, at least 2 x 2 pixels.
-        pattern: Bayer phase, or ``"grey"``.
-
-    Returns:
-        (4, B, T, h, w), with h and w half of H and W, rounded up; (1, B, T, H, W) for a grey sensor.
-
-    Raises:
-        ValueError: ``raw`` has fewer than 2 x 2 pixels.
+    (B, T, H, W) of at least 2 x 2 pixels becomes (4, B, T, h, w), with h and w half of H and W, rounded up;
+    (1, B, T, H, W) for a grey sensor.
     """
     height, width = raw.shape[-2:]
     if min(height, width) < 2:

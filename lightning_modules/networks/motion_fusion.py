@@ -35,13 +35,7 @@ def assembled_motion(motion: MotionEstimator, spikes: Tensor, times: tuple[int, 
 
 def _channel_flows(motion: MotionEstimator, spikes: Tensor, times: tuple[int, int, int], pattern: str) -> Tensor:
     """Return the two flows of each of the four sub-streams, (4, B, 2, 2, h, w), in Bayer cells."""
-    batch, _, height, width = spikes.shape
-    to_first, to_last = motion.channel_flows(spikes, times, pattern)
-    expected = 4, batch, 2, (height + 1) // 2, (width + 1) // 2
-    if not to_first.shape == to_last.shape == expected:
-        got = f"{tuple(to_first.shape)} and {tuple(to_last.shape)}"
-        raise ValueError(f"channel_flows: expected two flows {expected}, got {got}")
-    flows = torch.stack([to_first, to_last], dim=2)
+    flows = torch.stack(motion.channel_flows(spikes, times, pattern), dim=2)
     return flows.to(torch.promote_types(flows.dtype, torch.float32))
 
 

@@ -200,15 +200,7 @@ def _ours(kind: type[Network]) -> bool:
 
 
 def read_network(weights: str | Path) -> nn.Module:
-    """Load the network or motion estimator of a weights file, in training mode.
-
-    Args:
-        weights: name or path, as in :meth:`Network.from_pretrained`.
-
-    Raises:
-        FileNotFoundError: ``weights`` is neither a file nor a known name.
-        ValueError: the file is damaged, or holds no class of this package.
-    """
+    """Load the network or motion estimator of a weights file, in training mode."""
     found = read_weights(weights)
     if found.settings.get("class") not in ESTIMATORS:
         return Network.from_pretrained(weights).train()

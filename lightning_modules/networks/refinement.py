@@ -21,22 +21,14 @@ class FeatureRefinement(nn.Module):
         self.base = nn.Sequential(ConvBlock(times * features, width), conv(width, width))
         self.residual = nn.Sequential(ConvBlock(times * features, width), conv(width, width))
 
-    def first(self) -> tuple[Tensor, Tensor]:
-        """Return weight and bias of the first convolution of both branches."""
-        base, residual = self.base[0][0], self.residual[0][0]
+    def forward(self, pixels: Tensor) -> Tensor:  # noqa: D102
+        (base, base_end), (residual, residual_end) = ((part[0][0], part[1]) for part in (self.base, self.residual))
         # subtracting the mean from the few weights is cheaper than from the pixels
         weight = residual.weight.unflatten(1, (self.times, -1))
-        weight = (weight - weight.mean(dim=1, keepdim=True)).flatten(1, 2)
-        return torch.cat([base.weight, weight]), torch.cat([base.bias, residual.bias])
-
-    def finish(self, seen: Tensor) -> Tensor:
-        """Apply the layers after the first convolution."""
-        base, residual = self.base[1], self.residual[1]
-        weight = torch.cat([base.weight, residual.weight], dim=1)
-        return F.conv2d(seen.relu_(), weight, base.bias + residual.bias, padding=1)
-
-    def forward(self, pixels: Tensor) -> Tensor:  # noqa: D102
-        return self.finish(F.conv2d(pixels, *self.first(), padding=1))
+        weight = torch.cat([base.weight, (weight - weight.mean(dim=1, keepdim=True)).flatten(1, 2)])
+        seen = F.conv2d(pixels, weight, torch.cat([base.bias, residual.bias]), padding=1).relu_()
+        weight = torch.cat([base_end.weight, residual_end.weight], dim=1)
+        return F.conv2d(seen, weight, base_end.bias + residual_end.bias, padding=1)
 
 
 class TimeFusion(nn.Conv2d):
@@ -45,14 +37,6 @@ class TimeFusion(nn.Conv2d):
     def __init__(self, times: int, features: int, width: int) -> None:
         super().__init__(times * features, width, 3, padding=1)
         self.times = times
-
-    def first(self) -> tuple[Tensor, Tensor]:
-        """Return weight and bias of the convolution."""
-        return self.weight, self.bias
-
-    def finish(self, seen: Tensor) -> Tensor:
-        """Return the features unchanged."""
-        return seen
 
     @torch.no_grad()
     def start_at_the_mean(self, pixels: int) -> None:

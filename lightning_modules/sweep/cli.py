@@ -93,8 +93,7 @@ examples:
         "--time",
         type=_time,
         metavar="HH:MM:SS",
-        help="wall clock of training, validation included; for a schedule with an end, a few steps are timed first, "
-        "and training ends with the steps that the time allows, or with the time",
+        help="wall clock of training, validation included; a schedule with an end becomes a cosine that ends with it",
     )
     budget.add_argument(
         "--flops",
@@ -125,11 +124,7 @@ examples:
 
 
 def sweep(args: Sequence[str]) -> None:
-    """Run the verb with what was typed after it.
-
-    Raises:
-        InputError: what was asked for cannot be; or trials failed.
-    """
+    """Run the verb with what was typed after it."""
     asked = parser().parse_args(args)
     configs = [find_configs(name)[0] for name in asked.configs] + asked.config
     over = [[file for name in group for file in find_configs(name)] for group in asked.over]

@@ -7,7 +7,9 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from lightning_modules.cli.processes import reason, run_commands_on_ray, start, stop
+import torch
+
+from lightning_modules.cli.processes import calls_on_ray, reason, run_to_end, start, stop
 from lightning_modules.sweep.state import LOG
 
 _A_MOMENT = 0.2  # seconds
@@ -19,8 +21,7 @@ Ended = dict[Path, str | None]
 def run_locally(folders: Sequence[Path], jobs: int | None, every: float) -> Iterator[Ended]:
     """Run trials on this machine, ``jobs`` at once, which share the cores, and repeatedly yield those that ended."""
     jobs = jobs or 1
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    threads = {"OMP_NUM_THREADS": str(max(1, cores // jobs))} if jobs > 1 else {}
+    threads = {"OMP_NUM_THREADS": str(max(1, torch.get_num_threads() // jobs))} if jobs > 1 else {}
     waiting, running = list(folders), {}
     try:
         while waiting or running:
@@ -41,9 +42,11 @@ def run_on_ray(folders: Sequence[Path], jobs: int | None, every: float) -> Itera
     A trial takes a GPU where the cluster has any, else the cores of a node; with ``jobs``, such a share of all that as
     many run at once. All nodes need this package, the working directory and the folders, under the same paths.
     """
-    logs = {folder.absolute() / LOG: folder for folder in folders}
-    for ended in run_commands_on_ray({log: _trial(log.parent, every) for log in logs}, jobs):
-        yield {logs[log]: reason for log, reason in ended.items()}
+    here = os.getcwd()
+    calls = {
+        folder: (run_to_end, folder.absolute() / LOG, _trial(folder.absolute(), every), here) for folder in folders
+    }
+    return calls_on_ray(lambda _: calls, jobs)
 
 
 def _trial(folder: Path, every: float) -> list[str]:

@@ -23,42 +23,23 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return what :func:`write_json` wrote.
-
-    Raises:
-        InputError: the file cannot be read, or is damaged; the message is one line and names it.
-    """
+    """Return what :func:`write_json` wrote."""
     return _read(path, json.loads)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Return the configuration in a file.
-
-    Raises:
-        InputError: the file cannot be read, or is damaged; the message is one line and names it.
-    """
+    """Return the configuration in a file."""
     return _read(path, yaml.safe_load)
 
 
 def read_result(folder: Path) -> dict[str, Any] | None:
-    """Return the result of a trial, None where there is none yet.
-
-    Raises:
-        InputError: the file cannot be read, or is damaged; the message is one line and names it.
-    """
+    """Return the result of a trial, None where there is none yet."""
     path = folder / RESULT
     return _read(path, lambda text: check_result(json.loads(text))) if path.is_file() else None
 
 
 def check_result(result: dict[str, Any]) -> dict[str, Any]:
-    """Return a result where all of it is numbers.
-
-    Args:
-        result: ``scores`` by name, ``steps``, ``seconds_per_step`` and ``parameters``.
-
-    Raises:
-        ValueError: it is not.
-    """
+    """Return ``scores``, ``steps``, ``seconds_per_step`` and ``parameters``; raise where one is no number."""
     for name, value in {**result, "scores": 0, **result["scores"]}.items():
         if not isinstance(value, (int, float)) or not abs(value) < 1 << 53:
             raise ValueError(f"{name}: expected a number, got {value!s:.80}")
@@ -82,18 +63,6 @@ def _read(path: Path, parse: Any) -> dict[str, Any]:
         value = parse(no_pipe(path).read_text(encoding="utf-8"))
         if not isinstance(value, dict):
             raise ValueError(f"expected names and values, got {type(value).__name__}")
-        _check_text(value)
     except Exception as error:  # what the parser of YAML raises depends on the text
         raise InputError(f"{path}: damaged ({one_line(error)[:300]}); delete it, or the folder") from error
     return value
-
-
-def _check_text(value: Any) -> None:
-    """Refuse text that a terminal would obey or could not show, such as an escape sequence."""
-    if isinstance(value, dict):
-        _check_text([*value, *value.values()])
-    elif isinstance(value, list):
-        for inner in value:
-            _check_text(inner)
-    elif isinstance(value, str) and not value.replace("\n", "").replace("\t", "").isprintable():
-        raise ValueError("expected text that can be printed, got control characters")

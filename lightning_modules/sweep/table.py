@@ -21,14 +21,7 @@ _COLUMNS = "steps", "seconds_per_step", "parameters"
 
 @dataclass
 class VariantResults:
-    """A variant and the results of its trials.
-
-    Args:
-        labels: what it is made of.
-        trials: of one variant, a seed each.
-        results: of those that are finished, by seed.
-        failed: why others failed, by seed.
-    """
+    """A variant, the trials of it, a seed each, and what became of them, by seed: results, or why they failed."""
 
     labels: tuple[str, ...]
     trials: list[Trial] = field(default_factory=list)

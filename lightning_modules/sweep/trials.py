@@ -8,7 +8,6 @@ import re
 from argparse import ArgumentError
 from collections.abc import Sequence
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from lightning_modules.sweep.state import read_json, read_yaml, write_json
 from spikekit.io.whole_file import whole_file
 from spikekit.progress import progress
 
-_LONGEST = 180  # bytes of a folder's name
+_LONGEST = 240  # bytes of a folder's name
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ class Trial:
         labels: what it takes from each group of overlays or values.
         seed: of the initial weights; ``None`` for what the configuration says.
         folder: where everything lies that it leaves.
-        config: its configuration, resolved, as ``lightning fit -c`` reads it.
+        config: its configuration, resolved.
         budget: as :func:`lightning_modules.sweep.budget.with_budget` takes it.
     """
 
@@ -51,11 +50,7 @@ class Trial:
         return "-".join(self.labels)
 
     def write(self) -> None:
-        """Record in the folder what the trial is.
-
-        Raises:
-            InputError: the folder holds a trial of another configuration or budget.
-        """
+        """Record in the folder what the trial is; refuse one that holds another."""
         config, budget = self.folder / "trial.yaml", self.folder / "budget.json"
         if budget.is_file():  # it is written last
             there = {**read_yaml(config), "budget": read_json(budget)}
@@ -87,9 +82,6 @@ def make_trials(
         seeds: of the initial weights.
         budget: as :func:`lightning_modules.sweep.budget.with_budget` takes it.
         output: folder of the sweep.
-
-    Raises:
-        InputError: two combinations of one name, or two that are the same, or one that ``lightning fit`` would refuse.
     """
     common = [word for config in configs for word in ("-c", str(config))]
     groups = [[(Path(path).stem, ["-c", str(path)]) for path in group] for group in over]
@@ -122,10 +114,7 @@ def make_trials(
 
 def _folder_name(name: str) -> str:
     """A name that a file system takes, which has room for 255 bytes."""
-    name = re.sub(r"[^\w.=+-]+", "_", name)
-    if len(name.encode()) > _LONGEST:
-        name = f"{name.encode()[:_LONGEST].decode(errors='ignore')}-{sha256(name.encode()).hexdigest()[:12]}"
-    return name
+    return re.sub(r"[^\w.=+-]+", "_", name, flags=re.ASCII)[:_LONGEST]
 
 
 def _check_differences(trials: Sequence[Trial]) -> None:

@@ -11,7 +11,6 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-import torch
 import yaml
 from pytorch_lightning import Callback, LightningModule, Trainer
 from pytorch_lightning.callbacks import ModelCheckpoint
@@ -21,15 +20,12 @@ from lightning_modules.cli.command import Command, run
 from lightning_modules.cli.errors import as_one_line
 from lightning_modules.cli.processes import end_with_parent
 from lightning_modules.storage.checkpoint import DivergedError, read_checkpoint
-from lightning_modules.sweep.budget import has_end, with_budget
+from lightning_modules.sweep.budget import with_budget
 from lightning_modules.sweep.state import RESULT, check_result, read_json, read_yaml, say_progress, write_json
 from lightning_modules.tasks.pace import share_done
 from spikekit.io.whole_file import whole_file
 
 _A_MOMENT = 0.5  # seconds between two reports
-
-# Steps that are run to learn how long one takes, and how many of them are too early to count.
-_TIMED, _WARM_UP = 12, 4
 
 
 class Report(Callback):
@@ -91,31 +87,17 @@ class Report(Callback):
 
 
 class _Cost(Callback):
-    """Count the FLOPs of the first step, and time the others; a step may take several batches."""
+    """Count the FLOPs of batches, without those of making the clips in between."""
 
-    flops: int | None = None
-    _counted = 0
+    flops = 0
 
-    def on_train_batch_start(self, trainer: Trainer, module: LightningModule, batch: Any, index: int) -> None:
-        if self.flops is None:  # not of making the clips, between two batches
-            self._counter = FlopCounterMode(display=False)
-            self._counter.__enter__()
-        self._wait()
-        if trainer.global_step <= _WARM_UP and index % trainer.accumulate_grad_batches == 0:
-            self._began = time.monotonic()
+    def on_train_batch_start(self, *_: Any) -> None:
+        self._counter = FlopCounterMode(display=False)
+        self._counter.__enter__()
 
-    def on_train_batch_end(self, trainer: Trainer, *_: Any) -> None:
-        if self.flops is None:
-            self._counter.__exit__(None, None, None)
-            self._counted += self._counter.get_total_flops()
-            if trainer.global_step == 1:
-                self.flops = self._counted
-        self._wait()
-        self.seconds = (time.monotonic() - self._began) / max(1, trainer.global_step - _WARM_UP)
-
-    def _wait(self) -> None:
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
+    def on_train_batch_end(self, *_: Any) -> None:
+        self._counter.__exit__(None, None, None)
+        self.flops += self._counter.get_total_flops()
 
 
 def _command(callbacks: list[Callback]) -> type[Command]:
@@ -131,27 +113,25 @@ def plan(folder: Path) -> Path:
 
     One training step is run to count its FLOPs, forward, backward and optimizer, as
     :class:`torch.utils.flop_counter.FlopCounterMode` does: convolutions and matrix products, two for each product and
-    sum, and nothing that is done element by element, such as the warp. Where it is time that is given and the schedule
-    has an end, a few steps are timed. That is done once: a resumed trial has the plan that it began with.
+    sum, and nothing that is done element by element, such as the warp. A resumed trial has the plan that it began with.
     """
     own, planned = folder / "trial.yaml", folder / "plan.yaml"
     config, budget = read_yaml(own), read_json(folder / "budget.json")
-    if "flops" not in budget and not ("seconds" in budget and has_end(config)):
+    if "flops" not in budget:
         return own
     if not planned.is_file():
         say_progress(folder, "measuring a step")
-        batches = (1 if "flops" in budget else _TIMED) * config["trainer"]["accumulate_grad_batches"]
         cost = _Cost()
+        batches = config["trainer"]["accumulate_grad_batches"]
         run(["fit", "-c", str(own), f"--trainer.fast_dev_run={batches}"], _command([cost]))
-        count = budget["flops"] / max(1, cost.flops) if "flops" in budget else budget["seconds"] / cost.seconds
+        count = int(budget["flops"] / max(1, cost.flops))
         if count < 1:
             raise SystemExit(
                 f"lightning: a step takes {cost.flops:.3g} FLOPs, more than the budget {budget['flops']:.3g}"
             )
-        config = with_budget(config, {**budget, "steps": int(count)})
-        text = f"# a step: {cost.flops:.6g} FLOPs, {cost.seconds:.3g} s\n" + yaml.safe_dump(config, sort_keys=False)
+        text = yaml.safe_dump(with_budget(config, {"steps": count}), sort_keys=False)
         with whole_file(planned, "w") as file:
-            file.write(text)
+            file.write(f"# a step: {cost.flops:.6g} FLOPs\n{text}")
     return planned
 
 

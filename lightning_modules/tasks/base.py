@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 import torch
 from pytorch_lightning import Callback, LightningModule
 from pytorch_lightning.cli import LRSchedulerCallable, OptimizerCallable
-from torch import Tensor, nn
+from torch import nn
 
 from lightning_modules.networks.network import read_network
 from lightning_modules.storage.checkpoint import read_checkpoint
@@ -93,18 +93,6 @@ class BaseTask(LightningModule):
             how |= {"interval": "epoch", "frequency": every or 1}
             how["monitor"] = getattr(schedule, "monitor", self.best[0])
         return {"optimizer": optimizer, "lr_scheduler": how}
-
-    def log_mean(self, name: str, values: Tensor, **how: Any) -> None:
-        """Log the mean over the clips that all processes see, however many each of them has.
-
-        Args:
-            name: of the figure.
-            values: of a batch, one a clip.
-            how: other arguments of Lightning's ``log``.
-        """
-        processes = torch.distributed.get_world_size() if torch.distributed.is_initialized() else 1
-        # Lightning divides the number of clips by that of processes, and rounds down
-        self.log(name, values.mean(), batch_size=len(values) * processes, sync_dist=True, **how)
 
     def on_train_batch_start(self, batch: Any, batch_index: int) -> None:
         """Let loggers have the step that training stands at; resumed, Lightning's own count may be one off."""

@@ -35,11 +35,7 @@ def middle_half(batch: dict[str, Tensor]) -> slice:
 
 
 class ValidationPictures(Callback):
-    """Show the first clips of every validation in TensorBoard: decoded input (TFI), result and truth side by side.
-
-    Args:
-        clips: how many.
-    """
+    """Show the first clips of every validation in TensorBoard: decoded input (TFI), result and truth side by side."""
 
     title = "tfi, result, truth"
 
@@ -112,13 +108,8 @@ class TestReport(Callback):
             self._rows += self.rows(outputs["pictures"], batch)[: self.clips - len(self._rows)]
 
     def on_test_end(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
-        self._gather(trainer.world_size)
-        if not trainer.is_global_zero:
-            return
         clips = len(next(iter(self._scores.values())))
         named = getattr(trainer.datamodule, "test_names", None)
-        if trainer.world_size > 1 and named and clips < len(named):  # of every process the first clips
-            named = None
         names = range(clips) if named is None else named[:clips]
         means = {
             method: torch.tensor(scores, dtype=torch.float64).mean(dim=0).tolist()
@@ -134,15 +125,6 @@ class TestReport(Callback):
         missing = self.missing()
         print(f"\n{self._table(f'mean of {clips} clips', means)}\n\n{missing or ''}")  # noqa: T201
         print(f"{self.output / 'test.csv'}, {self.output / 'test.png'} (columns: {', '.join(self._scores)}, truth)")  # noqa: T201
-
-    def _gather(self, processes: int) -> None:
-        """Put together what all processes have seen, whose clips follow each other."""
-        if processes == 1:
-            return
-        parts: list[Any] = [None] * processes
-        torch.distributed.all_gather_object(parts, (dict(self._scores), self._rows))
-        self._scores = {method: [score for scores, _ in parts for score in scores[method]] for method in self._scores}
-        self._rows = [row for _, rows in parts for row in rows][: self.clips]
 
     def _table(self, clips: str, scores: dict[str, Sequence[float]]) -> str:
         lines = []

@@ -81,7 +81,7 @@ class FlowTraining(BaseTask):
         flow, truth = self(batch["spikes"]), batch["flow"]
         for name, estimate in (("", flow), ("_zero", torch.zeros_like(flow))):
             for measure, values in _scores(estimate, truth).items():
-                self.log_mean(f"val/{measure}{name}", values)
+                self.log(f"val/{measure}{name}", values.mean(), sync_dist=True)
         return flow
 
     def test_step(self, batch: dict[str, Tensor], batch_index: int) -> dict[str, dict[str, Any]]:
@@ -98,7 +98,7 @@ class FlowTraining(BaseTask):
             found |= {measure: 100 * found[measure] for measure in ("over_1px", "outliers")}  # per cent
             scores[name] = {**found, "milliseconds": flow.new_full((len(flow),), milliseconds)}
         for measure, values in scores[type(self.network).__name__].items():
-            self.log_mean(f"test/{measure}", values)
+            self.log(f"test/{measure}", values.mean())
         return {"pictures": flows, "scores": scores}
 
 

@@ -134,8 +134,8 @@ class SuperResolution(BaseTask):
         rgb = self._pictures(batch)[-1]
         if "every" in batch:  # of a film, the key frame in the middle stands for all
             rgb, batch = rgb[:, rgb.shape[1] // 2], middle_clip(batch)
-        self.log_mean("val/psnr", psnr(rgb, batch["rgb"]), prog_bar=True)
-        self.log_mean("val/ssim", ssim(rgb, batch["rgb"]))
+        self.log("val/psnr", psnr(rgb, batch["rgb"]).mean(), prog_bar=True, sync_dist=True)
+        self.log("val/ssim", ssim(rgb, batch["rgb"]).mean(), sync_dist=True)
         return rgb.clamp(0, 1)
 
     def test_step(self, batch: dict[str, Tensor], batch_index: int) -> dict[str, dict[str, Any]]:
@@ -159,7 +159,7 @@ class SuperResolution(BaseTask):
             pictures[f"{name}, true flow"] = self(spikes, batch["flow"])
         scores = {method: score(rgb, truth) for method, rgb in pictures.items()}
         for measure, values in scores[own].items():
-            self.log_mean(f"test/{measure}", values)
+            self.log(f"test/{measure}", values.mean())
         return {"pictures": pictures, "scores": scores}
 
     def _film(self, clips: Tensor, every: int) -> Tensor:

@@ -69,11 +69,7 @@ examples:
 
 
 def trade(args: Sequence[str]) -> None:
-    """Run the verb with what was typed after it.
-
-    Raises:
-        InputError: what was asked for cannot be; or nothing of it can run.
-    """
+    """Run the verb with what was typed after it."""
     asked, shared = parser().parse_known_args(args)
     given = [read_setting(text) for text in asked.setting]
     try:

@@ -63,13 +63,9 @@ class FilmRunner:
 
 
 class FilmScene(NamedTuple):
-    """A film with its truth.
+    """A film with its truth: spikes (1, T, H, W), pictures that count, (3, 3, s H, s W), and the flow in their pixels.
 
-    Args:
-        spikes: (1, T, H, W).
-        rgb: of the pictures that count, (3, 3, s H, s W).
-        flow: from the one in the middle to the one before it and to the one behind it, (2, 2, s H, s W), in pixels of
-            the pictures.
+    That is from the picture in the middle to the one before it and to the one behind it, (2, 2, s H, s W).
     """
 
     spikes: Tensor
@@ -83,19 +79,13 @@ def film_length(frames: int, every: int) -> int:
 
 
 def film_scenes(data: LightningDataModule, frames: int, every: int) -> Iterator[FilmScene]:
-    """Yield the test scenes of data as films, moving as fast as the clips do.
-
-    Raises:
-        UsageError: data of another kind, or without truth at so many clocks.
-        ValueError: a source film that is too short.
-    """
+    """Yield the test scenes of data as films, moving as fast as the clips do."""
     length = film_length(frames, every)
     if isinstance(data, StillScenes):
         stills = copy.copy(data.val_set)
         stills.key_frames, stills.every, stills.clocks = PICTURES, every, length
         for n in range(len(stills)):
-            scene = stills.scene(n)
-            yield _film_scene(stills.spikes(n, scene), scene, every, stills.scale)
+            yield _film_scene(stills.whole(n)["spikes"], stills.scene(n), every, stills.scale)
     elif isinstance(data, FilmScenes) and all(source.truth is None for source in data.found.test):
         recipe = replace(data.test_set.recipe, frames=length, key_frames=1, flow_times=())
         if every % recipe.clocks:
@@ -120,12 +110,7 @@ def _film_scene(spikes: Tensor, view: Scene | SequenceClip, every: int, scale: i
 def measure_films(
     rows: Sequence[Measurement], data: LightningDataModule, frames: int, every: int, rounds: int
 ) -> Timed:
-    """Measure settings as :func:`lightning_modules.trade.measure.measure` does, on films.
-
-    Raises:
-        UsageError: data that make no such films.
-        ValueError: likewise.
-    """
+    """Measure settings as :func:`lightning_modules.trade.measure.measure` does, on films."""
     for row in running(rows):
         row.runner = FilmRunner(row.runner, every)
     kept: list[Tensor] = []

@@ -22,12 +22,9 @@ from spikekit.timing import Timer, peak_memory, timer_of
 
 @dataclass
 class Measurement:
-    """A setting, and its measurements so far.
+    """A setting, and its measurements so far; why it cannot run, if it cannot.
 
     Args:
-        setting: which one.
-        runner: it, ready to run; None if it cannot be made.
-        reason: why it cannot run; None if it can.
         psnr: dB, of every clip.
         ssim: of every clip.
         lpips: of every clip; empty where it is not to be had.
@@ -58,14 +55,9 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Timed:
-    """How time was taken.
+    """How time was taken: clips that took turns, their size in sensor pixels, rounds, and what was counted.
 
-    Args:
-        clips: how many clips took turns.
-        size: theirs, (H, W) in sensor pixels.
-        rounds: how often every setting was timed.
-        unit: what was counted.
-        every: clocks between two pictures of the films that they are; None where they are single clips.
+    ``every`` is how many clocks are between two pictures of the films that they are; None where they are single clips.
     """
 
     clips: int

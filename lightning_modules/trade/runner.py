@@ -30,7 +30,7 @@ class CannotRunError(RuntimeError):
 
 class _Test(Rehearsal):
     def instantiate_trainer(self, **kwargs: Any) -> Any:
-        trainer = super().instantiate_trainer(devices=1, **kwargs)
+        trainer = super().instantiate_trainer(**kwargs)
         asked = self.config[self.verb].trainer.precision
         if asked == "16-mixed" and trainer.precision != asked:  # Lightning only warns
             raise MisconfigurationException(f"{asked}: not on this device, Lightning has {trainer.precision} instead")
@@ -38,17 +38,11 @@ class _Test(Rehearsal):
 
 
 class Runner:
-    """A network, its precision and its device.
+    """A network, its precision and its device, and ``data`` and ``config``, those of a test.
 
     Args:
         args: of ``lightning test``, in the order in which they are typed; and how pictures are made, as of ``predict``:
             ``--tile``, ``--tolerance``, ``--self_ensemble``, ``--interpolated`` and ``--future``.
-
-    Attributes:
-        network: with its weights.
-        device: where it runs.
-        data: the scenes of the configuration, set up for a test.
-        config: the whole configuration, as plain values.
 
     Raises:
         InputError: arguments that make no sense.
@@ -116,12 +110,7 @@ def _how() -> VerbParser:
 
 
 def make_runner(shared: Sequence[str], args: Sequence[str], base: Runner) -> Runner:
-    """Build a setting, and check that it runs on the scenes of all the others, which ``base`` has.
-
-    Raises:
-        InputError: arguments that make no sense, or that ask for other scenes.
-        CannotRunError: a file is missing, or the machine lacks what is asked for.
-    """
+    """Build a setting, and check that it runs on the scenes of all the others, which ``base`` has."""
     runner = Runner([*shared, *args])
     if runner.scenes != base.scenes:
         key = next(key for key in base.scenes if runner.scenes.get(key) != base.scenes[key])

@@ -21,12 +21,7 @@ _COLUMNS |= {"--model.weights": "weights", "--model.network": "network", "--trai
 
 
 class Setting(NamedTuple):
-    """Arguments to be measured, and what they are called.
-
-    Args:
-        name: what it is called.
-        args: arguments of ``lightning test`` that make it, behind those that all settings share.
-    """
+    """What a setting is called, and the arguments of ``lightning test`` that make it, behind those that all share."""
 
     name: str
     args: list[str]

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 import lightning_modules
-from lightning_modules.motion import Spike2Flow
 from lightning_modules.networks import CSCSR, RecurrentCSCSR
 from lightning_modules.registry import find_model, list_models
 
@@ -37,11 +36,6 @@ def test_a_row_says_what_the_network_is(model):
     assert model.parameters == sum(value.numel() for value in network.parameters())
     assert model.macs > 0
     assert model.pattern == "grey" or min(model.kodak, model.vid4) > 0
-
-
-def test_the_estimator_of_motion_has_a_row():
-    model = find_model("spike2flow")
-    assert model.parameters == sum(value.numel() for value in Spike2Flow(weights=model.name).parameters())
 
 
 @pytest.mark.parametrize("film", [model for model in NETWORKS if model.film], ids=lambda model: model.name)

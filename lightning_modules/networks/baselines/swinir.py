@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lightning_modules.motion import MotionEstimator
@@ -169,20 +170,16 @@ class AttentionLayer(nn.Module):
         # (3, B, windows, heads, pixels of a window, channels of a head)
         parts = self.qkv(_windows(tokens)).unflatten(-1, (3, self.heads, -1)).movedim(3, 0).transpose(-2, -3)
         query, key, value = parts.unbind(0)
-        scores = (query * query.shape[-1] ** -0.5) @ key.mT + self.bias[self.offset].movedim(-1, 0)
-        if self.shift:
-            scores = scores + hidden.to(scores.dtype)
-        seen = (scores.softmax(-1) @ value).transpose(-2, -3).flatten(-2)
+        bias = self.bias[self.offset].movedim(-1, 0)
+        bias = (bias + hidden if self.shift else bias[None]).to(query.dtype)
+        seen = F.scaled_dot_product_attention(query, key, value, bias).transpose(-2, -3).flatten(-2)
         seen = self.project(seen).unflatten(1, grid).unflatten(3, (_SIDE, _SIDE))
         seen = seen.transpose(2, 3).reshape(batch, height, width, channels)
         return seen.roll((self.shift, self.shift), (1, 2))
 
     def _drop(self, change: Tensor) -> Tensor:
         """Apply stochastic depth: skip the layer for random clips, and scale it up for the others."""
-        if not (self.training and self.drop):
-            return change
-        kept = torch.rand(len(change), 1, 1, 1, device=change.device) >= self.drop
-        return change * kept / (1 - self.drop)
+        return change * F.dropout(change.new_ones(len(change), 1, 1, 1), self.drop, self.training)
 
 
 def _windows(planes: Tensor) -> Tensor:
@@ -200,11 +197,7 @@ def _offsets() -> Tensor:
 
 
 def _hidden(height: int, width: int, device: torch.device) -> Tensor:
-    """Return the mask to add to the scores of shifted windows, -100 between pixels of different regions.
-
-    Returns:
-        (windows, 1, pixels of a window, pixels of a window).
-    """
+    """Return the mask of shifted windows, (windows, 1, pixels, pixels), -100 between pixels of different regions."""
     parts = []
     for length in (height, width):
         at = torch.arange(length, device=device)

@@ -59,61 +59,44 @@ def test_vid4_is_for_tests(tmp_path, folder, write_film):
         scenes(tmp_path, "fit")
 
 
-def test_vimeo_septuplets(tmp_path, septuplets):
-    root = tmp_path / "up" / "vimeo_septuplet"
+@pytest.mark.parametrize("small", [None, "BIx4", "../vimeo_septuplet_matlabLRx4/sequences"])
+def test_vimeo_septuplets(tmp_path, small, septuplets):
+    root = tmp_path / "vimeo_septuplet"
     septuplets(root, ["00001/0001", "00001/0002", "00002/0001"])
     (root / "sep_trainlist.txt").write_text("00001/0001\n00002/0001\n")
     (root / "sep_testlist.txt").write_text("00001/0002\n\n")
-    for typed in (root, root.parent):
+    if small:
+        septuplets(root, ["00001/0001", "00001/0002", "00002/0001"], small, (16, 24))
+    for typed in (root, tmp_path):
         films = found(typed)
         assert (films.name, films.clips, films.scale) == ("Vimeo-90K", 1, 4)
         assert names(films.train) == ["00001/0001", "00002/0001"]
         assert names(films.val) == names(films.test) == ["00001/0002"]
-        assert (films.test[0].folder, films.test[0].shrink) == (root / "sequences/00001/0002", 4)
+        (film,) = films.test
+        assert film.folder.samefile(root / (small or "sequences") / "00001/0002")
+        assert (film.truth, film.shrink) == (root / "sequences/00001/0002", 1 if small else 4)
 
 
-@pytest.mark.parametrize("small", ["BIx4", "../vimeo_septuplet_matlabLRx4/sequences"])
-def test_vimeo_with_small_frames(tmp_path, small, septuplets):
-    root = tmp_path / "vimeo_septuplet"
-    septuplets(root, ["00001/0001"])
-    septuplets(root, ["00001/0001"], small, (16, 24))
-    for split in ("train", "test"):
-        (root / f"sep_{split}list.txt").write_text("00001/0001\n")
-    (film,) = found(root).train
-    assert film.folder.samefile(root / small / "00001/0001")
-    assert (film.truth, film.shrink) == (root / "sequences/00001/0001", 1)
-
-
-def test_vimeo_test_set(tmp_path, septuplets):
-    septuplets(tmp_path, ["00001/0266"], "low_resolution", (16, 24))
-    septuplets(tmp_path, ["00001/0266"], "target", frames=[4])
+@pytest.mark.parametrize("made_small", [False, True])
+def test_the_camera_sees_the_small_frames_of_vimeo(tmp_path, made_small, septuplets):
+    large = tmp_path / ("sequences" if made_small else "target") / "00001/0266/im4.png"
+    septuplets(tmp_path, ["00001/0266"], large.parts[-4], frames=range(1, 8) if made_small else [4])
+    if not made_small:
+        septuplets(tmp_path, ["00001/0266"], "low_resolution", (16, 24))
     (tmp_path / "sep_testlist.txt").write_text("00001/0266")
-    films = found(tmp_path)
-    assert (names(films.train), names(films.test)) == ([], ["00001/0266"])
     data = scenes(tmp_path, "test", scale=4)
-    assert data.test_names == ["00001/0266/im4"]
-    clip = data.test_set[0]
+    assert (names(data.found.train), data.test_names) == ([], ["00001/0266/im4"])
+    clip, truth = data.test_set[0], read_picture(large)
     assert clip["spikes"].shape == (41, 16, 24)
     assert clip["flow"].shape == (2, 2, 16, 24)
-    assert torch.equal(clip["rgb"], read_picture(tmp_path / "target/00001/0266/im4.png"))
-    # the camera sees the small frames, pixel by pixel
-    seen = mosaic(read_picture(tmp_path / "low_resolution/00001/0266/im4.png"))
-    assert (clip["spikes"].float().mean(0) / 0.4 - seen).abs().median() < 1 / 41 / 0.4
-
-
-def test_vimeo_made_small(tmp_path, septuplets):
-    septuplets(tmp_path, ["00001/0001"])
-    (tmp_path / "sep_testlist.txt").write_text("00001/0001")
-    clip = scenes(tmp_path, "test", scale=4).test_set[0]
-    truth = read_picture(tmp_path / "sequences/00001/0001/im4.png")
     assert torch.equal(clip["rgb"], truth)
-    assert clip["spikes"].shape == (41, 16, 24)
     small = torch.nn.functional.interpolate(truth[None], scale_factor=0.25, mode="bicubic", antialias=True)[0]
+    small = small if made_small else read_picture(tmp_path / "low_resolution/00001/0266/im4.png")
     assert (clip["spikes"].float().mean(0) / 0.4 - mosaic(small)).abs().median() < 1 / 41 / 0.4
     with pytest.raises(ValueError, match="scale: expected 4 with Vimeo-90K"):
         scenes(tmp_path, "test", scale=2)
-    (tmp_path / "sep_testlist.txt").write_text("00001/0001\n00001/0009\n00003/0001")
-    with pytest.raises(FileNotFoundError, match=r"2 of 3 sequences are not in .*sequences, the first is 00001/0009"):
+    (tmp_path / "sep_testlist.txt").write_text("00001/0266\n00001/0009\n00003/0001")
+    with pytest.raises(FileNotFoundError, match=r"2 of 3 sequences are not in .*, the first is 00001/0009"):
         found(tmp_path)
 
 

@@ -8,9 +8,8 @@ import time
 from types import SimpleNamespace
 
 import pytest
-import torch
 
-from lightning_modules.data.loading import FreshClips, OwnPart, load_clips
+from lightning_modules.data.loading import FreshClips
 
 # A clip is larger than a pipe: its worker waits for somebody to take it.
 LOAD = """
@@ -69,20 +68,6 @@ subprocess.run([sys.executable, "-c", sys.argv[1]], env=dict(os.environ, LOCAL_R
         assert process.stdout.read() == ""  # the pipe ends with the last process that holds it
 
 
-def test_workers_are_no_more_than_there_are_batches():
-    class Clips(torch.utils.data.Dataset):
-        def __len__(self):
-            return 5
-
-        def __getitem__(self, index):
-            return {"index": torch.tensor(index)}
-
-    assert load_clips(Clips(), 2, 8).num_workers == 3
-    loader = load_clips(Clips(), 2, 0)
-    assert loader.num_workers == 0
-    assert [batch["index"].tolist() for batch in loader] == [[0, 1], [2, 3], [4]]
-
-
 def of_process(rank, processes, step=0, accumulated=1):
     trainer = SimpleNamespace(
         global_rank=rank, world_size=processes, global_step=step, accumulate_grad_batches=accumulated
@@ -101,10 +86,3 @@ def test_processes_see_every_training_clip_once():
     assert [*FreshClips(SimpleNamespace(trainer=None), 4, 13)] == alone
     with pytest.raises(ValueError, match="batch_size: 2 x 3 processes need 6 clips, got 5"):
         FreshClips(of_process(0, 3), 2, 5)
-
-
-def test_processes_share_the_clips_of_a_test():
-    assert [[*OwnPart(of_process(rank, 2), 5)] for rank in range(2)] == [[0, 1], [2, 3, 4]]
-    assert [*OwnPart(SimpleNamespace(trainer=None), 3)] == [0, 1, 2]
-    with pytest.raises(ValueError, match="devices: expected at most 1, a clip for every process, got 2"):
-        OwnPart(of_process(1, 2), 1)

@@ -1,7 +1,6 @@
 """Films: a clip is the same by content and seed, in whatever process, from the cache or fresh."""
 
 import functools
-import importlib
 import shutil
 
 import numpy as np
@@ -222,21 +221,6 @@ def test_another_setting_is_another_clip(film):
     keys = {ClipRecipe(**change).key(one, 2) for change in changes}
     assert len(keys) == len(changes)
     assert ClipRecipe().key(one, 2) in keys
-
-
-def test_an_interpolation_of_ones_own_that_changes_makes_another_clip(film, tmp_path, monkeypatch):
-    """That of the package has the version of the simulator instead."""
-    (one,) = find_sequences(film, lambda found: (found, found)).test
-    monkeypatch.syspath_prepend(tmp_path)
-    written = tmp_path / "mine_own.py"
-    written.write_text("class Mine:\n    pass\n\n\ndef halfway(first, second):\n    pass\n")
-    mine = importlib.import_module("mine_own")
-    kinds = [mine.Mine(), mine.halfway, FlowInterpolation()]
-    before = [ClipRecipe(interpolation=kind).key(one, 2) for kind in kinds]
-    with open(written, "a") as file:
-        file.write("# changed\n")
-    after = [ClipRecipe(interpolation=kind).key(one, 2) for kind in kinds]
-    assert [old == new for old, new in zip(before, after, strict=True)] == [False, False, True]
 
 
 def test_other_frames_are_another_clip(film, tmp_path, simulated, write_film):

@@ -144,13 +144,6 @@ def test_a_picture_waits_for_its_group(network):
             break
 
 
-def test_gradients_reach_the_first_key_frame_and_all_weights(network, clips):
-    spikes, flow = clips
-    sum(rgb.sum() for rgb in network.film(spikes[None].float(), flow[None], future=4)).backward()
-    assert all(weight.grad is not None and weight.grad.isfinite().all() for weight in network.parameters())
-    assert network.fusion.neighbor.weight.grad.abs().max() > 0
-
-
 def test_errors(network, clips):
     with pytest.raises(ValueError, match=r"resolution: expected correlated and sensor, .* got correlated and output"):
         RecurrentCSCSR(resolution="output")

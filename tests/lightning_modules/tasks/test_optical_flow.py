@@ -152,19 +152,3 @@ def test_test_compares_estimators_on_the_same_clips(trained, overlay, configs, c
         *each, mean = [float(row["epe"]) for row in rows if row["method"] == name]
         assert mean == pytest.approx(sum(each) / 3, abs=1e-4)
     assert read_picture(trained / "test.png").shape == (3, 3 * 12 + 2 * 4, 4 * 12 + 3 * 4)
-
-
-@pytest.mark.slow
-def test_its_checkpoint_goes_into_cscsr_by_an_overlay(trained, configs, tmp_path):
-    network = {**CSCSR_TINY, "motion": {"init_args": {**FLOW_TINY, "weights": str(trained / "checkpoints/best.ckpt")}}}
-    overlay = yaml.safe_load(TINY)
-    overlay["model"] = {"network": {"init_args": network}, "flow": "estimated"}
-    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(overlay))
-    args = ["fit", "-c", configs / "x4.yaml", "-c", configs / "motion/spike2flow.yaml", "-c", tmp_path / "tiny.yaml"]
-    main([*map(str, args), "-o", str(tmp_path / "run")])
-    motion, weights = (
-        torch.load(path, weights_only=True)["state_dict"]
-        for path in (trained / "checkpoints/best.ckpt", tmp_path / "run/checkpoints/last.ckpt")
-    )
-    name = "network.heads.0.0.weight"
-    assert weights[f"network.motion.{name}"].equal(motion[f"network.{name}"])  # frozen

@@ -1,8 +1,7 @@
-"""``lightning fit`` by several processes, and what they put together."""
+"""``lightning fit`` by several processes."""
 
 import subprocess
 import sys
-from collections import defaultdict
 from pathlib import Path
 
 import pytest
@@ -10,12 +9,11 @@ import torch
 
 from lightning_modules.__main__ import main
 from lightning_modules.storage.checkpoint import read_checkpoint
-from lightning_modules.tasks.callbacks import TestReport
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 TINY = """
 model: {network: {init_args: {width: 4, representation_width: 4, features: 1, stages: 1, blocks: 1, end_blocks: 1}}}
-data: {init_args: {patch: 12, val_patch: 16, train_clips: 9, val_clips: 3, workers: 0}}
+data: {init_args: {patch: 12, val_patch: 16, train_clips: 9, val_clips: 2, workers: 0}}
 trainer: {accelerator: cpu, enable_progress_bar: false}
 """
 
@@ -41,18 +39,3 @@ def test_two_processes_train_as_one_with_twice_the_batch(tmp_path, monkeypatch):
     for name, value in ours.items():
         torch.testing.assert_close(value, theirs[name], rtol=0, atol=1e-5)
     assert (tmp_path / "two" / "config.yaml").is_file()
-
-
-def test_a_test_is_of_the_clips_of_all_processes(tmp_path, monkeypatch):
-    parts = [({"CSCSR": [(1.0,), (2.0,)]}, [["a"], ["b"]]), ({"CSCSR": [(3.0,)]}, [["c"]])]
-
-    def all_gather_object(found, own):
-        assert own == parts[0]
-        found[:] = parts
-
-    monkeypatch.setattr(torch.distributed, "all_gather_object", all_gather_object)
-    report = TestReport(tmp_path, clips=3)
-    report._scores, report._rows = defaultdict(list, parts[0][0]), parts[0][1]
-    report._gather(2)
-    assert report._scores == {"CSCSR": [(1.0,), (2.0,), (3.0,)]}
-    assert report._rows == [["a"], ["b"], ["c"]]

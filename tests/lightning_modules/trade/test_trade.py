@@ -3,7 +3,6 @@
 import csv
 import random
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -26,7 +25,7 @@ from lightning_modules.trade.films import film_scenes
 from lightning_modules.trade.measure import Measurement, Timed, time_in_turns
 from lightning_modules.trade.runner import CannotRunError, Runner, make_runner
 from lightning_modules.trade.settings import Setting, read_setting, usual_settings
-from lightning_modules.trade.table import figures, front, markdown, write_csv
+from lightning_modules.trade.table import figures, front, write_csv
 from spikekit import flow_warp, psnr
 
 CONFIGS = Path(__file__).parents[3] / "configs"
@@ -369,13 +368,3 @@ def test_the_front_is_that_of_brute_force():
         beaten = [any(c <= ms and v >= db and (c, v) != (ms, db) for c, v in points) for ms, db in points]
         assert sorted(found) == [n for n in range(len(points)) if not beaten[n]]
         assert [points[n][0] for n in found] == sorted(points[n][0] for n in found)
-
-
-def test_the_front_leaves_out_what_cannot_run_and_differences_that_nobody_sees():
-    rows, _ = some_rows(4, [(2.0,), (3.0,), (1.0,), (4.0,)])
-    rows[0] = replace(rows[0], reason="no")
-    rows[1].psnr, rows[3].psnr = [22.0], [22.001]
-    assert front(rows) == [2, 1]
-    text = markdown(rows, "command", Timed(1, (8, 8), 1, "wall time"))
-    marked = [line.rstrip("| ").endswith("x") for line in text.splitlines() if line.startswith("|")][2:]
-    assert marked == [False, True, True, False]

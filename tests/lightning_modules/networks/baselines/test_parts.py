@@ -7,7 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from lightning_modules.networks import BasicVSR, RealRawVSR, SpikeSRNetLike, SwinIR, VidarSR
+from lightning_modules.networks import BasicVSR, RealRawVSR, SpikeSRNetLike, VidarSR
 from lightning_modules.networks.baselines.deformable import DeformableConv2d
 from lightning_modules.networks.baselines.per_channel import per_channel
 from lightning_modules.networks.baselines.pictures import mirror_to_multiple
@@ -214,14 +214,6 @@ def test_attention_against_loops(shift):
     layer.qkv.weight.normal_()
     tokens = torch.randn(1, 8, 8, 4, dtype=torch.float64)
     torch.testing.assert_close(layer._attend(tokens, _hidden(8, 8, tokens.device))[0], attention(layer, tokens[0]))
-
-
-def test_depth_is_stochastic_in_training_alone():
-    network, inputs = SwinIR(2, width=12, groups=2, layers=2, heads=2, drop_path=0.5), clip(8)
-    with torch.no_grad():
-        assert not network(*inputs).equal(network(*inputs))
-        network.eval()
-        assert network(*inputs).equal(network(*inputs))
 
 
 # TSCNN
