@@ -88,7 +88,7 @@ def _student(weights: str) -> Network:
 def clips_and_teacher(
     recording: Recording, student: Network, teacher: str | None, noisy: bool = True
 ) -> tuple[RecordingClips, str, Network]:
-    """Return clips of the recording, the name of the teacher, and the teacher: the slowest suitable one if not given."""
+    """Return clips of the recording, the name of the teacher, and the teacher, by default the slowest that fits."""
     name = teacher or _slowest(recording, student, noisy)
     network = Network.from_pretrained(name)
     for setting in ("scale", "pattern"):
