@@ -1,4 +1,4 @@
-"""The colour filter array: which colour every sensor pixel sees, and the way from pictures to mosaics and back."""
+"""The colour filter array: Bayer phases, masks, and conversion between pictures, mosaics and sub-streams."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from spikekit.options_module import OptionsModule
 #: Bayer phases by name, read along the rows of the top-left 2 x 2 cell.
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 
-#: The pattern of a sensor without colour filters, whose pixels all see the same.
+#: The pattern of a sensor without colour filters.
 GREY = "grey"
 
 _PATTERN_OF_CFA = {CFA.BG: "RGGB", CFA.RG: "BGGR", CFA.GB: "GRBG", CFA.GR: "GBRG"}
@@ -31,7 +31,7 @@ def bayer_pattern(pattern: str | CFA) -> str:
         One of :data:`PATTERNS`.
 
     Raises:
-        ValueError: neither of these.
+        ValueError: the pattern is unknown.
 
     Example:
         >>> from kornia.color import CFA
@@ -57,12 +57,12 @@ def cfa_pattern(pattern: str | CFA) -> str:
 
 
 def count_colors(pattern: str | CFA) -> int:
-    """Return how many colours a sensor sees: 3 through a Bayer filter, 1 where it is grey."""
+    """Return the number of colours of a sensor: 3 with a Bayer filter, 1 if it is grey."""
     return 1 if cfa_pattern(pattern) == GREY else 3
 
 
 def cfa_sites(pattern: str | CFA) -> tuple[tuple[tuple[int, int, int], ...], int]:
-    """Return the sites of one cell of a colour filter array, see :func:`bayer_sites`, and its side: 2, 1 of grey."""
+    """Return the sites of a cell, see :func:`bayer_sites`, and its side: 2, or 1 if the sensor is grey."""
     return (((0, 0, 0),), 1) if cfa_pattern(pattern) == GREY else (bayer_sites(pattern), 2)
 
 
@@ -90,9 +90,9 @@ def bayer_sites(pattern: str | CFA) -> tuple[tuple[int, int, int], ...]:
 
 
 class PatternModule(OptionsModule):
-    """Base of the modules whose only option is the pattern, see :func:`bayer_pattern`."""
+    """Base class of modules with a pattern, see :func:`bayer_pattern`."""
 
-    bayer_only: ClassVar[bool] = False  #: whether a grey sensor makes no sense
+    bayer_only: ClassVar[bool] = False  #: whether a grey sensor is rejected
 
     def __init__(self, pattern: str | CFA = "RGGB") -> None:
         super().__init__()
@@ -108,31 +108,30 @@ def bayer_mask(
     device: torch.device | str | None = None,
     dtype: torch.dtype | None = None,
 ) -> Tensor:
-    r"""Which pixels of a sensor are known, colour by colour, optionally after upsampling.
+    r"""Mask of the known pixels of a sensor for each colour, optionally after upsampling.
 
     .. math:: M_C(x, y) = [\text{the sensor's pixel } (\lfloor x / s \rfloor, \lfloor y / s \rfloor)
         \text{ sees the colour } C]
 
     Convention:
         Planes are R, G, B. One known sensor pixel becomes a block of ``scale`` x ``scale`` known pixels. The three
-        planes add up to one everywhere. The pattern begins at the top left, pixel (0, 0), whatever the size; with an
-        odd size the last cell is cut. Every pixel of a grey sensor is known, in the one plane that there is. A
-        constant: there is no gradient.
+        planes add up to one everywhere. The pattern starts at the top left, pixel (0, 0); with an odd size the last
+        cell is cut. Every pixel of a grey sensor is known, in a single plane. A constant, without gradient.
 
     Args:
         height: rows of the sensor.
         width: columns of the sensor.
         pattern: Bayer phase or ``"grey"``, see :func:`bayer_pattern`.
         scale: super-resolution factor.
-        device: where to put the mask.
-        dtype: its type; torch's default type when not given.
+        device: device of the mask.
+        dtype: dtype of the mask; default: torch's default.
 
     Returns:
-        Zeros and ones of shape :math:`(3, scale \cdot height, scale \cdot width)`, or :math:`(1, ...)` where the
-        sensor is grey.
+        Zeros and ones of shape :math:`(3, scale \cdot height, scale \cdot width)`, or :math:`(1, ...)` if the sensor
+        is grey.
 
     Raises:
-        TypeError: ``dtype`` is not a type of torch.
+        TypeError: ``dtype`` is not a torch dtype.
         ValueError: a size or the scale is below 1, or the pattern is unknown.
 
     Example:
@@ -164,7 +163,7 @@ class BayerMask(PatternModule):
 
     Shape:
         - Input: any tensor :math:`(*, H, W)`; only its size, device and dtype are read.
-        - Output: :math:`(3, scale \cdot H, scale \cdot W)`, or :math:`(1, ...)` where the sensor is grey.
+        - Output: :math:`(3, scale \cdot H, scale \cdot W)`, or :math:`(1, ...)` if the sensor is grey.
 
     Example:
         >>> BayerMask("GRBG", scale=2)(torch.zeros(1, 41, 4, 6)).shape
@@ -182,15 +181,14 @@ class BayerMask(PatternModule):
 
 
 def mosaic(rgb: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
-    r"""Keep, at every pixel, what a sensor sees there: one colour through a Bayer filter, else the luminance.
+    r"""Sample a picture by a colour filter array: one colour per pixel, or the luminance for a grey sensor.
 
     .. math:: R(x, y) = I_{C(x, y)}(x, y)
 
     Convention:
         C(x, y) is the colour of :func:`bayer_mask`. Values are copied, in any real dtype, as by
-        :func:`kornia.color.rgb_to_raw`, whose channel axis is dropped. The two colours that are not seen do not matter,
-        NaN included, and their gradient is 0; that of the seen one is passed on. A grey sensor sees what
-        :func:`bin_to_sensor` says.
+        :func:`kornia.color.rgb_to_raw`, but without the channel axis. The other two colours of a pixel are ignored,
+        even NaN, and get gradient 0. For a grey sensor see :func:`bin_to_sensor`.
 
     Args:
         rgb: colour image :math:`(*, 3, H, W)`; odd sizes are legal.
@@ -201,7 +199,7 @@ def mosaic(rgb: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
 
     Raises:
         TypeError: ``rgb`` is not a tensor of real numbers.
-        ValueError: ``rgb`` has no three channels, or the pattern is unknown.
+        ValueError: ``rgb`` does not have three channels, or the pattern is unknown.
 
     Example:
         >>> mosaic(torch.tensor([1.0, 2.0, 3.0]).reshape(3, 1, 1).expand(3, 2, 2)).tolist()
@@ -230,32 +228,32 @@ class Mosaic(PatternModule):
 
 
 def bin_to_sensor(rgb: Tensor, pattern: str | CFA = "RGGB", *, scale: int) -> Tensor:
-    r"""Average a high-resolution picture to what a sensor with ``scale`` times coarser pixels sees.
+    r"""Average a high-resolution picture to the mosaic of a sensor with ``scale`` times coarser pixels.
 
     .. math:: R(x, y) = \frac{1}{s^2} \sum_{0 \le a, b < s} I_{C(x, y)}(s x + a, s y + b)
 
     Convention:
-        The sensor pixel (x, y) covers the block that starts at (s x, s y), and averages the block's pixels of its own
-        colour C(x, y) only. The sum runs in float32 or wider. The gradient of a picture pixel is :math:`1 / s^2` of
-        its sensor pixel's in that colour, and 0 in the other two.
+        The sensor pixel (x, y) covers the block that starts at (s x, s y), and averages the values of its own colour
+        C(x, y). The sum is computed in float32 or wider. The gradient of a picture pixel is :math:`1 / s^2` of that of
+        its sensor pixel in this colour, and 0 in the other two.
 
-        A grey sensor sees the luminance of Rec. 601, :math:`0.299 R + 0.587 G + 0.114 B` of the values as they are
-        encoded, which is how the grey recordings that the field simulates were made; or a picture that has but one
-        channel, as it is.
+        A grey sensor sees the Rec. 601 luminance of the encoded values, :math:`0.299 R + 0.587 G + 0.114 B`, as in the
+        grey simulations of the literature. A single channel is taken as it is.
 
     Args:
-        rgb: colour image :math:`(*, 3, H, W)`, H and W multiples of ``scale``; :math:`(*, 1, H, W)` is taken by a
-            grey sensor, too.
+        rgb: colour image :math:`(*, 3, H, W)`, H and W multiples of ``scale``; for a grey sensor also
+            :math:`(*, 1, H, W)`.
         pattern: Bayer phase of the sensor or ``"grey"``, see :func:`bayer_pattern`.
-        scale: how many picture pixels a sensor pixel is wide.
+        scale: width of a sensor pixel in picture pixels.
 
     Returns:
-        The mosaic :math:`(*, H / s, W / s)`, in the dtype of ``rgb`` (integer pictures need ``scale=1``, and a sensor
-        that sees colours, or one channel).
+        The mosaic :math:`(*, H / s, W / s)`, in the dtype of ``rgb``. Integer pictures are accepted if nothing is
+        averaged: ``scale=1``, and a Bayer sensor or a single channel.
 
     Raises:
-        TypeError: ``rgb`` is not a tensor of real numbers, or not a floating-point one where it is to be averaged.
-        ValueError: no three channels, a size that ``scale`` does not divide, a scale below 1, an unknown pattern.
+        TypeError: ``rgb`` is not a tensor of real numbers, or not floating although values are averaged.
+        ValueError: ``rgb`` has another number of channels, ``scale`` is below 1 or does not divide the size, or the
+            pattern is unknown.
 
     Example:
         >>> bin_to_sensor(torch.arange(48.0).reshape(3, 4, 4), scale=2).tolist()
@@ -288,7 +286,7 @@ def bin_to_sensor(rgb: Tensor, pattern: str | CFA = "RGGB", *, scale: int) -> Te
 
 
 def _sum(parts: list[Tensor], dtype: torch.dtype) -> Tensor:
-    # stacked: torch.compile would guard how the strides of two views compare
+    # stacked, as torch.compile would add guards on the strides of two views
     return torch.stack(parts).sum(dim=0, dtype=dtype) if len(parts) > 1 else parts[0]
 
 
@@ -313,25 +311,25 @@ class BinToSensor(PatternModule):
 
 
 def split_colors(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
-    r"""Split a mosaic, or a stream of mosaics, into full-size ones that hold one colour each and 0 elsewhere.
+    r"""Split a mosaic, or a stream of mosaics, into full-size planes with one colour each and 0 elsewhere.
 
     .. math:: S^C = M_C \, S, \quad C \in \{R, G, B\}
 
     Convention:
         M is the mask of :func:`bayer_mask`. The colour is the **first** axis of the result, so that
-        ``red, green, blue = split_colors(spikes)`` leaves time at -3. Their sum is the input. The gradient of a pixel
-        is that of its own colour's plane. A grey sensor has one colour.
+        ``red, green, blue = split_colors(spikes)`` keeps time at -3. The planes add up to the input. The gradient of a
+        pixel is that of its own colour's plane. A grey sensor has one colour.
 
     Args:
         raw: mosaic or spike stream :math:`(*, H, W)`, any dtype.
         pattern: Bayer phase or ``"grey"``, see :func:`bayer_pattern`.
 
     Returns:
-        :math:`(3, *, H, W)`, or :math:`(1, *, H, W)` where the sensor is grey, in the dtype of ``raw``.
+        :math:`(3, *, H, W)`, or :math:`(1, *, H, W)` if the sensor is grey, in the dtype of ``raw``.
 
     Raises:
         TypeError: ``raw`` is not a tensor of real numbers.
-        ValueError: fewer than two dimensions, or an unknown pattern.
+        ValueError: ``raw`` has fewer than two dimensions, or the pattern is unknown.
 
     Example:
         >>> red, green, blue = split_colors(torch.tensor([[1, 2], [3, 4]]))
@@ -372,10 +370,9 @@ def split_bayer(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
     .. math:: S^k(x, y) = S(2 x + \text{column}_k, 2 y + \text{row}_k)
 
     Convention:
-        The sub-stream is the **first** axis of the result, so that ``r, g1, g2, b = split_bayer(spikes)`` leaves time
-        at -3. Rows and columns are those of :func:`bayer_sites`: G1 is the green of the row that the cell begins
-        with, G2 that of the row below. Every pixel goes to one place, and its gradient comes from there.
-        :func:`merge_bayer` is the inverse.
+        The sub-stream is the **first** axis of the result, so that ``r, g1, g2, b = split_bayer(spikes)`` keeps time at
+        -3. Rows and columns are those of :func:`bayer_sites`: G1 is the green pixel of the upper row of the cell, G2
+        that of the lower row. A permutation of pixels, and differentiable as such. :func:`merge_bayer` is the inverse.
 
     Args:
         raw: mosaic or spike stream :math:`(*, H, W)`, any dtype, H and W even.
@@ -386,7 +383,7 @@ def split_bayer(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
 
     Raises:
         TypeError: ``raw`` is not a tensor of real numbers.
-        ValueError: fewer than two dimensions, H or W is odd, or the pattern is unknown.
+        ValueError: ``raw`` has fewer than two dimensions, H or W is odd, or the pattern is unknown.
 
     Example:
         >>> r, g1, g2, b = split_bayer(torch.tensor([[1, 2], [3, 4]]), "GBRG")
@@ -421,13 +418,13 @@ class SplitBayer(PatternModule):
 
 
 def merge_bayer(planes: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
-    r"""Put the four sub-streams R, G1, G2, B back into one mosaic; the inverse of :func:`split_bayer`.
+    r"""Merge the four sub-streams R, G1, G2, B into one mosaic; the inverse of :func:`split_bayer`.
 
     .. math:: S(2 x + \text{column}_k, 2 y + \text{row}_k) = S^k(x, y)
 
     Convention:
-        The sub-stream is the **first** axis of the input, in the order and at the places of :func:`bayer_sites`.
-        Every pixel goes to one place, and its gradient comes from there.
+        The sub-stream is the **first** axis of the input, in the order and at the sites of :func:`bayer_sites`. A
+        permutation of pixels, and differentiable as such.
 
     Args:
         planes: :math:`(4, *, H, W)`, any dtype.
@@ -438,7 +435,8 @@ def merge_bayer(planes: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
 
     Raises:
         TypeError: ``planes`` is not a tensor of real numbers.
-        ValueError: fewer than three dimensions, a first axis that is not of length 4, or an unknown pattern.
+        ValueError: ``planes`` has fewer than three dimensions or a first axis whose length is not 4, or the pattern is
+            unknown.
 
     Example:
         >>> raw = torch.rand(5, 4, 6)

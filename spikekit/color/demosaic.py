@@ -1,4 +1,4 @@
-"""Demosaicing: from a mosaic to a colour picture of the same size."""
+"""Demosaicing by linear filters."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from spikekit.color.cfa import PatternModule, bayer_sites, count_colors
 
 
 def demosaic(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
-    r"""Fill in the two missing colours of every pixel with Malvar, He and Cutler's 5 x 5 linear filters.
+    r"""Interpolate the two missing colours of every pixel with the 5 x 5 linear filters of Malvar, He and Cutler.
 
-    Green at a red pixel, for one, is the mean of the green neighbours and half of what red differs from its own
-    neighbours by:
+    For example, green at a red pixel is the mean of its green neighbours, plus half the difference between the red
+    pixel and the mean of its red neighbours:
 
     .. math::
         \hat g(x, y) = \frac{1}{4} \sum_{|a| + |b| = 1} g(x + a, y + b)
         + \frac{1}{2} \Bigl(r(x, y) - \frac{1}{4} \sum_{|a| + |b| = 1} r(x + 2 a, y + 2 b)\Bigr)
 
-    Red and blue are found in the same way, with a gain of 5/8 at green pixels and of 3/4 at each other's.
+    Red and blue are interpolated in the same way, with a gain of 5/8 at green pixels and 3/4 at blue and red ones.
 
     Convention:
-        Known values are kept. Linear in the mosaic, and differentiable as such. Nothing is clamped: of a mosaic in
+        Known values are kept. Linear in the mosaic, and differentiable as such. Nothing is clamped: for a mosaic in
         [0, 1] the result is in [-3/4, 7/4]. Borders are mirrored without repeating the outermost pixel, which keeps
         the Bayer phase. Computed in float32 or wider.
 
     Args:
         raw: mosaic :math:`(*, H, W)`, floating, H and W at least 3; odd sizes are legal.
-        pattern: Bayer phase, see :func:`spikekit.bayer_pattern`; of ``"grey"`` there is nothing to fill in.
+        pattern: Bayer phase, see :func:`spikekit.bayer_pattern`; ``"grey"`` only adds an axis.
 
     Returns:
-        The picture :math:`(*, 3, H, W)`, or :math:`(*, 1, H, W)` of a grey sensor, in the dtype of ``raw``.
+        The picture :math:`(*, 3, H, W)`, or :math:`(*, 1, H, W)` for a grey sensor, in the dtype of ``raw``.
 
     Raises:
         TypeError: ``raw`` is not a floating-point tensor.
-        ValueError: fewer than two dimensions, smaller than 3 x 3, or an unknown pattern.
+        ValueError: ``raw`` has fewer than two dimensions or is smaller than 3 x 3, or the pattern is unknown.
 
     Example:
         >>> demosaic(torch.full((4, 6), 0.25)).unique().tolist()
@@ -68,10 +68,10 @@ def demosaic(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
 
 
 def _fill_in(phases: Tensor, row: int, column: int, *, green: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Estimate what is missing at one site of all cells, by the filters of Malvar, He and Cutler (2004), Fig. 2.
+    """Interpolate the colours at one site of all cells, by the filters of Malvar, He and Cutler (2004), Fig. 2.
 
-    Of the four phases (B, 4, h + 2, w + 2) of mosaics with two more pixels at each border: the site's own colour; at a
-    green one, the colours of its row and of its column, else green twice; and the colour of the diagonals.
+    Takes the four phases (B, 4, h + 2, w + 2) of mosaics padded by two pixels. Returns the site's own colour, the
+    colours of its row and its column (both green unless the site is green), and the colour of the diagonals.
     """
     height, width = phases.shape[-2] - 2, phases.shape[-1] - 2
 
@@ -93,7 +93,7 @@ def _fill_in(phases: Tensor, row: int, column: int, *, green: bool) -> tuple[Ten
 
 
 def wide_mosaics(raw: Tensor) -> Tensor:
-    """Check mosaics (*, H, W) and return them as (B, H, W), float32 or wider."""
+    """Return mosaics (*, H, W), checked, as (B, H, W) in float32 or wider."""
     check_planes("raw", raw, 2, "(*, H, W)", floating=True)
     if min(raw.shape[-2:]) < 3:
         raise ValueError(f"raw: expected (*, H, W) of at least 3 x 3, got {tuple(raw.shape)}")

@@ -1,4 +1,4 @@
-"""Demosaicing by residual interpolation: another colour predicts, and only the residual is interpolated."""
+"""Demosaicing by residual interpolation: one colour predicts another, and the residual is interpolated."""
 
 from __future__ import annotations
 
@@ -13,27 +13,26 @@ from torch import Tensor
 from spikekit.color.cfa import PatternModule, bayer_mask, count_colors
 from spikekit.color.demosaic import wide_mosaics
 
-_RADIUS = 5  # of the guided filter's windows
-_FLAT = 1e-5  # a guide's variance below which its window counts as flat, white being 1
-_STEADY = 1e-6  # the same of the square of a direction's changes
+_RADIUS = 5  # radius of the guided filter
+_FLAT = 1e-5  # lower bound of a guide's variance; white is 1
+_STEADY = 1e-6  # lower bound of the squared change along a direction
 _FADE = [math.exp(-(k**2) / 8) for k in range(5)]  # half of a Gaussian of nine taps, sigma 2
-_BORDER = 18  # as far as a pixel sees, 17, and even, as the Bayer phase is kept
+_BORDER = 18  # receptive radius, 17, rounded up to keep the Bayer phase
 
 
 def demosaic_residual(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
-    r"""Fill in the two missing colours of every pixel by residual interpolation, guided by green.
+    r"""Interpolate the two missing colours of every pixel by residual interpolation, guided by green.
 
-    A guide I predicts a colour p in every window by a line, fitted to the pixels k where p is known; interpolated is
-    only the residual, which is smoother than the colour itself:
+    In every window a guide I predicts a colour p by a line, fitted to the pixels k where p is known. Only the residual
+    is interpolated, which is smoother than the colour itself:
 
     .. math::
         \hat p = \bar a I + \bar b + \mathcal{L}(p - \bar a I - \bar b), \quad
         a = \frac{\operatorname{cov}_k(I, p)}{\operatorname{var}_k(I)}, \quad b = \bar p - a \bar I
 
-    Green comes first. In rows and in columns green and the other colour of the line predict each other over 11
-    pixels; their difference is smoothed on four sides, by half a Gaussian of nine taps, and the sides are weighed by
-    the inverse square of how much the difference changes over 5 x 5 pixels there. Green then guides red and blue, in
-    windows of 11 x 11 pixels.
+    Green is interpolated first. Along rows and columns, green and the other colour of the line predict each other over
+    11 pixels. Their difference is smoothed on four sides by half a Gaussian of nine taps, and the sides are weighted by
+    the inverse square of its change over 5 x 5 pixels. Green then guides red and blue, in windows of 11 x 11 pixels.
 
     Convention:
         Known values are kept. Not linear: fitted lines and weights depend on the mosaic, with white near 1;
@@ -42,22 +41,22 @@ def demosaic_residual(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
 
     Args:
         raw: mosaic :math:`(*, H, W)`, floating, H and W at least 3; odd sizes are legal.
-        pattern: Bayer phase, see :func:`spikekit.bayer_pattern`; of ``"grey"`` there is nothing to fill in.
+        pattern: Bayer phase, see :func:`spikekit.bayer_pattern`; ``"grey"`` only adds an axis.
 
     Returns:
-        The picture :math:`(*, 3, H, W)`, or :math:`(*, 1, H, W)` of a grey sensor, in the dtype of ``raw``.
+        The picture :math:`(*, 3, H, W)`, or :math:`(*, 1, H, W)` for a grey sensor, in the dtype of ``raw``.
 
     Raises:
         TypeError: ``raw`` is not a floating-point tensor.
-        ValueError: fewer than two dimensions, smaller than 3 x 3, or an unknown pattern.
+        ValueError: ``raw`` has fewer than two dimensions or is smaller than 3 x 3, or the pattern is unknown.
 
     Example:
         >>> demosaic_residual(torch.full((4, 6), 0.25)).unique().tolist()
         [0.25]
 
     Reference:
-        Kiku, Monno, Tanaka and Okutomi, Residual interpolation for color image demosaicking, ICIP 2013. Sigma, 2, and
-        the two floors are ours; so is that nothing is clamped on the way.
+        Kiku, Monno, Tanaka and Okutomi, Residual interpolation for color image demosaicking, ICIP 2013. Sigma = 2, the
+        two lower bounds, and the absence of clamping are our own.
     """
     known = wide_mosaics(raw)
     if count_colors(pattern) == 1:
@@ -86,7 +85,7 @@ class DemosaicResidual(PatternModule):
 
 
 def interpolate_green(known: Tensor, green: Tensor) -> Tensor:
-    """Fill in green in mosaics (B, H, W), given which of their pixels are green, (H, W)."""
+    """Interpolate green in mosaics (B, H, W), given the mask (H, W) of green pixels."""
     known, green = _with_border(known), _with_border(green)
     across = _green_minus_other(known, green)
     down = _green_minus_other(known.mT, green.mT).mT
@@ -103,14 +102,14 @@ def interpolate_green(known: Tensor, green: Tensor) -> Tensor:
 
 
 def guided_by_green(known: Tensor, greens: Tensor, mask: Tensor) -> Tensor:
-    """Fill in red or blue in mosaics (B, H, W), given green everywhere and which pixels are of the colour, (H, W)."""
+    """Interpolate red or blue in mosaics (B, H, W), given green everywhere and the mask (H, W) of the colour."""
     known, greens, mask = _with_border(known), _with_border(greens), _with_border(mask)
     filled = _predict(greens, known, mask, _RADIUS, lambda residual: _between(_between(residual, -1), -2))
     return _without_border(torch.where(mask, known, filled))
 
 
 def _green_minus_other(known: Tensor, green: Tensor) -> Tensor:
-    """Green less the colour that it shares the row with, at every pixel."""
+    """Return, at every pixel, green minus the other colour of the row."""
     beside = (_further(known, 1, -1) + _further(known, -1, -1)) / 2
     greens = _predict(torch.where(green, beside, known), known, green, 0, lambda residual: _between(residual, -1))
     others = _predict(torch.where(green, known, beside), known, ~green, 0, lambda residual: _between(residual, -1))
@@ -118,7 +117,7 @@ def _green_minus_other(known: Tensor, green: Tensor) -> Tensor:
 
 
 def _predict(guide: Tensor, known: Tensor, mask: Tensor, rows: int, interpolate: Callable[[Tensor], Tensor]) -> Tensor:
-    """Predict a colour from a guide by the guided filter, whose windows reach so many rows, and add the residual."""
+    """Predict a colour by a guided filter with windows of radius ``rows`` and ``_RADIUS``, and add the residual."""
 
     def mean(planes: Tensor) -> Tensor:
         return _sums(torch.where(mask, planes, 0), rows, _RADIUS) / count
@@ -134,21 +133,21 @@ def _predict(guide: Tensor, known: Tensor, mask: Tensor, rows: int, interpolate:
 
 
 def _between(planes: Tensor, axis: int) -> Tensor:
-    """Put, where every other pixel of a line is 0, the mean of those beside it."""
+    """Fill every other pixel of a line, which is 0, with the mean of its neighbours."""
     return planes + (_further(planes, 1, axis) + _further(planes, -1, axis)) / 2
 
 
 def _further(planes: Tensor, by: int, axis: int) -> Tensor:
-    """Shift planes by so many pixels along an axis, round the edge: only the border sees that."""
+    """Shift planes by ``by`` pixels along an axis; wrapping affects only the border."""
     return planes.roll(-by, axis)
 
 
 def _sums(planes: Tensor, rows: int, columns: int) -> Tensor:
-    """Sums of (B, H, W) over windows that reach so many rows and columns, as far as there are any."""
+    """Return the sums of (B, H, W) over windows of radius ``rows`` and ``columns``, cut at the edges."""
     for half in ((rows, 0), (0, columns)):
         if any(half):
             kernel = 2 * half[0] + 1, 2 * half[1] + 1
-            # a mean times its size: ONNX ignores another divisor
+            # mean times size, as ONNX ignores divisor_override
             planes = F.avg_pool2d(planes.unsqueeze(1), kernel, 1, half).squeeze(1) * max(kernel)
     return planes
 
@@ -157,7 +156,7 @@ def _with_border(planes: Tensor) -> Tensor:
     for axis in (-2, -1):
         length = planes.shape[axis]
         at = torch.arange(-_BORDER, length + _BORDER, device=planes.device)
-        at = at.remainder(torch.full((1,), 2 * length - 2, device=planes.device))  # ONNX takes tensors alone
+        at = at.remainder(torch.full((1,), 2 * length - 2, device=planes.device))  # ONNX needs a tensor
         planes = planes.index_select(axis, torch.minimum(at, 2 * length - 2 - at))
     return planes
 

@@ -1,4 +1,4 @@
-"""The sensor: from light to spikes, and the noise that a real one adds."""
+"""The sensor: from light to spikes, with the noise of a real one."""
 
 from spikekit.sensor.integrate_fire import SpikeIntegrateFire, spike_integrate_fire
 from spikekit.sensor.noise import SensorNoise, SpikeChange

@@ -12,17 +12,17 @@ from spikekit.kernels import operator
 from spikekit.options_module import OptionsModule
 
 
-# A custom operator, because torch.compile would unroll the loop over time and because the gradient does not need it.
+# A custom operator, as torch.compile would unroll the loop over time and the gradient does not need it.
 @operator(lambda light, threshold, charge, dtype: (torch.empty_like(light, dtype=dtype), torch.empty_like(charge)))
 def _integrate_fire(light: Tensor, threshold: float, charge: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     spikes = torch.empty_like(light, dtype=dtype)
-    theta = charge.new_tensor(threshold)  # a tensor: CUDA would divide by a number through its inverse
+    theta = charge.new_tensor(threshold)  # a tensor, as CUDA divides by a number through its reciprocal
     for light_t, spike_t in zip(light.unbind(-3), spikes.unbind(-3), strict=True):
         full = charge + light_t
         fired = full >= theta
         spike_t.copy_(fired)
         rest = torch.where(fired, full - theta, full)
-        # More than one threshold: the surplus is lost, and so is a remainder that rounding has pushed out of range.
+        # More than one threshold: drop the surplus, and a remainder that is out of range by rounding.
         remainder = full - torch.floor(full / theta) * theta
         remainder = torch.where((remainder >= 0) & (remainder < theta), remainder, 0)
         charge = torch.where(rest >= theta, remainder, rest)
@@ -48,7 +48,7 @@ class _StraightThrough(torch.autograd.Function):
         wide = torch.promote_types(light.dtype, torch.float32)
         theta = light.new_tensor(ctx.threshold, dtype=wide)
         linear = (light.to(wide) >= 0) & (light.to(wide) <= theta)
-        # not a product: 0 times infinity is not 0
+        # no product, as 0 times infinity is NaN
         return torch.where(linear, grad_spikes.to(wide) / theta, 0).to(grad_spikes.dtype), None, None, None
 
 
@@ -64,32 +64,32 @@ def spike_integrate_fire(
     Convention:
         Time is axis -3. Light is the charge that arrives per clock, in the unit of the threshold. A pixel fires at
         :math:`u \ge \theta` and is reset by subtraction. The read-out is one bit: surplus whole thresholds within one
-        clock are lost, not remembered. The charge goes in and comes out, so that a recording cut into chunks equals
+        clock are lost, not remembered. The charge is an input and an output, so a recording processed in chunks equals
         one run, bit for bit. It is held in float32 or wider, whatever the dtype of the light, and stays below the
-        threshold: a remainder that rounding puts outside [0, threshold) counts as 0.
+        threshold: a remainder outside [0, threshold) by rounding counts as 0.
 
-        Light below 0, which interpolation and noise make, is a debt: the charge goes below 0, k is 0 there, and later
-        light pays first. After infinite light the pixel fires and is empty. Light that is NaN or minus infinity
-        silences its pixel, and the charge shows it from then on.
+        Negative light, a result of interpolation or noise, lowers the charge below 0, and later light makes up for it
+        first; k is 0 there. After infinite light the pixel fires and is empty. Light that is NaN or minus infinity
+        silences its pixel from then on, which shows in the charge.
 
         The gradient is straight-through in the linear range,
-        :math:`\partial S_t / \partial I_t = 1 / \theta` where :math:`0 \le I_t \le \theta`, else 0, which makes the
-        gradient of a spike count that of the light. The charge that comes out is state and carries no gradient.
+        :math:`\partial S_t / \partial I_t = 1 / \theta` where :math:`0 \le I_t \le \theta`, else 0. The gradient of a
+        spike count is therefore that of the accumulated light. The returned charge has no gradient.
 
     Args:
         light: charge per sensor clock, :math:`(*, T, H, W)`, floating, >= 0.
         threshold: charge of one spike.
-        charge: charge at the start, broadcastable to :math:`(*, H, W)`, below the threshold; zero when not given.
-        dtype: that of the spikes; that of ``light`` when not given. ``torch.uint8`` and ``torch.bool`` take a byte a
+        charge: initial charge, broadcastable to :math:`(*, H, W)`, below the threshold; default: 0.
+        dtype: dtype of the spikes; default: that of ``light``. ``torch.uint8`` and ``torch.bool`` take one byte per
             spike, without a gradient.
 
     Returns:
-        The spikes, zeros and ones in the shape of ``light``, and the charge left, :math:`(*, H, W)`.
+        The spikes, zeros and ones in the shape of ``light``, and the remaining charge, :math:`(*, H, W)`.
 
     Raises:
-        TypeError: ``light`` or ``charge`` is not a floating-point tensor, ``dtype`` neither floating nor of a byte.
-        ValueError: fewer than three dimensions, a charge that does not fit, a threshold that is not above 0 or
-            that the charge's type cannot hold.
+        TypeError: ``light`` or ``charge`` is not a floating-point tensor, or ``dtype`` is not floating, uint8 or bool.
+        ValueError: ``light`` has fewer than three dimensions, ``charge`` has another size, or ``threshold`` is not
+            above 0 or not representable in the dtype of the charge.
 
     Example:
         >>> light = torch.full((5, 1, 1), 0.5)

@@ -12,21 +12,21 @@ from torch import Tensor
 
 from spikekit.check import check_whole
 
-# Each has its own random numbers. The place in the list tells them apart: append, never reorder.
+# Each purpose has a random stream of its own, given by its index: append, never reorder.
 _PURPOSES = ("charge", "gain", "dark current", "defects", "photons", "electrons")
 
 _MEAN_SIZE = math.sqrt(2 / math.pi)  # E|x| of a standard normal x
-# A pixel that leaks a threshold fires at every clock; of pixels that differ more, nearly all would see nothing.
+# At a dark current of 1 a pixel fires at every clock; with larger spreads nearly all pixels would see nothing.
 _MOST = {"dark_current": 1.0, "dark_spread": 10.0, "gain_spread": 10.0, "hot": 1.0, "dead": 1.0}
-_MOST_PHOTONS = 1e18  # NumPy's Poisson numbers end at 9.2e18, and one photon more or less is no longer seen here
+_MOST_PHOTONS = 1e18  # NumPy's Poisson numbers are limited to 9.2e18, and shot noise is negligible here
 
 
-#: What ``defects`` of a measured sensor hold: the pixel works, does not see light, or fires whatever the light is.
+#: Values of ``defects`` of a calibration: the pixel works, never fires, or always fires.
 WORKS, DEAD, HOT = 0, 1, 2
 
 
 class MeasuredPixels(Protocol):
-    """What noise reads of a sensor that was measured, such as a :class:`spikekit.Calibration`; all (H, W)."""
+    """Protocol of a measured sensor, such as a :class:`spikekit.Calibration`; all planes are (H, W)."""
 
     gain: Tensor
     dark: Tensor
@@ -38,12 +38,12 @@ class MeasuredPixels(Protocol):
 
 
 class SpikeChange(NamedTuple):
-    """How much one source of noise changes, see :meth:`SensorNoise.spike_changes`.
+    """Effect of one source of noise, see :meth:`SensorNoise.spike_changes`.
 
     Args:
-        charge: mean size of the error of a pixel's charge at the end of the clip, in thresholds: by how many spikes
-            its count is off.
-        share: the share of the stream's bits that differ, at most.
+        charge: mean absolute error of a pixel's charge at the end of the clip, in thresholds, which is the error of its
+            spike count.
+        share: upper bound of the share of bits that differ.
     """
 
     charge: float
@@ -52,7 +52,7 @@ class SpikeChange(NamedTuple):
 
 @dataclass(frozen=True)
 class SensorNoise:
-    r"""Noise of a real sensor; every source is off unless it is asked for.
+    r"""Noise of a real sensor; every source is off by default.
 
     .. math:: I'_t = \theta \, (g \, P_t + D_t), \quad
         P_t \sim \operatorname{Poisson}(p I_t / \theta) / p, \quad
@@ -60,41 +60,42 @@ class SensorNoise:
         \mathrm{E} g = 1, \; \sigma(g) = \sigma_g, \quad \mathrm{E} d = \bar d, \; \sigma(d) = \sigma_d \bar d
 
     Convention:
-        :math:`I_t` is the light of a pixel at a clock, :math:`\theta` the threshold, :math:`I'_t` the charge that the
-        pixel integrates. Charges are counted in thresholds, so that a setting means the same at every threshold.
-        Without ``photons``, light and dark current arrive evenly: :math:`P_t = I_t / \theta`, :math:`D_t = d`.
+        :math:`I_t` is the light of a pixel at a clock, :math:`\theta` the threshold, and :math:`I'_t` the charge that
+        the pixel integrates. Charges are in thresholds, so settings do not depend on the threshold. Without
+        ``photons``, light and dark current arrive evenly: :math:`P_t = I_t / \theta`, :math:`D_t = d`.
 
-        Gain g and dark current d are a pixel's own and stay as they are. They are log-normal: hardly to be told from
-        normal for a spread of some per cent, but above 0 and with the mean that was asked for, however wide.
+        Gain g and dark current d are constant for every pixel. They are log-normally distributed: close to normal for
+        spreads of a few per cent, but always above 0, and with the given mean.
 
-        A hot pixel fires at every clock, as one does whose leak fills a threshold each time; a dead one never fires.
-        No pixel is both. With a larger share, the same pixels fail and others with them.
+        A hot pixel fires at every clock; a dead one never fires. No pixel is both. A larger share keeps the defects of
+        a smaller one.
 
-        Light below 0 has no photons and stays as it is, so do NaN and infinity.
+        Negative light has no photon noise and is unchanged, and so are NaN and infinity.
 
-        Every source has random numbers of its own, drawn from the seed, and those in time anew for every clock. So
-        one source switched on or off changes nothing about the others, and neither does a cut between two clocks.
-        They are drawn on the CPU, and are the same wherever the light is.
+        Every source has a random stream of its own, derived from the seed, and temporal noise a new one at every clock.
+        A source therefore does not affect the others, and results do not depend on chunks. Random numbers are drawn on
+        the CPU, and are the same on every device.
 
     Args:
-        photons: p, electrons that make one threshold, at least 1; ``None`` for no photon noise.
-        dark_current: :math:`\bar d`, mean charge that leaks in per clock, in thresholds, at most 1.
-        dark_spread: :math:`\sigma_d`, standard deviation of the dark current between pixels, relative to its mean, at
+        photons: p, electrons per threshold, at least 1; ``None`` for no photon noise.
+        dark_current: :math:`\bar d`, mean dark current per clock, in thresholds, at most 1.
+        dark_spread: :math:`\sigma_d`, standard deviation of the dark current over the pixels, relative to its mean, at
             most 10.
-        gain_spread: :math:`\sigma_g`, standard deviation of the gain between pixels, at most 10: fixed-pattern noise.
+        gain_spread: :math:`\sigma_g`, standard deviation of the gain over the pixels (fixed-pattern noise), at most 10.
         hot: share of pixels that always fire.
         dead: share of pixels that never fire.
-        calibration: gain, dark current and defects of a sensor that was measured, a :class:`spikekit.Calibration`,
-            instead of random ones; then the spreads and shares above are 0.
+        calibration: gain, dark current and defects of a measured sensor, a :class:`spikekit.Calibration`, instead of
+            random ones; the other options except ``photons`` must then be 0.
 
     Raises:
-        ValueError: a number out of its range, shares of hot and dead pixels that together exceed 1, a spread of a dark
-            current of 0, a calibration beside one of the options that it replaces.
+        ValueError: a number is out of range, the shares of hot and dead pixels add up to more than 1, ``dark_spread``
+            is given without a dark current, or a calibration is combined with options that it replaces.
 
     Example:
-        The constants of Hu et al. for a camera of 250 x 400 pixels at 20 kHz, which are bare numbers, read as fF, V and
-        pA: a threshold is a charge of 4.35 fF x 1.09 V or 30 000 electrons; 0.44 pA of dark current, with a standard
-        deviation of 39 %, make 0.0047 of it in a clock; the gains of pixels spread by 6 %:
+        The constants of Hu et al. for a camera of 250 x 400 pixels at 20 kHz are given without units; here they are
+        read as fF, V and pA. The threshold is a charge of 4.35 fF x 1.09 V, or 30 000 electrons. A dark current of 0.44
+        pA, with a standard deviation of 39 %, gives 0.0047 thresholds per clock. Gains have a standard deviation of
+        6 %:
 
         >>> typical = SensorNoise(photons=30_000, dark_current=0.0047, dark_spread=0.39, gain_spread=0.06)
         >>> for source, change in typical.spike_changes(light=0.2, frames=41).items():
@@ -126,47 +127,46 @@ class SensorNoise:
             if not 0 <= value <= most:
                 raise ValueError(f"{name}: expected 0 to {most:g}, got {value}")
         if self.hot + self.dead > 1:
-            raise ValueError(f"hot, dead: expected shares that add up to 1 at most, got {self.hot}, {self.dead}")
+            raise ValueError(f"hot, dead: expected shares that add up to at most 1, got {self.hot}, {self.dead}")
         if self.dark_spread and not self.dark_current:
-            raise ValueError(f"dark_spread: expected a dark_current above 0 with it, got {self.dark_spread} of none")
+            raise ValueError(f"dark_spread: expected a dark_current above 0, got {self.dark_spread} without one")
         drawn = [name for name in ("dark_current", "gain_spread", "hot", "dead") if getattr(self, name)]
         if self.calibration is not None and drawn:
-            raise ValueError(f"{drawn[0]}: expected 0, as the calibration has it, got {getattr(self, drawn[0])}")
+            raise ValueError(f"{drawn[0]}: expected 0 with a calibration, got {getattr(self, drawn[0])}")
 
     def spike_changes(self, light: float, frames: int) -> dict[str, SpikeChange]:
-        r"""Tell how much each source that is on changes a clip, without simulating it.
+        r"""Predict the effect of each active source on a clip, without simulating it.
 
         .. math:: \text{share} \le \frac{1}{T} \sum_{t=1}^{T} \min(\mathrm{E}|E_{t-1}| + \mathrm{E}|E_t|, \;
             r + r', \; 1)
 
         Convention:
-            Let :math:`E_t` be the charge that the source has added to a pixel up to clock t. Without it, the pixel
-            fires at clock t if a multiple of the threshold lies in :math:`(Q_{t-1}, Q_t]`, with the source, if one
-            lies in :math:`(Q_{t-1} + E_{t-1}, Q_t + E_t]`. The bits can only differ if one lies between the
-            beginnings or between the ends, and as the charge begins uniform in [0, threshold), whatever the light,
-            that has the probabilities :math:`\min(1, |E_{t-1}|)` and :math:`\min(1, |E_t|)`. Nor can more bits differ
-            than are set with (:math:`r'`) and without (:math:`r`) the source. In light that does not change, the bound
-            is nearly reached until the errors become as large as the light of one clock or what it lacks of a
-            threshold.
+            Let :math:`Q_t` be the accumulated charge of a pixel up to clock t, and :math:`E_t` the part added by the
+            source. The pixel fires at clock t if a multiple of the threshold lies in :math:`(Q_{t-1}, Q_t]` without the
+            source, or in :math:`(Q_{t-1} + E_{t-1}, Q_t + E_t]` with it. The bits can differ only if a multiple lies
+            between the two lower ends or between the two upper ends. As the initial charge is uniform in
+            [0, threshold), these have the probabilities :math:`\min(1, |E_{t-1}|)` and :math:`\min(1, |E_t|)` in any
+            light. The number of differing bits is also bounded by the bits set with (:math:`r'`) and without
+            (:math:`r`) the source. In constant light the bound is nearly tight until the errors reach the light of one
+            clock, or its distance to the threshold.
 
-            Mean errors, in thresholds: that of a Poisson number for photons, :math:`\sqrt{2 t I / \pi p}` where many
-            arrive; :math:`t \bar d` for dark current; at most :math:`\sqrt{2 / \pi} \, t I \sigma_g` for gains. Hot
-            pixels change :math:`1 - I` of their bits and dead ones I, with errors of :math:`(1 - I) T` and
-            :math:`I T`.
+            Mean errors in thresholds: photons, :math:`\sqrt{2 t I / \pi p}` for many photons, else that of a Poisson
+            number; dark current, :math:`t \bar d`; gains, at most :math:`\sqrt{2 / \pi} \, t I \sigma_g`. Hot pixels
+            change :math:`1 - I` of their bits and dead ones I, with errors of :math:`(1 - I) T` and :math:`I T`.
 
-            The mean over pixels may stand for light that differs from pixel to pixel, below the threshold. The
-            shares of several sources together add up to a bound of what all of them change.
+            For light that differs between pixels, below the threshold, the mean can be used. The sum of the shares is a
+            bound for all sources together.
 
         Args:
             light: mean light per clock, in thresholds.
             frames: T, clocks of the clip.
 
         Returns:
-            One :class:`SpikeChange` for every source that is on, by the name of its field; ``dark_spread`` goes with
-            ``dark_current``. A calibration is not judged, and always stays.
+            One :class:`SpikeChange` per active source, by the name of its field; ``dark_spread`` is part of
+            ``dark_current``. A calibration is not included.
 
         Raises:
-            ValueError: light that is negative or not finite, frames below 1.
+            ValueError: ``light`` is negative or not finite, or ``frames`` is below 1.
         """
         if not 0 <= light < math.inf:
             raise ValueError(f"light: expected a finite number, 0 or more, got {light}")
@@ -191,17 +191,15 @@ class SensorNoise:
         return changes
 
     def required(self, light: float, frames: int, spike_tolerance: float) -> SensorNoise:
-        """Leave only the sources that may change more than a share of the bits, see :meth:`spike_changes`.
-
-        What is left out changes at most ``spike_tolerance`` of the bits each.
+        """Keep only the sources that may change more than a given share of the bits, see :meth:`spike_changes`.
 
         Args:
             light: mean light per clock, in thresholds.
             frames: clocks of the clip.
-            spike_tolerance: the share.
+            spike_tolerance: largest share of bits that each dropped source may change.
 
         Returns:
-            This noise without the rest.
+            The noise without the dropped sources; a calibration is always kept.
 
         Raises:
             ValueError: as :meth:`spike_changes`.
@@ -218,18 +216,18 @@ class SensorNoise:
 
 
 def random_numbers(seed: int, purpose: str, clock: int = 0) -> np.random.Generator:
-    """Return the random numbers of one purpose at one clock; they depend on nothing else."""
+    """Return the random generator of one purpose at one clock."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_PURPOSES.index(purpose), clock)))
 
 
 class NoisyPixels:
-    """The pixels (*, H, W) of one sensor: their fixed pattern, and the noise of every clock."""
+    """Pixels (*, H, W) of a sensor, with fixed-pattern and temporal noise."""
 
     def __init__(self, noise: SensorNoise, size: tuple[int, ...], seed: int) -> None:
         if noise.calibration is not None and noise.calibration.size != tuple(size[-2:]):
             expected, got = noise.calibration.size, tuple(size[-2:])
             raise ValueError(
-                f"light: expected {expected[0]} x {expected[1]} of the calibration, got {got[0]} x {got[1]}"
+                f"light: expected {expected[0]} x {expected[1]} as the calibration, got {got[0]} x {got[1]}"
             )
         self.noise, self.size, self.seed = noise, size, seed
         known, self._gain, self._dark, self._stuck = noise.calibration, None, None, []
@@ -246,7 +244,7 @@ class NoisyPixels:
             self._stuck = [(drawn < noise.hot, 1), (drawn >= 1 - noise.dead, 0)]
 
     def charge(self, light: Tensor, threshold: float, clock: int) -> Tensor:
-        """Return the charge that pixels integrate from light (*, T, H, W), whose first frame is that of ``clock``."""
+        """Return the charge that pixels integrate from light (*, T, H, W) that starts at ``clock``."""
         photons = self.noise.photons
         if photons is None and self._gain is None and self._dark is None:
             return light
@@ -266,7 +264,7 @@ class NoisyPixels:
         return charge
 
     def spikes(self, spikes: Tensor) -> Tensor:
-        """Set the bits (*, T, H, W) of hot and dead pixels, in place, and return all of them."""
+        """Set the spikes (*, T, H, W) of hot and dead pixels in place, and return all spikes."""
         for pixels, bit in self._stuck:
             spikes.masked_fill_(pixels.to(spikes.device).unsqueeze(-3), bit)
         return spikes
@@ -278,7 +276,7 @@ class NoisyPixels:
 
 
 def _poisson_error(means: np.ndarray) -> np.ndarray:
-    """E|N - mean| of Poisson numbers N; where they are large, that of normal ones."""
+    """Return E|N - mean| of Poisson numbers N, in the normal approximation for large means."""
 
     def error(mean: float) -> float:
         if mean > 1e4:
@@ -290,7 +288,7 @@ def _poisson_error(means: np.ndarray) -> np.ndarray:
 
 
 def _arrive(charge: Tensor, quantum: float, numbers: np.random.Generator) -> Tensor:
-    """Let a mean charge (*, H, W) arrive in whole quanta; what has no number of quanta stays as it is."""
+    """Replace a mean charge (*, H, W) by a Poisson number of quanta; values out of range are unchanged."""
     mean = charge.double().cpu().numpy() / quantum
     known = (mean > 0) & (mean < _MOST_PHOTONS)
     counts = numbers.poisson(np.where(known, mean, 0))

@@ -7,21 +7,21 @@ from torch import Tensor
 
 
 def flicker(weights: Tensor, light: Tensor) -> Tensor:
-    r"""Variance of weighted sums of a pixel's spikes in constant light, over all initial charges.
+    r"""Return the variance of weighted sums of a pixel's spikes in constant light, over all initial charges.
 
-    An ideal pixel fires where its charge passes a whole number: for a share r of all phases, r being the light, and
-    d frames later for as many, moved by d r around the circle. The share that is in both, less :math:`r^2`, is the
-    covariance of two spikes d frames apart.
+    In light r, an ideal pixel fires for a share r of all initial phases: an arc of the circle. The arc of the phases
+    that fire d frames later is rotated by d r. The overlap of both arcs minus :math:`r^2` is the covariance of two
+    spikes d frames apart.
 
     Args:
-        weights: (K, N), K sums over N frames.
-        light: (L), in thresholds a frame, from 0 to 1.
+        weights: weights of K sums over N frames, (K, N).
+        light: light in thresholds per frame, 0 to 1, (L).
 
     Returns:
-        (K, L), float32.
+        Variances (K, L), float32.
 
     Example:
-        >>> flicker(torch.ones(1, 1), torch.tensor([0.0, 0.25, 0.5]))  # one spike, of such a probability
+        >>> flicker(torch.ones(1, 1), torch.tensor([0.0, 0.25, 0.5]))  # one spike with this probability
         tensor([[0.0000, 0.1875, 0.2500]])
     """
     weights, light = weights.double(), light.double()

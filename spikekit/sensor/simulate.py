@@ -1,4 +1,4 @@
-"""Simulate a sensor: light to spikes, in one call or chunk by chunk."""
+"""Simulation of a sensor: from light to spikes, in one call or chunk by chunk."""
 
 from __future__ import annotations
 
@@ -11,26 +11,25 @@ from spikekit.sensor.noise import NoisyPixels, SensorNoise, random_numbers
 
 
 class SpikeSensor:
-    r"""A sensor that is exposed to light, chunk after chunk.
+    r"""A simulated sensor that is exposed to light chunk by chunk.
 
     Convention:
-        Time is axis -3. The light passes through :class:`SensorNoise` and the spikes are those of
-        :func:`spikekit.spike_integrate_fire`. The charge of every pixel begins uniform in [0, threshold), because the
-        camera has been running before. The sensor remembers the charge and the clock, so that light cut into chunks
-        gives the spikes of the whole, bit for bit. No gradient.
+        Time is axis -3. The light passes through :class:`SensorNoise` and :func:`spikekit.spike_integrate_fire`. The
+        initial charge of every pixel is uniform in [0, threshold), as in a camera that is already running. The sensor
+        keeps the charge and the clock, so chunks of light give the same spikes as the whole, bit for bit. No gradient.
 
-        The same seed gives the same spikes on every device, as far as the light is the same. With leading dimensions,
-        every (H, W) of them is a sensor of its own.
+        The same seed and light give the same spikes on every device. With leading dimensions, every (H, W) is a
+        separate sensor.
 
     Args:
-        noise: noise of the sensor; none when not given.
+        noise: noise of the sensor; default: none.
         threshold: charge of one spike.
         seed: random seed, 0 or more.
-        charge: charge at the start, broadcastable to :math:`(*, H, W)`, below the threshold.
-        clock: clocks before the first, to continue where another sensor of the same seed stopped.
+        charge: initial charge, broadcastable to :math:`(*, H, W)`, below the threshold; default: random.
+        clock: number of the first clock, to continue the simulation of another sensor with the same seed.
 
     Raises:
-        ValueError: a threshold that is not above 0, a negative seed or clock.
+        ValueError: ``threshold`` is not above 0, or ``seed`` or ``clock`` is negative.
 
     Example:
         >>> light = torch.rand(40, 6, 8)
@@ -60,7 +59,7 @@ class SpikeSensor:
         self._pixels: NoisyPixels | None = None
 
     def expose(self, light: Tensor) -> Tensor:
-        """Return the spikes of the next light.
+        """Return the spikes of the next chunk of light.
 
         Args:
             light: charge per clock, :math:`(*, T, H, W)`, floating; chunks of one recording have the same
@@ -71,7 +70,7 @@ class SpikeSensor:
 
         Raises:
             TypeError: ``light`` is not a floating-point tensor.
-            ValueError: fewer than three dimensions, a size that differs from that of the light before or does not fit
+            ValueError: ``light`` has fewer than three dimensions, or its size differs from that of earlier light or of
                 the charge.
         """
         check_planes("light", light, 3, "(*, T, H, W)", floating=True)
@@ -79,7 +78,7 @@ class SpikeSensor:
         if self._pixels is None:
             self._pixels = NoisyPixels(self.noise, tuple(size), self.seed)
         if self._pixels.size != tuple(size):
-            raise ValueError(f"light: expected the size {self._pixels.size} that came before, got {tuple(size)}")
+            raise ValueError(f"light: expected the size {self._pixels.size} as before, got {tuple(size)}")
         if self.charge is None:
             fraction = random_numbers(self.seed, "charge").random(size, dtype="float32")
             wide = torch.promote_types(light.dtype, torch.float32)
@@ -98,27 +97,28 @@ def simulate_spikes(
     charge: Tensor | None = None,
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    r"""Let the camera look at light: a random charge to begin with, noise, if wanted, and spikes.
+    r"""Simulate the spikes of a sensor in given light, with a random initial charge and optional noise.
 
     .. math:: c_0 \sim U[0, \theta), \quad S = \text{spikes of } I'_t \text{ from } c_0
 
     Convention:
-        One exposure of a :class:`SpikeSensor`, which says what happens, with :class:`SensorNoise` for I'. The same
-        generator state gives the same charge with and without noise. No gradient.
+        A single exposure of a :class:`SpikeSensor`; I' is the charge of :class:`SensorNoise`. The same generator state
+        gives the same initial charge with and without noise. No gradient.
 
     Args:
         light: charge per clock, :math:`(*, T, H, W)`, floating, on the generator's device.
         threshold: :math:`\theta`, charge of one spike.
-        noise: noise of the sensor; none when not given.
-        charge: charge at the start, broadcastable to :math:`(*, H, W)`, below the threshold; random when not given.
-        generator: of random numbers; torch's default one when not given.
+        noise: noise of the sensor; default: none.
+        charge: initial charge, broadcastable to :math:`(*, H, W)`, below the threshold; default: random.
+        generator: random generator; default: torch's.
 
     Returns:
         ``spikes``, uint8, :math:`(*, T, H, W)`.
 
     Raises:
         TypeError: ``light`` is not a floating-point tensor.
-        ValueError: fewer than three dimensions, a threshold that is not above 0, a charge that does not fit.
+        ValueError: ``light`` has fewer than three dimensions, ``threshold`` is not above 0, or ``charge`` has another
+            size.
 
     Example:
         >>> spikes = simulate_spikes(torch.full((40, 8, 8), 0.25), generator=torch.Generator().manual_seed(0))

@@ -189,9 +189,9 @@ def test_noise_of_a_measured_sensor(truth):
     spikes = SpikeSensor(noise).expose(torch.full((500, *SIZE), 0.2))
     expected = torch.where(truth.defects == WORKS, 0.2 * truth.gain + truth.dark, (truth.defects == HOT).float())
     assert ((spikes.float().mean(0) - expected).abs() <= 1 / 500 + 1e-6).all()
-    with pytest.raises(ValueError, match="light: expected 40 x 48 of the calibration, got 8 x 8"):
+    with pytest.raises(ValueError, match="light: expected 40 x 48 as the calibration, got 8 x 8"):
         SpikeSensor(noise).expose(torch.ones(3, 8, 8))
-    with pytest.raises(ValueError, match="gain_spread: expected 0, as the calibration has it"):
+    with pytest.raises(ValueError, match="gain_spread: expected 0 with a calibration"):
         SensorNoise(gain_spread=0.1, calibration=truth)
 
 

@@ -253,10 +253,10 @@ def test_light_that_is_no_number_of_photons_stays():
     [
         ({"photons": 0.99}, "photons: expected a finite number, 1 or more, got 0.99"),
         ({"dark_current": -0.1}, "dark_current: expected 0 to 1, got -0.1"),
-        ({"dark_spread": 0.1}, "dark_spread: expected a dark_current above 0 with it"),
+        ({"dark_spread": 0.1}, "dark_spread: expected a dark_current above 0"),
         ({"gain_spread": 1e200}, r"gain_spread: expected 0 to 10, got 1e\+200"),
         ({"dead": math.nan}, "dead: expected 0 to 1, got nan"),
-        ({"hot": 0.6, "dead": 0.5}, "hot, dead: expected shares that add up to 1 at most, got 0.6, 0.5"),
+        ({"hot": 0.6, "dead": 0.5}, "hot, dead: expected shares that add up to at most 1, got 0.6, 0.5"),
     ],
 )
 def test_a_noise_that_cannot_be_says_so(settings, message):
@@ -275,5 +275,5 @@ def test_errors_say_what_was_expected():
             make()
     sensor = SpikeSensor(EVERYTHING)
     sensor.expose(light)
-    with pytest.raises(ValueError, match=r"light: expected the size \(4, 5\) that came before, got \(4, 6\)"):
+    with pytest.raises(ValueError, match=r"light: expected the size \(4, 5\) as before, got \(4, 6\)"):
         sensor.expose(torch.rand(6, 4, 6))
