@@ -121,7 +121,7 @@ class Camera:
         height, width = spikes.shape[-2:]
         if height != self.height or width not in (self.width, self.stored_width):
             widths = " or ".join(str(w) for w in dict.fromkeys((self.width, self.stored_width)))
-            expected = f"{self.height} x {widths}, the size of the camera {self.name}"
+            expected = f"{self.height} x {widths} for the camera {self.name}"
             raise ValueError(f"spikes: expected {expected}, got {height} x {width}")
         if width != self.width:
             kept = [spikes[..., a:b] for a, b in zip(self._edges[::2], self._edges[1::2], strict=True)]

@@ -1,4 +1,4 @@
-"""Fast kernels of the heavy operators for CPU and GPU; the plain torch path is with the operator."""
+"""Fast CPU and GPU kernels of the heavy operators; each operator's module has its plain torch path."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from spikekit.kernels import cpu
 
 
 def operator(fake: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
-    """Make a custom operator of the decorated function, with any number of leading dimensions.
+    """Turn the decorated function into a custom operator with any number of leading dimensions.
 
-    It is called as the function, less the underscore, and is run by the functions of that name in
-    :mod:`spikekit.kernels.cpu` and :mod:`spikekit.kernels.gpu` where there are such.
+    The operator has the name of the function without the underscore. The functions of that name in
+    :mod:`spikekit.kernels.cpu` and :mod:`spikekit.kernels.gpu`, if they exist, are its kernels.
 
     Args:
-        fake: given the arguments, returns empty tensors of the sizes and types of the results.
+        fake: function of the same arguments that returns empty tensors of the shapes and dtypes of the results.
     """
 
     def make(plain: Callable[..., Any]) -> Any:
@@ -39,7 +39,7 @@ def operator(fake: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
 
 
 def custom_operator(name: str, plain: Callable[..., Any], fake: Callable[..., Any]) -> Any:
-    """Make the custom operator ``spikekit::name``, which ``plain`` runs where no kernel is registered."""
+    """Create the custom operator ``spikekit::name``; devices without a kernel run ``plain``."""
     op = torch.library.custom_op(f"spikekit::{name}", plain, mutates_args=(), device_types=())
     op.register_fake(fake)
     register_kernel(op, "default")(plain)
@@ -47,17 +47,17 @@ def custom_operator(name: str, plain: Callable[..., Any], fake: Callable[..., An
 
 
 def register_kernel(op: Any, device: str) -> Callable[[Callable[..., Any]], None]:
-    """Run a custom operator by the decorated function on a type of device.
+    """Register the decorated function as the kernel of a custom operator on a type of device.
 
-    The operator's own ``register_kernel`` would import the compiler at the first call, which takes a second or two. It
-    also looks, at every call, whether a result shares memory with an argument, which must not be; here a test does.
+    The operator's own ``register_kernel`` imports the compiler at the first call, which takes a second or two, and
+    checks for aliasing of results and arguments at every call, which a test does here.
     """
     return lambda kernel: torch.library.impl(f"spikekit::{op._name}", device, compiler_kept_out(kernel))
 
 
 def compiler_kept_out(function: Callable[..., Any]) -> Callable[..., Any]:
-    """As ``torch.compiler.disable``, which imports the compiler even for those who compile nothing."""
-    disabled = torch._disable_dynamo(function)  # imports it when it is called
+    """Exclude a function from compilation, like ``torch.compiler.disable`` but without importing the compiler."""
+    disabled = torch._disable_dynamo(function)  # imports the compiler when called
 
     @wraps(function)
     def run(*args: Any, **options: Any) -> Any:
@@ -67,18 +67,18 @@ def compiler_kept_out(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def register_on_gpu(op: Any, kernel: Callable[..., Any]) -> None:
-    """Run a custom operator by a Triton kernel, where Triton is installed; else its own torch path runs."""
+    """Register a Triton kernel of a custom operator, if Triton is installed."""
     if find_spec("triton") is not None:
         register_kernel(op, "cuda")(kernel)
 
 
 def gpu_kernel(name: str) -> Callable[..., Any]:
-    """Return a function of :mod:`spikekit.kernels.gpu`, which is imported when it is first needed."""
+    """Return a function of :mod:`spikekit.kernels.gpu`, which is imported lazily."""
     return getattr(import_module("spikekit.kernels.gpu"), name)
 
 
 def batch_first(op: Any) -> None:
-    """Let ``torch.func.vmap`` give its axis to a custom operator as one more leading dimension of every tensor."""
+    """Register a ``torch.func.vmap`` rule that adds the mapped axis as a leading dimension of every tensor."""
 
     def rule(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Any, Any]:
         def with_axis(value: Any, dim: int | None) -> Any:

@@ -1,4 +1,4 @@
-"""Loops that Numba compiles, for the modules that are imported only where there is one."""
+"""Compilation of loops by Numba, for modules that are imported only if Numba is installed."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from numba import njit
 
 
 def compiled(loop: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a loop when it is first called, and keep it for the next process where that is possible."""
+    """Compile a loop at its first call, and cache it on disk if possible."""
     options = {"nogil": True, "error_model": "numpy"}
     try:
         kept = njit(loop, cache=True, **options)
-    except RuntimeError:  # no folder for the cache that can be written to
+    except RuntimeError:  # no writable folder for the cache
         return njit(loop, **options)
     save = kept._cache.save_overload
 
@@ -29,7 +29,7 @@ def compiled(loop: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def in_threads(loop: Callable[..., Any], jobs: Iterable[tuple[Any, ...]], *, worth: bool = True) -> None:
-    """Run a compiled loop for every job, in as many threads as torch has where that is worth it."""
+    """Run a compiled loop for every job, in torch's number of threads if ``worth`` it."""
     threads = torch.get_num_threads()
     if threads == 1 or not worth:
         for job in jobs:

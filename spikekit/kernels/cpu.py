@@ -1,7 +1,7 @@
-"""The sensor and the decoders on the CPU: NumPy, one plane of one tile at a time, so that what is reused stays cached.
+"""NumPy kernels of the sensor and the decoders on the CPU, tile by tile, so that reused data stay in the cache.
 
-Every function takes the arguments of the custom operator of the same name and gives what its torch path gives. Tiles
-are some 64 k pixels; a loop over time runs within a tile. Outputs are allocated by NumPy, which asks for huge pages.
+Every function takes the arguments of the custom operator of the same name and returns the result of its torch path. A
+tile has about 64 k pixels, and loops over time run within a tile.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ _Slices = tuple[slice, slice]
 
 
 def _wide(*dtypes: torch.dtype) -> type[np.floating]:
-    """Return the type to compute in: halves are widened tile by tile."""
+    """Return the dtype to compute in; half precision is widened tile by tile."""
     return np.float64 if torch.float64 in dtypes else np.float32
 
 
 def _flat(stream: Tensor) -> Tensor:
-    """(*, T, H, W) as (B, T, P); a view where strides allow it."""
+    """Reshape (*, T, H, W) to (B, T, P), as a view if possible."""
     lead, (frames, height, width) = stream.shape[:-3], stream.shape[-3:]
     return stream.detach().reshape(math.prod(lead), frames, height * width)
 
 
 def _tiles(batch: int, pixels: int) -> Iterator[_Slices]:
     several = max(_TILE // pixels, 1)
-    part = -(-pixels // -(-pixels // _TILE))  # all of a plane's tiles are equally large
+    part = -(-pixels // -(-pixels // _TILE))  # equal tiles within a plane
     for b in range(0, batch, several):
         for p in range(0, pixels, part):
             yield slice(b, b + several), slice(p, p + part)
 
 
 def _read(flat: Tensor, tile: _Slices) -> np.ndarray:
-    """Return a tile as (T, b, p): a view, or a float32 copy of halves; bool as uint8."""
+    """Return a tile as (T, b, p): a view, with bool as uint8, or a float32 copy of half precision."""
     part = flat[tile[0], :, tile[1]].movedim(1, 0)
     if part.dtype is torch.bool:
         part = part.view(torch.uint8)
@@ -48,7 +48,7 @@ def _read(flat: Tensor, tile: _Slices) -> np.ndarray:
 
 
 class _Output:
-    """An output that is filled tile by tile, through a float32 buffer where it is half precision."""
+    """An output that is filled tile by tile, through a float32 buffer for half precision."""
 
     def __init__(self, shape: torch.Size, dtype: torch.dtype) -> None:
         self.tensor = new_tensor(shape, dtype)
@@ -56,7 +56,7 @@ class _Output:
         self._through_buffer = dtype in (torch.bfloat16, torch.float16)
 
     def tiles(self) -> Iterator[tuple[_Slices, np.ndarray]]:
-        """Yield where a tile lies, and the (T, b, p) to write it to."""
+        """Yield the slices of every tile and an array (T, b, p) to write to."""
         batch, _, pixels = self._flat.shape
         for tile in _tiles(batch, pixels):
             part = self._flat[tile[0], :, tile[1]].movedim(1, 0)
@@ -90,9 +90,9 @@ def _integrate_tile(light: np.ndarray, theta: np.floating, charge: np.ndarray, s
             np.greater_equal(full, theta, out=fired)
             np.copyto(spikes_t, fired)
             np.subtract(full, theta, out=rest)
-            # The smaller of the two as unsigned integers: `rest` where it is not negative, else `full`.
+            # The minimum as unsigned integers: `rest` if it is not negative, else `full`.
             np.minimum(full_bits, rest_bits, out=charge_bits)
-            if not charge.max() < theta:  # NaN comes this way as well
+            if not charge.max() < theta:  # also true for NaN
                 over = charge >= theta
                 several = full[over]
                 remainder = several - np.floor(several / theta) * theta
@@ -114,7 +114,7 @@ def _interval_tile(spikes: np.ndarray, interval: np.ndarray) -> None:
     one = interval.dtype.type(1)
     silent, factor, step = np.empty(plane, bool), np.empty(plane, interval.dtype), np.empty(plane, interval.dtype)
 
-    # Backwards: the distance to the next spike, or to T where there is none.
+    # Backwards: the distance to the next spike, or to T if there is none.
     ahead = np.zeros(plane, interval.dtype)
     for spikes_n, ahead_n in zip(spikes[::-1], interval[::-1], strict=True):
         np.equal(spikes_n, 0, out=silent)
@@ -123,7 +123,7 @@ def _interval_tile(spikes: np.ndarray, interval: np.ndarray) -> None:
         np.multiply(step, factor, out=ahead_n)
         ahead = ahead_n
 
-    # The first interval stretches back as far as the first complete one was long, but not less than to -1.
+    # The first interval is at least as long as the first complete one, and starts at -1 at the latest.
     first = interval[0].astype(np.int64)
     after = np.minimum(first + 1, frames - 1)
     second = after + np.take_along_axis(interval, after[None], axis=0)[0]
@@ -138,8 +138,8 @@ def _interval_tile(spikes: np.ndarray, interval: np.ndarray) -> None:
         np.multiply(behind, factor, out=behind)
         np.add(behind, one, out=behind)
 
-    # After the last spike, likewise: not less than the last complete interval.
-    last = frames - behind  # -1 of a pixel that never fired
+    # After the last spike: at least the last complete interval.
+    last = frames - behind  # -1 for a pixel without spikes
     complete = np.take_along_axis(interval, last.astype(np.int64).clip(0)[None], axis=0)[0]
     missing = np.where(last > first, np.maximum(complete - behind, 0), 0).astype(interval.dtype)
     for n in range(int(last[missing > 0].min(initial=frames)) + 1, frames):
@@ -150,7 +150,7 @@ def _interval_tile(spikes: np.ndarray, interval: np.ndarray) -> None:
 
 
 def tfi(spikes: Tensor, max_range: float, dtype: torch.dtype) -> Tensor:
-    """Read the spikes once and write the light once; the intervals of a tile lie between."""
+    """Read the spikes once and write the light once, with a buffer for the intervals of a tile."""
     light = _Output(spikes.shape, dtype)
     flat = _flat(spikes)
     counter = np.int16 if spikes.shape[-3] < 32767 else np.int32
@@ -167,7 +167,7 @@ def tfi(spikes: Tensor, max_range: float, dtype: torch.dtype) -> Tensor:
 
 
 def _store(value: np.ndarray, out: np.ndarray) -> None:
-    """Write a plane of floats, rounded to the nearest whole number and cut to the range where ``out`` is uint8."""
+    """Write a plane of floats; for uint8, round to the nearest whole number and clamp."""
     if value is out:
         return
     if out.dtype == np.uint8:
@@ -177,7 +177,7 @@ def _store(value: np.ndarray, out: np.ndarray) -> None:
 
 
 def tfp(spikes: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Tensor:
-    """Read the spikes twice, as they enter and leave the window, and write the light once, whatever the window."""
+    """Read the spikes twice, as they enter and leave the window, and write the light once, for any window."""
     light = _Output(spikes.shape, dtype)
     flat = _flat(spikes)
     wide = np.dtype(_wide(spikes.dtype, dtype))
@@ -195,7 +195,7 @@ def tfp(spikes: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Te
 
 
 def tfp_grad(grad: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Tensor:
-    """The same running sum over the gradient, each frame of it shared among the frames of its window."""
+    """Compute the same running sum over the gradient, divided by the window size of each frame."""
     result = _Output(grad.shape, dtype)
     flat = _flat(grad)
     weights = max_range / _window_sizes(grad.shape[-3], window)
@@ -206,16 +206,16 @@ def tfp_grad(grad: Tensor, window: int, max_range: float, dtype: torch.dtype) ->
 
 
 def _window_sizes(frames: int, window: int) -> np.ndarray:
-    """How many frames of the window around every frame exist."""
+    """Return the number of existing frames in the window around every frame."""
     n, half = np.arange(frames), window // 2
     return np.minimum(n + half, frames - 1) - np.maximum(n - half, 0) + 1
 
 
 def _running_sums(values: np.ndarray, window: int, weights: np.ndarray | None = None) -> Iterator[np.ndarray]:
-    """Yield, for every frame, the weighed sum over the frames of its window; the array is the same every time."""
+    """Yield the weighted sum over the window of every frame, in an array that is reused."""
     frames, half = len(values), window // 2
     if values.dtype.kind == "f":
-        counter = np.dtype(np.float64)  # or a large number that has left the window would leave its rounding behind
+        counter = np.dtype(np.float64)  # else large values would leave rounding errors in the running sum
     elif values.dtype == np.uint8:
         counter = np.min_scalar_type(window * int(values.max(initial=0)))
     else:

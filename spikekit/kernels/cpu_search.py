@@ -1,4 +1,4 @@
-"""The search of the nearest known pixels, position by position, in loops that Numba compiles."""
+"""Search for the nearest known pixels on a CPU, compiled by Numba."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _WORTH_THREADS = 1 << 14  # positions
 
 @compiled
 def _search(flow, rows, columns, height, width, begin, end, index, weight):
-    """Positions ``begin`` to ``end`` of an image: flow (2, H W) to index and weight (K, H W).
+    """Compute index and weight (K, H W) from flow (2, H W), for the positions ``begin`` to ``end`` of an image.
 
-    ``rows`` (P, 2 H, k) and ``columns`` (P, 2 W, k) name the nearest known rows and columns of every half of a pixel,
-    nearest first, -1 where there are no more.
+    ``rows`` (P, 2 H, k) and ``columns`` (P, 2 W, k) hold the nearest known rows and columns of every half pixel,
+    nearest first, padded by -1.
     """
     neighbors = len(index)
     best, distances = np.empty(neighbors, np.int64), np.empty(neighbors)
@@ -37,7 +37,7 @@ def _search(flow, rows, columns, height, width, begin, end, index, weight):
         away_x, away_y = (reference_x - cell_x) - part_x, (reference_y - cell_y) - part_y
         count = 0
         for p in range(len(rows)):
-            # (p - q)^2 - (r - q)^2 without squaring what is far away
+            # (p - q)^2 - (r - q)^2 without squaring large numbers
             for j in range(columns.shape[2]):
                 step = np.float64(columns[p, half_x, j] - reference_x)
                 along_x[j] = step * (step + 2 * away_x)
@@ -47,7 +47,7 @@ def _search(flow, rows, columns, height, width, begin, end, index, weight):
                     break
                 step = np.float64(row - reference_y)
                 along_y = step * (step + 2 * away_y)
-                for j in range(min(columns.shape[2], neighbors // (i + 1))):  # so many are at least as near
+                for j in range(min(columns.shape[2], neighbors // (i + 1))):  # the others are further away
                     column = columns[p, half_x, j]
                     distance = along_y + along_x[j]
                     full = count == neighbors
@@ -73,7 +73,7 @@ def _search(flow, rows, columns, height, width, begin, end, index, weight):
             index[k, n] = flat
         shortest = distances[0]
         for k in range(1, count):
-            # relative to the nearest: no overflow next to a known pixel, and nothing for the others on it
+            # relative to the nearest: no overflow near a known pixel; on it the other weights are 0
             distances[k] = shortest / distances[k]
             total += distances[k]
         weight[0, n] = 1 / total
@@ -82,12 +82,12 @@ def _search(flow, rows, columns, height, width, begin, end, index, weight):
 
 
 def _padded(tables: list[Tensor]) -> np.ndarray:
-    """Tables of (k, 2 L), k at most as many as neighbours, as (P, 2 L, k), -1 where there are no more."""
+    """Stack tables (k, 2 L) to (P, 2 L, k), padded by -1."""
     return pad_sequence(tables, batch_first=True, padding_value=-1).transpose(1, 2).contiguous().numpy()
 
 
 def nearest_known(flow: Tensor, products: list[tuple[Tensor, Tensor]], neighbors: int) -> tuple[Tensor, Tensor]:
-    """Indices and weights, (N, K, H W), as the operator of the same name; ``products`` as :func:`products_of` gives."""
+    """Return indices and weights, (N, K, H W), like the operator of this name; for ``products`` see `products_of`."""
     count, _, height, width = flow.shape
     plane = height * width
     rows, columns = (_padded(list(tables)) for tables in zip(*products, strict=True))

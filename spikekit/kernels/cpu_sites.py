@@ -1,4 +1,4 @@
-"""The site-wise search on a CPU, see :mod:`spikekit.warp.site_search`, in loops that Numba compiles."""
+"""Site-wise search on a CPU, see :mod:`spikekit.warp.site_search`, compiled by Numba."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from torch import Tensor
 from spikekit.kernels.compiled import compiled, in_threads
 from spikekit.kernels.layout import new_tensor
 
-_ROWS = 16  # sensor rows of a job
+_ROWS = 16  # sensor rows per job
 
 
 def _on_axis(moved: Any, at: Any, length: Any, low: Any, high: Any, steps: Any) -> Any:
-    """Base, place and fraction of a site that is moved along an axis, see :meth:`SiteTable.classes`."""
+    """Return base, place and fraction of a moved site on an axis, see :meth:`SiteTable.classes`."""
     moved = min(max(moved, np.float32(-2 * length)), np.float32(2 * length))
     to = min(max(np.int64(np.rint(moved * np.float32(steps))) + at * steps, -steps), length * steps)
     base = to // steps
@@ -31,7 +31,7 @@ _place = compiled(_on_axis)
 
 
 def _find(flow: Any, shares: Any, t: Any, y: Any, x: Any, low: Any, high: Any, steps: Any) -> Any:
-    """Row and column of the base of a site at a time point, and its class."""
+    """Return row and column of the base of a site at a time point, and its class."""
     height, width = flow.shape[2:]
     a, b = shares[t, 0], shares[t, 1]
     row, i, down = _place(a * flow[0, 1, y, x] + b * flow[1, 1, y, x], y, height, low, high, steps)
@@ -50,7 +50,7 @@ def _search(
     features: Any, flow: Any, shares: Any, start: Any, offset: Any, weight: Any, low: Any, high: Any, steps: Any,
     rows: Any, out: Any, half: Any,
 ) -> None:  # fmt: skip
-    """Temporal pixels of some rows: features (T, H, W, F), flow (2, 2, H, W), out (H, W, T, F, s^2)."""
+    """Compute the temporal pixels of some rows: features (T, H, W, F), flow (2, 2, H, W), out (H, W, T, F, s^2)."""
     times, height, width, channels = features.shape
     pixels = weight.shape[1]
     flat = features.reshape(times, height * width * channels)
@@ -69,7 +69,7 @@ def _search(
                         for c in range(channels):
                             total[c, 0] += weight[k, 0] * flat[t, at + jump[k] + c]
                         k += 1
-                while k + 4 <= last:  # four at a time: the sums stay in registers for longer
+                while k + 4 <= last:  # four at a time, to keep the sums in registers
                     for c in range(channels):
                         p, q = flat[t, at + jump[k] + c], flat[t, at + jump[k + 1] + c]
                         r, s = flat[t, at + jump[k + 2] + c], flat[t, at + jump[k + 3] + c]
@@ -99,7 +99,7 @@ def _spread(
     grad: Any, flow: Any, shares: Any, start: Any, offset: Any, weight: Any, low: Any, high: Any, steps: Any,
     t: Any, out: Any,
 ) -> None:  # fmt: skip
-    """What the features of a time point get back: grad (H, W, T, F, s^2), out (T, H, W, F), zeros before."""
+    """Add the gradient of the features of a time point to zeros ``out`` (T, H, W, F), from grad (H, W, T, F, s^2)."""
     _, height, width, channels = out.shape
     pixels = weight.shape[1]
     flat = out.reshape(len(out), height * width * channels)
@@ -123,7 +123,7 @@ def search_sites(
     features: Tensor, flow: Tensor, shares: Tensor, start: Tensor, offset: Tensor, weight: Tensor,
     scale: int, low: int, high: int, most: int, steps: int,
 ) -> Tensor:  # fmt: skip
-    """Float32 or bfloat16, (B, T, F, H, W) to (B, T F s^2, H, W)."""
+    """Map (B, T, F, H, W) to (B, T F s^2, H, W), float32 or bfloat16."""
     batch, times, channels, height, width = features.shape
     half = features.dtype is torch.bfloat16
     out = new_tensor((batch, height, width, times, channels, scale**2), features.dtype)
@@ -141,7 +141,7 @@ def spread_sites(
     grad: Tensor, flow: Tensor, shares: Tensor, start: Tensor, offset: Tensor, weight: Tensor,
     scale: int, low: int, high: int, most: int, steps: int,
 ) -> Tensor:  # fmt: skip
-    """Its derivative in the features, float32, (B, T F s^2, H, W) to (B, T, F, H, W)."""
+    """Return its derivative in the features, (B, T F s^2, H, W) to (B, T, F, H, W), float32."""
     times = len(shares)
     rows = grad.movedim(1, -1).float().contiguous().unflatten(-1, (times, -1, scale**2))
     batch, height, width, _, channels, _ = rows.shape

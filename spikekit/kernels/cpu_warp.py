@@ -1,7 +1,7 @@
-"""The warp on the CPU: rows of channels, gathered and weighed by ``embedding_bag``, in pieces that fit the cache.
+"""Warping on the CPU: rows of channels are gathered and weighted by ``embedding_bag``, in pieces that fit the cache.
 
-The gather's kernels are for many channels, or for channels that lie side by side; for a few planes the torch path is
-faster. Copies that are not contiguous are NumPy's: torch would share each small one among its threads.
+These kernels are for many channels, or channels last; for a few planes the torch path is faster. Strided copies use
+NumPy, as torch would use several threads even for small ones.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor
 from spikekit.check import wide_dtype
 from spikekit.kernels.layout import empty_like_layout, is_channels_last, new_tensor
 
-_PIECE = 1 << 18  # numbers that are gathered at a time
+_PIECE = 1 << 18  # elements that are gathered at a time
 
 
 def _new_like_layout(values: Tensor, size: int, numpy_new: Callable[..., np.ndarray] = np.empty) -> Tensor:
@@ -34,18 +34,18 @@ def _pieces(length: int, width: int) -> Iterator[slice]:
 
 
 def _rows(planes: Tensor, dtype: torch.dtype) -> Tensor:
-    """(C, P) as (P, C), side by side in memory."""
+    """Return (C, P) as contiguous (P, C)."""
     rows = planes.t()
     if rows.is_contiguous() and rows.dtype == dtype:
         return rows
     result = new_tensor(tuple(rows.shape), dtype)
     for piece in _pieces(*rows.shape):
-        result[piece].copy_(planes[:, piece].contiguous().t())  # torch transposes quickly what is contiguous
+        result[piece].copy_(planes[:, piece].contiguous().t())  # torch transposes contiguous tensors quickly
     return result
 
 
 def _used_rows(planes: Tensor, index: np.ndarray, dtype: torch.dtype) -> tuple[Tensor, np.ndarray | None]:
-    """Return the rows of (C, P) that the index reads, and where each is among them; None where all are there."""
+    """Return the rows of (C, P) that the index reads, and the new place of each pixel, or all rows and None."""
     channels, pixels = planes.shape
     if planes.t().is_contiguous() and planes.dtype == dtype:
         return planes.t(), None
@@ -67,7 +67,7 @@ def _bags(index: np.ndarray, place: np.ndarray | None, piece: slice) -> np.ndarr
 
 
 def weighted_gather(values: Tensor, index: Tensor, weight: Tensor) -> Tensor:
-    """Rows are made of what is read only; the sums of a piece are transposed while they are in the cache."""
+    """Gather from rows of the pixels that are read; sums of a piece are transposed while they are in the cache."""
     out, dtype = _new_like_layout(values, index.shape[2]), wide_dtype(values, weight)
     for planes, index_b, weight_b, out_b in zip(values.detach(), index.numpy(), weight.detach(), out, strict=True):
         rows, place = _used_rows(planes, index_b, dtype)
@@ -79,7 +79,7 @@ def weighted_gather(values: Tensor, index: Tensor, weight: Tensor) -> Tensor:
 
 
 def weighted_scatter(grad: Tensor, index: Tensor, weight: Tensor, size: int) -> Tensor:
-    """Sorted by pixel, what arrives at one is a bag: a gather again."""
+    """Sort entries by pixel; the entries of each pixel form a bag, as in a gather."""
     out, dtype = _new_like_layout(grad, size, np.zeros), wide_dtype(grad, weight)
     for planes, index_b, weight_b, out_b in zip(grad.detach(), index.numpy(), weight.detach(), out, strict=True):
         pixel, order = torch.from_numpy(index_b.ravel().astype(np.int32)).sort(stable=True)
@@ -101,7 +101,7 @@ def weighted_scatter(grad: Tensor, index: Tensor, weight: Tensor, size: int) -> 
 
 
 def weighted_dot(values: Tensor, grad: Tensor, index: Tensor) -> Tensor:
-    """Products of rows, a piece at a time."""
+    """Compute products of rows, a piece at a time."""
     dtype = wide_dtype(values, grad)
     out = new_tensor(tuple(index.shape), dtype)
     for planes, grad_b, index_b, out_b in zip(values.detach(), grad.detach(), index.numpy(), out.numpy(), strict=True):

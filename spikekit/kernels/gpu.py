@@ -1,11 +1,11 @@
-"""The sensor and the decoders on a GPU (CUDA or ROCm): fused Triton kernels; with those of the warp, all there are.
+"""Fused Triton kernels of the sensor and the decoders on a GPU (CUDA or ROCm); also exports the other GPU kernels.
 
-Every public function takes the arguments of the custom operator of the same name and gives what its torch path gives,
-in the memory layout of ``torch.empty_like``. It returns ``NotImplemented`` where the torch path is to run instead.
+Every public function takes the arguments of the custom operator of the same name and returns the result of its torch
+path, in the memory layout of ``torch.empty_like``, or ``NotImplemented`` if the torch path must run.
 
-Streams are seen as (B, T, P): batch, time, pixel. A program has a block of the pixels of one stream and loops over
-time; a second sweep is a kernel of its own, so that no thread depends on what another has just stored. Quotients are
-rounded as IEEE 754 asks and products are not fused with sums: Triton's defaults would move spikes.
+Streams are (B, T, P): batch, time, pixel. A program loops over time for a block of pixels of one stream. A second sweep
+is a separate kernel, so that threads do not depend on each other's stores. Division is rounded as in IEEE 754, and
+products are not fused with sums, as Triton's defaults would move spikes.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from spikekit.kernels.gpu_sites import search_sites, spread_sites  # noqa: F401
 from spikekit.kernels.gpu_tvl1 import tvl1_level  # noqa: F401
 from spikekit.kernels.gpu_warp import nearest_known, weighted_dot, weighted_gather, weighted_scatter  # noqa: F401
 
-_BLOCK = 512  # pixels of a program: four a thread, so that a thread reads four bytes or more at a time
-_STAGES = tl.constexpr(4)  # frames on their way from memory while one is worked on
-_LONGEST = 32766  # frames whose intervals, up to one more, fit into int16
+_BLOCK = 512  # pixels per program: four per thread, so that a thread reads at least four bytes at a time
+_STAGES = tl.constexpr(4)  # frames that are prefetched
+_LONGEST = 32766  # largest number of frames whose intervals, up to one more, fit into int16
 
 
 def _bytes(tensor: Tensor) -> Tensor:
-    """A bool tensor as what it is in memory; Triton would take it for single bits."""
+    """View a bool tensor as bytes; Triton would read single bits."""
     return tensor.view(torch.uint8) if tensor.dtype is torch.bool else tensor
 
 
 def _flat(stream: Tensor) -> Tensor:
-    """(*, T, H, W) as (B, T, P); a view where strides allow it."""
+    """Reshape (*, T, H, W) to (B, T, P), as a view if possible."""
     return _bytes(stream.detach()).reshape(stream.shape[:-3].numel(), stream.shape[-3], stream.shape[-2:].numel())
 
 
 def _scalar(value: float, like: Tensor, dtype: torch.dtype) -> Tensor:
-    """A number in memory: as an argument Triton would round it to float32."""
+    """Return a number as a tensor; Triton would round an argument to float32."""
     return torch.full((), value, dtype=dtype, device=like.device)
 
 
 def _as(layout: Tensor, result: Tensor) -> Tensor:
-    """The contiguous ``result`` in the shape and the memory layout of ``torch.empty_like(layout)``."""
+    """Return the contiguous ``result`` in the shape and memory layout of ``torch.empty_like(layout)``."""
     if torch.empty_like(layout, device="meta").is_contiguous():
         return result.reshape(layout.shape)
     return torch.empty_like(layout, dtype=result.dtype).copy_(result.reshape(layout.shape))
@@ -54,10 +54,10 @@ def _blocks(stream: Tensor) -> int:
 
 @triton.jit
 def _divide(a, b):
-    """IEEE division; the plain one is approximate in float32."""
+    """Divide as in IEEE 754; plain division is approximate in float32."""
     if a.dtype == tl.float64:
         return a / b
-    else:  # noqa: RET505 - Triton compiles the branch that is taken, and only that one
+    else:  # noqa: RET505 - Triton compiles only the branch that is taken
         return tl.div_rn(a, b)
 
 
@@ -99,7 +99,7 @@ def integrate_fire(light: Tensor, threshold: float, charge: Tensor, dtype: torch
 
 @triton.jit(do_not_specialize=["frames"])
 def _next_spike_kernel(spikes, following, first, frames, pixels, spikes_b, spikes_t, spikes_p, block: tl.constexpr):
-    """Next spike of every frame, T where there is none, and the first complete interval, for a block of pixels.
+    """Find the next spike of every frame, T if there is none, and the first complete interval of every pixel.
 
     Backwards in time: one read of the spikes, one write.
     """
@@ -121,7 +121,7 @@ def _next_spike_kernel(spikes, following, first, frames, pixels, spikes_b, spike
 
 @triton.jit(do_not_specialize=["frames"])
 def _interval_kernel(following, first, result, max_range, frames, pixels, as_light: tl.constexpr, block: tl.constexpr):
-    """Intervals of a block of pixels, or, with as_light, max_range over them; the result may lie on ``following``.
+    """Compute intervals, or max_range / interval if ``as_light``; the result may overwrite ``following``.
 
     Forwards in time: one read of the next spikes, one write.
     """
@@ -132,7 +132,7 @@ def _interval_kernel(following, first, result, max_range, frames, pixels, as_lig
     white = tl.load(max_range)
     first_complete = tl.load(first + b * pixels + pixel, mask=inside, other=0)
     last_complete = tl.zeros([block], tl.int32)
-    before = tl.zeros([block], tl.int32) - 1  # the last spike, -1 where there is none
+    before = tl.zeros([block], tl.int32) - 1  # the last spike, -1 if there is none
     for n in tl.range(frames, num_stages=_STAGES):
         after = tl.load(following + n * pixels, mask=inside, other=0).to(tl.int32)
         fired = after == n
@@ -141,7 +141,7 @@ def _interval_kernel(following, first, result, max_range, frames, pixels, as_lig
         last_complete = tl.where(fired & (before >= 0), n - before, last_complete)
         before = tl.where(fired, n, before)
         if as_light:
-            interval = tl.maximum(interval, 1).to(white.dtype)  # pixels beyond the picture have 0
+            interval = tl.maximum(interval, 1).to(white.dtype)  # 0 outside the picture
             store(result + n * pixels, _divide(white, interval), inside)
         else:
             tl.store(result + n * pixels, interval.to(result.dtype.element_ty), mask=inside)
@@ -171,7 +171,7 @@ def tfi(spikes: Tensor, max_range: float, dtype: torch.dtype) -> Tensor:
 
 @triton.jit
 def _window_size(n, half, frames):
-    """Number of frames that exist in the window around frame n."""
+    """Return the number of existing frames in the window around frame n."""
     return tl.minimum(n + half, frames - 1) - tl.maximum(n - half, 0) + 1
 
 
@@ -179,7 +179,7 @@ def _window_size(n, half, frames):
 def _term(
     values, n, exists, frames, step, half, max_range, pixel, pixels, counter: tl.constexpr, adjoint: tl.constexpr
 ):
-    """The addend of frame n to a window, 0 where there is no such frame."""
+    """Return the term of frame n in a window, 0 if there is no such frame."""
     value = tl.load(values + n * step, mask=pixel < tl.where(exists, pixels, 0), other=0).to(counter)
     if adjoint:
         value *= max_range / tl.maximum(_window_size(n, half, frames), 1).to(counter)
@@ -191,9 +191,9 @@ def _window_kernel(
     values, max_range, result, frames, half, pixels, values_b, values_t, values_p,
     counter: tl.constexpr, adjoint: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
-    """Mean over the window around every frame, or its adjoint, by a sum that frames enter and leave.
+    """Compute the mean over the window of every frame, or its adjoint, by a running sum.
 
-    Reads every frame twice, as it enters and as it leaves, and writes the result once, whatever the window.
+    Every frame is read twice, as it enters and leaves the window, and the result is written once, for any window.
     """
     b, pixel, inside = my_pixels(pixels, block)
     values += b * values_b + pixel * values_p
@@ -221,7 +221,7 @@ def _windows(values: Tensor, window: int, max_range: Tensor, dtype: torch.dtype,
     frames, pixels = flat.shape[1:]
     sizes = frames, min(window // 2, frames), pixels, *flat.stride()
     if values.is_floating_point():
-        count = tl.float64  # a sum that runs must not forget what is small
+        count = tl.float64  # so that rounding errors of large values do not remain in the running sum
     else:
         count = tl.int32 if values.dtype in (torch.bool, torch.uint8) else tl.int64
     constants = {"counter": count, "adjoint": adjoint, "block": _BLOCK}
@@ -230,11 +230,11 @@ def _windows(values: Tensor, window: int, max_range: Tensor, dtype: torch.dtype,
 
 
 def tfp(spikes: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Tensor:
-    """Read the spikes twice and write the light once, whatever the window."""
+    """Read the spikes twice and write the light once, for any window."""
     wide = torch.float64 if torch.float64 in (spikes.dtype, dtype) else torch.float32
     return _windows(spikes, window, _scalar(max_range, spikes, wide), dtype, False)
 
 
 def tfp_grad(grad: Tensor, window: int, max_range: float, dtype: torch.dtype) -> Tensor:
-    """Read the gradient twice and write the result once: every frame shares among the frames of its window."""
+    """Read the gradient twice and write the result once."""
     return _windows(grad, window, _scalar(max_range, grad, torch.float64), dtype, True)

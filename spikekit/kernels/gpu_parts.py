@@ -1,4 +1,4 @@
-"""Helpers that all GPU kernels share."""
+"""Helpers of the GPU kernels."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import triton.language as tl
 
 
 def launch(kernel: Any, programs: int, *args: Any, **constants: Any) -> None:
-    """Run ``programs`` programs of a kernel on the device of its first argument."""
+    """Launch ``programs`` programs of a kernel on the device of its first argument."""
     device = args[0].device
     if programs:
         with torch.cuda.device(device) if device.type == "cuda" else nullcontext():
@@ -20,7 +20,7 @@ def launch(kernel: Any, programs: int, *args: Any, **constants: Any) -> None:
 
 @triton.jit
 def my_pixels(pixels, block: tl.constexpr):
-    """Stream of this program, its pixels, and which of them exist; 64 bits, as all that is counted in elements."""
+    """Return stream and pixels of this program, as 64-bit element offsets, and the mask of existing pixels."""
     blocks = tl.cdiv(pixels, block)
     program = tl.program_id(0)
     pixel = (program % blocks).to(tl.int64) * block + tl.arange(0, block)
@@ -29,7 +29,7 @@ def my_pixels(pixels, block: tl.constexpr):
 
 @triton.jit
 def store(pointer, value, mask):
-    """Store floats: to uint8 by rounding half to even and cutting what is beyond, to halves through float32."""
+    """Store floats; uint8 is rounded half to even and clamped, half precision is converted from float32."""
     if pointer.dtype.element_ty == tl.uint8:
         value = tl.minimum(tl.maximum(value, 0.0), 255.0)
         whole = value.to(tl.int32)

@@ -1,4 +1,4 @@
-"""The site-wise search on a GPU, see :mod:`spikekit.warp.site_search`: forwards a gather, backwards atomic sums."""
+"""Site-wise search on a GPU, see :mod:`spikekit.warp.site_search`: a gather forwards, atomic sums backwards."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from torch import Tensor
 
 from spikekit.kernels.gpu_parts import launch, store
 
-_BLOCK = 32  # sites of a program
+_BLOCK = 32  # sites per program
 
 
 @triton.jit
 def _on_axis(moved, at, length, low, high, steps):
-    """Base, place and fraction of sites that are moved along an axis, see ``SiteTable.classes``."""
+    """Return base, place and fraction of moved sites on an axis, see ``SiteTable.classes``."""
     far = (2 * length).to(tl.float32)
     moved = tl.minimum(tl.maximum(moved, -far), far) * steps
-    # half to even: adding 1.5 * 2^23 leaves no room for a fraction, and far is well below 2^22 / steps
+    # round half to even by adding 1.5 * 2^23; far is well below 2^22 / steps
     whole = tl.where(tl.abs(moved) < 4194304.0, (moved + 12582912.0) - 12582912.0, moved).to(tl.int32)
     to = tl.minimum(tl.maximum(whole + at * steps, -steps), length * steps)
-    base = (to + steps) // steps - 1  # a division of what is not negative
+    base = (to + steps) // steps - 1  # keeps the dividend non-negative
     place = tl.where(base < -low, base + 3, base & 1)
     place = tl.where(base + high >= length, 3 - low + length - base, place)
     return base, place, to - base * steps
@@ -28,7 +28,7 @@ def _on_axis(moved, at, length, low, high, steps):
 
 @triton.jit
 def _classify(flow, shares, start, batch, time, y, x, inside, height, width, low, high, steps):
-    """Flat positions of the bases of sites, and where their features begin and end in the table."""
+    """Return rows and columns of the bases of sites, and the range of their features in the table."""
     plane = height * width
     at = batch.to(tl.int64) * 4 * plane + y * width + x
     a = tl.load(shares + 2 * time)
@@ -108,7 +108,7 @@ def search_sites(
     features: Tensor, flow: Tensor, shares: Tensor, start: Tensor, offset: Tensor, weight: Tensor,
     scale: int, low: int, high: int, most: int, steps: int,
 ) -> Tensor:  # fmt: skip
-    """Of any floating dtype but float64, (B, T, F, H, W) to (B, T F s^2, H, W)."""
+    """Map (B, T, F, H, W) to (B, T F s^2, H, W), any floating dtype but float64."""
     batch, times, channels, height, width = features.shape
     out = features.new_empty(batch, height, width, times, channels, scale**2)
     rows = features.permute(0, 1, 3, 4, 2).contiguous()
@@ -120,7 +120,7 @@ def spread_sites(
     grad: Tensor, flow: Tensor, shares: Tensor, start: Tensor, offset: Tensor, weight: Tensor,
     scale: int, low: int, high: int, most: int, steps: int,
 ) -> Tensor:  # fmt: skip
-    """Its derivative in the features, float32, (B, T F s^2, H, W) to (B, T, F, H, W)."""
+    """Return its derivative in the features, (B, T F s^2, H, W) to (B, T, F, H, W), float32."""
     times, pixels = len(shares), scale**2
     rows = grad.movedim(1, -1).contiguous().unflatten(-1, (times, -1, pixels))
     batch, height, width, _, channels, _ = rows.shape

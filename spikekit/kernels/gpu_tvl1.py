@@ -1,7 +1,4 @@
-"""One level of :func:`spikekit.flow.tvl1.tvl1_flow` on a GPU: three launches a round, whatever the number of clips.
-
-The torch path takes some sixty.
-"""
+"""One level of :func:`spikekit.flow.tvl1.tvl1_flow` on a GPU: three launches per round; torch needs about sixty."""
 
 from __future__ import annotations
 
@@ -17,11 +14,11 @@ _BLOCK = 128
 
 @triton.jit
 def _warped(image, flow, time, plane, y, x, height, width, inside):
-    """Value of an image where the flow of (x, y), times ``time``, points to; bilinear, the border continued."""
+    """Return an image warped by ``time`` times the flow at (x, y), bilinearly, with replicated borders."""
     pixel = y * width + x
     at_x = x + time * tl.load(flow + pixel, mask=inside, other=0.0)
     at_y = y + time * tl.load(flow + plane + pixel, mask=inside, other=0.0)
-    at_x = tl.where(at_x > 0, tl.minimum(at_x, width - 1.0), 0.0)  # NaN as well
+    at_x = tl.where(at_x > 0, tl.minimum(at_x, width - 1.0), 0.0)  # also for NaN
     at_y = tl.where(at_y > 0, tl.minimum(at_y, height - 1.0), 0.0)
     left = tl.minimum(at_x.to(tl.int32), width - 2)
     top = tl.minimum(at_y.to(tl.int32), height - 2)
@@ -36,7 +33,7 @@ def _warped(image, flow, time, plane, y, x, height, width, inside):
 
 @triton.jit
 def _slopes(image, flow, time, plane, y, x, height, width, inside):
-    """A warped image and its derivatives along both axes."""
+    """Return a warped image and its derivatives along both axes."""
     left, right = tl.maximum(x - 1, 0), tl.minimum(x + 1, width - 1)
     above, below = tl.maximum(y - 1, 0), tl.minimum(y + 1, height - 1)
     here = _warped(image, flow, time, plane, y, x, height, width, inside)
@@ -49,7 +46,7 @@ def _slopes(image, flow, time, plane, y, x, height, width, inside):
 
 @triton.jit(do_not_specialize=["height", "width"])
 def _linearize_kernel(pictures, times, flow, slope, rest, height, width, block: tl.constexpr):
-    """Derivative of the difference of two warped pictures by the flow, and what it is where there is no flow."""
+    """Linearize the difference of two warped pictures in the flow: slope, and value at zero flow."""
     plane = height * width
     clip, pixel, inside = my_pixels(plane, block)
     pixel = pixel.to(tl.int32)
@@ -70,7 +67,7 @@ def _linearize_kernel(pictures, times, flow, slope, rest, height, width, block: 
 
 @triton.jit
 def _primal(near, dual, plane, y, x, width, inside):
-    """The flow that belongs to the dual variable, at (x, y)."""
+    """Return the flow at (x, y) from the dual variable."""
     pixel = y * width + x
     flow = tl.load(near + pixel, mask=inside, other=0.0)
     flow += tl.load(dual + pixel, mask=inside, other=0.0)
@@ -81,10 +78,7 @@ def _primal(near, dual, plane, y, x, width, inside):
 
 @triton.jit(do_not_specialize=["height", "width"])
 def _follow_kernel(near, dual, flow, slope, rest, limit, height, width, follow: tl.constexpr, block: tl.constexpr):
-    """The smooth flow; then, moved along the slope until the pictures agree, by no more than the limit, the next near.
-
-    Without ``follow`` the smooth flow alone.
-    """
+    """Compute the smooth flow; with ``follow``, move it along the slope, at most by the limit, to the next ``near``."""
     plane = height * width
     clip, pixel, inside = my_pixels(plane, block)
     pixel = pixel.to(tl.int32)
@@ -103,14 +97,14 @@ def _follow_kernel(near, dual, flow, slope, rest, limit, height, width, follow: 
     differs = tl.load(rest + clip * plane + pixel, mask=inside, other=0.0) + along_x * flow_x + along_y * flow_y
     most = tl.load(limit + clip * plane + pixel, mask=inside, other=0.0)
     way = tl.minimum(tl.maximum(-differs / (along_x * along_x + along_y * along_y + 1e-30), -most), most)
-    # each program writes only what it has read of near
+    # each program writes only the elements of near that it has read
     tl.store(near + pixel, flow_x + way * along_x, mask=inside)
     tl.store(near + plane + pixel, flow_y + way * along_y, mask=inside)
 
 
 @triton.jit(do_not_specialize=["height", "width"])
 def _smooth_kernel(near, dual, new, height, width, step, damping, block: tl.constexpr):
-    """One step of the dual variable (B, 2, 2, H, W) towards the flow of least variation near ``near`` (B, 2, H, W)."""
+    """Take one step of total-variation denoising of ``near`` (B, 2, H, W), in the dual variable (B, 2, 2, H, W)."""
     plane = height * width
     component, pixel, inside = my_pixels(plane, block)
     pixel = pixel.to(tl.int32)
@@ -134,7 +128,7 @@ def tvl1_level(
     pictures: Tensor, times: Tensor, limit: Tensor, flow: Tensor, warps: int,
     rounds: int, smoothings: int, step: float, damping: float,
 ) -> Tensor:  # fmt: skip
-    """Return the flow (B, 2, H, W) of pictures (B, 2, H, W), float32, as :func:`spikekit.flow.tvl1.refine` does."""
+    """Return the flow (B, 2, H, W) of pictures (B, 2, H, W), float32, like :func:`spikekit.flow.tvl1.refine`."""
     clips, _, height, width = pictures.shape
     pictures, times, limit = pictures.contiguous(), times.to(pictures).contiguous(), limit.contiguous()
     near, slope, rest = (
@@ -148,7 +142,7 @@ def tvl1_level(
     size = height, width
     for _ in range(warps):
         launch(_linearize_kernel, blocks, pictures, times, flow, slope, rest, *size, block=_BLOCK)
-        # near holds the flow that the dual variable, as it stands, is added to
+        # near is the flow to which the dual variable is added
         for _ in range(rounds):
             launch(_follow_kernel, blocks, near, duals[0], flow, slope, rest, limit, *size, follow=True, block=_BLOCK)
             for _ in range(smoothings):

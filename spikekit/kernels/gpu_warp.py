@@ -1,6 +1,6 @@
-"""The warp on a GPU: the search of the nearest known pixels, and the weighted gather with its two derivatives.
+"""Warping on a GPU: the search for the nearest known pixels, and the weighted gather with its two derivatives.
 
-A picture's positions and planes are long; programs have a block of positions, or a tile of channels and positions.
+A program processes a block of positions, or a tile of channels and positions.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from spikekit.check import wide_dtype
 from spikekit.kernels.gpu_parts import launch, my_pixels, store
 from spikekit.kernels.layout import empty_like_layout, is_channels_last
 
-_BLOCK = 128  # positions that a program searches, one a thread
-_TILE = 1024  # numbers that a program gathers
-_CHANNELS = 8  # of a tile, or _CHANNELS_LAST of them where they lie side by side
-_CHANNELS_LAST = 64
+_BLOCK = 128  # positions per program of the search, one per thread
+_TILE = 1024  # elements per program of the gather
+_CHANNELS = 8  # channels per tile
+_CHANNELS_LAST = 64  # channels per tile in channels-last layout
 
 
 @triton.jit
 def _split(flow, pixel):
-    """The nearest whole position to pixel + flow, and what is missing: both exact, whatever the size of the picture.
+    """Return the whole position nearest to pixel + flow, and the remainder, both exact for any size.
 
-    Adding 1.5 * 2^52 leaves no room for a fraction, so that the sum is rounded, half to even.
+    Adding 1.5 * 2^52 rounds half to even.
     """
     whole = (flow.to(tl.float64) + 6755399441055744.0) - 6755399441055744.0
     return pixel + whole.to(tl.int64), flow.to(tl.float64) - whole
@@ -33,9 +33,9 @@ def _split(flow, pixel):
 
 @triton.jit
 def _on_axis(table, length, cell, part, inside):
-    """Position that the table names for cell + part, -1 for none, and its squared distance less a common reference's.
+    """Look up the position for cell + part, -1 for none, and its squared distance relative to a common reference.
 
-    (p - q)^2 - (r - q)^2 without squaring what is far away; q = cell + part, and r is the cell, moved into the axis.
+    (p - q)^2 - (r - q)^2 without squaring large numbers; q = cell + part, and r is the cell clamped to the axis.
     """
     half = 2 * cell + tl.ceil(2 * part).to(tl.int64)
     half = tl.minimum(tl.maximum(half, 0), 2 * length - 1)
@@ -47,7 +47,7 @@ def _on_axis(table, length, cell, part, inside):
 
 @triton.jit
 def _distance(index, width, x, x_part, y, y_part):
-    """Distance of a pixel from (x + x_part, y + y_part)."""
+    """Return the distance of a pixel from (x + x_part, y + y_part)."""
     row = index // width
     dx = (index - row * width - x).to(tl.float64) - x_part
     dy = (row - y).to(tl.float64) - y_part
@@ -58,11 +58,11 @@ def _distance(index, width, x, x_part, y, y_part):
 def _search_kernel(
     flow, rows, columns, index, height, width, products, on_rows, on_columns, neighbors, block: tl.constexpr
 ):
-    """Nearest known pixels of a block of positions, one after the other; the first again where there are no more.
+    """Find the nearest known pixels of a block of positions, one by one; repeat the first if too few exist.
 
-    The next one is the first, by distance and then by index, of the candidates that come after the last one. A
-    candidate is the i-th nearest row and the j-th nearest column of a product, with i j at most ``neighbors``: any
-    other has as many before it. The flow is read once and the index written once; the tables stay in the cache.
+    The next pixel is the first one after the last, by distance and then by index, among the candidates: pairs of the
+    i-th nearest row and the j-th nearest column of a product with i j <= ``neighbors``. All other pairs are further
+    away. The flow is read once and the index written once; the tables stay in the cache.
     """
     plane = tl.cast(height, tl.int64) * width
     b, pixel, inside = my_pixels(plane, block)
@@ -94,7 +94,7 @@ def _search_kernel(
 
 @triton.jit
 def _ratio(pixel, nearest, shortest, width, x, x_part, y, y_part):
-    """Inverse distance relative to that of the nearest pixel: no overflow, and 0 for all others where that is hit."""
+    """Return the inverse distance relative to that of the nearest pixel: no overflow, and 0 if that distance is 0."""
     distance = _distance(pixel, width, x, x_part, y, y_part)
     again = pixel == nearest
     return tl.where(again, 0.0, shortest / tl.where(again, 1.0, distance))
@@ -102,7 +102,7 @@ def _ratio(pixel, nearest, shortest, width, x, x_part, y, y_part):
 
 @triton.jit(do_not_specialize=["height", "width", "neighbors"])
 def _weigh_kernel(flow, index, weight, height, width, neighbors, block: tl.constexpr):
-    """Weights of the neighbours of a block of positions: the index is read twice, the weight written once."""
+    """Compute the weights of the neighbours of a block of positions; read the index twice, write the weight once."""
     plane = tl.cast(height, tl.int64) * width
     b, pixel, inside = my_pixels(plane, block)
     x, x_part = _split(tl.load(flow + 2 * b * plane + pixel, mask=inside, other=0), pixel % width)
@@ -122,10 +122,10 @@ def _weigh_kernel(flow, index, weight, height, width, neighbors, block: tl.const
 
 
 def nearest_known(flow: Tensor, products: list[tuple[Tensor, Tensor]], neighbors: int) -> tuple[Tensor, Tensor]:
-    """Exact search, in float64: as the operator of the same name, of flow that is rounded already.
+    """Search exactly, in float64, like the operator of the same name.
 
-    ``products`` has the tables of the rows and columns that the mask consists of, int32: for every half of a pixel on
-    the axis, its nearest known positions, (at most ``neighbors``, 2 H) and (at most ``neighbors``, 2 W).
+    ``products`` holds tables of rows and columns, int32, (at most ``neighbors``, 2 H) and (at most ``neighbors``, 2 W):
+    the nearest known positions of every half pixel on the axis.
     """
     rows, columns = (pad_sequence(list(axis), True, -1).contiguous() for axis in zip(*products, strict=True))
     batch, _, height, width = flow.shape
@@ -141,7 +141,7 @@ def nearest_known(flow: Tensor, products: list[tuple[Tensor, Tensor]], neighbors
 
 @triton.jit
 def _my_tile(channels, points, tile_c: tl.constexpr, tile_q: tl.constexpr):
-    """Picture, channels (a column) and points (a row) of this program; programs of the same points are neighbours."""
+    """Return picture, channels (a column) and points (a row) of this program; channels vary fastest."""
     program = tl.program_id(0)
     blocks = tl.cdiv(channels, tile_c)
     c = (program % blocks).to(tl.int64) * tile_c + tl.arange(0, tile_c)[:, None]
@@ -157,7 +157,7 @@ def _gather_kernel(
     values_b, values_c, values_p, result_b, result_c, result_q,
     wide: tl.constexpr, tile_c: tl.constexpr, tile_q: tl.constexpr,
 ):  # fmt: skip
-    """Weigh and sum the neighbours of a tile of channels and points: every neighbour is read once a channel."""
+    """Sum the weighted neighbours of a tile of channels and points."""
     b, c, q = _my_tile(channels, points, tile_c, tile_q)
     inside = (c < channels) & (q < points)
     values += b * values_b + c * values_c
@@ -176,7 +176,7 @@ def _scatter_kernel(
     grad_b, grad_c, grad_q, result_b, result_c, result_p,
     wide: tl.constexpr, tile_c: tl.constexpr, tile_q: tl.constexpr,
 ):  # fmt: skip
-    """Add a tile of channels and points, weighed, to the neighbours: read once, added atomically once a neighbour."""
+    """Add a weighted tile of channels and points to its neighbours, atomically."""
     b, c, q = _my_tile(channels, points, tile_c, tile_q)
     inside = (c < channels) & (q < points)
     value = tl.load(grad + b * grad_b + c * grad_c + q * grad_q, mask=inside, other=0).to(wide)
@@ -194,7 +194,7 @@ def _dot_kernel(
     values_b, values_c, values_p, grad_b, grad_c, grad_q,
     wide: tl.constexpr, tile_c: tl.constexpr, tile_q: tl.constexpr,
 ):  # fmt: skip
-    """Multiply and sum over the channels, for a block of points and one neighbour: both are read once a neighbour."""
+    """Compute the dot product over the channels for a block of points and one neighbour."""
     b, k, q = _my_tile(neighbors, points, 1, tile_q)
     entry = (b * neighbors + k) * points + q
     pixel = tl.load(index + entry, mask=q < points, other=0)
@@ -210,7 +210,7 @@ def _dot_kernel(
 
 
 def _tile(values: Tensor, dtype: torch.dtype) -> dict[str, int | tl.dtype]:
-    """Channels by points of a program, and the type of its sums."""
+    """Return the tile of a program, channels by points, and the dtype of its sums."""
     most = _CHANNELS_LAST if is_channels_last(values) else _CHANNELS
     channels = min(most, triton.next_power_of_2(values.shape[1]))
     wide = tl.float64 if dtype is torch.float64 else tl.float32
@@ -233,7 +233,7 @@ def weighted_gather(values: Tensor, index: Tensor, weight: Tensor) -> Tensor:
 
 
 def weighted_scatter(grad: Tensor, index: Tensor, weight: Tensor, size: int) -> Tensor:
-    """Read the gradient once and add it to every neighbour, in any order: not where that order must be the same."""
+    """Read the gradient once and add it to every neighbour; not deterministic."""
     if torch.are_deterministic_algorithms_enabled():
         return NotImplemented
     grad, index, weight = grad.detach(), index.contiguous(), weight.detach().contiguous()

@@ -1,4 +1,4 @@
-"""CUDA graphs of functions whose launches take a GPU longer than their work."""
+"""CUDA graphs, for functions whose kernel launches take longer than their work."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from threading import RLock
 import torch
 from torch import Tensor
 
-_CAPTURE = RLock()  # one capture at a time in a process
+_CAPTURE = RLock()  # one capture at a time per process
 
 
 class Replayed:
-    """A function of tensors on a GPU that is captured once for every set of sizes, and replayed from then on.
+    """A function of tensors on a GPU, captured as a CUDA graph once per set of sizes, and replayed afterwards.
 
-    The first call with some sizes runs as it is, so that kernels are compiled and libraries have chosen theirs; the
-    second captures. No gradient. Results are copies, and calls from several threads wait for each other. The function
-    takes a hashable argument and tensors, has no effects, and never waits for the GPU; ``most`` sizes are kept.
+    The first call with new sizes runs normally, so that kernels are compiled and tuned; the second captures. No
+    gradient. Results are copies, and the object is thread-safe. The function takes a hashable argument and tensors; it
+    must have no side effects and no GPU synchronisation. Graphs for the last ``most`` sets of sizes are kept.
     """
 
     def __init__(self, function: Callable[..., Tensor], most: int = 8) -> None:
@@ -27,7 +27,7 @@ class Replayed:
 
     @torch.no_grad()
     def __call__(self, argument: Hashable, *tensors: Tensor) -> Tensor:
-        """Run the function, or replay its graph."""
+        """Run the function or replay its graph."""
         if torch.cuda.is_current_stream_capturing():
             return self.function(argument, *tensors)
         key = argument, tensors[0].device, *((part.shape, part.dtype) for part in tensors)
@@ -41,7 +41,7 @@ class Replayed:
             if self._graphs[key] is None:
                 try:
                     self._graphs[key] = _Graph(self.function, argument, tensors)
-                except RuntimeError:  # something in it waits for the GPU after all, or there is no memory for a graph
+                except RuntimeError:  # the function synchronises, or memory is short
                     self._graphs[key] = False
             graph = self._graphs[key]
             return graph.replay(tensors) if graph else self.function(argument, *tensors)

@@ -1,4 +1,4 @@
-"""Memory of results: where it comes from on the CPU, and its layout after a gather, that of the input."""
+"""Allocation and memory layout of results."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from torch import Tensor
 
 
 def new_tensor(shape: tuple[int, ...], dtype: torch.dtype, numpy_new: Callable[..., np.ndarray] = np.empty) -> Tensor:
-    """Return a tensor on the CPU from NumPy, which asks for huge pages."""
+    """Allocate a CPU tensor by NumPy, which requests huge pages."""
     return torch.from_numpy(numpy_new(shape, f"i{dtype.itemsize}")).view(dtype)
 
 
 def is_channels_last(values: Tensor) -> bool:
-    """Whether the channels of (B, C, P) lie side by side in memory."""
+    """Return whether the channels of (B, C, P) are contiguous in memory."""
     return values.stride(1) == 1 and values.stride(2) > 1
 
 
 def empty_like_layout(values: Tensor, size: int, empty: Callable[[tuple[int, ...]], Tensor] | None = None) -> Tensor:
-    """Return an empty (B, C, size) in the dtype of ``values``, channels last where ``values`` are, else contiguous."""
+    """Return an empty tensor (B, C, size) in the dtype of ``values``, channels last if ``values`` are."""
     empty = empty or values.new_empty
     batch, channels, _ = values.shape
     if is_channels_last(values):

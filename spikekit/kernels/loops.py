@@ -1,4 +1,4 @@
-"""Lazy import of the modules that Numba compiles, where Numba is installed."""
+"""Lazy import of modules that need Numba."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ NUMBA = find_spec("numba") is not None
 
 
 def import_loops(module: str) -> Any:
-    """Return a module whose loops are :func:`spikekit.kernels.compiled.compiled`; None without a Numba that works."""
+    """Import a module with compiled loops; return None if Numba is missing or does not work."""
     try:
         return import_module(module) if NUMBA else None
-    except ImportError:  # installed, but not made for the NumPy that is
+    except ImportError:  # incompatible with the installed NumPy
         return None

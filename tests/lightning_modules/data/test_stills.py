@@ -241,7 +241,7 @@ def test_errors_say_what_is_wrong(folder, tmp_path):
 def test_corrupt_picture_is_named(tmp_path):
     (tmp_path / "broken.png").write_bytes(b"\x89PNG\r\n\x1a\nnot really")
     data = scenes(root=str(tmp_path), workers=1)
-    with pytest.raises(ValueError, match=r"broken\.png: not a picture"):
+    with pytest.raises(ValueError, match=r"broken\.png: not a readable picture"):
         next(iter(data.train_dataloader()))
 
 

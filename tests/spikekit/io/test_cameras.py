@@ -119,5 +119,5 @@ def test_errors_say_what_was_expected(tmp_path):
         with pytest.raises(ValueError, match=said):
             camera(name)
     for name, width, said in (("vidar", 250, "250 x 400 or 416"), ("uhsr", 400, "250 x 250")):
-        with pytest.raises(ValueError, match=f"spikes: expected {said} of the camera {name}, got 250 x {width}"):
+        with pytest.raises(ValueError, match=f"spikes: expected {said} for the camera {name}, got 250 x {width}"):
             camera(name).prepare(torch.zeros(3, 250, width))
