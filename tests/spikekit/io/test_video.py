@@ -131,11 +131,7 @@ def test_what_is_no_film(tmp_path, monkeypatch):
     for value in (-0.1, 1.5, float("nan")):  # beyond black and white
         Image.fromarray(np.full((6, 8), value, np.float32)).save(tmp_path / "a.tif")
         fails(tmp_path / "a.tif", "[0, 1]")
-    for name, said in (
-        ("notes.txt", "expected a folder of pictures"),
-        ("bad.png", "not a readable picture"),
-        ("bad.mp4", ""),
-    ):
+    for name, said in (("notes.txt", "a folder of pictures"), ("bad.png", "not a readable picture"), ("bad.mp4", "")):
         (tmp_path / name).write_text("no film")
         fails(tmp_path / name, said)
     fails(tmp_path / "notes.txt" / "deeper")
