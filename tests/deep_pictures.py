@@ -1,8 +1,6 @@
-"""Pictures of 16 bits that no library writes alone: TIFFs packed by LZW, PNGs of grey with alpha."""
+"""Pictures of 16 bits that no library writes alone: TIFFs packed by LZW."""
 
 import io
-import struct
-import zlib
 
 import tifffile
 from PIL import Image
@@ -20,13 +18,3 @@ def write_lzw_tiff(path, pixels, **how):
     tifffile.imwrite(path, iter([strip]), shape=pixels.shape, dtype="uint16", **how)
     with tifffile.TiffFile(path, mode="r+") as file:
         file.pages.first.tags["Compression"].overwrite(5)
-
-
-def write_grey_alpha_png(path, pixels):
-    """Write (H, W, 2) uint16."""
-    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in pixels)
-    head = struct.pack(">IIBBBBB", *pixels.shape[1::-1], 16, 4, 0, 0, 0)
-    data = b"\x89PNG\r\n\x1a\n"
-    for kind, part in ((b"IHDR", head), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")):
-        data += struct.pack(">I", len(part)) + kind + part + struct.pack(">I", zlib.crc32(kind + part))
-    path.write_bytes(data)

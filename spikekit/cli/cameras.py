@@ -18,9 +18,8 @@ def run(args: argparse.Namespace) -> None:
         height, width = one.prepared_size
         flip = "upside down" if one.flip else "upright"
         rows.append([one.name, f"{height} x {width}", one.pattern or "grey", flip, f"{one.rate:g}", one.title])
-    print(table(["camera", "H x W", "Bayer", "stored", "frames/s", "description"], rows, markdown=args.markdown))
+    print(table(["camera", "H x W", "Bayer", "stored", "frames/s", "description"], rows, markdown=False))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the verb."""
-    parser.add_argument("--markdown", action="store_true", help="print a Markdown table")
+    """Add the arguments of the verb: none."""

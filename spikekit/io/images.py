@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import math
-import zlib
 from collections.abc import Sequence
 from contextlib import suppress
 from itertools import chain
@@ -27,15 +25,15 @@ MOST_PIXELS = 1 << 27
 
 _ORIENTATION = 0x0112  # tag of EXIF and TIFF
 _PNG = b"\x89PNG"
-_GREY_ALPHA_16 = (_PNG, 16, 4)
 _FARTHEST = 1e9  # stands for infinite flow, in pixels
 
 
 def read_picture(path: str | Path) -> Tensor:
     """Read a picture file as a colour image, upright according to its EXIF orientation.
 
-    Grey pictures get three equal channels. 16-bit files keep their depth, except CMYK and colour PNM, which are read
-    with 8 bits. Transparent pixels are blended with white. Values stay gamma-encoded as in the file.
+    Grey pictures get three equal channels. 16-bit files keep their depth, except CMYK, colour PNM, and PNG of grey with
+    alpha, which are read with 8 bits. Transparent pixels are blended with white. Values stay gamma-encoded as in the
+    file.
 
     Args:
         path: a PNG, JPEG, TIFF (its first page), PNM or any other file that Pillow reads.
@@ -115,22 +113,17 @@ def _pixels(path: Path) -> tuple[np.ndarray, int]:
     from kornia_rs.io import read_image_png_u16, read_image_tiff_u16
     from PIL import Image
 
-    file: Path | io.BytesIO = path
     with path.open("rb") as opened:
         head = opened.read(26)
     tiff = head[:2] in (b"II", b"MM")
     if tiff and (plain := _plain_tiff(path)) is not None:
         return plain
     kind = (head[:4], *head[24:])  # for PNG: signature, bit depth, colour type
-    if kind == _GREY_ALPHA_16:
-        file = io.BytesIO(_four_bytes(path.read_bytes()))
-    with Image.open(file) as picture:
+    with Image.open(path) as picture:
         _check_pixels(picture.height * picture.width)
         tags = getattr(picture, "tag_v2", {})
         bits = tags.get(258, (16,))
-        if kind == _GREY_ALPHA_16:
-            pixels = _unit(np.asarray(picture).view(">u2"), 16)
-        elif kind[:2] == (_PNG, 16) and kind[2] in (2, 6):  # 16-bit colour, which Pillow reduces to 8 bits
+        if kind[:2] == (_PNG, 16) and kind[2] in (2, 6):  # 16-bit colour, which Pillow reduces to 8 bits
             pixels = _unit(read_image_png_u16(str(path), "rgb" if kind[2] == 2 else "rgba"), 16)
         elif tiff and max(bits) > 8 and tags.get(262) == 2:  # 16-bit RGB
             if len(bits) != 3 or tags.get(284, 1) != 1:
@@ -147,12 +140,6 @@ def _pixels(path: Path) -> tuple[np.ndarray, int]:
             pixels = _unit(np.asarray(picture.convert("RGBA" if picture.has_transparency_data else "RGB")), 8)
         turned = _orientation(picture)  # after loading: Pillow turns a TIFF upright
     return pixels.reshape(*pixels.shape[:2], -1), turned
-
-
-def _four_bytes(png: bytes) -> bytes:
-    """Relabel a 16-bit grey and alpha PNG as 8-bit RGBA, the only way that Pillow keeps all bits."""
-    head = png[12:24] + b"\x08\x06" + png[26:29]
-    return png[:12] + head + zlib.crc32(head).to_bytes(4, "big") + png[33:]
 
 
 def _plain_tiff(path: Path) -> tuple[np.ndarray, int] | None:

@@ -8,10 +8,9 @@ import pytest
 import torch
 from test_ablations import TINY, clip, variant
 
-from lightning_modules.inference.predict import predict
 from lightning_modules.inference.tiles import forward_in_tiles
 from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
-from lightning_modules.networks import CSCSR, ClassicalDecoder
+from lightning_modules.networks import CSCSR
 
 DEVICE = pretend.DEVICE
 LIBRARY = pretend.register()
@@ -56,20 +55,6 @@ def test_nothing_is_waited_for():
     assert pretend.waits == []
 
 
-def test_at_rest():
-    network = CSCSR(3, **TINY, resolution="sensor")
-    moved = copy.deepcopy(network).to(DEVICE)
-    spikes, _ = clip(height=16, width=17)
-    expected = network(spikes, static=True)
-    expected.sum().backward()
-    for _ in range(2):
-        pretend.waits.clear()
-        got = moved(spikes.to(DEVICE), static=True)
-        got.sum().backward()
-    assert pretend.waits == []
-    torch.testing.assert_close(got.detach().cpu(), expected.detach(), rtol=0, atol=1e-4)
-
-
 def test_tiles():
     torch.manual_seed(0)
     network = CSCSR(2, **TINY, motion=ZeroFlow())
@@ -77,18 +62,3 @@ def test_tiles():
     expected = forward_in_tiles(network, spikes, 24)
     got = forward_in_tiles(network.to(DEVICE), spikes.to(DEVICE), 24)
     torch.testing.assert_close(got.cpu(), expected, rtol=0, atol=1e-4)
-
-
-def test_self_ensemble():
-    network = CSCSR(2, **TINY)
-    spikes, flow = clip(height=12, width=15)
-    expected = predict(network, spikes, flow, self_ensemble=8)
-    got = predict(network.to(DEVICE), spikes.to(DEVICE), flow.to(DEVICE), self_ensemble=8)
-    assert got.device == DEVICE
-    torch.testing.assert_close(got.cpu(), expected, rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize("method", ["tfi", "tfp"])
-def test_decoders(method):
-    network, spikes = ClassicalDecoder(method, 2), clip()[0]
-    torch.testing.assert_close(network.to(DEVICE)(spikes.to(DEVICE)).cpu(), network.cpu()(spikes))

@@ -107,17 +107,6 @@ def test_light_that_flickers(truth, recording):
     assert alike(known.gain, truth.gain, truth.defects == WORKS) > 0.8
 
 
-def test_what_crosses_once_is_no_gain(truth, recording):
-    light = 0.25 * raw(recording[0], "BGGR")
-    for frame in range(230):  # something bright
-        light[frame + 10, 16:24, max(int(0.3 * frame) - 12, 0) : int(0.3 * frame) + 1] *= 2.5
-    spikes = SpikeSensor(SensorNoise(calibration=truth), seed=9).expose(light.clamp(max=0.9))
-    error = measured(spikes, "BGGR").calibration.gain - truth.gain
-    works, crossed = truth.defects == WORKS, torch.zeros(SIZE, dtype=torch.bool)
-    crossed[10:32] = True
-    assert error[crossed & works].std() < 1.33 * error[~crossed & works].std()
-
-
 @pytest.mark.parametrize("chunk", [7, 45])
 def test_counts_do_not_depend_on_the_chunks(chunk):
     spikes = torch.rand(100, 3, 4, generator=chance(8)) < 0.3

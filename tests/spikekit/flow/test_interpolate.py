@@ -1,7 +1,5 @@
 """Latent frames: against scenes whose motion is known, at the ends, where something is hidden, and across cuts."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -9,12 +7,7 @@ from scipy.ndimage import gaussian_filter
 
 from spikekit import psnr
 from spikekit.flow.interpolate import Between, Blend, FlowInterpolation, Still
-from spikekit.io.video import read_video
 from spikekit.scenes.analytic import Layer, Motion, Scene
-
-VIDEO = Path(__file__).parents[3].parent / "shared" / "data" / "video" / "vid4"
-
-needs_video = pytest.mark.skipif(not VIDEO.is_dir(), reason="the shared films are not beside the repository")
 
 
 def texture(height, width, seed=0, dtype=torch.float32):
@@ -195,17 +188,3 @@ def test_the_same_whatever_the_threads():
     finally:
         torch.set_num_threads(before)
     assert all(one.equal(two) for one, two in zip(*made, strict=True))
-
-
-# --- films ------------------------------------------------------------------------------------------------------------
-
-
-@needs_video
-@pytest.mark.parametrize("clip", ["walk", "foliage"])
-def test_a_frame_that_was_left_out(clip):
-    first, truth, second = (frame[:, 100:292, 200:456] for frame in read_video(VIDEO / clip, start=20, count=3))
-    made, blend, still = (
-        psnr(method(first, second).at(0.5), truth) for method in (FlowInterpolation(), Blend(), Still())
-    )
-    assert made > blend + 2
-    assert blend > still

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import tifffile
 import torch
-from deep_pictures import write_grey_alpha_png, write_lzw_tiff
+from deep_pictures import write_lzw_tiff
 from PIL import Image
 
 from spikekit import (
@@ -98,7 +98,6 @@ PICTURES = {
     "palette.png": picture("PNG", "P"),
     "alpha.png": picture("PNG", "LA"),
     "deep.png": saved(lambda path: write_picture(path, torch.rand(3, 12, 14), bits=16)),
-    "deep_alpha.png": saved(lambda path: write_grey_alpha_png(path, np.arange(168, dtype="uint16").reshape(6, 14, 2))),
     "a.jpg": picture("JPEG"),
     "cmyk.jpg": picture("JPEG", "CMYK"),
     "a.webp": picture("WEBP"),

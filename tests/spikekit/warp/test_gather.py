@@ -98,14 +98,3 @@ def test_each_is_the_derivative_of_the_others(channels):
     ]:
         assert gradcheck(function, args)
         assert gradgradcheck(function, args, fast_mode=True)  # what is linear in each is wrong in a random direction
-
-
-@pytest.mark.filterwarnings("error")  # without a rule of its own vmap loops, with a warning
-def test_vmap():
-    values, grad, index, weight = (a.unflatten(0, (2, 3)) for a in draw(6, 9, 4))
-    for dims in [(0, 0, 0), (1, 1, 1)]:
-        mapped = torch.func.vmap(Gather.apply, dims)(values, index, weight)
-        expected = Gather.apply(*(a.movedim(dims[0], 0).flatten(0, 1) for a in (values, index, weight)))
-        torch.testing.assert_close(mapped.flatten(0, 1), expected)
-    mapped = torch.func.vmap(Dot.apply, (0, None, 0))(values, grad[1], index)
-    torch.testing.assert_close(mapped[0], weighted_dot(values[0], grad[1], index[0]))
