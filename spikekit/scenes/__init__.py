@@ -1,4 +1,4 @@
-"""Scenes: analytic ones, and sequences of frames."""
+"""Scenes: analytic scenes and sequences of frames."""
 
 from spikekit.scenes.adaptive_sampling import Plan, SceneProfile
 from spikekit.scenes.analytic import Layer, Motion, Scene

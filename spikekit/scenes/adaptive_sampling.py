@@ -1,4 +1,4 @@
-"""Adaptive sampling of films: profile motion and brightness, and plan how many latent frames they require."""
+"""Adaptive sampling of films: profile the motion, and plan the number of latent frames it requires."""
 
 from __future__ import annotations
 
@@ -21,37 +21,37 @@ from spikekit.warp.warp import flow_warp
 #: A rectangle of the sensor: first row, first column, rows, columns.
 Region = tuple[int, int, int, int]
 
-# Sensor pixels around what moves that are interpolated with it, beyond its displacement: flow looks at neighbours.
+# Margin around moving pixels, in sensor pixels, in addition to the displacement; flow estimation needs context.
 _MARGIN = 8
 
-# Sensor pixels by which motion there and back may miss its start, at rest; as much more per pixel of way.
+# Largest forward-backward error of consistent flow: this many sensor pixels, plus as many per pixel of displacement.
 _CONSISTENT = 0.1
 
-# Where flow is consistent for fewer of the moving pixels than this, motion is not found.
+# If flow is consistent for a smaller share of the moving pixels, motion estimation has failed.
 _FEW = 0.1
 
-_NEARLY_ALL = 0.75  # share of the sensor from which on no region is cut out
+_NEARLY_ALL = 0.75  # larger regions, as a share of the sensor, are not cut out
 
-_FINE = 1e-6  # shorter motion has no direction
+_FINE = 1e-6  # shorter displacements have no direction
 
-# How many times as many spikes change, at most, as curvature seen at the sensor's pixels tells: it misses finer detail,
-# and over wide detail that moves far the charge keeps its sign for longer than for a pixel.
+# Safety factor of the estimated spike changes: curvature at the sensor's resolution misses finer detail, and for coarse
+# detail with large displacements errors accumulate over more than one pixel.
 _SAFETY = 4
 
-_BLACK = 1e-3  # added to both of two lights whose ratio is a gain
+_BLACK = 1e-3  # added to numerator and denominator of a gain
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Moments modelled in an interval between two frames; light is blended linearly in time between them.
+    """Latent frames of an interval between two frames; light is blended linearly in time between them.
 
     Args:
-        latent: frames that are synthesised in the interval, evenly spaced; with none, its two ends are blended.
-        region: the part of the sensor they are synthesised for, the ends being blended in the rest; first row and
-            column even; ``None`` for all of it.
+        latent: number of latent frames, evenly spaced; with 0, the two ends are blended.
+        region: part of the sensor for which latent frames are synthesised; elsewhere the ends are blended. The first
+            row and column are even. ``None`` for the whole sensor.
 
     Raises:
-        ValueError: a negative number of frames, a region that begins at an odd pixel or has none.
+        ValueError: ``latent`` is negative, or ``region`` is empty or starts at an odd pixel.
 
     Example:
         >>> Plan(latent=3).region is None  # for the whole sensor
@@ -70,28 +70,28 @@ class Plan:
 
     @classmethod
     def everything(cls, clocks: int) -> Plan:
-        """Model everything: a frame for every clock of the interval, all pixels."""
+        """Return the plan that models every clock of the interval at all pixels."""
         return cls(check_whole("clocks", clocks) - 1)
 
 
 @dataclass(frozen=True)
 class SceneProfile:
-    r"""How a scene moves, from frames that are some clocks apart.
+    r"""Motion in an interval between two frames.
 
     Convention:
-        Displacements are in sensor pixels. A pixel is static where its light changes so
-        little in an interval that its charge is off by less than the tolerance at the end, whichever way the light
-        takes from one end to the other.
+        Displacements are in sensor pixels. A pixel is static if its light changes so little in the interval that the
+        error of its charge at the end is below the tolerance for any course of the light between the ends.
 
     Args:
         size: rows and columns of the sensor.
         clocks: clocks of an interval.
         static: share of static pixels.
-        region: the smallest rectangle, beginning at even pixels, that holds all others; ``None`` without any.
-        displacement: per clock, in pixels that are not static; one per cent is faster, by weight of the squared slope
-            of the light along the motion, because where there is none, motion neither shows nor matters.
-        blending: share of the spikes that would change if the ends of an interval were blended, estimated from the
-            displacements and from how the light bends along them, and on the safe side.
+        region: the smallest rectangle, starting at even pixels, that contains all other pixels; ``None`` if there are
+            none.
+        displacement: 99th percentile of the displacement per clock of pixels that are not static, weighted by the
+            squared slope of the light along the motion, as motion without a slope is invisible.
+        blending: conservative estimate of the share of spikes that change if the ends of the interval are blended, from
+            the displacements and the curvature of the light along them.
     """
 
     size: tuple[int, int]
@@ -102,27 +102,27 @@ class SceneProfile:
     blending: float = 0.0
 
     def plan(self, *, spike_tolerance: float = 0.05, step: float = 0.5) -> Plan:
-        r"""Decide what must be modelled.
+        r"""Return the plan that this interval requires.
 
         .. math:: K = \max\left(\left\lceil \frac{d}{\text{step}} \right\rceil,
             \left\lceil \sqrt{\text{blending} / \text{spike tolerance}} \right\rceil\right)
 
         Convention:
-            An interval is cut into K steps by K - 1 latent frames, at most one a clock. A pixel whose displacement in
-            an interval is d moves by at most ``step`` between two of them, and by less where the light has so much
-            detail that blending would change more spikes than the tolerance: its error falls with :math:`K^2`.
-            Nothing is synthesised where nothing moves, and a frame for every clock where motion is not found: the
-            interpolation may find it in finer detail, or that the film was cut.
+            K - 1 latent frames, at most one per clock, divide an interval into K steps. A pixel with displacement d
+            moves by at most ``step`` between two of them, and by less if the light has so much detail that blending
+            would change more spikes than the tolerance; the error of blending falls with :math:`K^2`. Static pixels
+            need no latent frames. If motion estimation has failed, every clock is modelled: the interpolation sees
+            finer detail, and may find motion or a cut.
 
         Args:
             spike_tolerance: share of the spikes that may change.
-            step: displacement between two latent frames, in sensor pixels.
+            step: largest displacement between two latent frames, in sensor pixels.
 
         Returns:
-            The plan; change it by ``dataclasses.replace``.
+            The plan.
 
         Raises:
-            ValueError: a tolerance or a step that is not above 0.
+            ValueError: ``spike_tolerance`` or ``step`` is not above 0.
         """
         check_positive("spike_tolerance", spike_tolerance)
         check_positive("step", step)
@@ -148,25 +148,24 @@ def profile_interval(
     spike_tolerance: float = 0.05,
     motion: Callable[[Tensor, Tensor], Any] | None = None,
 ) -> SceneProfile:
-    r"""Look at two neighbouring frames of a film, as coarsely as the sensor sees them.
+    r"""Profile the motion between two neighbouring frames of a film, at the sensor's resolution.
 
     .. math:: \text{blending} = 4 \, \frac{T}{6} \, \frac{\overline{\min(d^2, d) \, |I''|}}{\overline{I}}
 
     Convention:
-        Motion is looked for in the frames averaged to cells of 2 x 2 sensor pixels, ``4 * scale**2`` times fewer
-        pixels than they have, and only where something changes; not at all where nothing does. A gain that all pixels
-        have in common is taken out before. Where the film is cut, or flow there and back ends elsewhere nearly
-        everywhere, displacement and blending are infinite.
+        Motion is estimated on frames averaged to cells of 2 x 2 sensor pixels, which have ``4 * scale**2`` times fewer
+        pixels, and only around pixels that change. A common change of brightness is compensated first. If there is a
+        cut, or forward and backward flow disagree nearly everywhere, displacement and blending are infinite.
 
-        The estimate: light I that moves by a step of :math:`\delta` pixels bends by :math:`\delta^2 I''` on the way,
-        and a straight line between the ends is off by :math:`\delta^2 |I''| / 12` on average. Over the T clocks of an
-        interval this adds up in the charge, as long as the sign of :math:`I''` stays: for about one pixel of way. A
-        charge that is off by E moves a spike with probability E, and a spike that moves changes two bits. The estimate
-        is multiplied by four for detail that is finer than the sensor's pixels.
+        Estimate of blending: light I with second derivative :math:`I''` that moves by a step of :math:`\delta` pixels
+        differs from linear interpolation by :math:`\delta^2 |I''| / 12` on average. Over the T clocks of an interval
+        these errors accumulate in the charge while :math:`I''` keeps its sign, for about one pixel of displacement. An
+        error E of the charge moves a spike with probability E, and a moved spike changes two bits. The factor 4
+        accounts for detail that is finer than the sensor's pixels.
 
     Frames are (3, H, W), H and W multiples of ``2 * scale``; the other arguments are those of
-    :class:`spikekit.FrameSequence`. Motion is found by ``FlowInterpolation(shrink=1)`` by default, because Bayer cells
-    are small already.
+    :class:`spikekit.FrameSequence`. The default for ``motion`` is ``FlowInterpolation(shrink=1)``, as Bayer cells are
+    already small.
     """
     light = [alpha * bin_to_sensor(frame, pattern, scale=scale) for frame in (first, second)]
     ends = torch.stack(light)
@@ -208,7 +207,7 @@ def profile_interval(
 
 
 def _derivatives(rgb: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the first and the second derivative of a picture (3, H, W) along a direction (2, H, W) of length 1."""
+    """Return the first and second derivatives of a picture (3, H, W) along unit vectors (2, H, W)."""
     around = F.pad(rgb[None], (1, 1, 1, 1), "replicate")[0]
     middle = slice(1, -1)
     left, right = around[:, middle, :-2], around[:, middle, 2:]
@@ -221,14 +220,14 @@ def _derivatives(rgb: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _fast(distance: Tensor, weight: Tensor) -> float:
-    """Return the displacement that 99 per cent of the weight does not exceed."""
+    """Return the weighted 99th percentile of the displacement."""
     distance, order = distance.flatten().sort()
     below = weight.flatten()[order].double().cumsum(0)
     return distance[torch.searchsorted(below, 0.99 * below[-1])].item()
 
 
 def _grown(region: Region, size: tuple[int, int], margin: int) -> Region:
-    """Return the rectangle with a margin, as far as the sensor goes, in whole cells."""
+    """Return the rectangle grown by a margin, clipped to the sensor and aligned to cells."""
     top, left = (max(0, first - margin) // 2 * 2 for first in region[:2])
     bottom, right = (
         min(most, first + length + margin + 1) // 2 * 2
@@ -238,7 +237,7 @@ def _grown(region: Region, size: tuple[int, int], margin: int) -> Region:
 
 
 def _bounds(moving: Tensor) -> Region | None:
-    """Return the smallest rectangle that holds all that is true and begins at even pixels."""
+    """Return the smallest rectangle that contains all True pixels and starts at even pixels."""
     rows, columns = (moving.any(dim).nonzero().flatten().tolist() for dim in (1, 0))
     if not rows:
         return None

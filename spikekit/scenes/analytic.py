@@ -15,30 +15,30 @@ from torch import Tensor
 from spikekit.check import check_planes, check_positive, check_whole
 from spikekit.color.cfa import bin_to_sensor, cfa_sites
 
-_CHUNK = 1 << 16  # positions sampled at a time: what they need stays in the cache
-_CHUNK_ELSEWHERE = 1 << 26  # on a GPU, where launches cost more
+_CHUNK = 1 << 16  # positions sampled at a time on a CPU, to fit in the cache
+_CHUNK_ELSEWHERE = 1 << 26  # on a GPU, to save launches
 
 
 @dataclass(frozen=True)
 class Motion:
-    r"""How a layer moves: translation, rotation and zoom about a centre, steady in time but for an acceleration.
+    r"""Motion of a layer: accelerated translation, and constant rotation and zoom about a centre.
 
     .. math:: x(\tau) = c + z^\tau R(\omega \tau) (x - c) + v \tau + \tfrac12 a \tau^2
 
     Convention:
         :math:`\tau` is the clock, counted from the middle of the clip, where the motion is the identity. Positions are
-        (x, y), x right, y down, pixel centres at whole numbers. A positive rotation turns x towards y: clockwise on
-        the screen. In a batch of scenes every number may have a value for each of them: arrays (B, 2) or (B,).
+        (x, y), x right, y down, pixel centres at whole numbers. A positive rotation turns x towards y, clockwise on the
+        screen. For a batch of scenes, every argument may be an array (B, 2) or (B,).
 
     Args:
-        velocity: v, pixels per clock, (x, y).
+        velocity: v, (x, y) in pixels per clock.
         rotation: :math:`\omega`, radians per clock.
-        zoom: z, growth per clock, above 0; 1 keeps the size.
+        zoom: z, magnification per clock, above 0.
         center: c, (x, y).
-        acceleration: a, pixels per clock squared, (x, y).
+        acceleration: a, (x, y) in pixels per clock squared.
 
     Raises:
-        ValueError: a zoom that is not above 0.
+        ValueError: ``zoom`` is not above 0.
 
     Example:
         >>> Motion(velocity=(0.25, 0.0), rotation=0.01, center=(16.0, 16.0)).zoom
@@ -56,7 +56,7 @@ class Motion:
             raise ValueError(f"zoom: expected numbers above 0, got {np.min(self.zoom)}")
 
     def _turn_and_shift(self, tau: Tensor) -> tuple[Tensor, Tensor]:
-        """Positions as complex numbers x + iy: every position goes to ``turn * position + shift``; both (B, T)."""
+        """Return the motion ``turn * position + shift`` of complex positions x + iy; both (B, T)."""
         center, velocity, acceleration = map(_points, (self.center, self.velocity, self.acceleration))
         growth, rotation = (torch.from_numpy(np.atleast_1d(n)) for n in (np.log(self.zoom), np.float64(self.rotation)))
         turn = torch.exp(tau * torch.complex(growth, rotation)[:, None])
@@ -64,25 +64,25 @@ class Motion:
 
 
 def _points(pairs: ArrayLike) -> Tensor:
-    """Pairs (x, y), or an array of them, as complex numbers x + iy, (B, 1)."""
+    """Return pairs (x, y) as complex numbers x + iy, (B, 1)."""
     return torch.view_as_complex(torch.from_numpy(np.array(pairs, "float64").reshape(-1, 1, 2)))
 
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """A picture in motion: the background of a scene, or an object in front of it.
+    """A moving picture: the background of a scene, or an object in front of it.
 
     Args:
-        picture: ``rgb`` (3, h, w), float32 or float64; (1, h, w) of a scene that only grey sensors see; of a batch of
-            scenes (B, 3, h, w) or (B, 1, h, w).
-        motion: how it moves.
-        position: (x, y) of the picture's pixel (0, 0) in the view, at the middle of the clip; of a batch also (B, 2).
-        mask: (h, w), how much of the object there is, 0 to 1; 0 beyond its border; of a batch (B, h, w). ``None`` for
-            a background, which has no end: beyond its border it is mirrored.
+        picture: ``rgb`` (3, h, w), float32 or float64; (1, h, w) for grey sensors only; (B, 3, h, w) or (B, 1, h, w)
+            for a batch of scenes.
+        motion: motion of the picture.
+        position: (x, y) of the picture's pixel (0, 0) in the view, at the middle of the clip; (B, 2) for a batch.
+        mask: opacity of an object, 0 to 1, (h, w), or (B, h, w) for a batch; 0 outside its border. ``None`` for a
+            background, which is mirrored at its border.
 
     Raises:
-        TypeError: not a float32 or float64 picture.
-        ValueError: sizes that do not fit.
+        TypeError: ``picture`` is not float32 or float64.
+        ValueError: the sizes do not match.
 
     Example:
         >>> coin = Layer(torch.rand(3, 9, 9), Motion(velocity=(1.0, 0.0)), position=(4, 4), mask=torch.ones(9, 9))
@@ -97,7 +97,7 @@ class Layer:
         check_planes("picture", self.picture, 3, "(3, h, w)", floating=True)
         if self.picture.ndim > 4 or self.picture.shape[-3] not in (1, 3):
             raise ValueError(
-                f"picture: expected (3, h, w), (1, h, w) of grey, or a batch of them, got {tuple(self.picture.shape)}"
+                f"picture: expected (3, h, w), (1, h, w), or a batch of them, got {tuple(self.picture.shape)}"
             )
         if self.picture.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"picture: expected float32 or float64, got {self.picture.dtype}")
@@ -107,9 +107,9 @@ class Layer:
             raise ValueError(f"mask: expected {size}, got {got}")
 
     def _planes(self) -> tuple[Tensor, Tensor]:
-        """The planes to sample, (B, C, h, w), and the positions of their corners, (B, 1).
+        """Return the planes to sample, (B, C, h, w), and the positions of their corners, (B, 1).
 
-        An object gets a mask as last plane, and a rim.
+        Objects are padded, with the mask as last plane.
         """
         picture, corner = self.picture.reshape(-1, *self.picture.shape[-3:]), _points(self.position)
         if self.mask is None:
@@ -119,7 +119,7 @@ class Layer:
 
 
 def _inside(position: Tensor, length: int, padding: str) -> Tensor:
-    """Whole positions on an axis, brought inside as grid_sample does."""
+    """Map whole positions on an axis into the picture, like the padding of grid_sample."""
     index = position.long()
     if padding == "border":
         return index.clamp(0, length - 1)
@@ -130,15 +130,15 @@ def _inside(position: Tensor, length: int, padding: str) -> Tensor:
 def _sample(
     planes: Tensor, corner: Tensor, turn: Tensor, shift: Tensor, rows: Tensor, columns: Tensor, padding: str
 ) -> Tensor:
-    """Sample moved planes (B, C, h, w) at every one of ``rows`` x ``columns`` of the view: (B, C, T, rows, columns).
+    """Sample moved planes (B, C, h, w) at ``rows`` x ``columns`` of the view: (B, C, T, rows, columns).
 
-    All but the planes is known to the host, which decides and need not wait for a device.
+    All arguments but the planes are on the CPU, to avoid synchronisation.
     """
     scenes, _, height, width = planes.shape
     frames, device = turn.shape[1], planes.device
     whole = turn[0, 0] == 1 and all((axis == axis.round()).all() for axis in (rows, columns))
     if whole and (turn == 1).all() and (shift == 0).all():
-        # at rest, pixels are copied, so that the ground truth has the picture's own values to the last bit
+        # copy pixels at rest, so that the ground truth equals the picture bit for bit
         i = _inside(rows - corner.imag, height, padding).to(device).expand(scenes, -1)
         j = _inside(columns - corner.real, width, padding).to(device).expand(scenes, -1)
         which = torch.arange(scenes, device=device)[:, None, None]
@@ -151,11 +151,11 @@ def _sample(
         kind = torch.complex64 if planes.dtype == torch.float32 else torch.complex128
         return torch.complex(position.real * (2 / width), position.imag * (2 / height)).to(kind)
 
-    # Where the pixels of the view come from is affine: a part that the column gives plus one that the row gives.
+    # The source position of a pixel is affine: a part from its column plus a part from its row.
     across = normalized(columns / turn[..., None])
     down = normalized((1j * rows - shift[..., None]) / turn[..., None] - to_centre[..., None])
     grid = torch.view_as_real(across[:, :, None, :] + down[:, :, :, None]).expand(scenes, -1, -1, -1, -1)
-    if scenes == 1:  # every clock for itself, for the threads of a CPU
+    if scenes == 1:  # one batch element per clock, for the threads of a CPU
         seen = F.grid_sample(planes.expand(frames, -1, -1, -1), grid[0], "bilinear", padding, align_corners=False)
         return seen.transpose(0, 1)[None]
     seen = F.grid_sample(planes, grid.flatten(1, 2), "bilinear", padding, align_corners=False)
@@ -163,20 +163,20 @@ def _sample(
 
 
 class Scene:
-    r"""A stack of pictures in motion, seen by a spike camera.
+    r"""A stack of moving pictures, seen by a spike camera.
 
     Convention:
         The view has high-resolution pixels, centres at whole numbers. The scene is the bilinear interpolant of its
-        pictures (and masks) and is evaluated exactly at every clock, so nothing is interpolated in time. At the
-        middle, clock ``frames // 2``, every motion is the identity: there the view shows the pictures' own pixels,
-        and this is the ground truth. Objects lie over each other in the order given, the last on top.
+        pictures and masks, evaluated exactly at every clock, without interpolation in time. At the middle, clock
+        ``frames // 2``, every motion is the identity: the view shows the original pixels, which are the ground truth.
+        Later objects cover earlier ones.
 
-        A sensor pixel averages the s x s view pixels of its own colour, or their luminance where the sensor is grey,
-        see :func:`spikekit.bin_to_sensor`; the
-        sensor pixel (x, y) is centred at (s x + (s - 1) / 2, s y + (s - 1) / 2) of the view.
+        A sensor pixel averages the s x s view pixels of its own colour, or their luminance if the sensor is grey, see
+        :func:`spikekit.bin_to_sensor`. The sensor pixel (x, y) is centred at (s x + (s - 1) / 2, s y + (s - 1) / 2) of
+        the view.
 
-        Layers of a batch make a batch of scenes, all of one size: results have a leading dimension more. It is
-        computed where the pictures are, and on a GPU waits for nothing.
+        Batched layers give a batch of scenes of one size, and results have a leading dimension. The computation runs on
+        the device of the pictures, without synchronisation.
 
     Args:
         layers: the background, then the objects from back to front.
@@ -185,8 +185,8 @@ class Scene:
         frames: clocks of the clip.
 
     Raises:
-        ValueError: no layer, a background with a mask, an object without one, pictures of 1 and of 3 channels, sizes
-            below 1.
+        ValueError: there are no layers, the background has a mask or an object has none, the pictures differ in their
+            number of channels, or a size is below 1.
 
     Example:
         >>> picture = torch.rand(3, 40, 40)
@@ -217,10 +217,10 @@ class Scene:
         """Return the view at a clock.
 
         Args:
-            clock: any; whole numbers from 0 to ``frames - 1`` are what the sensor sees.
+            clock: any number; the sensor sees the whole numbers from 0 to ``frames - 1``.
 
         Returns:
-            ``rgb`` of shape (3, height, width), or (1, height, width) where the pictures have one channel.
+            ``rgb`` of shape (3, height, width), or (1, height, width) if the pictures have one channel.
         """
         rows, columns = _axis(self.height), _axis(self.width)
         view = self._render(self._picked([*range(self.channels)]), self._moves([clock]), rows, columns).squeeze(2)
@@ -229,20 +229,20 @@ class Scene:
     def light(self, pattern: str | CFA = "RGGB", *, scale: int, alpha: float = 0.4) -> Tensor:
         """Return the light that arrives at the sensor at every clock.
 
-        Equals ``alpha * bin_to_sensor(scene.rgb(clock), pattern, scale=scale)``, but evaluates, of every view pixel,
-        only the one colour that the sensor sees there.
+        Equals ``alpha * bin_to_sensor(scene.rgb(clock), pattern, scale=scale)``, but evaluates only the colour that the
+        sensor sees at each view pixel.
 
         Args:
             pattern: Bayer phase, see :func:`spikekit.bayer_pattern`, or ``"grey"``.
-            scale: how many view pixels a sensor pixel is wide; it divides the view.
+            scale: width of a sensor pixel in view pixels; it divides the view.
             alpha: light of a white pixel per clock.
 
         Returns:
             ``light`` of shape (frames, height / scale, width / scale).
 
         Raises:
-            ValueError: an unknown pattern, or a Bayer phase for pictures of one channel; a scale that does not divide
-                the view, an alpha that is not above 0.
+            ValueError: the pattern is unknown, or a Bayer phase for pictures of one channel; ``scale`` does not divide
+                the view; or ``alpha`` is not above 0.
         """
         height, width = self._sensor(scale)
         check_positive("alpha", alpha)
@@ -272,18 +272,18 @@ class Scene:
         """Return the true flow from the middle to a clock, at the sensor's resolution.
 
         Convention:
-            In sensor pixels, order (x, y). At every sensor pixel it is the motion of what is seen, in the middle, at
-            the pixel's centre; at an object's edge, that of the object where the mask is one half or more.
+            In sensor pixels, order (x, y). The flow of a sensor pixel is the motion of the layer visible at its centre
+            at the middle of the clip; an object counts as visible if its mask is at least one half.
 
         Args:
-            clock: to when.
-            scale: how many view pixels a sensor pixel is wide; it divides the view.
+            clock: target clock.
+            scale: width of a sensor pixel in view pixels; it divides the view.
 
         Returns:
             ``flow`` of shape (2, height / scale, width / scale).
 
         Raises:
-            ValueError: a scale that does not divide the view.
+            ValueError: ``scale`` does not divide the view.
         """
         height, width = self._sensor(scale)
         rows, columns = _axis(height) * scale + (scale - 1) / 2, _axis(width) * scale + (scale - 1) / 2
@@ -302,12 +302,12 @@ class Scene:
         return flow.expand(len(self._planes[0][0]), -1, -1, -1) if self._batch else flow[0]
 
     def _moves(self, clocks: Sequence[float]) -> list[tuple[Tensor, Tensor]]:
-        """Turns and shifts of every layer, on the host."""
+        """Return the turns and shifts of every layer, on the CPU."""
         tau = torch.tensor(list(clocks), dtype=torch.float64) - self.middle
         return [layer.motion._turn_and_shift(tau) for layer in self.layers]
 
     def _picked(self, colours: list[int]) -> list[Tensor]:
-        """Some colours of every layer, and the masks of objects."""
+        """Return some colours of every layer, and the masks of objects."""
         chosen = slice(colours[0], colours[-1] + 1)
         return [
             planes[:, chosen] if n == 0 else torch.cat([planes[:, chosen], planes[:, -1:]], dim=1)
@@ -344,7 +344,7 @@ def _axis(length: int) -> Tensor:
 def _touched(
     planes: Tensor, corner: Tensor, turn: Tensor, shift: Tensor, rows: Tensor, columns: Tensor
 ) -> tuple[slice, slice]:
-    """Which of the rows and columns of the view moved planes can touch, in any scene and at any clock."""
+    """Return the rows and columns of the view that moved planes can cover, in any scene and at any clock."""
     height, width = planes.shape[-2:]
     ends = corner + torch.tensor([0, width - 1, 1j * (height - 1), width - 1 + 1j * (height - 1)]).to(turn)
     ends = turn[..., None] * ends[:, None, :] + shift[..., None]

@@ -20,50 +20,51 @@ from spikekit.sensor.noise import SensorNoise
 from spikekit.sensor.simulate import SpikeSensor
 from spikekit.warp.warp import flow_warp
 
-#: Version of the simulation from frames to spikes. Whoever changes light, spikes or flow, in whatever module,
-#: counts it up: clips that were kept are simulated again, and a test that knows every version's output passes again.
+#: Version of the simulation from frames to spikes. Increment it with every change of light, spikes or flow in any
+#: module: cached clips are then simulated again. A test knows the output of every version.
 SIMULATOR_VERSION = 1
 
 T = TypeVar("T")
 
-_KEPT = 2  # frames and intervals that stay in memory: a clip and its flow look at two intervals
+_KEPT = 2  # frames and intervals kept in memory: a clip and its flow use two intervals
 
 
 class FrameSequence:
     r"""A sequence of frames, seen by a colour spike camera.
 
     Convention:
-        Frame f is what the sensor sees at clock ``f * clocks``; the film ends with the clock of its last frame. In
-        between, an interval of two frames is interpolated as far as its :class:`Plan` says: the light of the latent
-        frames, and of the two ends, is blended linearly in time. Every interval has its own plan, made from its
-        :class:`SceneProfile`, unless one is given for all of them.
+        The sensor sees frame f at clock ``f * clocks``; the film ends at the clock of its last frame. The interval
+        between two frames is interpolated according to its :class:`Plan`: the light of the two ends and of the latent
+        frames is blended linearly in time. Every interval has its own plan, made from its :class:`SceneProfile`, unless
+        ``plan`` is given.
 
         Light at the clock of a frame or latent frame is ``alpha * bin_to_sensor(rgb, pattern, scale=scale)``; nothing
         is linearised.
 
-        The view is the largest part of the frames whose sides are multiples of ``2 * scale``, from the top left:
-        rows and columns are left out at the bottom and at the right, so that positions and the Bayer phase stay.
+        The view is the largest part of the frames, from the top left, whose sides are multiples of ``2 * scale``. Rows
+        and columns are cut only at the bottom and the right, which keeps positions and the Bayer phase.
 
-        What is computed for one clock depends on the two frames around it alone; spans, chunks and their order change
-        nothing. Two frames and two intervals are held.
+        The light of a clock depends only on the two frames around it, not on spans, chunks or their order. Two frames
+        and two intervals are held in memory.
 
     Args:
-        frames: ``rgb`` (3, H, W) each, floating, in [0, 1], such as :class:`spikekit.VideoFrames`.
-        scale: how many pixels a sensor pixel is wide.
+        frames: sequence of ``rgb`` (3, H, W), floating, in [0, 1], such as :class:`spikekit.VideoFrames`.
+        scale: width of a sensor pixel in frame pixels.
         pattern: Bayer phase of the sensor, see :func:`spikekit.bayer_pattern`, or ``"grey"``.
         alpha: light of a white pixel per clock, in thresholds.
         clocks: clocks from one frame to the next.
-        interpolation: what makes latent frames; :class:`spikekit.FlowInterpolation` by default.
-        plan: what is modelled, the same in every interval; ``Plan.everything(clocks)`` for the most.
-        spike_tolerance: share of the spikes that may change by not modelling more, see :meth:`SceneProfile.plan`.
-        step: displacement between latent frames in sensor pixels, likewise.
-        motion: what finds motion for the profile, see ``spikekit.scenes.adaptive_sampling.profile_interval``.
+        interpolation: function of two frames that returns a :class:`spikekit.Between`; default:
+            :class:`spikekit.FlowInterpolation`.
+        plan: plan of every interval, such as ``Plan.everything(clocks)``; default: made for each interval.
+        spike_tolerance: share of the spikes that may differ from a full simulation, see :meth:`SceneProfile.plan`.
+        step: largest displacement between latent frames, in sensor pixels, see :meth:`SceneProfile.plan`.
+        motion: flow estimation of the profile, see ``spikekit.scenes.adaptive_sampling.profile_interval``.
 
     Raises:
-        TypeError: frames that are not floating-point tensors.
-        ValueError: no frames, frames that are smaller than a cell of the sensor or of several sizes, an unknown
-            pattern, a scale or a number of clocks that is not a whole number, an alpha, a tolerance or a step that is
-            not above 0.
+        TypeError: a frame is not a floating-point tensor.
+        ValueError: there are no frames, a frame is smaller than a cell of the sensor or differs in size, the pattern is
+            unknown, ``scale`` or ``clocks`` is not a whole number >= 1, or ``alpha``, ``spike_tolerance`` or ``step``
+            is not above 0.
 
     Example:
         >>> picture = torch.rand(3, 34, 41)
@@ -103,7 +104,7 @@ class FrameSequence:
         self.interpolation = FlowInterpolation() if interpolation is None else interpolation
         self.spike_tolerance, self.step, self.motion = spike_tolerance, step, motion
         self.fixed = plan
-        if plan is None and isinstance(self.interpolation, (Blend, Still)):  # these know no motion
+        if plan is None and isinstance(self.interpolation, (Blend, Still)):  # these do not use motion
             self.fixed = Plan() if isinstance(self.interpolation, Blend) else Plan.everything(self.clocks)
         self._views: dict[int, Tensor] = {}
         self._intervals: dict[int, _Interval] = {}
@@ -122,28 +123,28 @@ class FrameSequence:
         """Return the view of a source frame, bit for bit.
 
         Args:
-            frame: which, 0 to ``len(frames) - 1``.
+            frame: number of the frame, 0 to ``len(frames) - 1``.
 
         Returns:
             ``rgb`` of shape (3, height, width).
 
         Raises:
-            ValueError: there is no such frame, or it has another size than the first.
+            ValueError: ``frame`` is out of range, or the frame differs in size from the first.
         """
         return self._view(frame).clone()
 
     def light(self, first: int = 0, count: int | None = None) -> Tensor:
-        """Return the light that arrives at the sensor, clock by clock.
+        """Return the light that arrives at the sensor at every clock of a span.
 
         Args:
             first: the first clock.
-            count: how many; up to the film's end when not given.
+            count: number of clocks; default: up to the end of the film.
 
         Returns:
             ``light`` of shape (count, height / scale, width / scale).
 
         Raises:
-            ValueError: clocks that the film does not have, a frame of another size than the first.
+            ValueError: the span is out of range, or a frame differs in size from the first.
         """
         count = self._count(first, count)
         light = []
@@ -161,29 +162,29 @@ class FrameSequence:
         seed: int = 0,
         chunk: int = 64,
     ) -> Iterator[Tensor]:
-        """Let a sensor look at a span of the film.
+        """Simulate the spikes of a span of the film, chunk by chunk.
 
         :func:`spikekit.write_spikes` accepts the result; ``torch.cat(list(film.spikes()))`` is the whole film.
 
         Args:
             first: the first clock.
-            count: how many; up to the film's end when not given.
+            count: number of clocks; default: up to the end of the film.
             noise: noise of the sensor, see :class:`spikekit.SensorNoise`.
-            seed: random seed: the first charge and all noise.
-            chunk: clocks of light that are held.
+            seed: random seed of the initial charge and the noise.
+            chunk: clocks per chunk.
 
         Returns:
             An iterator over chunks of spikes (T, height / scale, width / scale), uint8.
 
         Raises:
-            ValueError: as :meth:`light` and :class:`spikekit.SpikeSensor`, and a chunk below 1.
+            ValueError: as :meth:`light` and :class:`spikekit.SpikeSensor`, or ``chunk`` is below 1.
         """
         sensor = SpikeSensor(noise, seed=seed)
         chunk, last = check_whole("chunk", chunk), first + self._count(first, count)
         return (sensor.expose(self.light(at, min(chunk, last - at))) for at in range(first, last, chunk))
 
     def clip(self, frame: int, frames: int = 41) -> SequenceClip:
-        """Return a clip that is centred on a source frame.
+        """Return a clip centred on a source frame.
 
         Args:
             frame: the source frame at clock ``frames // 2`` of the clip.
@@ -193,19 +194,19 @@ class FrameSequence:
             A scene like :class:`spikekit.Scene`.
 
         Raises:
-            ValueError: the film does not have all frames that the clip needs.
+            ValueError: the film does not contain all frames of the clip.
         """
         half = check_whole("frames", frames) // 2
         first, last = frame - -(-half // self.clocks), frame + -(-(frames - 1 - half) // self.clocks)
         if first < 0 or last >= len(self.frames):
             raise ValueError(
-                f"frame: a clip of {frames} clocks, {self.clocks} an interval, needs frames {first} to {last} of "
-                f"0 to {len(self.frames) - 1}, got {frame}"
+                f"frame: a clip of {frames} clocks around frame {frame}, {self.clocks} per interval, needs frames "
+                f"{first} to {last}, got 0 to {len(self.frames) - 1}"
             )
         return SequenceClip(self, frame, frames)
 
     def profile(self, interval: int) -> SceneProfile:
-        """Profile the change between frame ``interval`` and the next.
+        """Return the profile of the interval between frame ``interval`` and the next.
 
         Args:
             interval: 0 to ``len(frames) - 2``.
@@ -214,12 +215,12 @@ class FrameSequence:
             The profile.
 
         Raises:
-            ValueError: no such interval, a frame of another size than the first.
+            ValueError: ``interval`` is out of range, or a frame differs in size from the first.
         """
         return self._interval(interval).profile
 
     def plan(self, interval: int) -> Plan:
-        """Return what is modelled between frame ``interval`` and the next.
+        """Return the plan of the interval between frame ``interval`` and the next.
 
         Args:
             interval: 0 to ``len(frames) - 2``.
@@ -228,26 +229,26 @@ class FrameSequence:
             The plan.
 
         Raises:
-            ValueError: no such interval, a frame of another size than the first.
+            ValueError: ``interval`` is out of range, or a frame differs in size from the first.
         """
         return self._interval(interval).plan
 
     def flow(self, frame: int, clock: float) -> Tensor:
-        """Return the flow from a source frame to a clock, as far as the interpolation knows it.
+        """Return the flow from a source frame to a clock, as estimated by the interpolation.
 
         Convention:
-            As :meth:`spikekit.Scene.flow`: sensor pixels, order (x, y). Within an interval motion is steady; over
-            several, flows are followed one after the other. 0 where a plan was made and nothing moves.
+            As :meth:`spikekit.Scene.flow`: sensor pixels, order (x, y). Motion within an interval is linear; the flows
+            of several intervals are concatenated. Intervals whose profile is static have flow 0.
 
         Args:
-            frame: from which.
-            clock: to when, counted from the film's first frame.
+            frame: number of the source frame.
+            clock: target clock, counted from the first frame of the film.
 
         Returns:
             ``flow`` of shape (2, height / scale, width / scale).
 
         Raises:
-            ValueError: a clock that the film does not have, or to which there is no flow.
+            ValueError: ``clock`` is out of range, or there is no flow to it.
         """
         if not 0 <= clock < self.clock_count:
             raise ValueError(f"clock: expected 0 to {self.clock_count - 1}, got {clock}")
@@ -260,7 +261,7 @@ class FrameSequence:
                 between = interval.between(None)
                 flow = between.forward if way > 0 else between.backward
                 if flow is None:
-                    raise ValueError(f"clock: there is no flow from frame {frame}: a cut, or an interpolation without")
+                    raise ValueError(f"clock: no flow from frame {frame}: a cut, or an interpolation without flow")
                 moved = moved + share * flow_warp(flow[None], moved)
             frame, way = (frame + 1, way - share) if way > 0 else (frame - 1, way + share)
         return F.avg_pool2d(moved, self.scale)[0] / self.scale
@@ -287,7 +288,7 @@ class FrameSequence:
             rgb = self._read(frame)
             if tuple(rgb.shape[1:]) != self._size:
                 expected, got = (f"{height} x {width}" for height, width in (self._size, rgb.shape[1:]))
-                raise ValueError(f"frames[{frame}]: expected {expected} as the first, got {got}")
+                raise ValueError(f"frames[{frame}]: expected {expected} as the first frame, got {got}")
             return rgb[:, : self.height, : self.width].contiguous()
 
         return _kept(self._views, frame, read)
@@ -302,7 +303,7 @@ class FrameSequence:
 
 
 class _Interval:
-    """Two neighbouring frames and the light between them, computed on demand, by the settings of their film."""
+    """Two neighbouring frames and the light between them, computed lazily."""
 
     def __init__(self, film: FrameSequence, first: Tensor, second: Tensor) -> None:
         self.film, self.frames = film, (first, second)
@@ -311,13 +312,13 @@ class _Interval:
 
     @cached_property
     def profile(self) -> SceneProfile:
-        """Change within the interval."""
+        """Profile of the interval."""
         names = "scale", "pattern", "alpha", "clocks", "spike_tolerance", "motion"
         return profile_interval(*self.frames, **{name: getattr(self.film, name) for name in names})
 
     @cached_property
     def plan(self) -> Plan:
-        """Moments that are modelled."""
+        """Plan of the interval."""
         film = self.film
         return film.fixed or self.profile.plan(spike_tolerance=film.spike_tolerance, step=film.step)
 
@@ -326,7 +327,7 @@ class _Interval:
         return tuple(map(self.film._seen, self.frames))
 
     def between(self, region: Region | None = None) -> Any:
-        """Return the interpolation for a region of the sensor, or for all of it when not given."""
+        """Return the interpolation for a region of the sensor; default: the whole sensor."""
         if region not in self._betweens:
             ends = self.frames
             if region is not None:
@@ -359,7 +360,7 @@ class _Interval:
 
 
 def _kept(kept: dict[int, T], index: int, make: Callable[[], T]) -> T:
-    """Return what is kept, or made and kept; the oldest is forgotten. Other threads may do the same meanwhile."""
+    """Return a cached value, or make and cache it, dropping the oldest; safe with several threads."""
     value = kept.get(index)
     if value is None:
         value = kept[index] = make()
@@ -370,11 +371,11 @@ def _kept(kept: dict[int, T], index: int, make: Callable[[], T]) -> T:
 
 @dataclass(frozen=True)
 class SequenceClip:
-    """Some clocks around a source frame: a scene like :class:`spikekit.Scene`, see :meth:`FrameSequence.clip`.
+    """A clip around a source frame: a scene like :class:`spikekit.Scene`, see :meth:`FrameSequence.clip`.
 
     Args:
-        sequence: that it is a part of.
-        frame: the source frame at the middle.
+        sequence: the film.
+        frame: number of the source frame at the middle.
         frames: clocks of the clip.
     """
 
@@ -384,12 +385,12 @@ class SequenceClip:
 
     @property
     def middle(self) -> int:
-        """The clock of the source frame."""
+        """Clock of the source frame in the clip."""
         return self.frames // 2
 
     @property
     def first(self) -> int:
-        """The clip's first clock in the sequence."""
+        """Clock of the sequence at which the clip starts."""
         return self.frame * self.sequence.clocks - self.middle
 
     @property
@@ -403,14 +404,14 @@ class SequenceClip:
         return self.sequence.width
 
     def rgb(self, clock: int) -> Tensor:
-        """Return the view at a clock that has a source frame: at the middle, the ground truth.
+        """Return the view at the clock of a source frame; at the middle it is the ground truth.
 
         Raises:
-            ValueError: a clock without one.
+            ValueError: there is no source frame at ``clock``.
         """
         frame, phase = divmod(self.first + clock, self.sequence.clocks)
         if phase:
-            raise ValueError(f"clock: expected that of a source frame, as {self.middle}, got {clock}")
+            raise ValueError(f"clock: expected the clock of a source frame, such as {self.middle}, got {clock}")
         return self.sequence.rgb(frame)
 
     def light(self) -> Tensor:
@@ -421,8 +422,8 @@ class SequenceClip:
         """Return the flow from the middle to a clock, see :meth:`FrameSequence.flow`.
 
         Raises:
-            ValueError: another scale than the sequence's, or as :meth:`FrameSequence.flow`.
+            ValueError: ``scale`` differs from that of the sequence, or as :meth:`FrameSequence.flow`.
         """
         if scale not in (None, self.sequence.scale):
-            raise ValueError(f"scale: expected that of the sequence, {self.sequence.scale}, got {scale}")
+            raise ValueError(f"scale: expected {self.sequence.scale}, that of the sequence, got {scale}")
         return self.sequence.flow(self.frame, self.first + clock)

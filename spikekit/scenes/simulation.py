@@ -1,4 +1,4 @@
-"""Simulations on disk: from frames to a stream, its ground truth and its side-car."""
+"""Simulation to files: from frames to a stream, its ground truth and its side-car."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ from spikekit.scenes.adaptive_sampling import Plan
 from spikekit.scenes.frame_sequence import FrameSequence
 from spikekit.sensor.noise import SensorNoise
 
-#: What makes latent frames, by name.
+#: Interpolations by name.
 INTERPOLATIONS = {kind.__name__: kind for kind in (FlowInterpolation, Blend, Still)}
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings that a stream depends on, besides its source, as in side-cars; see :class:`spikekit.FrameSequence`."""
+    """Settings of a simulation, as stored in side-cars; see :class:`spikekit.FrameSequence`."""
 
     scale: int
     pattern: str = "RGGB"
     alpha: float = 0.4
     clocks: int = 20
-    frame: int | None = None  #: the source frame at the middle of a clip; the middle one when not given
-    frames: int | None = 41  #: of the stream; ``None`` for the whole film
+    frame: int | None = None  #: source frame at the middle of the clip; default: the middle of the film
+    frames: int | None = 41  #: spike frames of the stream; ``None`` for the whole film
     seed: int = 0
-    plan: str | int = "scene"  #: what the scene requires, ``everything``, or a number of latent frames
+    plan: str | int = "scene"  #: ``scene``, ``everything``, or a number of latent frames per interval
     tolerance: float = 0.05
     step: float = 0.5
     interpolation: str = "FlowInterpolation"  #: one of :data:`INTERPOLATIONS`
     noise: SensorNoise = field(default_factory=SensorNoise)
-    calibration: str | None = None  #: the file of the sensor that was measured, whose pixels ``noise`` has
+    calibration: str | None = None  #: file of the calibration in ``noise``
 
     def __post_init__(self) -> None:
         if not (self.plan in ("scene", "everything") or self.plan in range(self.clocks)):
@@ -57,7 +57,7 @@ class Settings:
             )
 
     def film(self, frames: Sequence[Tensor]) -> FrameSequence:
-        """Return the film of these frames."""
+        """Return the film of the given frames."""
         plan = None
         if self.plan != "scene":
             plan = Plan.everything(self.clocks) if self.plan == "everything" else Plan(self.plan)
@@ -74,7 +74,7 @@ class Settings:
         )
 
     def span(self, film: FrameSequence) -> tuple[int, int, dict[int, int]]:
-        """Return the first clock of the stream, how many there are, and by frame of the film the clock of its truth."""
+        """Return the first clock of the stream, the number of clocks, and the clocks of the ground truth by frame."""
         if self.frames is None:
             if self.frame is not None:
                 raise ValueError(f"frame: expected none with the whole film, got {self.frame}")
@@ -84,16 +84,16 @@ class Settings:
 
 
 def simulate(path: Path, settings: Settings, output: Path) -> list[str]:
-    """Write a stream, and beside it its ground truth and its side-car; return what was done, line by line.
+    """Write a stream, its ground truth and its side-car; return the lines of a report.
 
     Raises:
-        UsageError: a setting that makes no sense for these frames.
-        ValueError: something is wrong with a file; it names it.
+        UsageError: a setting is invalid for these frames.
+        ValueError: a file is invalid or would be overwritten; the message names it.
     """
     video = frames = read_video(path)
-    if len(video) == 1:  # a still picture, as often as it takes
+    if len(video) == 1:  # a still picture, repeated as needed
         if settings.frames is None:
-            raise UsageError(f"--frames: expected a number, as {path} is one picture without an end, got all")
+            raise UsageError(f"--frames: expected a number, as {path} is a single picture, got all")
         frames, settings = [video[0]] * (settings.frames // settings.clocks + 3), replace(settings, frame=None)
     try:
         film = settings.film(frames)
@@ -102,7 +102,7 @@ def simulate(path: Path, settings: Settings, output: Path) -> list[str]:
     height, width = film.height // film.scale, film.width // film.scale
     known = settings.noise.calibration
     if known is not None and known.size != (height, width):
-        sizes = f"expected {height} x {width} pixels as the film gives them, got {known.size[0]} x {known.size[1]}"
+        sizes = f"expected {height} x {width} pixels, as in the film, got {known.size[0]} x {known.size[1]}"
         raise ValueError(f"{settings.calibration}: {sizes}")
     try:
         first, count, clocks = settings.span(film)
@@ -119,7 +119,7 @@ def simulate(path: Path, settings: Settings, output: Path) -> list[str]:
     sources = {os.path.realpath(path / name if path.is_dir() else path) for name in names}
     for picture in pictures.values():
         if os.path.realpath(output.parent / picture) in sources:
-            raise ValueError(f"{output}: its ground truth, {picture}, would replace the source; choose another name")
+            raise ValueError(f"{output}: its ground truth {picture} would overwrite the source; choose another name")
     with _one_thread(), published(output) as part:
         for frame, picture in progress(pictures.items(), "pictures"):
             with whole_file(part / picture) as file:
@@ -142,8 +142,8 @@ def simulate(path: Path, settings: Settings, output: Path) -> list[str]:
             file.write(sidecar.dumps())
     latent = [plan.latent for plan in plans.values()]
     return [
-        f"source       {path}: {video.height} x {video.width} (H x W), of which {film.height} x {film.width} are seen",
-        f"sensor       {height} x {width}, {film.pattern}, a white pixel fires {settings.alpha:g} times a clock",
+        f"source       {path}: {video.height} x {video.width} (H x W), cropped to {film.height} x {film.width}",
+        f"sensor       {height} x {width}, {film.pattern}, white level {settings.alpha:g} spikes per clock",
         f"latent       {sum(latent)} frames in {len(latent)} intervals, none in {latent.count(0)} of them",
         f"left out     {', '.join(left_out) or 'no source of noise'}",
         f"stream       {output}: {count} frames, {bits / (count * height * width):.2%} of the bits set",
@@ -153,7 +153,7 @@ def simulate(path: Path, settings: Settings, output: Path) -> list[str]:
 
 
 def _needed_noise(settings: Settings, film: FrameSequence, frames: range) -> tuple[SensorNoise, list[str]]:
-    """Return the noise that changes spikes, and the sources that are left out."""
+    """Return the noise that affects the spikes, and the names of the sources that are left out."""
     noise, count = settings.noise, settings.frames
     if noise == SensorNoise() or count is None or settings.plan == "everything":
         return noise, []
@@ -171,7 +171,7 @@ def _expose(
     path: Path,
     plans: dict[int, Plan],
 ) -> tuple[int, str]:
-    """Write the stream, and collect the plans of its intervals; return how many bits are set, and its hash."""
+    """Write the stream and collect the plans of its intervals; return the number of spikes and the hash."""
     digest = hashlib.sha256()
     bits, clock = 0, span[0]
 
@@ -192,7 +192,7 @@ def _expose(
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Sum in one order, however many cores there are: sums in another order differ in their last bits."""
+    """Use one thread, so that the order of sums, and with it the stream, does not depend on the number of cores."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -76,7 +76,7 @@ def test_a_clip(film, capsys):
     simulate(film, "-o", "made/a.dat", "--scale", 2, "--seed", 3, "--pattern", "gbrg", "--frame", 2)
     report, err = capsys.readouterr()
     assert err == ""
-    assert "35 x 37 (H x W), of which 32 x 36 are seen" in report
+    assert "35 x 37 (H x W), cropped to 32 x 36" in report
     assert believed(Path("made/a.dat"))
     known = read_sidecar(Path("made/a.json"))
     assert [known.stream[name] for name in ("frames", "height", "width")] == [41, 16, 18]
@@ -236,8 +236,8 @@ def test_nothing_of_others_is_replaced(film, fails):
     Path("elsewhere").mkdir()
     Path("e").symlink_to("elsewhere")
     for words, said in (
-        ((film, "-o", "film.dat", "--all"), "its ground truth, film/f0.png, would replace the source"),
-        (("film/f1.png", "-o", "film/f1.dat"), "would replace the source"),
+        ((film, "-o", "film.dat", "--all"), "its ground truth film/f0.png would overwrite the source"),
+        (("film/f1.png", "-o", "film/f1.dat"), "would overwrite the source"),
         ((film, "-o", "a.npz"), "a.npz: its side-car a.json would overwrite that of a.dat"),
         ((film, "-o", "b.dat"), "b.json: not a readable side-car"),
         ((film, "-o", "c.dat"), "c.dat: expected a file, got a folder"),
@@ -264,7 +264,7 @@ def test_nothing_of_others_is_replaced(film, fails):
         (["film"], 2, "--scale"),
         (["film", "--scale", "2", "--plan", "20"], 2, "0 to 19 latent frames in 20 clocks, got 20"),
         (["film", "--scale", "2", "--dark-current", "-1"], 2, "--dark-current: expected 0 to 1, got -1.0"),
-        (["film/f0.png", "--scale", "2", "--all"], 2, "one picture without an end"),
+        (["film/f0.png", "--scale", "2", "--all"], 2, "is a single picture"),
         (["damaged", "--scale", "2"], 1, "damaged/0.png: not a readable picture"),
         (["nothing", "--scale", "2"], 1, "nothing: no such file or folder"),
     ],
@@ -299,5 +299,5 @@ def test_the_pixels_of_a_sensor_that_was_measured(film, fails):
     assert (real - expected)[works].abs().max() < 0.02
     assert read_sidecar(Path("out/real.json")).settings["calibration"] == "cameras/one.safetensors"
     calibrated("cameras/one.safetensors", width=20)
-    said = "one.safetensors: expected 16 x 18 pixels as the film gives them, got 16 x 20"
+    said = "one.safetensors: expected 16 x 18 pixels, as in the film, got 16 x 20"
     assert said in fails(1, *words, *sensor, "-o", "a.dat")

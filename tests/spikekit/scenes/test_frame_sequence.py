@@ -273,9 +273,9 @@ def test_a_clip_is_a_scene():
     assert film.clip(2, 50).light().shape[0] == 50
     with pytest.raises(ValueError, match="needs frames -1 to 3"):
         film.clip(1, 50)
-    with pytest.raises(ValueError, match="expected that of the sequence, 2, got 4"):
+    with pytest.raises(ValueError, match="expected 2, that of the sequence, got 4"):
         clip.flow(3, scale=4)
-    with pytest.raises(ValueError, match="expected that of a source frame"):
+    with pytest.raises(ValueError, match="expected the clock of a source frame"):
         clip.rgb(19)
 
 
@@ -304,13 +304,13 @@ def film_of(frames=FRAMES, **settings):
         (lambda: film_of([torch.rand(4, 8, 8)]), r"frames\[0\]: expected \(3, H, W\), got \(4, 8, 8\)"),
         (
             lambda: film_of([*FRAMES, torch.rand(3, 8, 9)]).light(),
-            r"frames\[3\]: expected 8 x 8 as the first, got 8 x 9",
+            r"frames\[3\]: expected 8 x 8 as the first frame, got 8 x 9",
         ),
         (lambda: film_of().light(0, 42), "first, count: expected clocks of the film, 0 to 40, got 42 from 0 on"),
         (lambda: film_of().rgb(3), "frame: expected 0 to 2, got 3"),
         (lambda: film_of().plan(2), "interval: expected 0 to 1, got 2"),
         (lambda: film_of().flow(1, 41), "clock: expected 0 to 40, got 41"),
-        (lambda: film_of(interpolation=Fade(), plan=Plan()).flow(1, 3), "there is no flow from frame 1"),
+        (lambda: film_of(interpolation=Fade(), plan=Plan()).flow(1, 3), "no flow from frame 1"),
         (lambda: film_of().clip(0), r"needs frames -1 to 1 of 0 to 2, got 0"),
     ],
 )
