@@ -1,7 +1,7 @@
-"""Measure what ``lightning adapt`` is worth where the truth is known.
+"""Measure the benefit of ``lightning adapt`` on scenes of known truth.
 
-``python benchmarks/adaptation.py PICTURES`` prints the table: still pictures in motion, seen by one
-noisy sensor; weights adapted to each recording, and judged on its end and on the end of the next one.
+``python benchmarks/adaptation.py PICTURES`` prints the table. Moving still pictures are recorded by one noisy sensor.
+Weights are adapted to each recording, and tested on its end and on the end of the next one.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ MOTION = 24.0, 12.0, 6.0
 
 @dataclass
 class Seen:
-    """A recording whose truth is known."""
+    """A recording of known truth."""
 
     path: Path
     alpha: float
@@ -43,7 +43,7 @@ class Seen:
     truth: list[Tensor]
 
     def clips(self, frames: int) -> RecordingClips:
-        """Return its clips of so many frames."""
+        """Return its clips of ``frames`` frames."""
         return RecordingClips(replace(open_recording(self.path), alpha=self.alpha, pattern="RGGB"), frames)
 
     def psnr(self, network: Network) -> float:
@@ -55,7 +55,7 @@ class Seen:
 
 
 def record(picture: Path, number: int, noise: SensorNoise, alpha: float, scale: int, frames: int, path: Path) -> Seen:
-    """Let a sensor, always the same, see a still picture in motion; ``frames`` are those of the longest clip."""
+    """Simulate a moving still picture, always with the same sensor; ``frames`` is the length of the longest clip."""
     stills = StillClips(
         [picture],
         scale=scale,
@@ -78,12 +78,12 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("pictures", help="folder of pictures")
-    parser.add_argument("--weights", default="cscsr_small_x4", help="what is adapted; cscsr_small_x4 if not given")
-    parser.add_argument("--teacher", default="cscsr_huge_long_noisy_x4", help="cscsr_huge_long_noisy_x4 if not given")
-    parser.add_argument("--noise", type=json.loads, help="of the sensor; that of noisy_sensor.py")
-    parser.add_argument("--alpha", type=float, default=0.25, help="light of a white pixel per clock; 0.25")
-    parser.add_argument("--count", type=int, default=4, help="how many pictures, evenly from the folder; 4")
-    parser.add_argument("--steps", type=int, default=100, help="100")
+    parser.add_argument("--weights", default="cscsr_small_x4", help="weights to adapt; default: %(default)s")
+    parser.add_argument("--teacher", default="cscsr_huge_long_noisy_x4", help="default: %(default)s")
+    parser.add_argument("--noise", type=json.loads, help="noise of the sensor as JSON; default: as noisy_sensor.py")
+    parser.add_argument("--alpha", type=float, default=0.25, help="light of a white pixel per clock; default: 0.25")
+    parser.add_argument("--count", type=int, default=4, help="number of pictures, spread over the folder; default: 4")
+    parser.add_argument("--steps", type=int, default=100, help="training steps; default: 100")
     args = parser.parse_args()
     without_chatter()
     noise = NOISE if args.noise is None else SensorNoise(**args.noise)

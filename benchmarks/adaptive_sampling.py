@@ -1,4 +1,4 @@
-"""Measure the savings and costs of adaptive sampling, on scenes whose light is known.
+"""Measure the savings and costs of adaptive sampling on scenes of known light.
 
 ``python benchmarks/adaptive_sampling.py`` prints the table.
 """
@@ -34,7 +34,7 @@ Spikes: bits that differ, per spike; those of the plan from those with every clo
 
 
 def drawing(height: int, width: int, seed: int) -> Tensor:
-    """Draw a picture with the spectrum of natural ones, soft shades and fine grain, and discs with sharp edges.
+    """Draw a picture with a natural spectrum, from soft shades to fine grain, and discs with sharp edges.
 
     Returns:
         ``rgb`` of shape (3, height, width), float32, in [0, 1].
@@ -90,16 +90,16 @@ def scenes(side: int, scale: int) -> Iterator[tuple[str, Callable[[int], Scene],
 
 @dataclass(frozen=True)
 class Row:
-    """A scene, simulated as planned and with everything.
+    """A scene, simulated by its plans and with every clock modelled ("everything").
 
     Attributes:
-        scene: which.
-        plan: the plan of its first interval.
-        seconds: process time of the light of a clip, as planned and with everything.
-        memory: peak memory in MiB, likewise.
-        changed: bits that differ between the two, per spike.
-        changed_truth: bits of the planned stream and of that with everything that differ from the exact one, per spike.
-        decibels: PSNR of TFI and TFP of the middle frame: as planned, with everything, from the exact light.
+        scene: name of the scene.
+        plan: plan of its first interval.
+        seconds: process time for the light of a clip: planned, everything.
+        memory: peak memory in MiB: planned, everything.
+        changed: bits that differ between the two streams, per spike.
+        changed_truth: bits that differ from the exact stream, per spike: planned, everything.
+        decibels: PSNR of TFI and TFP of the middle frame: planned, everything, exact.
     """
 
     scene: str
@@ -130,7 +130,7 @@ def measure(
     lights = [runs[0][1] for runs in timed]
     seconds = tuple(min(taken for taken, _ in runs) for runs in timed)
     memory = tuple(peak_memory(lambda plan=plan: film(plan).light(), torch.device("cpu")) for plan in plans)
-    # several draws of the first charge, so that the shares are those of the scene and not of chance
+    # average over several random initial charges
     draws = 4
     spikes = [
         simulate_spikes(light.expand(draws, *light.shape), generator=torch.Generator().manual_seed(0))
@@ -186,10 +186,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     add = parser.add_argument
     add("--side", type=int, default=64, help="rows and columns of the sensor")
-    add("--scale", type=int, default=4, help="how many pixels of a frame a sensor pixel is wide")
+    add("--scale", type=int, default=4, help="width of a sensor pixel in pixels of a frame")
     add("--spike-tolerance", type=float, default=0.05, help="share of the spikes that may change")
     add("--step", type=float, default=0.5, help="sensor pixels between latent frames")
-    add("--rounds", type=int, default=2, help="timings of each, of which the least counts")
+    add("--rounds", type=int, default=2, help="timings of each, of which the smallest is reported")
 
 
 def run(args: argparse.Namespace) -> None:

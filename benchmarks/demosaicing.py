@@ -1,7 +1,7 @@
-"""Quality of the demosaicings on pictures whose truth is known: of mosaics, and of TFI of simulated films.
+"""Quality of demosaicing of known pictures: from their mosaics, and from TFI of simulated films.
 
-``python benchmarks/demosaicing.py --pictures FOLDER --films FOLDER`` prints the table; ``--weights`` adds the column of
-a colour network of scale 1, which demosaics and reconstructs in one.
+``python benchmarks/demosaicing.py --pictures FOLDER --films FOLDER`` prints the table. ``--weights`` adds a column for
+a colour network of scale 1, which reconstructs and demosaics in one step.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _SEED = 0
 
 
 def picture_row(folder: Path) -> list[float]:
-    """Return the mean PSNR of a folder of pictures whose mosaics are filled in by ``demosaic`` and its residual kin."""
+    """Return the mean PSNR of the pictures of a folder, demosaiced by ``demosaic`` and ``demosaic_residual``."""
     paths = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in _PICTURES]
     if not paths:
         raise ValueError(f"{folder}: holds no pictures")
@@ -41,16 +41,16 @@ def picture_row(folder: Path) -> list[float]:
 
 
 def film_row(folder: Path, clocks: int, alpha: float, network: Network | None = None) -> list[float]:
-    """Return the PSNR of the middle frame of a film, by TFI and all three demosaicings, and by a network.
+    """Return the PSNR of the middle frame of a film, by TFI with all three demosaicings, and by a network.
 
-    The sensor has a pixel for each of the film. The motion is that which the film's latent frames are made with;
-    the network estimates its own.
+    The sensor has the resolution of the film. Motion is the flow that interpolates the film's latent frames; the
+    network estimates its own.
 
     Args:
-        folder: its frames.
-        clocks: of the camera, from one frame to the next.
+        folder: folder of the film's frames.
+        clocks: clocks from one frame to the next.
         alpha: light of a white pixel per clock, in thresholds.
-        network: of scale 1.
+        network: network of scale 1.
     """
     frames = read_video(folder)
     middle = len(frames) // 2
@@ -76,7 +76,7 @@ def _decibels(rgb: Tensor, truth: Tensor) -> float:
 def lines(
     pictures: Path | None, films: Path | None, clocks: int, alphas: Sequence[float], weights: str | None
 ) -> Iterator[str]:
-    """Yield the table as Markdown, each line as soon as it is known."""
+    """Yield the lines of a Markdown table as they are measured."""
     names = ["demosaic", "demosaic_residual", "demosaic_along_motion"]
     network = None
     if weights is not None:
@@ -101,13 +101,13 @@ def _line(name: str, decibels: Sequence[float | None]) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="pictures, whose own mosaics are filled in")
-    parser.add_argument("--films", type=Path, metavar="FOLDER", help="a folder of frames for every film")
-    parser.add_argument("--clocks", type=int, default=20, help="of the camera from one frame to the next; default 20")
+    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="pictures, whose mosaics are demosaiced")
+    parser.add_argument("--films", type=Path, metavar="FOLDER", help="folder with one folder of frames per film")
+    parser.add_argument("--clocks", type=int, default=20, help="clocks from one frame to the next; default: 20")
     parser.add_argument(
-        "--alpha", type=float, nargs="+", default=[0.4], help="light of a white pixel per clock; default 0.4"
+        "--alpha", type=float, nargs="+", default=[0.4], help="light of a white pixel per clock; default: 0.4"
     )
-    parser.add_argument("--weights", metavar="NAME", help="those of a colour network of scale 1")
+    parser.add_argument("--weights", metavar="NAME", help="weights of a colour network of scale 1")
     asked = parser.parse_args(arguments)
     if asked.pictures is None and asked.films is None:
         parser.error("expected --pictures or --films")

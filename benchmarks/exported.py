@@ -27,12 +27,12 @@ from spikekit.timing import cpu_name, cpu_timer
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Print size, difference and time of every format, as ratios to the network, in turns in one process and thread."""
+    """Print size, difference and relative time of every format, timed in turn in one process and thread."""
     parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("weights", nargs="+", help="what lightning export takes")
-    parser.add_argument("--side", type=whole(16), default=96, help="of the clip, in sensor pixels; 96")
-    parser.add_argument("--rounds", type=whole(1), default=5, help="timings of each; 5")
-    parser.add_argument("--formats", nargs="+", choices=FORMATS, default=list(FORMATS), help="torch onnx")
+    parser.add_argument("weights", nargs="+", help="names or files of weights")
+    parser.add_argument("--side", type=whole(16), default=96, help="side of the clip, in sensor pixels; default: 96")
+    parser.add_argument("--rounds", type=whole(1), default=5, help="timings of each; default: 5")
+    parser.add_argument("--formats", nargs="+", choices=FORMATS, default=list(FORMATS), help="default: all")
     asked = parser.parse_args(args)
     torch.set_num_threads(1)
     rows = [row for name in asked.weights for row in _rows(name, asked.formats, asked.side, asked.rounds)]

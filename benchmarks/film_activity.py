@@ -1,7 +1,7 @@
-"""Measure what a film saves where its scene rests, and what its pictures gain: ``python benchmarks/film_activity.py``.
+"""Measure time and quality of films of partly still scenes: ``python benchmarks/film_activity.py``.
 
-Beside the film that makes everything everywhere, in turns, on scenes whose truth is known. ``--overlay FOLDER`` writes
-pictures of both beside each other, what the network was asked for in green.
+The scenes have known truth. The film is compared with one that recomputes everything, timed in turn. ``--overlay
+FOLDER`` writes pictures of both side by side, with recomputed parts in green.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ NOISE = SensorNoise(photons=30_000, dark_current=0.0047, dark_spread=0.39, gain_
 
 
 def scenes(size: tuple[int, int], clocks: int, scale: int) -> Iterator[tuple[str, Scene, Callable[[int], float]]]:
-    """Yield scenes of so many sensor pixels, and how bright they are at a clock."""
+    """Yield names, scenes of ``size`` sensor pixels, and their brightness as a function of the clock."""
     ground, thing = (read_picture(path) for path in embedded_pictures()[:2])
     view = [scale * side for side in size]
     side = scale * round(math.sqrt(0.05 * size[0] * size[1] * 4 / math.pi))
@@ -49,7 +49,7 @@ def scenes(size: tuple[int, int], clocks: int, scale: int) -> Iterator[tuple[str
 
 
 def film_of(name: str, scene: Scene, bright: Callable[[int], float], network: Network) -> Tensor:
-    """The spikes of a scene, (clocks, H, W)."""
+    """Simulate the spikes of a scene, (clocks, H, W)."""
     scale, pattern = network.scale, network.pattern
     if all(layer.motion == Motion() for layer in scene.layers):
         light = ALPHA * bin_to_sensor(scene.rgb(0), pattern, scale=scale).expand(scene.frames, -1, -1)
@@ -66,7 +66,7 @@ def main() -> None:
     parser.add_argument("--weights", default="cscsr_tiny_x4")
     parser.add_argument("--size", type=whole(16), nargs=2, default=[96, 128])
     parser.add_argument("--pictures", type=whole(12), default=60)
-    parser.add_argument("--scene", action="append", help="only those that begin so")
+    parser.add_argument("--scene", action="append", help="only scenes whose names start with this")
     parser.add_argument("--overlay", type=Path)
     args = parser.parse_args()
     torch.set_num_threads(1)

@@ -1,8 +1,8 @@
-"""Measure the cost of errors in the flows of the four sub-streams, joined in the three ways of Table 3: J, D and E.
+"""Measure the effect of errors in the flows of the four sub-streams, for the three fusions of Table 3: J, D and E.
 
-``python benchmarks/flow_noise.py VID4`` prints the table. The flows are those of ``ClassicalFlow``,
-asked for every sub-stream by itself; normal noise is added to each of them, and they are joined as eq. (7) has it (J),
-by colour (D), or side by side (E).
+``python benchmarks/flow_noise.py VID4`` prints the table. ``ClassicalFlow`` estimates the flow of every sub-stream
+separately, and normal noise is added. The flows are then averaged by eq. (7) (J), averaged by colour (D), or
+interleaved (E).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FUSIONS = {"J": "joint", "D": "independent", "E": "assembled"}
 
 
 class NoisyFlow(MotionEstimator):
-    """``ClassicalFlow`` of the sub-streams, with noise; it keeps the flows of the last clip.
+    """``ClassicalFlow`` of the sub-streams, with noise; caches the flows of the last clip.
 
     Args:
         smooth: standard deviation, in pixels of a sub-stream, of the blur of the noise; 0 for independent pixels.
@@ -59,7 +59,7 @@ class NoisyFlow(MotionEstimator):
 def measure(
     weights: str, clips: list[dict[str, Tensor]], noises: list[float], smooth: float = 0.0
 ) -> dict[float, dict[str, float]]:
-    """Return the mean PSNR over clips by noise, in sensor pixels, and by the letter of a fusion in :data:`FUSIONS`."""
+    """Return the mean PSNR over clips by noise, in sensor pixels, and by fusion."""
     motion = NoisyFlow(smooth)
     networks = {
         letter: CSCSR.from_pretrained(weights, motion=motion, motion_fusion=fusion)

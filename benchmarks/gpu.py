@@ -1,10 +1,10 @@
-"""What a GPU does in a second: scenes, motion, training, pictures and films, beside what its memory and units allow.
+"""Throughput of a GPU: scenes, motion, training, pictures and films, compared with its limits.
 
     python benchmarks/gpu.py [PICTURES] [--short]
 
-Takes at most five minutes and writes results/gpu.csv, a row as soon as it is measured. A limit is the time that the
-bytes or the multiplications take which nobody can do without, at the rates that a copy and a matrix product reach here.
-``--short`` tries everything once on small sizes, on any device.
+Takes at most five minutes, and writes rows to results/gpu.csv as they are measured. The limit of a task is the time of
+its necessary memory traffic or multiplications, at the measured rates of a copy and a matrix product. ``--short`` runs
+everything once on small sizes, on any device.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ RESULTS = Path(__file__).parents[1] / "results" / "gpu.csv"
 COLUMNS = ("what", "shape", "seconds", "rate", "unit", "limit", "card", "torch", "date")
 KINDS = {"clips": {}, "films of 5, every 8": {"key_frames": 5, "every": 8, "motion": 6.0, "bend": 1.2}}
 
-Row = tuple[str, str, Callable[[], object], float, str, float]  # what, shape, work, units of it, unit, its limit in s
+Row = tuple[str, str, Callable[[], object], float, str, float]  # task, shape, work, number of units, unit, limit in s
 
 
 def seconds(work: Callable[[], object], device: torch.device, most: float) -> float:
-    """Median time of some work, of as many times as there is time for."""
+    """Return the median time of some work, repeated as often as time allows."""
 
     def once() -> float:
         start = time.perf_counter()
@@ -58,7 +58,7 @@ def seconds(work: Callable[[], object], device: torch.device, most: float) -> fl
 
 
 def scenes(pictures: list[Path], count: int, patch: int, device: torch.device, bytes_s: float) -> Iterator[Row]:
-    """Scenes of both kinds, rendered in parts as training has them."""
+    """Return rows for scenes of both kinds, rendered in parts as in training."""
     for kind, options in KINDS.items():
         clips = StillClips(pictures, scale=4, patch=patch, **options)
         gallery = clips.sources.gallery(device)
@@ -72,7 +72,7 @@ def scenes(pictures: list[Path], count: int, patch: int, device: torch.device, b
             clips.draw(index)
         own = (time.perf_counter() - start) / 20
         made = parts * len(drawn["picture"])
-        # positions of the background at every clock, written and read, and what is seen there
+        # positions of the background at every clock, written and read, and the values there
         limit = made * clips.clocks * (4 * patch) ** 2 * (2 * 8 + 2 * 4) / bytes_s
         shape = f"{made} of {patch} x {patch}, drawn in {1e6 * own:.0f} us each by one core"
         work = partial(render, clips, drawn, gallery, parts)
@@ -86,7 +86,7 @@ def render(clips: StillClips, drawn: dict[str, np.ndarray], gallery: Gallery, pa
 
 
 def motion(sizes: list[tuple[int, int, int]], device: torch.device) -> Iterator[Row]:
-    """ClassicalFlow of batches of clips."""
+    """Return rows for ClassicalFlow of batches of clips."""
     for count, height, width in sizes:
         spikes = (torch.rand(count, 41, height, width, device=device) < 0.2).to(torch.uint8)
         work = partial(ClassicalFlow(), spikes, (5, 20, 35), "RGGB")
@@ -94,7 +94,7 @@ def motion(sizes: list[tuple[int, int, int]], device: torch.device) -> Iterator[
 
 
 def training(names: list[str], batches: list[int], patch: int, device: torch.device, flops: float) -> Iterator[Row]:
-    """Steps of Muon on batches that are there already: single clips, and films of 5."""
+    """Return rows for training steps of Muon on given batches: single clips, and films of 5."""
     macs = {model.name: model.macs for model in list_models()}
     for name in names:
         network = CSCSR.from_pretrained(name).to(device).train().to(memory_format=torch.channels_last)
@@ -125,7 +125,7 @@ def step(network: CSCSR, optimizer: MuonWithAdam, *batch: torch.Tensor) -> None:
 
 
 def pictures(names: list[str], sizes: list[tuple[int, int]], device: torch.device, flops: float) -> Iterator[Row]:
-    """Pictures in bfloat16: the network alone, with its motion, and in a film of 5."""
+    """Return rows for pictures in bfloat16: the network alone, with motion, and in a film of 5."""
     for model in (model for model in list_models() if model.name in names):
         network = CSCSR.from_pretrained(model.name).to(device).to(memory_format=torch.channels_last)
         for height, width in sizes:
@@ -148,7 +148,7 @@ def run(network: CSCSR, *inputs: torch.Tensor) -> None:
 
 
 def sensor(shape: tuple[int, int, int], device: torch.device, bytes_s: float) -> Iterator[Row]:
-    """The simulator's kernel and the decoders."""
+    """Return rows for the simulator's kernel and the decoders."""
     light = torch.rand(*shape, device=device) * 0.4
     charge = torch.zeros(shape[1:], device=device)
     spikes, _ = spike_integrate_fire(light, 1.0, charge, dtype=torch.uint8)
@@ -162,7 +162,7 @@ def sensor(shape: tuple[int, int, int], device: torch.device, bytes_s: float) ->
 
 
 def roofs(device: torch.device, size: int) -> tuple[float, float]:
-    """Bytes a second that a copy reads and writes, and operations a second of a matrix product in bfloat16."""
+    """Return the bytes per second of a copy, and the operations per second of a matrix product in bfloat16."""
     matrix = torch.rand(size, size, device=device)
     copied, small = torch.empty_like(matrix), matrix.bfloat16()
     most = 0.5 if size > 1024 else 0.0
@@ -171,11 +171,11 @@ def roofs(device: torch.device, size: int) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Measure, print and write."""
+    """Measure, print and write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("pictures", nargs="?", type=Path, help="folder; without it those of scikit-image")
+    parser.add_argument("pictures", nargs="?", type=Path, help="folder; default: pictures of scikit-image")
     parser.add_argument("--short", action="store_true")
-    parser.add_argument("--minutes", type=float, default=5.0, help="at most")
+    parser.add_argument("--minutes", type=float, default=5.0, help="time limit; default: 5")
     parser.add_argument("-o", "--output", type=Path, default=RESULTS)
     args = parser.parse_args()
     device, start = torch.device("cuda" if torch.cuda.is_available() else "cpu"), time.monotonic()
@@ -218,7 +218,7 @@ def main() -> None:
                     return
                 try:
                     took = seconds(work, device, 0.0 if args.short else 2.0)
-                except RuntimeError as error:  # a figure, too, such as that it does not fit
+                except RuntimeError as error:  # such as out of memory, which is a result, too
                     took, shape = float("inf"), f"{shape}: {str(error).splitlines()[0]}"
                 write(what, shape, took, units / took, unit, limit)
 

@@ -1,14 +1,14 @@
-"""Judge reconstructions of grey recordings whose truth is known, as the field does on its REDS clips.
+"""Evaluate reconstructions of grey recordings with known truth, such as the REDS clips of the literature.
 
-``python benchmarks/grey.py FOLDER [WEIGHTS ...]`` prints PSNR and SSIM up to exposure of TFI, TFP, TFP of third order
-and networks, and the seconds of a processor that each picture took, and writes them to ``results/grey.csv``. Weights
-are names or files; those for Bayer sensors read the grey stream as if it were one, and a picture larger than the sensor
-is averaged down. FOLDER is searched with all folders in it for recordings with a truth beside them:
+``python benchmarks/grey.py FOLDER [WEIGHTS ...]`` prints PSNR and SSIM up to exposure and the CPU seconds per picture
+of TFI, TFP, TFP of third order and networks, and writes them to ``results/grey.csv``. Weights are names or files. Those
+for Bayer sensors treat the grey stream as a mosaic; pictures larger than the sensor are averaged down. FOLDER is
+searched recursively for recordings with a truth beside them:
 
 - ``spike/NAME_key_idK.dat`` and ``gt/NAME_key_idK.png``, the K-th frame: Spike-Zoo's BASE set as its repository has it;
 - ``NAME.dat``, or with a size as ``NAME_250x400.dat``, and ``NAME_truth_N.png``, frame N counted from 0.
 
-Up to exposure: the picture is multiplied by the one number that brings it nearest to the truth, in least squares.
+Up to exposure: the picture is scaled by the factor that fits the truth best in least squares.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Method = Callable[[Tensor, int], Tensor]
 
 @dataclass
 class Known:
-    """A recording whose truth is known at one of its frames."""
+    """A recording with a known truth at one of its frames."""
 
     name: str
     path: Path
@@ -59,7 +59,7 @@ class Known:
 
 
 def recordings(folder: Path) -> Iterator[Known]:
-    """Find the recordings in a folder that have a truth, by name."""
+    """Find the recordings with a truth in a folder, sorted by name."""
     for path in sorted(folder.rglob("*.dat")):
         keyed = re.search(r"_key_id(\d+)$", path.stem)
         picture = path.parent.parent / "gt" / f"{path.stem}.png"
@@ -90,7 +90,7 @@ def by_network(network: Network, every: int, spikes: Tensor, frame: int) -> Tens
     if film:
         picture = network(clips[None], every=every, future=len(frames) - 1)[0, 1]
     else:
-        # as light, which is 1 at most, whatever white is: predict cuts what is brighter
+        # as light, at most 1 for any white level, since predict clips brighter pixels
         picture = predict(network, clips, exposure=network.settings["alpha"])[0]
     picture = F.avg_pool2d(picture.clamp(min=0), network.scale)
     return bin_to_sensor(picture, GREY, scale=1)
@@ -113,11 +113,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folder", type=Path, help="recordings and truths")
     parser.add_argument("weights", nargs="*", help="names or files of weights")
-    parser.add_argument("--height", type=int, default=250, help="rows of a recording whose name has no size; 250")
-    parser.add_argument("--width", type=int, default=400, help="columns; 400")
+    parser.add_argument("--height", type=int, default=250, help="rows, if the name has no size; default: 250")
+    parser.add_argument("--width", type=int, default=400, help="columns; default: 400")
     parser.add_argument("--upright", action="store_true", help="frames are not stored upside down")
-    parser.add_argument("--every", type=int, default=20, help="clocks between the key frames of a film; 20")
-    parser.add_argument("-o", "--output", type=Path, default=Path("results/grey.csv"), help="results/grey.csv")
+    parser.add_argument("--every", type=int, default=20, help="clocks between key frames of a film; default: 20")
+    parser.add_argument("-o", "--output", type=Path, default=Path("results/grey.csv"), help="default: %(default)s")
     args = parser.parse_args()
     known = list(recordings(args.folder))
     if not known:
@@ -128,7 +128,7 @@ def main() -> None:
         for one in known:
             spikes, truth = one.read(args.height, args.width, not args.upright)
             if not scores:
-                method(spikes, one.frame)  # what is compiled the first time is not timed
+                method(spikes, one.frame)  # warm up, to exclude compilation
             begin = time.process_time()
             picture = method(spikes, one.frame)
             scores.append([*judge(picture, truth), time.process_time() - begin])

@@ -9,24 +9,23 @@ from typing import NamedTuple
 
 from spikekit.timing import Run, Timer
 
-_SHORTEST = 2e-3  # seconds: what is faster is called several times within one timing
+_SHORTEST = 2e-3  # seconds; faster functions are called several times per timing
 _FEWEST_ROUNDS = 3
 
 
 def interleave(runs: Mapping[str, Run], rounds: int, timer: Timer, seconds: float = math.inf) -> dict[str, list[float]]:
-    """Time all runs in turn, A B C A B C ..., so that whatever else the machine does falls on all of them alike.
+    """Time all runs in turn, A B C A B C ..., so that other load on the machine affects all of them equally.
 
-    Every run is called once before, to warm up and to learn how often it must be called for a timing of a few
-    milliseconds.
+    Every run is called once before, to warm up and to find the number of calls that take a few milliseconds.
 
     Args:
-        runs: what to time, by name.
-        rounds: how many timings of each.
-        timer: how.
-        seconds: no further round is begun after so much time, from the third one on.
+        runs: functions to time, by name.
+        rounds: number of timings of each.
+        timer: timer of the device.
+        seconds: after this time no further round is started; at least three are.
 
     Returns:
-        The seconds of one call, by name, as many as there were rounds.
+        Seconds per call, by name, one value per round.
     """
     number = {}
     for name, run in runs.items():
@@ -44,7 +43,7 @@ def interleave(runs: Mapping[str, Run], rounds: int, timer: Timer, seconds: floa
 
 
 class Ratio(NamedTuple):
-    """How many times as long one run takes as another: median, least and most of the rounds."""
+    """Ratio of the times of two runs: median, minimum and maximum over the rounds."""
 
     median: float
     least: float
@@ -52,7 +51,7 @@ class Ratio(NamedTuple):
 
 
 def ratio(times: Sequence[float], reference: Sequence[float]) -> Ratio:
-    """Compare round by round, as the two timings of one round saw the same machine.
+    """Return the ratio of two runs, compared round by round.
 
     Example:
         >>> ratio([2.0, 30.0, 4.0], [1.0, 10.0, 1.0])

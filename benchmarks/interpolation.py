@@ -1,7 +1,7 @@
-"""Quality of latent frames where the truth is known: ``python benchmarks/interpolation.py [FILM ...]``.
+"""Quality of latent frames with known truth: ``python benchmarks/interpolation.py [FILM ...]``.
 
-In every film, each second frame is left out and interpolated from its two neighbours. In scenes whose motion is known
-exactly, the frame halfway between two frames a given displacement apart is interpolated.
+In films, a frame is left out and interpolated from its two neighbours. In scenes of exactly known motion, the frame
+halfway between two frames is interpolated, for several displacements.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _Triple = tuple[Tensor, Tensor, Tensor]  # first, truth half way, second
 
 
 def film(path: Path, every: int) -> Iterator[_Triple]:
-    """Give three frames in a row, from every so many frames on."""
+    """Yield three consecutive frames, starting at every Nth frame."""
     frames = read_video(path)
     for n in range(0, len(frames) - 2, every):
         first, truth, second = frames[n : n + 3]
@@ -42,11 +42,11 @@ def film(path: Path, every: int) -> Iterator[_Triple]:
 
 
 def scene(pixels: float, *, hidden: bool) -> _Triple:
-    """Give a view of 256 x 256 that moves by so many pixels; an object moves against it where something is hidden."""
+    """Return a view of 256 x 256 that moves by a number of pixels, optionally with an object that moves against it."""
     from scipy.ndimage import gaussian_filter
     from skimage import data
 
-    def picture(pixels: object) -> Tensor:  # a little soft, so that no detail is finer than the pixels can show
+    def picture(pixels: object) -> Tensor:  # slightly blurred, to avoid aliasing
         return torch.from_numpy(gaussian_filter(pixels / 255.0, (0.8, 0.8, 0))).permute(2, 0, 1).float()
 
     def motion(x: float, y: float) -> Motion:
@@ -60,7 +60,7 @@ def scene(pixels: float, *, hidden: bool) -> _Triple:
 
 
 def measure(triples: Iterator[_Triple]) -> tuple[int, dict[str, float], dict[str, float]]:
-    """Return how many triples there were, and each method's mean PSNR and seconds of CPU time a pair."""
+    """Return the number of triples, and the mean PSNR and CPU seconds per pair of each method."""
     scores: dict[str, list[float]] = {name: [] for name in METHODS}
     seconds: dict[str, list[float]] = {name: [] for name in METHODS}
     for first, truth, second in triples:
@@ -77,7 +77,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("films", nargs="*", type=Path, metavar="FILM", help="folder of pictures, or video file")
-    parser.add_argument("--every", type=int, default=6, metavar="N", help="begin at every Nth frame (default: 6)")
+    parser.add_argument("--every", type=int, default=6, metavar="N", help="start at every Nth frame; default: 6")
     args = parser.parse_args(argv)
     cases = [(str(path.name), film(path, args.every)) for path in args.films]
     for hidden in (False, True):

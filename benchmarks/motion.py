@@ -1,6 +1,6 @@
 """Error and time of ClassicalFlow and of scikit-image's TV-L1: ``python benchmarks/motion.py``.
 
-On scenes whose flow is known; all estimators take turns, in one process.
+The scenes have known flow; the estimators are timed in turn, in one process.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from spikekit.timing import cpu_name, software, timer_of
 
 
 class ScikitImage(ClassicalFlow):
-    """The same pictures, given to scikit-image's TV-L1: a flow for each half of the clip, and their mean."""
+    """TV-L1 of scikit-image on the same pictures: a flow for each half of the clip, and their mean."""
 
     def _velocities(self, pictures: Tensor, clock: Tensor, attachment: Tensor) -> Tensor:
         from skimage.registration import optical_flow_tvl1
@@ -41,9 +41,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--clips", type=int, default=12, help="scenes")
     parser.add_argument("--patch", type=int, default=48, help="side of a scene, in sensor pixels")
     parser.add_argument("--motion", type=float, default=3.0, help="largest motion, in sensor pixels")
-    parser.add_argument("--alpha", type=float, default=0.4, help="spikes a frame of a white pixel")
+    parser.add_argument("--alpha", type=float, default=0.4, help="spikes per frame of a white pixel")
     parser.add_argument("--frames", type=int, default=41, help="frames of a clip")
-    parser.add_argument("--root", help="folder of pictures; without it, held-out ones of scikit-image")
+    parser.add_argument("--root", help="folder of pictures; default: held-out ones of scikit-image")
     parser.add_argument("--rounds", type=int, default=5, help="timings of each")
     args = parser.parse_args(arguments)
     times = 5, args.frames // 2, args.frames - 6
@@ -81,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         spread = f"{times_as_long.median:.2f} ({times_as_long.least:.2f} to {times_as_long.most:.2f})"
         milliseconds = 1000 * float(np.median(taken[name])) / len(clips)
         lines.append([name, f"{sum(errors) / len(errors):.3f}", f"{milliseconds:.1f}", spread])
-    print("\n" + table(["estimator", "end-point error (px)", "ms a clip", "time, ratio"], lines))
+    print("\n" + table(["estimator", "end-point error (px)", "ms per clip", "time, ratio"], lines))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Measure the benefit of a calibration on a noisy sensor, for decoders and a network.
 
-``python benchmarks/noisy_sensor.py PICTURES`` prints the table: still pictures in motion, seen by a BGGR
-sensor of another gain than the weights were trained for.
+``python benchmarks/noisy_sensor.py PICTURES`` prints the table. Moving still pictures are recorded by a BGGR sensor
+with another gain than that of the training data.
 """
 
 from __future__ import annotations
@@ -95,8 +95,8 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("pictures", help="folder of pictures")
-    parser.add_argument("--weights", default="cscsr_small_x4", help="of CSCSR; cscsr_small_x4 if not given")
-    parser.add_argument("--count", type=int, default=4, help="how many pictures, evenly from the folder; 4")
+    parser.add_argument("--weights", default="cscsr_small_x4", help="weights of CSCSR; default: %(default)s")
+    parser.add_argument("--count", type=int, default=4, help="number of pictures, spread over the folder; default: 4")
     args = parser.parse_args()
     network = CSCSR.from_pretrained(args.weights, alpha=ALPHA)
     found = folder_pictures(args.pictures)

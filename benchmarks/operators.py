@@ -1,6 +1,6 @@
-"""Time of every operator beside what a user would otherwise run: ``python benchmarks/operators.py [OPERATOR ...]``.
+"""Time of every operator compared with alternatives: ``python benchmarks/operators.py [OPERATOR ...]``.
 
-Both sides of a row take turns in one process. The ratio is their time over ours: above 1, spikekit is faster.
+Both sides of a row are timed in turn, in one process. The ratio is their time over ours: above 1, spikekit is faster.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from spikekit.timing import cpu_name, software, timer_of
 ROOT = Path(__file__).parents[1]
 HEADING = "operator", "case", "beside", "ours ms", "theirs ms", "ratio", "least", "most", "equal"
 Run = Callable[[], Any]
-#: operator, case, ours, {what it stands beside: theirs}; a result is compared where both give tensors of one shape
+#: operator, case, ours, {alternative: theirs}; results are compared if both are tensors of one shape
 Case = tuple[str, str, Run, dict[str, Run]]
 
 
 class Inputs:
-    """What the operators are given: always the same numbers."""
+    """Inputs of the operators, with a fixed seed."""
 
     def __init__(self, device: torch.device, small: bool) -> None:
         self.device = device
@@ -55,7 +55,7 @@ class Inputs:
         return F.interpolate(coarse, size=(self.side, self.side), mode="bicubic", align_corners=True)
 
 
-# --- the other sides, in plain torch ----------------------------------------------------------------------------------
+# --- alternatives in plain torch --------------------------------------------------------------------------------------
 
 
 def unpack(packed: Tensor) -> Tensor:
@@ -68,7 +68,7 @@ def pack(spikes: Tensor) -> Tensor:
 
 
 def intervals(spikes: Tensor) -> Tensor:
-    """Eq. (4) in two passes, right between two spikes."""
+    """Compute eq. (4) in two passes, correct between two spikes."""
     last, before, after = torch.full(spikes.shape[1:], -1, device=spikes.device), [], []
     for n, frame in enumerate(spikes):
         before.append(last)
@@ -124,7 +124,7 @@ def motion(to_first: Tensor, to_last: Tensor, times: list[int], scale: int) -> T
     )
 
 
-# --- and by other projects, where they are installed ------------------------------------------------------------------
+# --- alternatives of other projects, if installed ---------------------------------------------------------------------
 
 
 def spikingjelly(light: Tensor) -> Run:
@@ -150,7 +150,7 @@ def scikit_image(one: Tensor, other: Tensor) -> Run:
 
 
 def made(make: Callable[..., Run], *inputs: Tensor) -> dict[str, Run]:
-    """Run something where its project is installed."""
+    """Run a function if its project is installed."""
     try:
         return {make.__name__.replace("_", "-"): make(*inputs)}
     except ImportError:
@@ -233,7 +233,7 @@ def colour(given: Inputs) -> Iterator[Case]:
 
 
 def equal(ours: Any, theirs: Any) -> str:
-    """Share of equal values; another algorithm has its own."""
+    """Return the share of equal values, which other algorithms need not reach."""
     if not isinstance(ours, Tensor) or not isinstance(theirs, Tensor) or ours.shape != theirs.shape:
         return ""
     return f"{torch.isclose(ours.double(), theirs.double(), rtol=1e-3, atol=1e-3).double().mean().item():.1%}"
@@ -250,10 +250,10 @@ def measure(case: Case, rounds: int, timer: Any) -> Iterator[list[str]]:
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("operators", nargs="*", metavar="OPERATOR", help="what is measured; all if not given")
-    parser.add_argument("--device", default="cpu", help="cpu, one thread of it, or cuda; default cpu")
-    parser.add_argument("--rounds", type=int, default=7, help="timings of each side; default 7")
-    parser.add_argument("--small", action="store_true", help="small inputs, to see that everything runs")
+    parser.add_argument("operators", nargs="*", metavar="OPERATOR", help="operators to measure; default: all")
+    parser.add_argument("--device", default="cpu", help="cpu (one thread) or cuda; default: cpu")
+    parser.add_argument("--rounds", type=int, default=7, help="timings of each side; default: 7")
+    parser.add_argument("--small", action="store_true", help="small inputs, for a quick test")
     parser.add_argument(
         "-o", "--output", type=Path, default=ROOT / "results" / "operators.csv", help="default %(default)s"
     )
@@ -269,7 +269,7 @@ def main(arguments: list[str] | None = None) -> None:
                 rows.append(row)
                 print(" | ".join(row), flush=True)
     before = []
-    if asked.operators and asked.output.exists():  # the others' rows stay
+    if asked.operators and asked.output.exists():  # keep the rows of other operators
         with asked.output.open(newline="") as file:
             before = [row for row in list(csv.reader(file))[1:] if row[0] not in asked.operators]
     with asked.output.open("w", newline="") as file:

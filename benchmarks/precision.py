@@ -1,8 +1,8 @@
-"""What bfloat16 costs and saves: PSNR and time of networks in both precisions, in turns, in one process.
+"""Cost and benefit of bfloat16: PSNR and time of networks in both precisions, in turn, in one process.
 
 python benchmarks/precision.py PICTURES [--weights NAME ...]
 
-Writes results/precision.csv. PICTURES are set in motion, in clips of 96 x 96 sensor pixels.
+Writes results/precision.csv. The scenes are moving PICTURES, in clips of 96 x 96 sensor pixels.
 """
 
 import argparse
@@ -21,7 +21,7 @@ RESULTS = Path(__file__).parents[1] / "results" / "precision.csv"
 
 
 def seconds(device: str) -> float:
-    """Time of the process on a CPU, of the wall elsewhere."""
+    """Return process time on a CPU, and wall time elsewhere."""
     if device == "cuda":
         torch.cuda.synchronize()
     return time.process_time() if device == "cpu" else time.perf_counter()
@@ -29,7 +29,7 @@ def seconds(device: str) -> float:
 
 @torch.inference_mode()
 def measure(name: str, pictures: list[Path], device: str) -> dict[str, object]:
-    """Row of the table."""
+    """Return a row of the table."""
     network = CSCSR.from_pretrained(name).to(device)
     config = network.config
     clips = StillClips(
@@ -60,7 +60,7 @@ def measure(name: str, pictures: list[Path], device: str) -> dict[str, object]:
 
 
 def main() -> None:
-    """Measure, print, write."""
+    """Measure, print and write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("pictures", type=Path)
     parser.add_argument("--weights", nargs="+", default=["cscsr_tiny_x4", "cscsr_small_x4", "cscsr_huge_x4"])

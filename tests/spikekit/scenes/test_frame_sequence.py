@@ -311,7 +311,7 @@ def film_of(frames=FRAMES, **settings):
         (lambda: film_of().plan(2), "interval: expected 0 to 1, got 2"),
         (lambda: film_of().flow(1, 41), "clock: expected 0 to 40, got 41"),
         (lambda: film_of(interpolation=Fade(), plan=Plan()).flow(1, 3), "no flow from frame 1"),
-        (lambda: film_of().clip(0), r"needs frames -1 to 1 of 0 to 2, got 0"),
+        (lambda: film_of().clip(0), r"needs frames -1 to 1, got 0 to 2"),
     ],
 )
 def test_errors(make, message):
