@@ -1,4 +1,4 @@
-"""Fine-tuning on a recording: what a lesson shows, what is held out, and what is kept."""
+"""Fine-tuning on a recording: lessons, the held-out part, and the written weights."""
 
 import pytest
 import torch
@@ -17,7 +17,7 @@ from spikekit.recording import open_recording
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    """Stripes of all colours that move sideways."""
+    """A recording of grey stripes that move sideways."""
     path = tmp_path_factory.mktemp("adapt") / "recording.npz"
     x = torch.arange(24) - 0.05 * torch.arange(160)[:, None]
     write_spikes(path, simulate_spikes((0.2 + 0.15 * torch.sin(x / 2))[:, None].expand(160, 28, 24)))
@@ -25,7 +25,7 @@ def recording(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("total", "frames"), [(123, 41), (1000, 101)])
-def test_no_clip_that_is_held_out_overlaps_one_that_is_taught(total, frames):
+def test_held_out_clips_do_not_overlap_with_training_clips(total, frames):
     chosen = chosen_frames(total, frames)
     taught, held_out = chosen[:-HELD_OUT], chosen[-HELD_OUT:]
     assert min(taught) - frames // 2 == 0
@@ -34,12 +34,12 @@ def test_no_clip_that_is_held_out_overlaps_one_that_is_taught(total, frames):
     assert chosen == sorted(chosen)
 
 
-def test_lessons_are_what_the_student_would_see_where_it_is_the_teacher(recording, monkeypatch):
-    monkeypatch.setattr(making, "_SIDE", 20)  # windows, by chance
+def test_student_matches_lessons_made_by_itself(recording, monkeypatch):
+    monkeypatch.setattr(making, "_SIDE", 20)  # random windows
     student = CSCSR.from_pretrained("cscsr_tiny_x4").eval()
-    clips = RecordingClips(open_recording(recording, pattern="BGGR"), 51)  # longer than the student's
+    clips = RecordingClips(open_recording(recording, pattern="BGGR"), 51)  # longer than those of the student
     assert clips.size == (27, 23)
-    brighter = CSCSR.from_pretrained("cscsr_tiny_x4", alpha=0.2).eval()  # half the light is white
+    brighter = CSCSR.from_pretrained("cscsr_tiny_x4", alpha=0.2).eval()  # half the light gives white
     made = make_lessons(student, brighter, clips)
     assert made.spikes.shape == (16, 41, 20, 20)
     assert made.rgb.shape == (16, 3, 80, 80)
@@ -50,7 +50,7 @@ def test_lessons_are_what_the_student_would_see_where_it_is_the_teacher(recordin
     assert likeness(student, worse) < 50
 
 
-def test_patches_keep_place_time_and_motion_together(monkeypatch):
+def test_patches_keep_spikes_pictures_and_motion_aligned(monkeypatch):
     monkeypatch.setattr(learning, "_PATCH", 8)
     spikes = torch.arange(3 * 12 * 20, dtype=torch.float32).reshape(1, 3, 12, 20)
     rgb = spikes[:, 1:2].repeat_interleave(2, -1).repeat_interleave(2, -2).expand(1, 3, 24, 40)
@@ -72,7 +72,7 @@ def test_patches_keep_place_time_and_motion_together(monkeypatch):
     assert all(plane[0, 1] == plane[0, 0] + 1 for plane in whole)
 
 
-def test_a_student_comes_nearer_to_its_teacher_on_what_is_held_out(recording):
+def test_student_approaches_its_teacher_on_held_out_lessons(recording):
     student, fresh = (CSCSR.from_pretrained("cscsr_tiny_x4").eval() for _ in range(2))
     teacher = CSCSR.from_pretrained("cscsr_small_x4").eval()
     lessons = make_lessons(student, teacher, RecordingClips(open_recording(recording, pattern="RGGB"), 41))
@@ -87,7 +87,7 @@ def typed(recording, output, *more):
     return ["adapt", str(recording), "--pattern", "RGGB", "--weights", "cscsr_tiny_x4", "-o", str(output), *more]
 
 
-def test_the_command(recording, tmp_path, capsys):
+def test_command_writes_usable_weights(recording, tmp_path, capsys):
     main(typed(recording, tmp_path / "out", "--teacher", "cscsr_small_x4", "--steps", "8"))
     written = tmp_path / "out" / "adapted.safetensors"
     said = capsys.readouterr().out
@@ -101,7 +101,7 @@ def test_the_command(recording, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("after", [30.05, float("nan")])
-def test_what_gains_nothing_is_not_kept(recording, tmp_path, monkeypatch, after):
+def test_weights_without_gain_are_not_written(recording, tmp_path, monkeypatch, after):
     monkeypatch.setattr(cli, "learn", lambda *_: (30.0, after))
     monkeypatch.setattr(cli, "make_lessons", lambda *_: None)
     with pytest.raises(SystemExit, match=r"expected a gain of 0\.1 dB; nothing written, keep using cscsr_tiny_x4"):
@@ -136,7 +136,7 @@ def test_errors_are_one_line(recording, tmp_path, capsys, more, expected):
         ("cscsr_tiny_x4", 100, None, None),
     ],
 )
-def test_the_teacher_is_the_slowest_for_such_a_sensor(tmp_path, weights, frames, measured, expected):
+def test_default_teacher_is_the_slowest_for_the_sensor(tmp_path, weights, frames, measured, expected):
     path = tmp_path / "camera.npz"
     write_spikes(path, torch.ones(frames, 6, 6, dtype=torch.uint8))
     if measured is not None:

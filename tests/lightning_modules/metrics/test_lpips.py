@@ -1,4 +1,4 @@
-"""LPIPS: by weights that are at hand where they are, by random ones elsewhere."""
+"""LPIPS, with random weights, and with the true ones if they are installed."""
 
 import os
 import re
@@ -34,7 +34,7 @@ def pictures(side=70):
     return torch.rand(2, 3, 3, side, 64, generator=generator).unbind()
 
 
-def test_the_example_of_the_authors():
+def test_example_of_the_authors():
     path = os.environ.get(VARIABLE)
     folder = os.path.dirname(path or "")
     if not path or not os.path.isfile(f"{folder}/ex_ref.png"):
@@ -44,7 +44,7 @@ def test_the_example_of_the_authors():
     assert lpips(second, truth).item() == pytest.approx(0.138, abs=2e-3)
 
 
-def test_the_distance_of_layers_written_out(weights):
+def test_distance_against_a_plain_implementation(weights):
     path, tensors = weights
     rgb, truth = pictures()
     expected = torch.zeros(3)
@@ -60,7 +60,7 @@ def test_the_distance_of_layers_written_out(weights):
     torch.testing.assert_close(lpips(rgb, truth, path), expected, rtol=1e-4, atol=1e-6)
 
 
-def test_pictures_that_are_the_same_too_bright_or_too_small(weights):
+def test_equal_bright_and_small_pictures(weights):
     path, _ = weights
     rgb, truth = pictures()
     assert lpips(truth, truth, path).tolist() == [0, 0, 0]
@@ -70,7 +70,7 @@ def test_pictures_that_are_the_same_too_bright_or_too_small(weights):
     assert lpips(rgb.double(), truth.double(), path).equal(lpips(rgb, truth, path))
 
 
-def test_alexnet_of_torchvision_serves_with_the_heads_of_torchmetrics(weights, tmp_path, monkeypatch):
+def test_weights_of_torchvision_and_torchmetrics_are_found(weights, tmp_path, monkeypatch):
     pytest.importorskip("torchmetrics")
     monkeypatch.delenv(VARIABLE, raising=False)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
@@ -90,7 +90,7 @@ def test_alexnet_of_torchvision_serves_with_the_heads_of_torchmetrics(weights, t
     assert not lpips(rgb, truth).equal(lpips(rgb, truth, path))  # other heads
 
 
-def test_files_of_something_else_are_named(weights, tmp_path, monkeypatch):
+def test_invalid_files_are_named(weights, tmp_path, monkeypatch):
     _, tensors = weights
     save_file({**tensors, "conv2.weight": torch.zeros(3)}, tmp_path / "a.safetensors")
     (tmp_path / "b.pth").write_bytes(b"no weights")
@@ -103,7 +103,7 @@ def test_files_of_something_else_are_named(weights, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("there", [True, False])
-def test_the_tables_say_lpips_or_why_not(weights, there, configs, tmp_path, capsys, monkeypatch):
+def test_tables_show_lpips_or_the_reason_for_its_absence(weights, there, configs, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv(VARIABLE, str(weights[0]) if there else "")
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "home"))
     shared = ["-c", str(configs / "x2.yaml"), "--data.val_clips", "2", "--data.val_patch", "32", "-o", str(tmp_path)]

@@ -23,7 +23,7 @@ def clip(batch=1, height=16, width=20, seed=0):
     return (torch.rand(batch, 41, height, width, generator=generator) < 0.3).to(torch.uint8)
 
 
-def test_size_of_the_paper_and_work_of_the_default_size():
+def test_parameters_of_the_paper_and_multiplications_of_the_default_size():
     with torch.device("meta"):
         network = Spike2Flow(**PAPER)
     assert sum(p.numel() for p in network.parameters()) == 6_603_718 - 101_888
@@ -50,7 +50,7 @@ def test_any_size_and_any_spikes_without_nan(size, value):
 
 
 class Known(torch.nn.Module):
-    """In place of the network: what it was given, and a flow of one, two and three cells by three times as many."""
+    """Substitute for the network: records its input, and returns flows x of 1, 2, 3 cells, with y three times x."""
 
     stride = 4
 
@@ -58,12 +58,12 @@ class Known(torch.nn.Module):
         self.windows = windows
         flow = torch.tensor([1.0, 2, 3])[:, None] * torch.tensor([1.0, 3.0])
         flow = flow.reshape(1, 3, 2, 1, 1).expand(len(windows), 3, 2, *windows.shape[-2:])
-        # the streams backwards in time have even places
+        # time-reversed streams have even indices
         sign = torch.tensor([-1.0, 1.0]).repeat(len(windows) // 2).reshape(-1, 1, 1, 1, 1)
         return [0 * flow, sign * flow]
 
 
-def test_flow_is_that_of_the_last_iteration_and_of_the_farthest_window_in_sensor_pixels():
+def test_result_is_the_third_flow_of_the_last_iteration_in_sensor_pixels():
     estimator = Spike2Flow(**TINY)
     estimator.network = Known()
     estimator.register_parameter("dtype", torch.nn.Parameter(torch.zeros(1)))
@@ -74,7 +74,7 @@ def test_flow_is_that_of_the_last_iteration_and_of_the_farthest_window_in_sensor
     assert to_first.equal(-expected)
 
 
-def test_windows_are_those_of_intervals_around_the_times():
+def test_windows_hold_intervals_around_four_times():
     estimator = Spike2Flow(**{**TINY, "window": 21})
     estimator.network = Known()
     estimator.register_parameter("dtype", torch.nn.Parameter(torch.zeros(1)))
@@ -88,7 +88,7 @@ def test_windows_are_those_of_intervals_around_the_times():
             assert seen[:, :, direction, number].equal(sites[:, :, frames].float())
 
 
-def test_every_clip_by_itself_and_large_ones_bit_by_bit(monkeypatch):
+def test_result_does_not_depend_on_the_batch(monkeypatch):
     estimator = Spike2Flow(**TINY)
     spikes = clip(3)
     whole = estimator(spikes, TIMES, "RGGB")
@@ -97,15 +97,15 @@ def test_every_clip_by_itself_and_large_ones_bit_by_bit(monkeypatch):
         torch.testing.assert_close(flow, expected[1:2], rtol=1e-4, atol=1e-5)
 
 
-def test_every_parameter_learns():
+def test_every_parameter_has_a_gradient():
     estimator = Spike2Flow(**{**TINY, "attention": 4, "blocks": 2, "motion": 8})
     with torch.no_grad():
         for encoder in (estimator.network.features, estimator.network.context):
-            encoder[-1].gain.fill_(0.5)  # nothing passes at the beginning
+            encoder[-1].gain.fill_(0.5)  # initialised with 0
     flows = estimator.refinements(clip(), TIMES, "RGGB")
     sum((flow - 1).abs().mean() for flow in flows).backward()
     for name, parameter in estimator.named_parameters():
-        before_norm = name.endswith("bias") and parameter.grad.abs().max() < 1e-6  # a bias that is normalised away
+        before_norm = name.endswith("bias") and parameter.grad.abs().max() < 1e-6  # normalisation removes such a bias
         assert before_norm or parameter.grad.abs().sum() > 0, name
     assert sum(p.grad.abs().sum() > 1e-6 for p in estimator.parameters()) > 40
 
@@ -136,7 +136,7 @@ def test_correlation_against_brute_force():
 
 
 @pytest.mark.usefixtures("_kind")
-def test_halves_are_looked_up_where_they_are():
+def test_half_precision_looks_up_exact_positions():
     here = torch.ones(1, 1, 1, 700, dtype=torch.bfloat16)
     there = torch.zeros(1, 1, 1, 1, 700, dtype=torch.bfloat16)
     there[..., 601] = 1
@@ -147,13 +147,13 @@ def test_halves_are_looked_up_where_they_are():
 
 @pytest.mark.usefixtures("_kind")
 def test_coarse_correlations_are_centred_on_the_same_point():
-    """A correlation that grows steadily across the picture is found alike on every scale."""
+    """A linear correlation has the same value on every scale."""
     here = torch.ones(1, 1, 16, 16)
     there = torch.arange(16.0).expand(1, 1, 1, 16, 16)
     found = Correlation(here, there, levels=3, radius=1)(torch.full((1, 2, 16, 16), 0.5)).reshape(3, 9, 16, 16)
     centre = found[:, 4, 6:10, 6:10]
     torch.testing.assert_close(centre, (torch.arange(6.0, 10) + 0.5).expand(3, 4, 4))
-    torch.testing.assert_close(found[:, 5, 8, 8] - found[:, 4, 8, 8], torch.tensor([1.0, 2, 4]))  # x is the inner one
+    torch.testing.assert_close(found[:, 5, 8, 8] - found[:, 4, 8, 8], torch.tensor([1.0, 2, 4]))  # x varies fastest
 
 
 def test_convex_upsampling():
@@ -162,9 +162,9 @@ def test_convex_upsampling():
     fine = upsample_convex(flow, torch.randn(2, 9 * 16, 4, 5, generator=generator), 4)
     assert fine.shape == (2, 3, 2, 16, 20)
     constant = upsample_convex(torch.ones(1, 3, 2, 4, 5), torch.randn(1, 9 * 4, 4, 5, generator=generator), 2)
-    torch.testing.assert_close(constant, torch.full_like(constant, 2.0))  # at the border as well
+    torch.testing.assert_close(constant, torch.full_like(constant, 2.0))  # also at the border
     right = torch.zeros(2, 9, 4, 4, 5)
-    right[:, 5, 1] = 200  # the second of the four fine pixels, from the coarse one to the right
+    right[:, 5, 1] = 200  # the second of four fine pixels takes the coarse pixel to its right
     moved = upsample_convex(flow, right.flatten(1, 2), 2)[..., ::2, 1::2]
     torch.testing.assert_close(moved[..., :-1], 2 * flow[..., 1:])
 
@@ -189,7 +189,7 @@ def checkpoint(path, estimator, **changes):
 
 
 @pytest.mark.parametrize("frozen", [True, False])
-def test_weights_plug_into_cscsr(frozen, tmp_path):
+def test_weights_can_be_used_in_cscsr(frozen, tmp_path):
     torch.manual_seed(1)
     trained = Spike2Flow(**TINY)
     path = checkpoint(tmp_path / "flow.ckpt", trained)
@@ -218,12 +218,12 @@ def test_weights_plug_into_cscsr(frozen, tmp_path):
         ({"motion": 3}, "motion: expected an even number"),
     ],
 )
-def test_wrong_arguments(arguments, message):
+def test_invalid_arguments_are_rejected(arguments, message):
     with pytest.raises(ValueError, match=message):
         Spike2Flow(**{**TINY, **arguments})
 
 
-def test_a_network_in_half_precision_asks_it_for_motion():
+def test_network_in_half_precision_can_estimate_motion():
     dtype = torch.bfloat16
     network = CSCSR(2, width=4, representation_width=4, features=1, stages=1, end_blocks=1, motion=Spike2Flow(**TINY))
     expected = network.estimate_flow(clip(1, 24, 24))

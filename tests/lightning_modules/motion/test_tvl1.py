@@ -12,7 +12,7 @@ FORWARD = torch.tensor([[0.0, 1.0]])
 
 
 def moved(velocity, height=48, width=64, times=(0.0, 1.0), seed=1, count=1):
-    """Smooth textures, (count, 2, H, W) in double, that move by ``velocity`` (x, y) in a unit of time."""
+    """Smooth textures, (count, 2, H, W) in float64, that move by ``velocity`` (x, y) per unit of time."""
     waves = torch.rand(count, 3, 24, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
 
@@ -42,8 +42,8 @@ def test_a_translation_is_found(times, velocity):
 @pytest.mark.parametrize(
     ("dtype", "size"), [(torch.float64, (33, 35)), (torch.float32, (17, 5)), (torch.float64, (2, 2))]
 )
-def test_compiled_loops_do_what_the_tensors_do(dtype, size):
-    """In a batch of different motion, with weights and times of their own, and from a flow to begin with."""
+def test_compiled_loops_equal_tensor_operations(dtype, size):
+    """For a batch of different motion, weights, times and initial flow."""
     still, far = moved((0.0, 0.0), *size), moved((1.5, -0.7), *size)
     pictures = torch.cat([still, far, far.flip(-1)]).to(dtype)
     generator = torch.Generator().manual_seed(0)
@@ -70,35 +70,35 @@ class TestBothPaths:
         for one, flow in zip(pictures.split(1), together.split(1), strict=True):
             torch.testing.assert_close(tvl1_flow(one, FORWARD, steady(one)), flow)
 
-    def test_it_goes_on_from_a_start(self):
+    def test_initial_flow_is_refined(self):
         pictures = moved((6.0, 0.0))
         truth = torch.zeros_like(pictures) + torch.tensor([6.0, 0.0]).reshape(2, 1, 1)
         flow = tvl1_flow(pictures, FORWARD, steady(pictures), truth)
         assert (flow - truth)[..., 10:-10, 10:-10].abs().mean() < 0.1
         assert not tvl1_flow(pictures * 0, FORWARD, steady(pictures), truth * 0).any()
 
-    def test_no_weight_is_no_opinion(self):
-        """What moves on the left alone, seen on the right alone, is what a still picture is."""
+    def test_pixels_without_weight_are_ignored(self):
+        """If only the left half moves and only the right half has weight, there is no motion."""
         pictures = moved((0.0, 0.0))
         pictures[..., :24] = moved((1.0, 0.0))[..., :24]
         weight = steady(pictures)
         weight[..., :32] = 0
         assert tvl1_flow(pictures, FORWARD, weight).abs().max() < 0.05
 
-    def test_nothing_to_see_is_no_motion(self):
+    def test_uniform_pictures_give_no_motion(self):
         for level in (0.0, 0.3):
             pictures = torch.full((2, 2, 20, 20), level)
             assert not tvl1_flow(pictures, FORWARD.expand(2, 2), steady(pictures)).any()
 
     @pytest.mark.parametrize("wrong", [float("nan"), float("inf"), 1e30])
-    def test_a_broken_pixel_breaks_no_memory(self, wrong):
+    def test_invalid_pixels_cause_no_memory_error(self, wrong):
         pictures = moved((1.0, 0.0)).float()
         pictures[0, 0, 10, 10] = wrong
         assert tvl1_flow(pictures, FORWARD, steady(pictures)).shape == (1, 2, 48, 64)
 
 
 def energy(pictures, flow, attachment):
-    """Of the problem that is solved, in plain NumPy, not linearized."""
+    """Energy of the minimisation problem in plain NumPy, not linearised."""
     from scipy.ndimage import map_coordinates
 
     first, second = pictures.numpy()

@@ -1,4 +1,4 @@
-"""One list of what a CSCSR is made of: the constructor, the command line, weights and checks read it."""
+"""CSCSRConfig, the one list of options for the constructor, the command line and weights."""
 
 from dataclasses import FrozenInstanceError, asdict, fields
 from inspect import signature
@@ -14,21 +14,21 @@ NAMES = [field.name for field in fields(CSCSRConfig)]
 TINY = {"width": 4, "representation_width": 4, "features": 1, "stages": 1, "end_blocks": 1}
 
 
-def test_the_constructor_takes_the_fields_and_what_weights_serve_with_any_of():
+def test_constructor_takes_all_fields_and_motion():
     parameters = signature(CSCSR).parameters
     assert list(parameters) == [*NAMES, "motion"]
     assert {name: parameters[name].default for name in NAMES} == {one.name: one.default for one in fields(CSCSRConfig)}
     network = CSCSR(2, 23, **TINY)
     assert network.config == CSCSRConfig(scale=2, frames=23, **TINY)
     assert network.settings == network.config.settings
-    assert CSCSR(**network.settings).config.settings == network.settings  # a file without the size builds the same
+    assert CSCSR(**network.settings).config.settings == network.settings  # files do not store the size
     with pytest.raises(TypeError, match="widht"):
         CSCSR(widht=4)
     with pytest.raises(FrozenInstanceError):
         network.config.scale = 3
 
 
-def test_the_command_line_takes_the_fields_and_says_what_they_are():
+def test_command_line_takes_all_fields_and_documents_them():
     parser = ArgumentParser(exit_on_error=False)
     parser.add_subclass_arguments(CSCSR, "network")
     typed = [f"--network.{name}={value}" for name, value in {**TINY, "pattern": "BGGR", "alpha": 0.5}.items()]
@@ -66,13 +66,13 @@ def test_the_command_line_takes_the_fields_and_says_what_they_are():
         ({"pattern": "grey", "reconstruction": "early"}, "motion_fusion, reconstruction: .* grey"),
     ],
 )
-def test_wrong_fields(changed, message):
+def test_invalid_fields_are_rejected(changed, message):
     with pytest.raises(ValueError, match=f"^{message}"):
         CSCSRConfig(**changed)
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_a_size_fills_what_is_not_given(size):
+def test_size_sets_the_missing_fields(size):
     config, other = CSCSRConfig(size=size), CSCSRConfig(size=size, width=8, stride=15)
     assert SIZES[size].items() <= config.settings.items()
     assert (other.width, other.stride, other.end_blocks) == (8, 15, config.end_blocks)
@@ -81,13 +81,13 @@ def test_a_size_fills_what_is_not_given(size):
 
 
 @pytest.mark.parametrize(("frames", "points"), [(101, 11), (53, 15), (13, 3)])
-def test_the_stride_follows_the_frames_and_always_divides(frames, points):
+def test_default_stride_divides_the_clip(frames, points):
     times = CSCSRConfig(frames=frames).times
     assert len(times) == points
     assert times[0] + times[-1] == frames - 1
 
 
-def test_settings_are_plain_values_whatever_came():
+def test_settings_are_plain_values():
     config = CSCSRConfig(width=torch.tensor(8))
     assert type(config.width) is int
     assert {type(value) for value in asdict(config).values()} <= {int, float, bool, str, type(None)}

@@ -1,4 +1,4 @@
-"""What a network is told of the camera: its gain, and the level of its noise."""
+"""Gain and noise level of the camera as inputs of a network."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ KINDS = pytest.mark.parametrize("kind", [CSCSR, RecurrentCSCSR])
 def _network(kind=CSCSR, **settings):
     torch.manual_seed(0)
     network = kind(**TINY, skip=True, **settings).eval()
-    for name, parameter in network.named_parameters():  # those that training begins at 0
+    for name, parameter in network.named_parameters():  # initialised with 0
         if "noise" in name or "rgb" in name:
             parameter.data += 0.1 * torch.randn(parameter.shape)
     return network
@@ -25,7 +25,7 @@ def _spikes(*size):
 
 
 @KINDS
-def test_the_picture_is_divided_by_the_gain(kind):
+def test_picture_is_divided_by_the_gain(kind):
     network, spikes = _network(kind, alpha=0.5), _spikes(2, 41, 8, 10)
     picture = network(spikes, static=True)
     assert torch.equal(network(spikes, static=True, alpha=0.5), picture)
@@ -36,7 +36,7 @@ def test_the_picture_is_divided_by_the_gain(kind):
 
 @KINDS
 @pytest.mark.parametrize("pattern", ["RGGB", "grey"])
-def test_a_network_is_told_the_noise_of_every_clip(kind, pattern):
+def test_noise_level_is_set_per_clip(kind, pattern):
     network, spikes = _network(kind, noise=True, pattern=pattern), _spikes(2, 41, 8, 10)
     quiet, loud = (network(spikes, static=True, noise=level) for level in (0.0, 1.0))
     torch.testing.assert_close(network(spikes, static=True), quiet)
@@ -47,7 +47,7 @@ def test_a_network_is_told_the_noise_of_every_clip(kind, pattern):
     torch.testing.assert_close(each, torch.stack([quiet[0], loud[1]]))
 
 
-def test_films_are_told_once_a_film():
+def test_gain_and_noise_are_set_per_film():
     network, films = _network(RecurrentCSCSR, noise=True), _spikes(2, 3, 41, 8, 10)
     told = {"noise": torch.tensor([0.3, 1.0]), "alpha": torch.tensor([0.2, 0.4])}
     both = network(films, static=True, future=2, **told)
@@ -56,7 +56,7 @@ def test_films_are_told_once_a_film():
         torch.testing.assert_close(network(films[n : n + 1], static=True, future=2, **one)[0], both[n])
 
 
-def test_before_training_noise_changes_nothing_and_old_weights_fit():
+def test_untrained_noise_level_has_no_effect_and_old_weights_load():
     torch.manual_seed(0)
     old = CSCSR(**TINY)
     new = CSCSR(**TINY, noise=True)
@@ -68,8 +68,8 @@ def test_before_training_noise_changes_nothing_and_old_weights_fit():
     assert torch.equal(new(spikes, static=True, noise=1.0), old(spikes, static=True))
 
 
-def test_what_a_network_cannot_be_told():
-    with pytest.raises(ValueError, match="noise: expected none"):
+def test_invalid_gain_and_noise_are_rejected():
+    with pytest.raises(ValueError, match="noise: expected None"):
         _network()(_spikes(1, 41, 8, 10), static=True, noise=0.5)
-    with pytest.raises(ValueError, match=r"alpha: expected a number or \(2,\).*got \(3,\)"):
+    with pytest.raises(ValueError, match=r"alpha: expected a number or shape \(2,\), got \(3,\)"):
         _network()(_spikes(2, 41, 8, 10), static=True, alpha=torch.ones(3))

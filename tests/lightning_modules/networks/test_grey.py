@@ -1,4 +1,4 @@
-"""Networks of one colour, for grey sensors."""
+"""Networks for grey sensors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def _spikes(*size: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(("scale", "resolution"), [(1, "output"), (1, "sensor"), (2, "output"), (3, "sensor")])
-def test_a_grey_picture_has_one_channel_at_any_scale_and_size(scale, resolution):
+def test_grey_picture_has_one_channel_at_any_scale_and_size(scale, resolution):
     spikes = _spikes(2, 41, 11, 14)
     network = CSCSR(scale, resolution=resolution, skip=True, **TINY)
     flow = torch.randn(2, 2, 2, 11, 14, generator=torch.Generator().manual_seed(1))
@@ -26,11 +26,11 @@ def test_a_grey_picture_has_one_channel_at_any_scale_and_size(scale, resolution)
 
 
 @pytest.mark.parametrize(("pattern", "scale"), [("grey", 1), ("RGGB", 1), ("RGGB", 3)])
-def test_what_moved_by_whole_pixels_is_found(pattern, scale):
-    """A clip that moves by two pixels between time points looks like one at rest, where the flow says so."""
+def test_search_finds_pixels_that_moved_by_whole_pixels(pattern, scale):
+    """With its true flow, a clip that moves by two pixels per time point gives the result of a still clip."""
     network = CSCSR(scale, **{**TINY, "pattern": pattern, "representation": "spikes", "window": 1, "stride": 10})
     scene, times = torch.rand(80, 80, generator=torch.Generator().manual_seed(0)), network.times
-    if pattern != "grey":  # a Bayer cell moves by whole cells
+    if pattern != "grey":  # whole Bayer cells have one colour
         scene = scene.reshape(40, 2, 40, 2).mean(dim=(1, 3)).repeat_interleave(2, 0).repeat_interleave(2, 1)
     moving = torch.stack([scene[20:60, 20 - (n // 10 - 2) * 2 :][:, :40] for n in range(41)])[None]
     resting = scene[20:60, 20:60].expand(1, 41, 40, 40)
@@ -50,8 +50,7 @@ def test_motion_is_estimated_on_all_pixels_of_a_grey_sensor(estimator):
     assert estimator.channel_flows(spikes, (5, 20, 35), "grey")[0].shape == (1, 2, 2, 21, 18)
 
 
-def test_a_still_scene_begins_at_the_mean_of_its_spikes():
-    """Before training, what a network adds to the mean of a still clip is nothing."""
+def test_untrained_network_returns_the_firing_rate_of_a_still_scene():
     spikes = torch.zeros(1, 41, 24, 24)
     spikes[:, ::2, :, :12] = 1
     spikes[:, ::4, :, 12:] = 1

@@ -18,7 +18,7 @@ def clip(batch=1, height=12, width=16, seed=0):
     return spikes, torch.randn(batch, 2, 2, height, width, generator=generator)
 
 
-def test_a_trace_keeps_no_motion_of_its_example():
+def test_trace_does_not_record_the_motion_of_its_example():
     spikes, flow = clip()
     network = CSCSR(2, **TINY)
     for inputs in ((spikes,), (spikes, flow)):
@@ -28,7 +28,7 @@ def test_a_trace_keeps_no_motion_of_its_example():
     torch.testing.assert_close(torch.jit.trace(at_rest, (spikes,))(other), at_rest(other))
 
 
-# The figures of sizes.py.
+# the figures in sizes.py
 @pytest.mark.parametrize(
     ("size", "parameters", "mmac"),
     [
@@ -42,7 +42,7 @@ def test_a_trace_keeps_no_motion_of_its_example():
         ("huge", 3_783_526, 4.18),
     ],
 )
-def test_parameters_and_work_of_the_sizes(size, parameters, mmac):
+def test_parameters_and_multiplications_of_each_size(size, parameters, mmac):
     network = CSCSR(4, size=size)
     assert network.times == (5, 8, 11, 14, 17, 20, 23, 26, 29, 32, 35)[:: 2 if size == "tiny" else 1]
     assert network.flow_times == (5, 20, 35)
@@ -66,8 +66,8 @@ def test_parameters_and_work_of_the_sizes(size, parameters, mmac):
         (3, (9, 7), {"resolution": "sensor", "reconstruction": "early", "end_width": 6}),
     ],
 )
-def test_any_size_and_scale_and_every_parameter_learns(scale, size, choice):
-    torch.manual_seed(0)  # so few channels may all be silent otherwise
+def test_any_size_and_scale_works_and_every_parameter_has_a_gradient(scale, size, choice):
+    torch.manual_seed(0)  # other seeds may leave all of these few channels inactive
     network = CSCSR(scale, **TINY, **choice)
     spikes, flow = clip(2, *size)
     rgb = network(spikes, flow)
@@ -76,7 +76,7 @@ def test_any_size_and_scale_and_every_parameter_learns(scale, size, choice):
     assert all(p.grad is not None and p.grad.isfinite().all() and p.grad.any() for p in network.parameters())
 
 
-def test_result_moves_with_the_scene_by_whole_bayer_periods():
+def test_network_is_equivariant_to_shifts_by_bayer_cells():
     network = CSCSR(2, **TINY).double()
     spikes, _ = clip(1, 48, 48)
     still = torch.zeros(1, 2, 2, 48, 48, dtype=torch.float64)
@@ -84,8 +84,8 @@ def test_result_moves_with_the_scene_by_whole_bayer_periods():
     torch.testing.assert_close(moved[..., 32:-32, 32:-32], network(spikes, still)[..., 32:-32, 32:-32])
 
 
-def test_features_at_sensor_resolution_are_where_the_sensor_has_them():
-    """What a sensor pixel sees changes the picture around its own place."""
+def test_sensor_resolution_keeps_the_place_of_each_pixel():
+    """A changed sensor pixel changes the picture around its own position."""
     network = CSCSR(3, **TINY, resolution="sensor").double()
     still = torch.zeros(1, 2, 2, 40, 44, dtype=torch.float64)
     spikes, _ = clip(1, 40, 44)
@@ -100,7 +100,7 @@ def test_features_at_sensor_resolution_are_where_the_sensor_has_them():
 
 @pytest.mark.parametrize("global_perception", [True, False])
 def test_representation_fuses_windows_with_the_whole_clip(global_perception):
-    """Fig. 4 as it is drawn: the features of the clip beside those of every window, then convolutions."""
+    """Fig. 4: features of the clip and of each window are concatenated and convolved."""
     torch.manual_seed(0)
     part = SpikeRepresentation(9, 5, 2, 4, 3, global_perception).double()
     spikes = (torch.rand(2, 9, 7, 6) < 0.4).double()
@@ -113,16 +113,16 @@ def test_representation_fuses_windows_with_the_whole_clip(global_perception):
     torch.testing.assert_close(part(spikes), torch.stack(expected, dim=1))
 
 
-def test_refinement_looks_at_what_deviates_from_the_mean():
-    """Section 4.3: a base layer of everything, and a residual layer of what is left without the mean over time."""
+def test_refinement_sees_the_deviation_from_the_temporal_mean():
+    """Section 4.3: a base layer of all features, and a residual layer without their temporal mean."""
     refine, pixels = FeatureRefinement(5, 3, 4).double(), torch.rand(2, 5, 3, 6, 7, dtype=torch.float64)
     residual = pixels - pixels.mean(dim=1, keepdim=True)
     expected = refine.base(pixels.flatten(1, 2)) + refine.residual(residual.flatten(1, 2))
     torch.testing.assert_close(refine(pixels.flatten(1, 2)), expected)
 
 
-def test_skip_starts_at_a_smooth_classical_picture():
-    """Equal to the classical one where the scene is plain, and without its zipper at edges."""
+def test_skip_starts_from_a_smooth_classical_picture():
+    """It equals the classical picture of flat scenes, and has no zipper artefacts at edges."""
     spikes = torch.ones(1, 41, 12, 12)
     torch.testing.assert_close(CSCSR(4, **TINY, skip=True)(spikes, clip(1, 12, 12)[1]), torch.full((1, 3, 48, 48), 2.5))
     spikes[..., 6:] = 0
@@ -133,8 +133,8 @@ def test_skip_starts_at_a_smooth_classical_picture():
 
 
 @pytest.mark.parametrize("motion", [1, 15, torch.nan])
-def test_tiles_change_nothing(motion):
-    """However far it moves: a tile sees what comes into it."""
+def test_tiles_give_the_picture_of_the_whole(motion):
+    """Tiles include the pixels that move into them, at any speed."""
     network = CSCSR(2, **TINY, skip=True)
     with torch.no_grad():
         network.reconstruction.rgb.weight.normal_(std=0.1)
@@ -146,7 +146,7 @@ def test_tiles_change_nothing(motion):
 
 
 @pytest.mark.parametrize(("method", "pattern"), [("tfi", "RGGB"), ("tfp", "GBRG")])
-def test_classical_decoder_finds_the_colour_of_a_plain_scene(method, pattern):
+def test_classical_decoder_recovers_the_colour_of_a_flat_scene(method, pattern):
     rgb = torch.tensor([1.0, 0.5, 0.25]).reshape(1, 3, 1, 1)
     light = 0.5 * mosaic(rgb.expand(1, 3, 12, 12), pattern).expand(41, 1, 12, 12).movedim(0, 1)
     spikes, _ = spike_integrate_fire(light)
@@ -157,13 +157,13 @@ def test_classical_decoder_finds_the_colour_of_a_plain_scene(method, pattern):
 @pytest.mark.parametrize(
     ("method", "settings"), [("tfi", {}), ("tfp", {"window": 13}), ("tfp", {"window": 13, "order": 3})]
 )
-def test_classical_decoder_shows_the_middle_of_the_clip(method, settings):
+def test_classical_decoder_decodes_the_middle_frame(method, settings):
     spikes, _ = clip(2)
     raw = {"tfi": tfi, "tfp": tfp}[method](spikes, **settings)[:, 20]
     torch.testing.assert_close(ClassicalDecoder(method, 1, **settings)(spikes), demosaic(raw / 0.4))
 
 
-def test_wrong_input():
+def test_invalid_shapes_are_rejected():
     spikes, flow = clip()
     network = CSCSR(2, **TINY)
     with pytest.raises(ValueError, match=r"expected \(B, 41, H, W\) of at least 3 x 3 pixels, got \(1, 21, 12, 16\)"):
@@ -172,8 +172,8 @@ def test_wrong_input():
         network(spikes, flow[..., :8])
 
 
-def test_trains_after_a_look_in_inference_mode():
-    """What Lightning's validation keeps in the network must serve training, too."""
+def test_training_works_after_inference_mode():
+    """Tensors cached in Lightning's validation are valid in training."""
     network = CSCSR(2, **TINY)
     spikes, flow = clip()
     with torch.inference_mode():

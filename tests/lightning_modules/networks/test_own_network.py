@@ -1,4 +1,4 @@
-"""Networks and estimators of a user's own, compiled networks, and networks that threads share."""
+"""User-defined networks and estimators, compiled networks, and networks shared by threads."""
 
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +17,7 @@ SPIKES = (torch.rand(1, 41, 12, 10, generator=torch.Generator().manual_seed(0)) 
 
 
 class Mean(Network):
-    """What the page on training shows."""
+    """The example in the documentation of training."""
 
     def __init__(self, scale=4, frames=41):
         super().__init__()
@@ -48,7 +48,7 @@ def saved(path, network):
     return path.with_suffix(".ckpt"), path.with_suffix(".safetensors")
 
 
-def test_a_network_of_ones_own_trains_is_tested_and_is_read_again(tmp_path):
+def test_user_defined_network_can_be_trained_tested_and_loaded(tmp_path):
     network = Mean(scale=2)
     module = SuperResolution(network)
     batch = {"spikes": SPIKES, "rgb": torch.rand(1, 3, 24, 20), "flow": torch.zeros(1, 2, 2, 12, 10)}
@@ -62,18 +62,18 @@ def test_a_network_of_ones_own_trains_is_tested_and_is_read_again(tmp_path):
         assert torch.equal(read(SPIKES), network(SPIKES))
 
 
-def test_an_estimator_of_ones_own_brings_its_weights(tmp_path):
+def test_user_defined_estimator_is_loaded_with_its_weights(tmp_path):
     estimator = Steady()
     torch.nn.init.constant_(estimator.speed, 0.5)
     network = CSCSR(2, **TINY, motion=estimator)
     for path in saved(tmp_path / "steady", network):
         with pytest.raises(ValueError, match="Steady"):
-            CSCSR.from_pretrained(path)  # a file builds no class from outside
+            CSCSR.from_pretrained(path)  # files cannot build classes outside the package
         assert torch.equal(CSCSR.from_pretrained(path, motion=Steady())(SPIKES), network(SPIKES))
         assert CSCSR.from_pretrained(path, motion=ZeroFlow()).motion.static
 
 
-def test_a_compiled_network_is_stored_as_the_network_that_it_is(tmp_path):
+def test_compiled_network_is_saved_without_its_wrapper(tmp_path):
     network = CSCSR(2, **TINY, motion=ZeroFlow())
     compiled = torch.compile(network, backend="eager")
     for path in saved(tmp_path / "compiled", compiled):
@@ -81,8 +81,8 @@ def test_a_compiled_network_is_stored_as_the_network_that_it_is(tmp_path):
         SuperResolution(torch.compile(CSCSR(2, **TINY), backend="eager"), weights=str(path))
 
 
-def test_a_compiled_network_makes_the_same_pictures_whatever_comes_first():
-    """As in a training: it is validated with its own motion, then learns smaller clips with theirs."""
+def test_compiled_network_handles_validation_before_training():
+    """Validation with estimated motion, then training on smaller clips with given motion."""
     network = CSCSR(2, **TINY).eval()
     compiled = torch.compile(network, backend="eager")
     for side, own in ((16, True), (8, False)):
@@ -92,7 +92,7 @@ def test_a_compiled_network_makes_the_same_pictures_whatever_comes_first():
             torch.testing.assert_close(compiled(spikes, flow), network(spikes, flow))
 
 
-def test_a_checkpoint_alone_is_enough(tmp_path):
+def test_checkpoint_can_be_loaded_without_a_configuration(tmp_path):
     network = CSCSR(2, **TINY, motion=ZeroFlow())
     path, _ = saved(tmp_path / "alone", network)
     module = SuperResolution.load_from_checkpoint(path)
@@ -100,8 +100,8 @@ def test_a_checkpoint_alone_is_enough(tmp_path):
     assert torch.equal(module.network(SPIKES, static=True), network(SPIKES))
 
 
-def test_threads_that_share_a_network_make_the_pictures_of_one():
-    """Many small sizes press on whatever is kept by size."""
+def test_network_is_thread_safe():
+    """Many small sizes stress the caches by size."""
     least = {"frames": 3, "window": 1, "stride": 1, "representation": "spikes", "refinement": False, "width": 2}
     network = CSCSR(2, **{**TINY, **least}, motion=ZeroFlow()).eval()
     generator = torch.Generator().manual_seed(0)

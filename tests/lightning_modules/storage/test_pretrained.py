@@ -1,4 +1,4 @@
-"""Weights in files, from Python and as they are typed."""
+"""Files of weights, in Python and on the command line."""
 
 import json
 import pickle
@@ -27,7 +27,7 @@ SPIKES = torch.rand(1, 41, 8, 10, generator=torch.Generator().manual_seed(0)) < 
 def network(**changes):
     torch.manual_seed(0)
     made = CSCSR(**{**TINY, **changes})
-    torch.nn.init.normal_(made.reconstruction.rgb.weight, std=0.1)  # the skip begins with zeros, as any network would
+    torch.nn.init.normal_(made.reconstruction.rgb.weight, std=0.1)  # the skip initialises it with zeros
     return made
 
 
@@ -72,14 +72,14 @@ def test_learned_motion_is_part_of_the_weights(tmp_path, suffix):
 
 
 @pytest.mark.parametrize("fusion", ["independent", "assembled"])
-def test_weights_serve_with_any_way_of_joining_motion(fusion, file):
+def test_weights_work_with_any_motion_fusion(fusion, file):
     other = network(motion_fusion=fusion, motion=ZeroFlow())
     load_weights(other, read_weights(file))
     assert other.config.motion_fusion == fusion
     torch.testing.assert_close(other(SPIKES), network(motion=ZeroFlow())(SPIKES))
 
 
-def test_weights_of_something_else(file, tmp_path):
+def test_unsuitable_weights_are_rejected(file, tmp_path):
     with pytest.raises(ValueError, match="expected weights of ClassicalDecoder, got those of CSCSR"):
         ClassicalDecoder.from_pretrained(file)
     with pytest.raises(ValueError, match=r"trained with scale=2, width=4; this run asks for scale=4, width=8"):
@@ -106,7 +106,7 @@ def test_weights_that_share_memory_can_be_exported(tmp_path):
     assert set(load_file(tmp_path / "shared.safetensors")) == {"a", "b"}
 
 
-def test_a_module_can_be_pickled():
+def test_module_can_be_pickled():
     module = SuperResolution(CSCSR.from_pretrained("cscsr_tiny_x4"))
     spikes = torch.ones(1, 41, 8, 8)
     assert torch.equal(pickle.loads(pickle.dumps(module))(spikes), module(spikes))
@@ -121,7 +121,7 @@ def test_a_module_can_be_pickled():
         (["--model.network.motion.iterations", "1"], Spike2Flow),
     ],
 )
-def test_motion_is_that_of_the_weights_unless_another_is_named(named, expected, tmp_path, configs, monkeypatch):
+def test_motion_estimator_comes_from_the_weights_by_default(named, expected, tmp_path, configs, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["lightning"])
     trained = checkpoint(tmp_path / "moving.ckpt", SuperResolution(network(motion=Spike2Flow(**FLOW_TINY))))
     (tmp_path / "still.yaml").write_text("model: {network: {init_args: {motion: {class_path: ZeroFlow}}}}")
@@ -141,7 +141,7 @@ def test_motion_is_that_of_the_weights_unless_another_is_named(named, expected, 
         (["-c", "{configs}/data/paper.yaml", "--model.network.alpha", "0.5"], 0.5),
     ],
 )
-def test_gain_is_that_of_the_weights_unless_another_is_named(named, expected, tmp_path, configs, monkeypatch):
+def test_gain_comes_from_the_weights_by_default(named, expected, tmp_path, configs, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["lightning"])
     film = tmp_path / "film"
     film.mkdir()
@@ -156,7 +156,7 @@ def test_gain_is_that_of_the_weights_unless_another_is_named(named, expected, tm
 
 
 @pytest.mark.slow
-def test_fit_goes_on_from_weights_and_data_follow_them(file, tmp_path):
+def test_fit_starts_from_weights_and_data_follow_their_settings(file, tmp_path):
     x4 = Path(__file__).parents[3] / "configs" / "x4.yaml"
     (tmp_path / "tiny.yaml").write_text(
         "data: {init_args: {patch: 8, val_patch: 8, train_clips: 4, val_clips: 1, workers: 0}}\n"
@@ -169,7 +169,7 @@ def test_fit_goes_on_from_weights_and_data_follow_them(file, tmp_path):
     torch.testing.assert_close(after(SPIKES), network()(SPIKES))
 
 
-def test_the_same_weights_are_the_same_bytes(tmp_path):
+def test_files_of_the_same_weights_are_identical(tmp_path):
     weights, written = read_weights("cscsr_tiny_x4"), set()
     for _ in range(8):
         write_weights(weights, tmp_path / "weights.safetensors")
