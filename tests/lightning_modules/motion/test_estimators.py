@@ -8,7 +8,7 @@ TIMES = (5, 20, 35)
 
 
 def moving(velocity, height=48, width=64, pattern="RGGB", frames=41, alpha=0.4):
-    """A smooth coloured texture that moves by ``velocity`` (x, y) sensor pixels a frame."""
+    """Spikes of a smooth coloured texture that moves by ``velocity`` (x, y) in sensor pixels per clock."""
     generator = torch.Generator().manual_seed(1)
     waves = torch.rand(3, 12, 4, generator=generator, dtype=torch.float64)
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
@@ -31,7 +31,7 @@ def test_classical_flow_finds_a_translation(velocity, pattern):
         assert error.mean() < 0.2, error.mean()
 
 
-def test_precision_of_a_network_is_not_that_of_motion():
+def test_classical_flow_ignores_autocast():
     spikes = moving((0.2, -0.1))
     expected = ClassicalFlow()(spikes, TIMES, "RGGB")
     with torch.autocast("cpu", torch.bfloat16):
@@ -53,12 +53,12 @@ def test_any_size(size):
 
 
 @pytest.mark.parametrize("bends", [False, True])
-def test_motion_keeps_its_edge_and_flows_part_where_it_bends(bends):
-    """The upper half is at rest, or moves evenly, while the lower half moves, or begins to move in the middle."""
+def test_flow_has_sharp_edges_and_is_not_linear_where_motion_bends(bends):
+    """Upper and lower halves: at rest and moving; or moving, and starting to move in the middle of the clip."""
     torch.manual_seed(0)
     texture = torch.rand(1, 1, 12, 16, generator=torch.Generator().manual_seed(0))
     texture = torch.nn.functional.interpolate(texture, size=(5 * 48, 5 * 64), mode="bilinear")
-    even = torch.cat([texture.roll(clock - 20, dims=-1) for clock in range(41)])  # a fifth of a sensor pixel a frame
+    even = torch.cat([texture.roll(clock - 20, dims=-1) for clock in range(41)])  # a fifth of a sensor pixel per clock
     upper, lower = (even, even.clone()) if bends else (texture.expand_as(even), even)
     if bends:
         lower[:20] = texture[0]
@@ -69,14 +69,14 @@ def test_motion_keeps_its_edge_and_flows_part_where_it_bends(bends):
     right, parted = to_last[0, 0, :, 8:-8], (to_first + to_last)[0, 0, :, 8:-8]
     if bends:
         assert parted[:20].abs().mean() < 0.05
-        assert 1 < parted[28:].mean() < 4  # of 3: pictures of the moment see a little before and after it
+        assert 1 < parted[28:].mean() < 4  # 3, blurred by the window of the middle picture
     else:
         assert right[:20].abs().mean() < 0.3
         assert (right[28:] - 3).abs().mean() < 0.3
         assert (to_first + to_last).abs().mean() < 0.03
 
 
-def test_every_clip_of_a_batch_is_seen_by_its_own_light():
+def test_clips_of_a_batch_are_independent():
     dark = moving((0.2, 0.1), frames=101, alpha=0.05)
     bright = moving((0.2, 0.1), frames=101, alpha=0.8)
     both = torch.cat([dark, bright, moving((-0.2, 0.1), frames=101, alpha=0.05)])
@@ -88,8 +88,8 @@ def test_every_clip_of_a_batch_is_seen_by_its_own_light():
                 torch.testing.assert_close(flow[..., n, :, :, :], part[..., 0, :, :, :])
 
 
-def test_motion_in_dim_light_is_seen_by_longer_means(monkeypatch):
-    """0.02 spikes a frame on average; the motion is half a pixel every ten clocks."""
+def test_longer_windows_are_more_accurate_in_low_light(monkeypatch):
+    """A mean of 0.02 spikes per frame; motion of half a pixel in ten clocks."""
     spikes, truth = moving((0.05, 0.02), frames=101, alpha=0.05), torch.tensor([0.05, 0.02]) * 45
 
     def error():
@@ -101,23 +101,23 @@ def test_motion_in_dim_light_is_seen_by_longer_means(monkeypatch):
 
 
 @pytest.mark.parametrize("step", [3, 63, 512])
-def test_noise_of_a_mean_is_that_of_an_ideal_pixel(step):
+def test_noise_by_rate_is_the_variance_of_an_ideal_pixel(step):
     charge = (torch.arange(100_000, dtype=torch.float64) + 0.5) / 100_000
     light = torch.full((41, 1, len(charge)), (step + 0.5) / 1024, dtype=torch.float64)
     means = tfp_at(spike_integrate_fire(light, charge=charge.reshape(1, -1))[0].double(), 20, 13, order=3)
     assert classical.noise_by_rate(13)[step].item() == pytest.approx(means.var().item(), rel=1e-3)
 
 
-def test_dark_flicker_is_no_motion():
-    """A pixel that fires once in a clip says little of where it moves, and is not followed."""
+def test_flicker_of_dark_pixels_gives_no_motion():
+    """Pixels that fire about once per clip get little weight."""
     light = torch.full((41, 48, 48), 0.02)
     spikes = spike_integrate_fire(light, charge=torch.rand(48, 48, generator=torch.Generator().manual_seed(0)))[0][None]
     far = ClassicalFlow(attachment=1e6)(spikes, TIMES, "RGGB")[1].norm(dim=1).mean()
     assert ClassicalFlow()(spikes, TIMES, "RGGB")[1].norm(dim=1).mean() < 0.2 * far
 
 
-def test_mosaic_without_motion_is_no_motion():
-    """The filter array stands still while the scene moves: what is left of it would hold the flow back."""
+def test_static_bayer_pattern_gives_no_motion():
+    """Residues of the static filter array would bias the flow towards zero."""
     colour = torch.tensor([0.9, 0.3, 0.1])[:, None, None].expand(3, 24, 24)
     light = 0.4 * mosaic(colour, "RGGB").expand(41, 24, 24)
     grey = ClassicalFlow()(spike_integrate_fire(light, charge=torch.rand(24, 24))[0][None], TIMES, "RGGB")
@@ -125,7 +125,7 @@ def test_mosaic_without_motion_is_no_motion():
 
 
 class Constant(MotionEstimator):
-    """Every site has a flow of its own."""
+    """Constant flows, different for each sub-stream."""
 
     def channel_flows(self, spikes, times, pattern):
         height, width = ((side + 1) // 2 for side in spikes.shape[-2:])
@@ -134,7 +134,7 @@ class Constant(MotionEstimator):
         return -flow, flow
 
 
-def test_joint_flow_is_the_mean_of_the_sites_in_sensor_pixels():
+def test_joint_flow_is_the_mean_of_the_sub_streams_in_sensor_pixels():
     to_first, to_last = Constant()(torch.zeros(3, 41, 8, 9), TIMES, "RGGB")
     expected = torch.tensor([8.0, 12]).reshape(1, 2, 1, 1).expand(3, 2, 8, 9)
     assert to_last.equal(expected)
@@ -149,6 +149,6 @@ def test_joint_flow_is_the_mean_of_the_sites_in_sensor_pixels():
         ((41, 1, 8), TIMES, "at least 2 x 2 pixels"),
     ],
 )
-def test_classical_flow_refuses_what_has_no_motion(size, times, message):
+def test_classical_flow_rejects_clips_that_are_too_small_or_too_short(size, times, message):
     with pytest.raises(ValueError, match=message):
         ClassicalFlow()(torch.zeros(1, *size), times, "RGGB")

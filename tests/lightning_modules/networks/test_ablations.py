@@ -1,4 +1,4 @@
-"""The ten variants of Table 3: what every one leaves out or puts in another's place."""
+"""The ten variants of Table 3, and what each omits or replaces."""
 
 import pytest
 import torch
@@ -17,7 +17,7 @@ VARIANTS |= {"b": 607_791, "h": 624_975, "i": 652_655}
 
 
 class Motions(MotionEstimator):
-    """Known flows of the four sub-streams, in Bayer cells: so far to the right, and half as far down."""
+    """Known flows of the four sub-streams in Bayer cells; y is half of x."""
 
     def __init__(self, constants=(1.0, 1.0, 1.0, 1.0)):
         super().__init__()
@@ -33,7 +33,7 @@ class Motions(MotionEstimator):
 
 
 class Slopes(MotionEstimator):
-    """What four perfect estimators see of a flow that is linear in space: its value at their pixels."""
+    """Perfect estimates of a flow that is linear in space, sampled at the pixels of each sub-stream."""
 
     def channel_flows(self, spikes, times, pattern):
         height, width = spikes.shape[-2:]
@@ -55,7 +55,7 @@ def slope(height, width):
 
 
 def settings(configs, *overlays):
-    """Arguments of the network, overlay over overlay."""
+    """Arguments of the network after all overlays."""
     merged = {}
     for overlay in overlays:
         config = yaml.safe_load((configs / f"{overlay}.yaml").read_text())
@@ -74,14 +74,14 @@ def clip(batch=1, height=12, width=16, seed=0):
     return spikes, torch.randn(batch, 2, 2, height, width, generator=generator)
 
 
-def test_the_full_variant_is_the_default_and_the_others_estimate_motion(configs):
+def test_variant_j_is_the_default_and_variant_d_estimates_motion(configs):
     plain, full = (CSCSRConfig(**settings(configs, "x4", "quick", *over)) for over in ((), ("ablation/j",)))
     assert plain == full
     assert yaml.safe_load((configs / "ablation/d.yaml").read_text())["model"]["flow"] == "estimated"
 
 
 @pytest.mark.parametrize("letter", VARIANTS)
-def test_variants_have_their_parameters(letter, configs):
+def test_number_of_parameters_of_each_variant(letter, configs):
     with torch.device("meta"):
         network = CSCSR(**{**settings(configs, "x4", f"ablation/{letter}"), "size": "full_base"})
     assert sum(p.numel() for p in network.parameters()) == VARIANTS[letter]
@@ -91,7 +91,7 @@ def test_variants_have_their_parameters(letter, configs):
 
 
 @pytest.mark.parametrize("letter", VARIANTS)
-def test_any_size_and_every_parameter_learns(letter, configs):
+def test_any_size_works_and_every_parameter_has_a_gradient(letter, configs):
     spikes, flow = clip(2, 9, 7)
     network = variant(letter, configs, 3, motion=Motions())
     rgb = network(spikes)
@@ -106,7 +106,7 @@ def test_any_size_and_every_parameter_learns(letter, configs):
 
 
 @pytest.mark.parametrize("letter", "ceh")
-def test_precisions(letter, configs):
+def test_float64_and_bfloat16_agree_with_float32(letter, configs):
     spikes, _ = clip(1, 12, 12)
     network = variant(letter, configs, motion=Motions((0.93, 0.41, 0.57, 0.13)), skip=True)
     torch.nn.init.normal_(network.reconstruction.rgb.weight, std=0.1)
@@ -125,7 +125,7 @@ def test_precisions(letter, configs):
 
 
 @pytest.mark.parametrize("letter", "ac")
-def test_a_and_c_show_the_share_of_frames_that_fired_and_the_inverse_interval(letter, configs):
+def test_a_gives_the_firing_rate_and_c_the_inverse_interval(letter, configs):
     spikes, _ = clip()
     spikes[..., 2, 2] = 0
     mask = bayer_mask(12, 16)[0]
@@ -139,8 +139,8 @@ def test_a_and_c_show_the_share_of_frames_that_fired_and_the_inverse_interval(le
 
 
 @pytest.mark.parametrize("velocity", [(0.0, 0.0), (1.37, -0.81)])
-def test_learned_features_show_no_pattern_of_motion_on_a_flat_scene(velocity):
-    """0.15 to 0.25 of a step of 8 bits, at rest as in motion."""
+def test_flat_scene_gives_a_flat_picture_at_rest_and_in_motion(velocity):
+    """Measured: 0.15 to 0.25 steps of 8 bits, at rest and in motion."""
     network = CSCSR.from_pretrained("cscsr_small_x4")
     spikes, _ = spike_integrate_fire(torch.full((1, 41, 32, 32), 0.2), charge=torch.full((1, 32, 32), 0.05))
     flow = torch.tensor(velocity).reshape(1, 2, 1, 1).expand(1, 2, 32, 32)
@@ -150,7 +150,7 @@ def test_learned_features_show_no_pattern_of_motion_on_a_flat_scene(velocity):
 
 
 @pytest.mark.parametrize(("letter", "sees"), [("a", False), ("b", False), ("j", True)])
-def test_frames_between_the_windows_are_global_perception_alone(letter, sees, configs):
+def test_only_global_perception_sees_frames_between_windows(letter, sees, configs):
     network = variant(letter, configs, window=5, stride=12)  # frames 0-4, 12-16, 24-28, 36-40
     spikes, flow = clip()
     spikes[:, 8] = 0
@@ -165,15 +165,15 @@ def test_frames_between_the_windows_are_global_perception_alone(letter, sees, co
 
 
 @pytest.mark.parametrize("letter", "de")
-def test_one_motion_of_all_colours_is_the_joint_one(letter, configs):
+def test_d_and_e_equal_j_if_all_colours_move_alike(letter, configs):
     spikes, flow = clip(2, 13, 11)
     one, other = variant(letter, configs, motion=Motions()), variant("j", configs, motion=Motions())
     torch.testing.assert_close(one(spikes), other(spikes))
-    assert one(spikes, flow).equal(other(spikes, flow))  # a given flow is that of every colour
+    assert one(spikes, flow).equal(other(spikes, flow))  # a given flow applies to all colours
 
 
 @pytest.mark.parametrize(("letter", "pattern"), [("d", "RGGB"), ("d", "GBRG"), ("e", "RGGB"), ("e", "GBRG")])
-def test_flows_are_where_their_pixels_are(letter, pattern, configs):
+def test_flows_are_aligned_with_their_pixels(letter, pattern, configs):
     spikes, _ = clip(2, 13, 10)
     flow = variant(letter, configs, pattern=pattern, motion=Slopes()).estimate_flow(spikes)
     flow = flow if letter == "d" else flow[:, None]
@@ -184,7 +184,7 @@ def test_flows_are_where_their_pixels_are(letter, pattern, configs):
     torch.testing.assert_close(flow[:, :, 1][inside], expected[inside])
 
 
-def test_tiles_take_the_flow_of_every_colour(configs):
+def test_tiles_use_the_flow_of_each_colour(configs):
     network = variant("d", configs, motion=Motions((0.2, 0.4, 0.1, 0.3)))
     spikes, _ = clip(1, 70, 58)
     torch.testing.assert_close(forward_in_tiles(network, spikes, 32), network(spikes), rtol=0, atol=1e-5)
@@ -193,7 +193,7 @@ def test_tiles_take_the_flow_of_every_colour(configs):
 # F, G: search and refinement
 
 
-def test_f_neither_estimates_motion_nor_takes_any(configs):
+def test_f_ignores_motion(configs):
     spikes, flow = clip(1, 70, 58)
     network = variant("f", configs, motion=Unwanted())
     assert network(spikes).equal(network(spikes, flow))
@@ -204,7 +204,7 @@ def test_f_neither_estimates_motion_nor_takes_any(configs):
 
 
 @pytest.mark.parametrize(("letter", "apart"), [("h", True), ("i", False), ("j", False)])
-def test_colours_help_each_other_except_in_h(letter, apart, configs):
+def test_colours_affect_each_other_except_in_h(letter, apart, configs):
     spikes, flow = clip()
     network = variant(letter, configs)
     before = network(spikes, flow)
@@ -218,7 +218,7 @@ def test_colours_help_each_other_except_in_h(letter, apart, configs):
 
 
 @pytest.mark.parametrize("letter", "ce")
-def test_a_checkpoint_of_another_variant_is_refused(letter, configs):
+def test_checkpoint_of_another_variant_is_rejected(letter, configs):
     checkpoint = {"state_dict": {}}
     SuperResolution(variant("j", configs)).on_save_checkpoint(checkpoint)
     module = SuperResolution(variant(letter, configs), flow="estimated")

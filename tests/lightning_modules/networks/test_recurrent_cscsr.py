@@ -12,7 +12,7 @@ CLOCKS = [20, 40, 60, 80, 100]
 
 @pytest.fixture(name="network")
 def _network():
-    """A network whose neighbours matter, as if it had been trained."""
+    """A network with random instead of zero weights, so that neighbours matter."""
     torch.manual_seed(0)
     network = RecurrentCSCSR(**TINY).eval()
     torch.nn.init.normal_(network.fusion.share.weight, std=0.05)
@@ -23,14 +23,14 @@ def _network():
 
 @pytest.fixture(name="clips")
 def _clips():
-    """Clips (5, 41, H, W) around every 20th clock, and their flows."""
+    """Five clips (5, 41, H, W), 20 clocks apart, and their flows."""
     generator = torch.Generator().manual_seed(1)
     stream = torch.rand(121, 22, 26, generator=generator) < 0.3
     flow = torch.randn(5, 2, 2, 1, 1, generator=generator).expand(-1, -1, -1, 22, 26)
     return torch.stack([stream[clock - 20 : clock + 21] for clock in CLOCKS]), flow
 
 
-def test_untrained_it_is_the_network_that_it_began_as(clips):
+def test_untrained_fusion_gives_the_pictures_of_the_clip_network(clips):
     single = CSCSR(**TINY, resolution="sensor").eval()
     network = RecurrentCSCSR(**single.settings).eval()
     assert all(name.startswith("fusion.") for name in network.load_state_dict(single.state_dict(), strict=False)[0])
@@ -42,7 +42,7 @@ def test_untrained_it_is_the_network_that_it_began_as(clips):
     torch.testing.assert_close(pictures, single(spikes, flow))
 
 
-def test_the_first_key_frame_is_that_of_a_single_clip_and_the_others_are_not(network, clips):
+def test_only_the_first_key_frame_equals_that_of_a_single_clip(network, clips):
     spikes, flow = clips
     pictures, single = network(spikes[None], flow[None])[0], network(spikes, flow)
     torch.testing.assert_close(pictures[0], single[0])
@@ -50,7 +50,7 @@ def test_the_first_key_frame_is_that_of_a_single_clip_and_the_others_are_not(net
 
 
 @pytest.mark.parametrize("future", [0, 1, 4])
-def test_a_picture_depends_on_all_before_and_on_those_of_its_group(network, clips, future):
+def test_picture_depends_on_all_earlier_key_frames_and_on_its_group(network, clips, future):
     spikes, flow = clips
     known = spikes[None].float().requires_grad_()
     rgb = network(known, flow[None], future=future)
@@ -60,18 +60,18 @@ def test_a_picture_depends_on_all_before_and_on_those_of_its_group(network, clip
         assert seen.tolist() == [m < last for m in range(5)]
 
 
-def test_a_film_read_from_its_end_is_its_mirror_image(network, clips):
+def test_backward_pass_is_the_forward_pass_of_the_reversed_film(network, clips):
     spikes, flow = clips
     earlier, final = network.film(spikes[None], flow[None], future=4)
     torch.testing.assert_close(earlier[0, 4], network(spikes[4:], flow[4:])[0])
     assert (final[0, 4] - earlier[0, 4]).abs().max() > 1e-3
-    # a scene at rest knows no direction: what is read first is the film backwards, read once
+    # at rest, the backward pass equals the forward pass of the reversed film
     turned = network(spikes.flip(0)[None], static=True)
     torch.testing.assert_close(network.film(spikes[None], static=True, future=4)[0].flip(1), turned)
 
 
 @pytest.mark.parametrize(("future", "tile"), [(0, 16), (1, 0), (4, 16)])
-def test_a_film_is_the_same_group_by_group_and_tile_by_tile(network, clips, future, tile):
+def test_groups_and_tiles_give_the_pictures_of_the_whole_film(network, clips, future, tile):
     spikes, _ = clips
     maker = FilmMaker(network, future, tile=tile)
     found = [maker(spikes[n : n + future + 1], CLOCKS[n : n + future + 1]) for n in range(0, 5, future + 1)]
@@ -80,19 +80,19 @@ def test_a_film_is_the_same_group_by_group_and_tile_by_tile(network, clips, futu
     torch.testing.assert_close(torch.cat(found), expected, rtol=0, atol=2e-3 if tile else 1e-4)
 
 
-def test_a_state_moves_with_the_scene(network):
+def test_state_is_warped_with_the_scene(network):
     network = RecurrentCSCSR(**{**TINY, "scale": 4})
     state = torch.rand(1, 48 + 32, 10, 12)
     flow = torch.zeros(1, 2, 10, 12)
     torch.testing.assert_close(network.moved(state, flow), state)
-    flow[:, 0], flow[:, 1] = 0.75, -0.5  # three and two pixels of the picture
+    flow[:, 0], flow[:, 1] = 0.75, -0.5  # three and two output pixels
     moved = network.moved(state, flow)
     torch.testing.assert_close(moved[:, 48:], flow_warp(state[:, 48:], flow))
     inside = network.picture(moved)[..., 8:-8, 8:-8]
     torch.testing.assert_close(inside, network.picture(state)[..., 6:-10, 11:-5])
 
 
-def test_what_is_too_far_away_is_not_asked(network, clips):
+def test_distant_key_frames_are_not_neighbours(network, clips):
     spikes, _ = clips
     maker, single = FilmMaker(network), FilmMaker(network)(spikes[1:2], [61])
     maker(spikes[:1], [20])
@@ -108,7 +108,7 @@ def test_what_is_too_far_away_is_not_asked(network, clips):
         ({"size": "huge", "frames": 101}, 4_206_310, 0, 4.56),
     ],
 )
-def test_parameters_and_work_of_sizes_for_films(settings, parameters, future, mmac):
+def test_parameters_and_multiplications_of_film_networks(settings, parameters, future, mmac):
     network = RecurrentCSCSR(4, **settings)
     assert sum(weight.numel() for weight in network.parameters()) == parameters
     frames = network.frames
@@ -118,7 +118,7 @@ def test_parameters_and_work_of_sizes_for_films(settings, parameters, future, mm
 
 
 @pytest.mark.parametrize("future", [0, 3])
-def test_the_film_of_a_stream(network, clips, future):
+def test_film_of_a_stream(network, clips, future):
     torch.manual_seed(3)
     stream = (torch.rand(113, 12, 14) < 0.3).to(torch.uint8)
     shown = list(film(network, stream.split(7), 20, white=0.4, future=future, static=True))
@@ -129,7 +129,7 @@ def test_the_film_of_a_stream(network, clips, future):
     torch.testing.assert_close(torch.stack([frame.rgb for frame in shown]), expected)
 
 
-def test_a_picture_waits_for_its_group(network):
+def test_picture_is_returned_once_its_group_is_complete(network):
     come = []
 
     def camera():
@@ -144,8 +144,8 @@ def test_a_picture_waits_for_its_group(network):
             break
 
 
-def test_errors(network, clips):
-    with pytest.raises(ValueError, match=r"resolution: expected correlated and sensor, .* got correlated and output"):
+def test_invalid_settings_are_rejected(network, clips):
+    with pytest.raises(ValueError, match=r"resolution: expected correlated and sensor .* got correlated and output"):
         RecurrentCSCSR(resolution="output")
     with pytest.raises(ValueError, match=r"correlated and sensor.* got early"):
         RecurrentCSCSR(reconstruction="early")

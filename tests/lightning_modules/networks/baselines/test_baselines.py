@@ -1,4 +1,4 @@
-"""What all baselines have in common, in tables: sizes, gradients, the skip, phases, published sizes, bad arguments."""
+"""Common properties of the baselines: sizes, gradients, skip, phases, published sizes, invalid arguments."""
 
 import pytest
 import torch
@@ -30,7 +30,7 @@ def clip(batch=1, height=12, width=16):
 
 
 def build(name, seed=0, **settings):
-    """A network in which what starts at zero does not stay there."""
+    """A network with random weights instead of those initialised with zeros."""
     torch.manual_seed(seed)
     network = getattr(networks, name)(**{"scale": 2, **settings})
     for module in network.modules():
@@ -51,9 +51,9 @@ def test_any_size_and_scale(name, tiny, scale, size):
 
 
 @EVERY
-def test_every_parameter_learns(name, tiny):
+def test_every_parameter_has_a_gradient(name, tiny):
     resting = None
-    for seed in range(4):  # few channels may all be silent by chance
+    for seed in range(4):  # all of a few channels may be inactive by chance
         network = build(name, seed, **tiny)
         network(*clip(2, 9, 8)).square().mean().backward()
         silent = {name for name, one in network.named_parameters() if one.grad is None or not one.grad.any()}
@@ -64,7 +64,7 @@ def test_every_parameter_learns(name, tiny):
 
 
 @EVERY
-def test_a_flow_changes_what_it_says_it_changes(name, tiny):
+def test_takes_flow_states_whether_the_flow_matters(name, tiny):
     network, (spikes, flow) = build(name, **tiny).eval(), clip()
     with torch.no_grad():
         still, moved = network(spikes, static=True), network(spikes, flow)
@@ -86,7 +86,7 @@ def test_bfloat16_keeps_the_picture_in_float32(name, tiny):
     assert 0 < (half - exact).abs().max() < 0.1 * exact.abs().max()
 
 
-# of the publications; BasicVSR without the 1,440,300 of SPyNet, VidarSR with 9,216 for three planes a picture
+# as published; BasicVSR without the 1,440,300 of SPyNet, VidarSR with 9,216 more for three planes per picture
 @pytest.mark.parametrize(
     ("name", "settings", "counts"),
     [
@@ -106,7 +106,7 @@ def test_bfloat16_keeps_the_picture_in_float32(name, tiny):
         ("VidarSR", {"width": 256, "features": 64, **STAR}, {2: 12_785_894}),
     ],
 )
-def test_parameters_are_those_of_the_publication(name, settings, counts):
+def test_number_of_parameters_as_published(name, settings, counts):
     for scale, expected in counts.items():
         with torch.device("meta"):
             network = getattr(networks, name)(scale=scale, **settings)
@@ -129,7 +129,7 @@ def test_parameters_are_those_of_the_publication(name, settings, counts):
         ("SwinIR", {"width": 12, "groups": 1, "layers": 2, "heads": 2}, None),
     ],
 )
-def test_with_a_skip_training_starts_where_a_decoder_ends(name, settings, decode):
+def test_skip_starts_from_the_decoded_picture(name, settings, decode):
     network, (spikes, flow) = build(name, **settings, alpha=0.5, pattern="GBRG", skip=True), clip(2)
     rgb = network(spikes, flow)
     if decode:
@@ -139,12 +139,12 @@ def test_with_a_skip_training_starts_where_a_decoder_ends(name, settings, decode
         offsets = linear_motion(flow[:, 0], flow[:, 1], times, first=5, middle=20, last=35)
         picture = demosaic_along_motion(2 * tfi(spikes)[:, times], offsets, "GBRG")
     torch.testing.assert_close(rgb, F.interpolate(picture, scale_factor=2, mode="bicubic"), rtol=0, atol=1e-4)
-    (rgb - 1).square().mean().backward()  # and goes on from there
+    (rgb - 1).square().mean().backward()  # and training goes on from there
     assert sum(p.grad is not None and p.grad.abs().sum() > 0 for p in network.parameters()) >= 2
 
 
-@pytest.mark.parametrize("case", [3, 7])  # those that split the colours themselves
-def test_a_mosaic_moved_by_a_pixel_is_one_of_another_phase(case):
+@pytest.mark.parametrize("case", [3, 7])  # networks that split the colours themselves
+def test_mosaic_shifted_by_a_pixel_has_another_phase(case):
     name, tiny = CASES[case]
     tiny = {**tiny, **({"corrections": 1} if "corrections" in tiny else {})}
     network, moved, other = (build(name, **tiny, pattern=one).double() for one in ("RGGB", "GRBG", "RGGB"))
@@ -172,6 +172,6 @@ def test_a_mosaic_moved_by_a_pixel_is_one_of_another_phase(case):
         ("VidarSR", {"frames": 40}, "frames: expected an odd number, 9 or more, got 40"),
     ],
 )
-def test_wrong_settings(name, settings, message):
+def test_invalid_settings_are_rejected(name, settings, message):
     with pytest.raises(ValueError, match=f"^{message}"):
         getattr(networks, name)(**settings)

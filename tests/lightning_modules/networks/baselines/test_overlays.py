@@ -1,4 +1,4 @@
-"""Baselines by name, as their users type them: trained, tested, exported, read again, and run."""
+"""Baselines on the command line: training, test, export and prediction."""
 
 import csv
 from inspect import signature
@@ -21,8 +21,8 @@ TINY = {"BasicVSR": {"width": 4, "blocks": 1, "neighbors": 1}, "RealRawVSR": {"w
 
 
 @pytest.mark.parametrize("name", BASELINES)
-def test_a_baseline_takes_scale_frames_pattern_and_skip_of_a_configuration_of_cscsr(name):
-    """It is named over one, whose settings of the same name stay."""
+def test_baselines_share_only_common_settings_with_configurations_of_cscsr(name):
+    """A baseline named after a configuration keeps its settings of the same name."""
     kind = getattr(networks, name)
     for below in ("x2", "x3", "x4", "quick"):
         said = yaml.safe_load((CONFIGS / f"{below}.yaml").read_text())["model"]["network"]["init_args"]
@@ -31,7 +31,7 @@ def test_a_baseline_takes_scale_frames_pattern_and_skip_of_a_configuration_of_cs
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["BasicVSR", "RealRawVSR"])  # with a flow, and without
-def test_from_training_to_a_picture(kind, tmp_path):
+def test_train_test_export_and_predict(kind, tmp_path):
     scale = 2 + BASELINES.index(kind) % 3
     configs = ["-c", f"x{scale}", "--model.network", kind]
     tiny = [f"--model.network.{name}={value}" for name, value in TINY[kind].items()]
@@ -72,7 +72,7 @@ def test_from_training_to_a_picture(kind, tmp_path):
         ("flow.yaml", ["window=21"], "'frames': 41,.*'flow_times': (10, 30)"),
     ],
 )
-def test_clips_have_the_frames_and_the_flow_that_the_network_takes(config, settings, expected, tmp_path, monkeypatch):
+def test_data_follow_frames_and_flow_times_of_the_network(config, settings, expected, tmp_path, monkeypatch):
     def stop(self, stage):
         raise ValueError(self.options)
 

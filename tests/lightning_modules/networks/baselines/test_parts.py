@@ -1,4 +1,4 @@
-"""What only one baseline has, against plain loops."""
+"""Parts of single baselines, against plain loops."""
 
 import itertools
 import math
@@ -27,7 +27,7 @@ def clip(batch=1, height=12, width=16):
 
 
 def seen_by(module, of=0):
-    """What a module is given, call after call."""
+    """Record the inputs of a module."""
     seen = []
     module.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[of]))
     return seen
@@ -37,7 +37,7 @@ def seen_by(module, of=0):
 
 
 @pytest.mark.parametrize("size", [(7, 12), (9, 11), (8, 16), (3, 5), (2, 2)])
-def test_mirrored_sides_keep_the_bayer_phase(size):
+def test_padding_keeps_the_bayer_phase(size):
     planes = torch.rand(1, 2, *size)
     mirrored = mirror_to_multiple(planes, 8)
     height, width = mirrored.shape[-2:]
@@ -49,7 +49,7 @@ def test_mirrored_sides_keep_the_bayer_phase(size):
 
 
 def at(plane, y, x):
-    """Bilinear, zero outside."""
+    """Sample bilinearly, zero outside."""
     total = 0.0
     for row, column in itertools.product((math.floor(y), math.floor(y) + 1), (math.floor(x), math.floor(x) + 1)):
         if 0 <= row < plane.shape[0] and 0 <= column < plane.shape[1]:
@@ -57,7 +57,7 @@ def at(plane, y, x):
     return total
 
 
-def test_taps_of_a_deformable_convolution_look_where_features_say():
+def test_deformable_convolution_against_loops():
     part = DeformableConv2d(4, groups=2).double()
     torch.nn.init.normal_(part.where.weight, std=0.3)
     torch.nn.init.normal_(part.where.bias)
@@ -72,8 +72,8 @@ def test_taps_of_a_deformable_convolution_look_where_features_say():
     torch.testing.assert_close(part(features, guide)[0], expected)
 
 
-def test_a_deformable_convolution_begins_at_half_weight_and_is_exact_under_autocast():
-    """In bfloat16 whole numbers above 256 would be rounded."""
+def test_untrained_deformable_convolution_is_exact_under_autocast():
+    """bfloat16 would round integers above 256."""
     part, features = DeformableConv2d(8), torch.randn(1, 8, 3, 600)
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
         got = part(features, features)
@@ -81,7 +81,7 @@ def test_a_deformable_convolution_begins_at_half_weight_and_is_exact_under_autoc
 
 
 def ramps(height, width, scale=1):
-    """Three planes, a slope of its own each; in sensor pixels, whatever the scale."""
+    """Three planes with different slopes per sensor pixel, at any scale."""
     y, x = ((torch.arange(scale * side, dtype=torch.float64) + 0.5) / scale - 0.5 for side in (height, width))
     slopes = torch.tensor([[0.3, 0.7], [-0.2, 0.5], [0.9, -0.4]], dtype=torch.float64)
     return slopes[:, 0, None, None] * y[:, None] + slopes[:, 1, None, None] * x + 5
@@ -89,8 +89,8 @@ def ramps(height, width, scale=1):
 
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
 @pytest.mark.parametrize(("scale", "size"), [(1, (16, 20)), (2, (15, 19)), (3, (16, 19))])
-def test_colours_that_are_reconstructed_apart_stand_where_their_pixels_are(scale, pattern, size):
-    """Linear slopes, enlarged linearly, are the slopes of the picture, but for the edge."""
+def test_separate_colours_are_aligned(scale, pattern, size):
+    """Bilinear enlargement keeps linear slopes, except near the border."""
 
     def enlarge(planes, flows):
         assert planes.shape == (4, 1, (size[0] + 1) // 2, (size[1] + 1) // 2)
@@ -103,7 +103,7 @@ def test_colours_that_are_reconstructed_apart_stand_where_their_pixels_are(scale
     torch.testing.assert_close(rgb[0][inner], ramps(*size, scale)[inner])
 
 
-def test_every_sub_stream_has_its_flow_in_its_pixels():
+def test_flow_of_sub_streams_is_in_their_pixels():
     spikes, flow = torch.rand(2, 41, 6, 8), torch.randn(2, 2, 2, 6, 8)
     seen = []
 
@@ -120,7 +120,7 @@ def test_every_sub_stream_has_its_flow_in_its_pixels():
 # BasicVSR
 
 
-def test_features_go_from_both_ends_to_the_middle():
+def test_features_propagate_from_both_ends_to_the_middle():
     network = BasicVSR(2, width=4, blocks=1, neighbors=0).double()
     spikes, flow = clip()
     pictures = [demosaic_residual(tfi(spikes.double())[:, 5 + 3 * n] / 0.4) for n in range(11)]
@@ -139,7 +139,7 @@ def test_features_go_from_both_ends_to_the_middle():
     torch.testing.assert_close(network(spikes, flow), network.picture(features) + enlarged)
 
 
-def test_every_picture_is_demosaiced_along_the_motion_to_its_neighbours():
+def test_pictures_are_demosaiced_along_motion():
     network, (spikes, flow) = BasicVSR(2, width=4, blocks=1, neighbors=2, alpha=0.5), clip()
     seen = seen_by(network.backward_trunk)
     network(spikes, flow)
@@ -153,7 +153,7 @@ def test_every_picture_is_demosaiced_along_the_motion_to_its_neighbours():
 # Real-RawVSR
 
 
-def test_five_mosaics_are_aligned_to_the_middle_of_their_clip():
+def test_five_mosaics_are_aligned_to_the_middle():
     network = RealRawVSR("tfp", 2, width=8, blocks=2, tfp_window=13, pattern="GRBG", alpha=0.5)
     for module in network.modules():
         if hasattr(module, "where"):
@@ -169,7 +169,7 @@ def test_five_mosaics_are_aligned_to_the_middle_of_their_clip():
 # SpikeSR-Net
 
 
-def test_every_pixel_filters_its_spikes_by_kernels_of_its_own():
+def test_spikes_are_filtered_with_kernels_per_pixel():
     network = SpikeSRNetLike(2, width=8, maps=3, corrections=1, alpha=0.5).double()
     spikes, _ = clip(2, 4, 6)
     windows, maps = seen_by(network.kernels), seen_by(network.represent)
@@ -189,12 +189,12 @@ def test_every_pixel_filters_its_spikes_by_kernels_of_its_own():
 
 
 def attention(layer, tokens):
-    """Attention of one shifted layer without norms, pixel by pixel."""
+    """Attention of one layer without norms, pixel by pixel."""
     height, width, channels = tokens.shape
     qkv = (tokens @ layer.qkv.weight.T + layer.qkv.bias).reshape(height, width, 3, layer.heads, -1)
     pixels = list(itertools.product(range(height), range(width)))
 
-    def window(y, x):  # two pixels see each other where the grid, moved by the shift, has no line between them
+    def window(y, x):  # index of the shifted window of a pixel
         return (y - layer.shift) // 8, (x - layer.shift) // 8
 
     out = torch.zeros(height, width, layer.heads, channels // layer.heads, dtype=tokens.dtype)
@@ -208,7 +208,7 @@ def attention(layer, tokens):
 
 @torch.no_grad()
 @pytest.mark.parametrize("shift", [0, 4])
-def test_attention_against_loops(shift):
+def test_window_attention_against_loops(shift):
     layer = AttentionLayer(4, 2, shift, 0.0).double()
     layer.bias.normal_()
     layer.qkv.weight.normal_()
@@ -220,7 +220,7 @@ def test_attention_against_loops(shift):
 
 
 @torch.no_grad()
-def test_known_pixels_are_averaged_by_how_many_there_are():
+def test_convolution_is_normalised_by_the_number_of_known_pixels():
     part = KnownPixels(3).double().eval()
     raw, mask = torch.rand(1, 1, 5, 6, dtype=torch.float64), bayer_mask(5, 6, dtype=torch.float64)[0]
     features = torch.zeros(1, 3, 5, 6, dtype=torch.float64)
@@ -234,7 +234,7 @@ def test_known_pixels_are_averaged_by_how_many_there_are():
 # VidarSR
 
 
-def test_neighbours_are_those_of_the_publication():
+def test_neighbours_and_their_flows():
     network, (spikes, flow) = VidarSR(2, width=6, features=3), clip()
     assert network.times == (20, 6, 13, 27, 34)
     assert network.flow_times == (5, 20, 35)
