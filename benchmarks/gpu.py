@@ -182,19 +182,19 @@ def main() -> None:
     card = torch.cuda.get_device_name() if device.type == "cuda" else platform.processor() or platform.machine()
     bytes_s, flops = roofs(device, 256 if args.short else 8192)
     found = folder_pictures(args.pictures)[:64] if args.pictures else embedded_pictures()
-    best = ["cscsr_small_x4", "cscsr_huge_film_fast_x4"]
+    best = ["cscsr_small_x4", "cscsr_huge_x4"]
     if args.short:
         rows = [
             scenes(found[:2], 4, 8, device, bytes_s), motion([(2, 16, 16)], device),
             sensor((4, 8, 8), device, bytes_s), pictures(["cscsr_tiny_x4"], [(16, 16)], device, flops),
-            training(["cscsr_large_film_x4"], [5], 8, device, flops),
+            training(["cscsr_large_x4"], [5], 8, device, flops),
         ]  # fmt: skip
     else:
         rows = [
             scenes(found, 960, 48, device, bytes_s),
             motion([(1, 250, 400), (960, 48, 48), (1, 1000, 1000)], device),
             sensor((200, 1000, 1000), device, bytes_s), training(best, [48, 240, 480], 48, device, flops),
-            pictures([*best, "cscsr_tiny_x4", "cscsr_large_film_x4"], [(250, 400), (1000, 1000)], device, flops),
+            pictures([*best, "cscsr_tiny_x4", "cscsr_large_x4"], [(250, 400), (1000, 1000)], device, flops),
         ]  # fmt: skip
     args.output.parent.mkdir(parents=True, exist_ok=True)
     with open(args.output, "w", newline="") as file:

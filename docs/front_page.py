@@ -13,7 +13,7 @@ import spikekit as sk
 from lightning_modules.inference.film import film
 from lightning_modules.networks import CSCSR, ClassicalDecoder
 
-HERE, SCALE, ALPHA, WEIGHTS = Path(__file__).parent, 4, 0.4, "cscsr_huge_film_fast_x4"
+HERE, SCALE, ALPHA, WEIGHTS = Path(__file__).parent, 4, 0.4, "cscsr_huge_x4"
 
 
 def recorded(photograph, height, width, frames, position, **motion):

@@ -10,9 +10,6 @@ from pathlib import Path
 
 from safetensors import safe_open
 
-#: prefix of the parameters that a film network has in addition to the clip network inside
-FUSION = "fusion."
-
 _FOLDER = Path(__file__).parent / "weights"
 
 
@@ -22,21 +19,19 @@ class Model:
 
     Args:
         name: name for ``from_pretrained`` and ``--model.weights``, such as ``"cscsr_small_x4"``.
-        file: file in the folder ``weights``. The file of a film network also serves the clip network inside.
         scale: super-resolution factor s; None for motion estimators, as are the next four.
         pattern: Bayer phase, or ``"grey"``.
         size: name in :data:`lightning_modules.networks.sizes.SIZES`.
         frames: number of spike frames per clip.
         margin: radius of the receptive field in sensor pixels, measured with these weights.
-        film: the network uses the neighbouring key frames of a film.
+        film: the network also uses the neighbouring key frames of a film.
         noise: the network was trained for noisy sensors without calibration.
-        macs: multiplications per sensor pixel for one picture or one motion estimate.
+        macs: multiplications per sensor pixel for the picture of a single clip or one motion estimate.
         kodak: PSNR in dB on Kodak's 24 stills in motion, or None.
-        vid4: PSNR in dB on foliage and walk of Vid4, with 20 clocks per source frame, or None.
+        vid4: PSNR in dB on foliage and walk of Vid4, as films, with 20 clocks per source frame, or None.
     """
 
     name: str
-    file: str
     scale: int | None
     pattern: str | None
     size: str | None
@@ -50,15 +45,14 @@ class Model:
 
     @property
     def path(self) -> Path:
-        """Path of the file."""
-        return _FOLDER / self.file
+        """Where the file is."""
+        return _FOLDER / f"{self.name}.safetensors"
 
     @property
     def parameters(self) -> int:
         """Number of learned parameters, including those of a learned motion estimator."""
         with safe_open(self.path, "numpy") as file:
-            own = [name for name in file.keys() if self.film or not name.startswith(FUSION)]  # noqa: SIM118
-            return sum(prod(file.get_slice(name).get_shape()) for name in own)
+            return sum(prod(file.get_slice(name).get_shape()) for name in file.keys())  # noqa: SIM118
 
 
 def list_models(scale: int | None = None, pattern: str | None = None) -> list[Model]:
@@ -96,7 +90,6 @@ def _models() -> tuple[Model, ...]:
 def _model(row: dict[str, str]) -> Model:
     return Model(
         row["name"],
-        row["file"],
         pattern=row["pattern"] or None,
         size=row["size"] or None,
         film=row["film"] == "1",

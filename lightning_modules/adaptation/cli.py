@@ -16,7 +16,7 @@ from lightning_modules.cli.folder_lock import check_folder, locked_folder
 from lightning_modules.inference.clips import RecordingClips
 from lightning_modules.inference.output import check_place
 from lightning_modules.inference.reconstruct import may_be_noisy, precision_of
-from lightning_modules.networks import Network, RecurrentCSCSR
+from lightning_modules.networks import Network
 from lightning_modules.registry import list_models
 from lightning_modules.storage.pretrained import Weights, motion_of, settings_of, write_weights
 from spikekit.arguments import whole
@@ -80,8 +80,8 @@ def adapt(args: Sequence[str]) -> None:
 
 def _student(weights: str) -> Network:
     student = Network.from_pretrained(weights)
-    if isinstance(student, RecurrentCSCSR) or student.settings.get("motion_fusion", "joint") != "joint":
-        raise UsageError(f"--weights: expected a network for single clips with one flow, got {weights}")
+    if student.settings.get("motion_fusion", "joint") != "joint":
+        raise UsageError(f"--weights: expected a network with one flow for all colours, got {weights}")
     return student.eval()
 
 
@@ -105,7 +105,7 @@ def _slowest(recording: Recording, student: Network, noisy: bool) -> str:
     """Return the name of the slowest weights for this recording, which are expected to give the best pictures."""
     room = recording.frames // ROOM
     models = list_models(student.scale, student.pattern)
-    fit = [one for one in models if not one.film and one.frames and one.frames <= room]
+    fit = [one for one in models if one.frames and one.frames <= room]
     if not fit:
         raise ValueError(_too_short(recording, student.frames))
     of_sensor = [one for one in fit if one.noise == noisy] or fit

@@ -153,8 +153,8 @@ class FilmMaker:
         psnr_tolerance: by how many dB the PSNR of a picture may fall where this saves work. With any but 0 the network
             is asked only where the spikes say that something moves (:class:`lightning_modules.inference.rest.Rest`).
             The first picture knows of nothing that rests, so a film of one is as it is without.
-        how: ``self_ensemble`` and ``done`` of :func:`lightning_modules.inference.predict.predict`. A network that
-            carries a state on has no ensemble.
+        how: ``self_ensemble`` and ``done`` of :func:`lightning_modules.inference.predict.predict`. With a
+            self-ensemble every clip is reconstructed alone: no state is carried on.
 
     Raises:
         ValueError: a ``future`` for a network that takes every clip by itself; ``interpolated`` pictures by one that
@@ -179,7 +179,7 @@ class FilmMaker:
         **how: Any,
     ) -> None:
         kind = type(network).__name__
-        self.carries_on = isinstance(network, RecurrentCSCSR)
+        self.carries_on = isinstance(network, RecurrentCSCSR) and how.get("self_ensemble", 1) == 1
         for name, number in (("future", future), ("interpolated", interpolated)):
             if isinstance(number, bool) or not isinstance(number, int) or number < 0:
                 raise ValueError(f"{name}: expected a whole number >= 0, got {number!r}")
@@ -187,8 +187,6 @@ class FilmMaker:
             raise ValueError(f"future: expected 0, as {kind} takes every clip by itself, got {future}")
         if interpolated and not network.takes_flow:
             raise ValueError(f"interpolated: expected 0, as {kind} estimates no motion of a clip, got {interpolated}")
-        if self.carries_on and how.get("self_ensemble", 1) > 1:
-            raise ValueError(f"self_ensemble: expected 1 for {kind}, got {how['self_ensemble']}")
         check_views(how.get("self_ensemble", 1))
         if not 0 <= psnr_tolerance < math.inf:
             raise ValueError(f"psnr_tolerance: expected 0 dB or more, got {psnr_tolerance}")
@@ -209,7 +207,8 @@ class FilmMaker:
     @property
     def warm_up(self) -> int:
         """On how many pictures before a group its pictures depend, as far as one can see."""
-        pictures = max(self.network.warm_up, min(self.interpolated, 1), Rest.warm_up if self.rest else 0)
+        known = self.network.warm_up if self.carries_on else 0
+        pictures = max(known, min(self.interpolated, 1), Rest.warm_up if self.rest else 0)
         return pictures * (self.interpolated + 1)
 
     @torch.no_grad()

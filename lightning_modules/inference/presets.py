@@ -235,8 +235,8 @@ def choices(
 def _for_noise(scale: int) -> dict[str, str]:
     """Return the names of weights that were trained for noise, by those of the same network that were not."""
     models = list_models(scale)
-    noisy = {(one.size, one.frames, one.film, one.pattern): one.name for one in models if one.noise}
-    keys = {one.name: (one.size, one.frames, one.film, one.pattern) for one in models if not one.noise}
+    noisy = {(one.size, one.frames, one.pattern): one.name for one in models if one.noise}
+    keys = {one.name: (one.size, one.frames, one.pattern) for one in models if not one.noise}
     return {name: noisy[key] for name, key in keys.items() if key in noisy}
 
 

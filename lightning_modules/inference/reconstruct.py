@@ -294,12 +294,11 @@ def _digest(values: Any) -> str:
     return total.hexdigest()
 
 
-def by_size(models: Sequence[Model], speed: str, film: bool) -> Model | None:
+def by_size(models: Sequence[Model], speed: str) -> Model | None:
     """Return the weights that a speed stands for where no table was measured, from the smallest to the largest."""
     if speed not in SPEEDS:
         raise ValueError(f"speed: expected one of {', '.join(SPEEDS)}, got {speed!r}")
-    able = [model for model in models if model.film == film] or [model for model in models if not model.film]
-    able.sort(key=lambda model: model.macs)
+    able = sorted(models, key=lambda model: model.macs)
     place = list(SPEEDS).index(speed) / (len(SPEEDS) - 1)
     return able[round(place * (len(able) - 1))] if able else None
 
@@ -320,7 +319,7 @@ def _chosen(
     film = every <= clips.frames  # one picture knows the other
     if recording.pattern == GREY or scale == 1:
         kind = GREY if recording.pattern == GREY else "RGGB"  # serves every phase
-        model = by_size(list_models(scale, kind), speed or "balanced", film)
+        model = by_size(list_models(scale, kind), speed or "balanced")
         if model is not None:
             said = "grey cameras" if kind == GREY else "colour at the resolution of the sensor"
             return Preset(model.name), [f"{model.name}, for {said}"]

@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from lightning_modules.registry import FUSION, find_model, list_models
+from lightning_modules.registry import find_model, list_models
 from lightning_modules.storage.checkpoint import check_tensors, read_checkpoint
 from lightning_modules.storage.settings import check_plain, check_shapes, load_state
 from spikekit.arguments import one_line
@@ -67,17 +67,7 @@ def read_weights(source: str | Path) -> Weights:
         names = ", ".join(model.name for model in list_models())
         raise FileNotFoundError(f"{source}: expected a file of weights or a name in the package ({names})")
     found = _read_safetensors(path) if path.suffix == ".safetensors" else _read_checkpoint(path)
-    if model and not model.film and found.settings["class"] == "RecurrentCSCSR":
-        found = _of_a_clip(found)
     return replace(found, halo=model.margin) if model else found
-
-
-def _of_a_clip(weights: Weights) -> Weights:
-    """Return the weights of the clip network (CSCSR) inside a film network."""
-    added = ("fusion_width", "fusion_blocks", "memory")
-    settings = {name: value for name, value in weights.settings.items() if name not in added} | {"class": "CSCSR"}
-    tensors = {name: value for name, value in weights.tensors.items() if not name.startswith(FUSION)}
-    return replace(weights, settings=settings, tensors=tensors)
 
 
 def check_weights(weights: Weights, kinds: Mapping[str, type[nn.Module]]) -> None:

@@ -108,11 +108,11 @@ def usual_settings(
         own: arguments that give weights to the network of all settings, such as ``--ckpt_path``: that network then
             stands in the place of those in the package.
         network: that network, of which only what it has arguments for is changed.
-        film: pictures of films are measured: those of all networks, for films or not, as they are and without motion.
+        film: pictures of films are measured, as they are and without motion.
         frames: spike frames of the scenes; networks of longer clips are left out.
     """
-    # Noisy sensors would need other scenes; a network for films is another's equal on one clip.
-    models = [one for one in list_models(scale) if not one.noise and one.film <= film and one.frames <= frames]
+    # noisy sensors would need other scenes
+    models = [one for one in list_models(scale) if not one.noise and one.frames <= frames]
     models.sort(key=lambda model: model.macs)
     largest = models[-1].name if models else None
     reference = _reference(models) if models else None
@@ -148,5 +148,5 @@ def usual_settings(
 def _reference(models: Sequence[Model]) -> Model:
     """Return what ratios refer to and is tried in more ways than the others: of a middle size, for a short clip."""
     short = min(one.frames for one in models)
-    single = [one for one in models if one.frames == short and not one.film]
-    return single[(len(single) - 1) // 2]
+    those = [one for one in models if one.frames == short]
+    return those[(len(those) - 1) // 2]

@@ -1,7 +1,6 @@
 """The registry of the weights that come with the package."""
 
 import pytest
-import torch
 
 import lightning_modules
 from lightning_modules.networks import CSCSR, RecurrentCSCSR
@@ -36,12 +35,3 @@ def test_a_row_says_what_the_network_is(model):
     assert model.parameters == sum(value.numel() for value in network.parameters())
     assert model.macs > 0
     assert model.pattern == "grey" or min(model.kodak, model.vid4) > 0
-
-
-@pytest.mark.parametrize("film", [model for model in NETWORKS if model.film], ids=lambda model: model.name)
-def test_a_network_for_films_makes_the_picture_of_the_network_for_clips_inside_it(film):
-    (inside,) = (model for model in NETWORKS if model.file == film.file and not model.film)
-    spikes = (torch.rand(1, inside.frames, 12, 10) < 0.3).to(torch.uint8)
-    clip, both = CSCSR.from_pretrained(inside.name), CSCSR.from_pretrained(film.name)
-    assert inside.parameters < film.parameters
-    assert torch.equal(clip(spikes, static=True), both(spikes, static=True))

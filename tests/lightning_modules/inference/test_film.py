@@ -230,6 +230,13 @@ def test_the_film_of_a_stream_waits_for_the_next_picture_of_the_network():
     assert shown[:4] == [(2, 4), (4, 8), (6, 8), (8, 12)]
 
 
+def test_with_a_self_ensemble_every_clip_of_a_film_stands_alone():
+    network = RecurrentCSCSR(**TINY).eval()
+    spikes = (torch.rand(2, 41, 12, 10) < 0.3).to(torch.uint8)
+    alone = [predict(network, clip, self_ensemble=2) for clip in spikes.split(1)]
+    torch.testing.assert_close(FilmMaker(network, self_ensemble=2)(spikes, [20, 40]), torch.cat(alone))
+
+
 def test_what_a_network_cannot_do_in_a_film_is_said():
     network = CSCSR(**TINY)
     for wrong in (-1, 0.5, True):
@@ -239,7 +246,5 @@ def test_what_a_network_cannot_do_in_a_film_is_said():
         FilmMaker(ClassicalDecoder(), 0, 1)
     with pytest.raises(ValueError, match="future: expected 0, as CSCSR takes every clip by itself, got 1"):
         FilmMaker(network, 1)
-    with pytest.raises(ValueError, match="self_ensemble: expected 1 for RecurrentCSCSR"):
-        FilmMaker(RecurrentCSCSR(**TINY), self_ensemble=2)
     with pytest.raises(ValueError, match=r"clocks: expected 2 increasing ones, got \[3, 3\]"):
         FilmMaker(network)(torch.zeros(2, 41, 12, 10), [3, 3])

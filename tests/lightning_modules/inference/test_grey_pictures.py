@@ -64,18 +64,16 @@ def test_weights_for_another_sensor_are_told(recording):
 
 
 def test_speeds_stand_for_sizes_of_grey_weights():
-    def model(name, macs, film=False):
-        known = {"file": "", "scale": 1, "pattern": "grey", "size": None, "frames": 41, "margin": 16, "noise": True}
-        return Model(name, macs=macs, film=film, kodak=None, vid4=None, **known)
+    def model(name, macs):
+        known = {"scale": 1, "pattern": "grey", "size": None, "frames": 41, "margin": 16, "film": False, "noise": True}
+        return Model(name, macs=macs, kodak=None, vid4=None, **known)
 
-    models = [model("large", 2000), model("small", 700), model("large_film", 2100, film=True)]
-    chosen = {speed: by_size(models, speed, film=False).name for speed in SPEEDS}
+    models = [model("large", 2000), model("small", 700)]
+    chosen = {speed: by_size(models, speed).name for speed in SPEEDS}
     assert chosen == {"fastest": "small", "fast": "small", "balanced": "large", "best": "large"}
-    assert by_size(models, "fastest", film=True).name == "large_film"
-    assert by_size(models[:2], "best", film=True).name == "large"
-    assert by_size([], "best", film=False) is None
+    assert by_size([], "best") is None
     with pytest.raises(ValueError, match="speed"):
-        by_size(models, "soon", film=False)
+        by_size(models, "soon")
 
 
 @pytest.mark.parametrize(("pattern", "weights"), [("grey", "cscsr_small_grey_x1"), ("RGGB", "cscsr_small_x1")])
