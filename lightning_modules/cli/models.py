@@ -10,8 +10,9 @@ from lightning_modules.registry import list_models
 from spikekit.tables import table
 
 _LEGEND = """
-MMAC/px: million multiplications by sensor pixel, of a picture or of an estimate of motion. Kodak, Vid4: PSNR in dB
-of 24 stills in motion, and of foliage and walk at 20 clocks a frame, both at alpha 0.4; to be compared at one scale."""
+clip: spike frames of a clip. film: also uses the neighbouring pictures of a film. MMAC/px: million multiplications per
+sensor pixel, for the picture of a single clip or one motion estimate. PSNR in dB at alpha 0.4, to be compared at one
+scale. Kodak: 24 stills in motion, single clips. Vid4: foliage and walk, 20 clocks per source frame, as films."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -28,8 +29,10 @@ def models(args: Sequence[str]) -> None:
     parser().parse_args(args)
     rows = []
     for one in list_models():
-        cells = [one.name, one.scale and f"x{one.scale}", one.size, f"{one.parameters:,}", f"{one.macs / 1e6:.2f}"]
+        cells = [one.name, one.scale and f"x{one.scale}", one.size, one.frames, "yes" if one.film else ""]
+        cells += [f"{one.parameters:,}", f"{one.macs / 1e6:.2f}"]
         scores = [score and f"{score:.2f}" for score in (one.kodak, one.vid4)]
         rows.append([*cells, *scores, f"{one.path.stat().st_size / 1e6:.1f}"])
-    print(table(["weights", "scale", "size", "parameters", "MMAC/px", "Kodak", "Vid4", "MB"], rows))
+    head = ["weights", "scale", "size", "clip", "film", "parameters", "MMAC/px", "Kodak", "Vid4", "MB"]
+    print(table(head, rows))
     print(_LEGEND)
