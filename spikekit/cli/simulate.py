@@ -55,7 +55,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
 
     def option(name: str, kind: Callable[[str], Any], metavar: str, said: str, to: Any = parser) -> None:
-        to.add_argument(f"--{name}", type=kind, metavar=metavar, help=f"{said}; default: {getattr(Settings, name)}")
+        default = getattr(Settings, name.replace("-", "_"))
+        to.add_argument(f"--{name}", type=kind, metavar=metavar, help=f"{said}; default: {default}")
 
     add("input", type=home_path, metavar="INPUT", help="folder of pictures, video or picture")
     stream = ending_in(*RECORDING_ENDINGS, said=f"a stream that ends in {', '.join(RECORDING_ENDINGS)}")
@@ -75,14 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     model = parser.add_argument_group("modelling")
     said = "scene: what the scene requires; everything: every clock and all noise; K: K latent frames per interval"
     option("plan", _plan, "scene|everything|K", said, model)
-    said = "share of the spikes that may differ from a full simulation"
-    model.add_argument(
-        "--spike-tolerance",
-        dest="tolerance",
-        type=positive,
-        metavar="SHARE",
-        help=f"{said}; default: {Settings.tolerance}",
-    )
+    option("spike-tolerance", positive, "SHARE", "share of the spikes that may differ from a full simulation", model)
     option("step", positive, "PIXELS", "largest displacement between latent frames, in sensor pixels", model)
     said = f"method that interpolates latent frames; default: {Settings.interpolation}"
     model.add_argument("--interpolation", choices=INTERPOLATIONS, help=said)

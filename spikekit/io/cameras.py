@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from spikekit.arguments import home_path, one_line, printable
+from spikekit.arguments import home_path, one_line
 from spikekit.check import check_planes, check_positive, check_whole
 from spikekit.color.cfa import bayer_pattern
 from spikekit.io.failures import no_pipe
@@ -172,20 +172,15 @@ def camera(name: str | Path) -> Camera:
     if not own and name not in CAMERAS:
         raise ValueError(f"camera: expected {', '.join(CAMERAS)}, or a .json file, got {name}")
     file = home_path(name) if own else _PRESETS / f"{name}.json"
-    try:
-        if own:
-            no_pipe(file)
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise ValueError(f"{name}: {one_line(error)}") from error
     wanted = [field.name for field in fields(Camera) if field.name != "name"]
-    if not isinstance(data, dict) or set(data) != set(wanted):
-        got = printable(", ".join(data) if isinstance(data, dict) else type(data).__name__)[:300]
-        raise ValueError(f"{name}: expected an object with {', '.join(wanted)}, got {got}")
     try:
+        data = json.loads((no_pipe(file) if own else file).read_text(encoding="utf-8"))
+        if not isinstance(data, dict) or set(data) != set(wanted):
+            got = ", ".join(data) if isinstance(data, dict) else type(data).__name__
+            raise ValueError(f"expected an object with {', '.join(wanted)}, got {got[:300]}")
         return Camera(**{"name": file.name.removesuffix(".json")} | {key: _frozen(data[key]) for key in wanted})
-    except (TypeError, ValueError, RecursionError) as error:
-        raise ValueError(f"{name}: {one_line(error)[:300]}") from error
+    except (OSError, TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"{name}: {one_line(error)[:500]}") from error
 
 
 @cache

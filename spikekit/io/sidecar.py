@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from spikekit.arguments import one_line
+from spikekit.check import check_positive, check_whole
 from spikekit.color.cfa import PATTERNS
 from spikekit.io.failures import no_pipe
 from spikekit.io.whole_file import flush_folder, hidden_name
@@ -45,7 +45,7 @@ def read_sidecar(path: Path) -> Sidecar:
         _check(sidecar)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         said = f"lacks {error}" if isinstance(error, KeyError) else one_line(error)[:300]
         raise ValueError(f"{path}: not a readable side-car ({said})") from error
     return sidecar
@@ -59,33 +59,20 @@ def _data(path: Path) -> dict[str, Any]:
 
 
 def _check(sidecar: Sidecar) -> None:
-    """Raise unless all values have the expected types."""
+    """Raise unless all values that are read have the expected types."""
     for part, values in vars(sidecar).items():
         if not isinstance(values, dict):
             raise ValueError(f"{part}: expected names and values, got {values!r}")
-        for name, (expected, is_good) in _VALUES.get(part, {}).items():
-            if (part != "settings" or name in values) and not is_good(values[name]):
-                raise ValueError(f"{part}.{name}: expected {expected}, got {values[name]!r}")
-
-
-def _is_whole(value: Any) -> bool:
-    return type(value) is int and 1 <= value < 1 << 31  # excludes True, and the unbounded integers of JSON
-
-
-_TEXT = ("a text", lambda value: isinstance(value, str))
-_WHOLE = ("a whole number, 1 or more", _is_whole)
-
-# Description and test of each value that is read.
-_VALUES: dict[str, dict[str, tuple[str, Callable[[Any], bool]]]] = {
-    "stream": {"file": _TEXT, "sha256": _TEXT, "frames": _WHOLE, "height": _WHOLE, "width": _WHOLE},
-    "settings": {
-        "pattern": (f"one of {', '.join(PATTERNS)}", lambda value: value in PATTERNS),
-        "alpha": (
-            "a finite number above 0",
-            lambda value: type(value) in (int, float) and 0 < value <= sys.float_info.max,
-        ),
-    },
-}
+    if not isinstance(sidecar.stream["file"], str):
+        raise ValueError(f"stream.file: expected a text, got {sidecar.stream['file']!r}")
+    for name in ("frames", "height", "width"):
+        check_whole(f"stream.{name}", sidecar.stream[name])
+    alpha, pattern = sidecar.settings.get("alpha", 1.0), sidecar.settings.get("pattern", "RGGB")
+    if type(alpha) not in (int, float):
+        raise ValueError(f"settings.alpha: expected a number, got {alpha!r}")
+    check_positive("settings.alpha", float(alpha))
+    if pattern not in PATTERNS:
+        raise ValueError(f"settings.pattern: expected one of {', '.join(PATTERNS)}, got {pattern!r}")
 
 
 def find_sidecar(stream: Path) -> Sidecar | None:

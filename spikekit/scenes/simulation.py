@@ -43,7 +43,7 @@ class Settings:
     frames: int | None = 41  #: spike frames of the stream; ``None`` for the whole film
     seed: int = 0
     plan: str | int = "scene"  #: ``scene``, ``everything``, or a number of latent frames per interval
-    tolerance: float = 0.05
+    spike_tolerance: float = 0.05
     step: float = 0.5
     interpolation: str = "FlowInterpolation"  #: one of :data:`INTERPOLATIONS`
     noise: SensorNoise = field(default_factory=SensorNoise)
@@ -61,17 +61,8 @@ class Settings:
         plan = None
         if self.plan != "scene":
             plan = Plan.everything(self.clocks) if self.plan == "everything" else Plan(self.plan)
-        return FrameSequence(
-            frames,
-            scale=self.scale,
-            pattern=self.pattern,
-            alpha=self.alpha,
-            clocks=self.clocks,
-            interpolation=INTERPOLATIONS[self.interpolation](),
-            plan=plan,
-            spike_tolerance=self.tolerance,
-            step=self.step,
-        )
+        how = {name: getattr(self, name) for name in ("scale", "pattern", "alpha", "clocks", "spike_tolerance", "step")}
+        return FrameSequence(frames, interpolation=INTERPOLATIONS[self.interpolation](), plan=plan, **how)
 
     def span(self, film: FrameSequence) -> tuple[int, int, dict[int, int]]:
         """Return the first clock of the stream, the number of clocks, and the clocks of the ground truth by frame."""
@@ -158,7 +149,7 @@ def _needed_noise(settings: Settings, film: FrameSequence, frames: range) -> tup
     if noise == SensorNoise() or count is None or settings.plan == "everything":
         return noise, []
     light = sum(film.light(n * film.clocks, 1).mean().item() for n in frames) / len(frames)
-    needed = noise.required(light, count, settings.tolerance * min(1.0, light))
+    needed = noise.required(light, count, settings.spike_tolerance * min(1.0, light))
     kept = needed.spike_changes(light, count)
     return needed, [source for source in noise.spike_changes(light, count) if source not in kept]
 

@@ -139,7 +139,7 @@ def test_noise_that_changes_nothing_is_left_out_and_the_plan_can_be_given(film, 
     ("part", "value", "said"),
     [
         ("source", None, "source: expected names and values, got None"),
-        ("stream.frames", True, "stream.frames: expected a whole number, 1 or more, got True"),
+        ("stream.frames", True, "stream.frames: expected a whole number >= 1, got True"),
         ("settings.alpha", float("nan"), "settings.alpha: expected a finite number above 0, got nan"),
         ("settings.pattern", "RGB", "settings.pattern: expected one of RGGB, BGGR, GRBG, GBRG, got 'RGB'"),
     ],
