@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import torch
 from kornia.color import CFA, rgb_to_grayscale
 from torch import Tensor
@@ -92,11 +90,9 @@ def bayer_sites(pattern: str | CFA) -> tuple[tuple[int, int, int], ...]:
 class PatternModule(OptionsModule):
     """Base class of modules with a pattern, see :func:`bayer_pattern`."""
 
-    bayer_only: ClassVar[bool] = False  #: whether a grey sensor is rejected
-
     def __init__(self, pattern: str | CFA = "RGGB") -> None:
         super().__init__()
-        self.pattern = bayer_pattern(pattern) if self.bayer_only else cfa_pattern(pattern)
+        self.pattern = cfa_pattern(pattern)
 
 
 def bayer_mask(
@@ -411,8 +407,6 @@ class SplitBayer(PatternModule):
         torch.Size([4, 2, 41, 4, 3])
     """
 
-    bayer_only = True
-
     def forward(self, raw: Tensor) -> Tensor:  # noqa: D102
         return split_bayer(raw, self.pattern)
 
@@ -464,8 +458,6 @@ class MergeBayer(PatternModule):
         >>> MergeBayer()(torch.ones(4, 41, 4, 3)).shape
         torch.Size([41, 8, 6])
     """
-
-    bayer_only = True
 
     def forward(self, planes: Tensor) -> Tensor:  # noqa: D102
         return merge_bayer(planes, self.pattern)
