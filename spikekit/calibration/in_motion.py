@@ -96,37 +96,33 @@ def calibrate_in_motion(segments: Segments, known: Calibration, pattern: str | N
         return None
     planes = [torch.from_numpy(plane) & works for plane in colors(known.size, pattern)]
     measured = Measured(known)
-    with progress(what="motion and gains", total=2 * _ROUNDS * len(counts)) as bar:
-        for _ in range(_ROUNDS):
-            # sums over both halves: number of comparisons, expected light, and excess of the rate over it
-            halves = torch.zeros(3, 2, *known.size, dtype=torch.float64)
-            for number, (light, seen) in enumerate(_expected(segments, measured.calibration, pattern, bar.update)):
-                excess = counts[number] / segments.frames - light
-                halves[:, 2 * number // len(counts)] += torch.stack([torch.ones_like(light), light, excess]) * (
-                    seen & works
-                )
-            found = _most_likely(halves, works, planes, known)
-            if found is None:
-                return None
-            measured = found
+    for _ in range(_ROUNDS):
+        # sums over both halves: number of comparisons, expected light, and excess of the rate over it
+        halves = torch.zeros(3, 2, *known.size, dtype=torch.float64)
+        for number, (light, seen) in enumerate(_expected(segments, measured.calibration, pattern)):
+            excess = counts[number] / segments.frames - light
+            part = torch.stack([torch.ones_like(light), light, excess]) * (seen & works)
+            halves[:, 2 * number // len(counts)] += part
+        found = _most_likely(halves, works, planes, known)
+        if found is None:
+            return None
+        measured = found
     return measured
 
 
-def _expected(
-    segments: Segments, known: Calibration, pattern: str | None, done: Callable[[], object]
-) -> Iterator[tuple[Tensor, Tensor]]:
+def _expected(segments: Segments, known: Calibration, pattern: str | None) -> Iterator[tuple[Tensor, Tensor]]:
     """Yield the expected rate of every segment, (H, W), from other pixels, and where it is known."""
     count, size = len(segments.counts), known.size
 
     def light(number: int) -> Tensor:
         return known.correct(segments.counts[number] / segments.frames, pattern)
 
-    place = _places(light, count, pattern is not None, done)
+    place = _places(light, count, pattern is not None)
     passed = torch.stack([part.mean(0) for part in place.tensor_split(4)])
     enough = (passed.amax(0) - passed.amin(0)).norm(dim=0) * 4 / 3 >= _PATH
     mask = None if pattern is None else bayer_mask(*size, pattern)
     pictures: dict[int, Tensor] = {}
-    for number in range(count):
+    for number in progress(range(count), "gains"):
         rate, (total, sources) = segments.counts[number] / segments.frames, torch.zeros(2, *size)
         near = range(max(number - _SOURCES, 0), min(number + _SOURCES + 1, count))
         pictures = {n: pictures[n] if n in pictures else _colored(light(n), pattern) for n in near}
@@ -140,10 +136,9 @@ def _expected(
                 total += lamp * seen
                 sources += use
         yield (total / sources.clamp(min=1)).clamp(min=0), sources > 0
-        done()
 
 
-def _places(light: Callable[[int], Tensor], count: int, color: bool, done: Callable[[], object]) -> Tensor:
+def _places(light: Callable[[int], Tensor], count: int, color: bool) -> Tensor:
     """Return the displacement of the scene at each pixel since the first segment, (J, 2, H, W), in pixels."""
 
     def grey(number: int) -> Tensor:
@@ -151,7 +146,7 @@ def _places(light: Callable[[int], Tensor], count: int, color: bool, done: Calla
         return filter2d_separable(plane[None, None], _GREY, _GREY, "reflect")[0, 0] if color else plane
 
     place, before = torch.zeros(count, 2, *light(0).shape), 0
-    for number in range(count):
+    for number in progress(range(count), "motion"):
         start, end = max(number - 1, 0), min(number + 1, count - 1)
         ends = torch.stack([grey(start), grey(end)])
         ends[1] *= ends[0].mean() / ends[1].mean().clamp(min=1e-9)
@@ -160,7 +155,6 @@ def _places(light: Callable[[int], Tensor], count: int, color: bool, done: Calla
         if number:
             place[number] = place[number - 1] + (before + velocity) / 2
         before = velocity
-        done()
     return place
 
 

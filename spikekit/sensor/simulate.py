@@ -26,10 +26,9 @@ class SpikeSensor:
         threshold: charge of one spike.
         seed: random seed, 0 or more.
         charge: initial charge, broadcastable to :math:`(*, H, W)`, below the threshold; default: random.
-        clock: number of the first clock, to continue the simulation of another sensor with the same seed.
 
     Raises:
-        ValueError: ``threshold`` is not above 0, or ``seed`` or ``clock`` is negative.
+        ValueError: ``threshold`` is not above 0, or ``seed`` is negative.
 
     Example:
         >>> light = torch.rand(40, 6, 8)
@@ -47,15 +46,13 @@ class SpikeSensor:
         threshold: float = 1.0,
         seed: int = 0,
         charge: Tensor | None = None,
-        clock: int = 0,
     ) -> None:
         check_positive("threshold", threshold)
-        for name, value in (("seed", seed), ("clock", clock)):
-            if value < 0:
-                raise ValueError(f"{name}: expected 0 or more, got {value}")
+        if seed < 0:
+            raise ValueError(f"seed: expected 0 or more, got {seed}")
         self.noise = SensorNoise() if noise is None else noise
         self.threshold, self.seed = threshold, seed
-        self.charge, self.clock = charge, clock
+        self.charge, self.clock = charge, 0
         self._pixels: NoisyPixels | None = None
 
     def expose(self, light: Tensor) -> Tensor:

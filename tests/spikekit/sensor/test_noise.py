@@ -166,9 +166,6 @@ def test_chunks_make_the_whole(noise, cuts, threshold, dtype):
     sensor = SpikeSensor(noise, **settings)
     parts = []
     for start, stop in itertools.pairwise(edges):
-        # half of the time another sensor goes on, as after a break
-        if start % 2:
-            sensor = SpikeSensor(noise, **settings, charge=sensor.charge, clock=sensor.clock)
         parts.append(sensor.expose(light[start:stop]))
     assert torch.equal(torch.cat(parts), expected)
     assert torch.equal(sensor.charge, whole.charge)
@@ -267,7 +264,7 @@ def test_a_noise_that_cannot_be_says_so(settings, message):
 def test_errors_say_what_was_expected():
     light = torch.rand(6, 4, 5)
     for make, message in (
-        (lambda: SpikeSensor(clock=-1), "clock: expected 0 or more, got -1"),
+        (lambda: SpikeSensor(seed=-1), "seed: expected 0 or more, got -1"),
         (lambda: simulate_spikes(light, charge=torch.zeros(3, 5)), r"charge: expected \(4, 5\), got \(3, 5\)"),
         (lambda: SensorNoise().spike_changes(-0.1, 41), "light: expected a finite number, 0 or more, got -0.1"),
     ):
