@@ -16,8 +16,8 @@ import torch
 from noisy_sensor import NOISE
 from torch import Tensor
 
-from lightning_modules.adaptation.learn import learn
-from lightning_modules.adaptation.lessons import HELD_OUT, chosen_frames, make_lessons
+from lightning_modules.adaptation.distillation import HELD_OUT, chosen_frames, make_distillation_set
+from lightning_modules.adaptation.fine_tune import fine_tune
 from lightning_modules.cli.command import without_chatter
 from lightning_modules.data.pictures import folder_pictures
 from lightning_modules.data.stills import StillClips
@@ -98,8 +98,8 @@ def main() -> None:
         for one, other in zip(seen, [*seen[1:], seen[0]], strict=True):
             student = Network.from_pretrained(args.weights).eval()
             before = one.psnr(student), other.psnr(student)
-            lessons = make_lessons(student, teacher, one.clips(longest))
-            alike = learn(student, lessons, args.steps)
+            examples = make_distillation_set(student, teacher, one.clips(longest))
+            alike = fine_tune(student, examples, args.steps)
             after = one.psnr(student), other.psnr(student)
             rows.append([before[0], after[0], one.psnr(teacher), *alike, before[1], after[1]])
     rows.append(torch.tensor(rows).mean(0).tolist())

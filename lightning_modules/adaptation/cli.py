@@ -9,8 +9,8 @@ from time import perf_counter
 
 import torch
 
-from lightning_modules.adaptation.learn import learn
-from lightning_modules.adaptation.lessons import ROOM, make_lessons
+from lightning_modules.adaptation.distillation import ROOM, make_distillation_set
+from lightning_modules.adaptation.fine_tune import fine_tune
 from lightning_modules.cli.errors import InputError, UsageError, VerbParser, input_errors
 from lightning_modules.cli.folder_lock import check_folder, locked_folder
 from lightning_modules.inference.clips import RecordingClips
@@ -66,9 +66,9 @@ def adapt(args: Sequence[str]) -> None:
         noisy = asked.calibration != "none" and may_be_noisy(recording)
         clips, name, teacher = clips_and_teacher(recording, student, asked.teacher, noisy)
         with locked_folder(asked.output, "adaptation"):
-            lessons = make_lessons(student, teacher.to(device).eval(), clips)
+            examples = make_distillation_set(student, teacher.to(device).eval(), clips)
             precision = precision_of(torch.device(device)) if device == "cuda" else "32-true"
-            before, after = learn(student, lessons, asked.steps, precision)
+            before, after = fine_tune(student, examples, asked.steps, precision)
             held_out = f"dB PSNR to the held-out pictures of {name}"
             said = f"{before:.2f} {held_out} before, {after:.2f} dB after {asked.steps} steps"
             if not after >= before + LEAST_GAIN:

@@ -1,14 +1,14 @@
-"""Fine-tuning on a recording: lessons, the held-out part, and the written weights."""
+"""Fine-tuning on a recording: examples, the held-out part, and the written weights."""
 
 import pytest
 import torch
 
 from lightning_modules.__main__ import main
 from lightning_modules.adaptation import cli
-from lightning_modules.adaptation import learn as learning
-from lightning_modules.adaptation import lessons as making
-from lightning_modules.adaptation.learn import learn, likeness, patch_of
-from lightning_modules.adaptation.lessons import HELD_OUT, Lessons, chosen_frames, make_lessons
+from lightning_modules.adaptation import distillation as making
+from lightning_modules.adaptation import fine_tune as learning
+from lightning_modules.adaptation.distillation import HELD_OUT, DistillationSet, chosen_frames, make_distillation_set
+from lightning_modules.adaptation.fine_tune import fine_tune, likeness, patch_of
 from lightning_modules.inference.clips import RecordingClips
 from lightning_modules.networks import CSCSR
 from spikekit import Calibration, simulate_spikes, write_calibration, write_spikes
@@ -40,13 +40,13 @@ def test_student_matches_lessons_made_by_itself(recording, monkeypatch):
     clips = RecordingClips(open_recording(recording, pattern="BGGR"), 51)  # longer than those of the student
     assert clips.size == (27, 23)
     brighter = CSCSR.from_pretrained("cscsr_tiny_x4", alpha=0.2).eval()  # half the light gives white
-    made = make_lessons(student, brighter, clips)
+    made = make_distillation_set(student, brighter, clips)
     assert made.spikes.shape == (16, 41, 20, 20)
     assert made.rgb.shape == (16, 3, 80, 80)
     made = made.part(slice(3))
     assert likeness(student, made) > 60
     assert likeness(CSCSR.from_pretrained("cscsr_small_x4").eval(), made) < 50
-    worse = Lessons(made.spikes.roll(1, dims=1), made.rgb, made.flow, made.white)
+    worse = DistillationSet(made.spikes.roll(1, dims=1), made.rgb, made.flow, made.white)
     assert likeness(student, worse) < 50
 
 
@@ -55,10 +55,10 @@ def test_patches_keep_spikes_pictures_and_motion_aligned(monkeypatch):
     spikes = torch.arange(3 * 12 * 20, dtype=torch.float32).reshape(1, 3, 12, 20)
     rgb = spikes[:, 1:2].repeat_interleave(2, -1).repeat_interleave(2, -2).expand(1, 3, 24, 40)
     along = torch.stack([spikes[:, 0], spikes[:, 2]], dim=1)  # (1, 2, 12, 20)
-    lessons = Lessons(spikes, rgb, torch.stack([along, along + 1000], dim=2), 1.0)
+    examples = DistillationSet(spikes, rgb, torch.stack([along, along + 1000], dim=2), 1.0)
     kinds = set()
     for number in range(60):
-        patch = patch_of(lessons, "RGGB", 2, number)
+        patch = patch_of(examples, "RGGB", 2, number)
         clip, flow = patch["spikes"], patch["flow"]
         assert clip.shape == (3, 8, 8)
         assert torch.equal(patch["rgb"][0, ::2, ::2], clip[1])
@@ -68,19 +68,19 @@ def test_patches_keep_spikes_pictures_and_motion_aligned(monkeypatch):
         assert clip[1, 0, 0] % 20 % 2 == clip[1, 0, 0] // 20 % 2 == 0  # the Bayer phase
         kinds.add((backwards, transposed))
     assert len(kinds) == 4
-    whole = [patch_of(lessons, "GRBG", 2, number)["spikes"][1] for number in range(60)]
+    whole = [patch_of(examples, "GRBG", 2, number)["spikes"][1] for number in range(60)]
     assert all(plane[0, 1] == plane[0, 0] + 1 for plane in whole)
 
 
 def test_student_approaches_its_teacher_on_held_out_lessons(recording):
     student, fresh = (CSCSR.from_pretrained("cscsr_tiny_x4").eval() for _ in range(2))
     teacher = CSCSR.from_pretrained("cscsr_small_x4").eval()
-    lessons = make_lessons(student, teacher, RecordingClips(open_recording(recording, pattern="RGGB"), 41))
-    before, after = learn(student, lessons, 10)
+    examples = make_distillation_set(student, teacher, RecordingClips(open_recording(recording, pattern="RGGB"), 41))
+    before, after = fine_tune(student, examples, 10)
     assert after > before + 0.3
     assert not student.training
-    assert before == likeness(fresh, lessons.part(slice(-HELD_OUT, None)))
-    assert after == likeness(student, lessons.part(slice(-HELD_OUT, None)))
+    assert before == likeness(fresh, examples.part(slice(-HELD_OUT, None)))
+    assert after == likeness(student, examples.part(slice(-HELD_OUT, None)))
 
 
 def typed(recording, output, *more):
@@ -102,8 +102,8 @@ def test_command_writes_usable_weights(recording, tmp_path, capsys):
 
 @pytest.mark.parametrize("after", [30.05, float("nan")])
 def test_weights_without_gain_are_not_written(recording, tmp_path, monkeypatch, after):
-    monkeypatch.setattr(cli, "learn", lambda *_: (30.0, after))
-    monkeypatch.setattr(cli, "make_lessons", lambda *_: None)
+    monkeypatch.setattr(cli, "fine_tune", lambda *_: (30.0, after))
+    monkeypatch.setattr(cli, "make_distillation_set", lambda *_: None)
     with pytest.raises(SystemExit, match=r"expected a gain of 0\.1 dB; nothing written, keep using cscsr_tiny_x4"):
         main(typed(recording, tmp_path))
     assert [path.name for path in tmp_path.iterdir()] == ["lock"]

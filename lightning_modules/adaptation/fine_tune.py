@@ -1,4 +1,4 @@
-"""Fine-tuning of a network on lessons from a recording, and its evaluation on held-out lessons."""
+"""Fine-tuning of a network on examples from a recording, and its evaluation on held-out examples."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lightning_modules.adaptation.lessons import HELD_OUT, Lessons
+from lightning_modules.adaptation.distillation import HELD_OUT, DistillationSet
 from lightning_modules.inference.tiles import TILE, forward_in_tiles
 from lightning_modules.networks import Network
 from spikekit import psnr
@@ -20,16 +20,16 @@ _PATCH, _BATCH, _RATE = 40, 4, 1e-3
 _RISING = 10  # warm-up steps of the learning rate, which then falls linearly to 0
 
 
-def patch_of(lessons: Lessons, pattern: str, scale: int, index: int) -> dict[str, Tensor]:
-    """Return a random patch of a lesson, with its picture and flow; the index is the random seed."""
+def patch_of(examples: DistillationSet, pattern: str, scale: int, index: int) -> dict[str, Tensor]:
+    """Return a random patch of a example, with its picture and flow; the index is the random seed."""
     rng = np.random.default_rng(index)
-    one, sides = int(rng.integers(len(lessons))), lessons.spikes.shape[-2:]
+    one, sides = int(rng.integers(len(examples))), examples.spikes.shape[-2:]
     size = min(*sides, _PATCH)
     y, x = (2 * int(rng.integers((side - size) // 2 + 1)) for side in sides)
     here, there = (tuple(slice(k * z, k * (z + size)) for z in (y, x)) for k in (1, scale))
-    patch = {"spikes": lessons.spikes[one][..., *here], "rgb": lessons.rgb[one][..., *there].float()}
-    if lessons.flow is not None:
-        patch["flow"] = lessons.flow[one][..., *here]
+    patch = {"spikes": examples.spikes[one][..., *here], "rgb": examples.rgb[one][..., *there].float()}
+    if examples.flow is not None:
+        patch["flow"] = examples.flow[one][..., *here]
     if rng.uniform() < 0.5:  # reversed in time
         patch |= {name: patch[name].flip(0) for name in ("spikes", "flow") if name in patch}
     if pattern in ("RGGB", "BGGR", GREY) and rng.uniform() < 0.5:  # transposition keeps these patterns
@@ -40,14 +40,14 @@ def patch_of(lessons: Lessons, pattern: str, scale: int, index: int) -> dict[str
 
 
 @torch.no_grad()
-def likeness(network: Network, lessons: Lessons) -> float:
+def likeness(network: Network, examples: DistillationSet) -> float:
     """Return the PSNR in dB of a network's pictures with respect to the teacher's, normalised to white and clamped."""
     values, device = [], next(network.parameters()).device
-    for number in range(len(lessons)):
-        one = lessons.part(slice(number, number + 1))
+    for number in range(len(examples)):
+        one = examples.part(slice(number, number + 1))
         flow = None if one.flow is None else one.flow.to(device)
         rgb = forward_in_tiles(network, one.spikes.to(device), TILE, flow=flow)
-        shown = [(picture.float() / lessons.white).clamp(0, 1) for picture in (rgb, one.rgb.to(device))]
+        shown = [(picture.float() / examples.white).clamp(0, 1) for picture in (rgb, one.rgb.to(device))]
         values.append(psnr(*shown).mean())
     return torch.stack(values).mean().item()
 
@@ -56,19 +56,21 @@ def _rate(step: int, steps: int) -> float:
     return _RATE * min(1, (step + 1) / _RISING) * (1 - step / (steps + 1))
 
 
-def learn(student: Network, lessons: Lessons, steps: int, precision: str = "32-true") -> tuple[float, float]:
-    """Train a network on lessons.
+def fine_tune(
+    student: Network, examples: DistillationSet, steps: int, precision: str = "32-true"
+) -> tuple[float, float]:
+    """Fine-tune a network on examples.
 
     Args:
         student: network to train, in evaluation mode.
-        lessons: lessons; the last ones are held out.
+        examples: examples; the last ones are held out.
         steps: training steps.
         precision: ``"32-true"`` or ``"bf16-mixed"``.
 
     Returns:
         PSNR in dB of the held-out pictures with respect to the teacher's, before and after.
     """
-    taught, held_out = lessons.part(slice(-HELD_OUT)), lessons.part(slice(-HELD_OUT, None))
+    taught, held_out = examples.part(slice(-HELD_OUT)), examples.part(slice(-HELD_OUT, None))
     before = likeness(student, held_out)
     device = next(student.parameters()).device
     optimizer = torch.optim.Adam(student.parameters(), lr=_RATE)

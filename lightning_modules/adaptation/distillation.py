@@ -1,4 +1,4 @@
-"""Lessons from a recording: clips, and pictures of them by a slower network, the teacher."""
+"""Examples from a recording: clips, and pictures of them by a slower network, the teacher."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from lightning_modules.inference.tiles import TILE, forward_in_tiles
 from lightning_modules.networks import Network
 from spikekit.progress import progress
 
-#: number of lessons, and how many of them, at the end of the recording, are held out
-LESSONS, HELD_OUT = 16, 4
+#: number of examples, and how many of them, at the end of the recording, are held out
+EXAMPLES, HELD_OUT = 16, 4
 #: minimum length of a recording, in clips of the network with the longer clips
 ROOM = 3
 
-_SIDE = 160  # side of a lesson in sensor pixels
+_SIDE = 160  # side of an example in sensor pixels
 
 
 @dataclass(frozen=True)
-class Lessons:
-    """Clips of a recording, and the teacher's pictures of them.
+class DistillationSet:
+    """Examples: clips of a recording, and the teacher's pictures of them.
 
     Args:
         spikes: clips of the student's length, (L, N, H, W), uint8.
@@ -40,14 +40,14 @@ class Lessons:
     def __len__(self) -> int:
         return len(self.spikes)
 
-    def part(self, which: slice) -> Lessons:
-        """Return a slice of the lessons."""
+    def part(self, which: slice) -> DistillationSet:
+        """Return a slice of the examples."""
         flow = None if self.flow is None else self.flow[which]
-        return Lessons(self.spikes[which], self.rgb[which], flow, self.white)
+        return DistillationSet(self.spikes[which], self.rgb[which], flow, self.white)
 
 
 def chosen_frames(total: int, frames: int) -> list[int]:
-    """Return the middle frames of the lessons; clips of held-out lessons do not overlap with the others.
+    """Return the middle frames of the examples; clips of held-out examples do not overlap with the others.
 
     Args:
         total: number of spike frames of the recording, at least ``ROOM`` clips.
@@ -59,12 +59,12 @@ def chosen_frames(total: int, frames: int) -> list[int]:
     """
     first, last = frames // 2, total - (frames + 1) // 2
     held_out = last - (last - first) // 5
-    taught = np.linspace(first, held_out - frames, LESSONS - HELD_OUT)
+    taught = np.linspace(first, held_out - frames, EXAMPLES - HELD_OUT)
     return [round(frame) for frame in [*taught, *np.linspace(held_out, last, HELD_OUT)]]
 
 
-def make_lessons(student: Network, teacher: Network, clips: RecordingClips) -> Lessons:
-    """Create lessons from clips of a recording.
+def make_distillation_set(student: Network, teacher: Network, clips: RecordingClips) -> DistillationSet:
+    """Create examples from clips of a recording.
 
     Args:
         student: network to train.
@@ -76,7 +76,7 @@ def make_lessons(student: Network, teacher: Network, clips: RecordingClips) -> L
     device, rng = next(teacher.parameters()).device, np.random.default_rng(0)
     sides = [min(side, _SIDE) // 2 * 2 for side in clips.size]
     spikes, pictures, flows = [], [], []
-    for _, clip in progress(clips.in_order(chosen), "lessons", len(chosen)):
+    for _, clip in progress(clips.in_order(chosen), "examples", len(chosen)):
         corner = (2 * int(rng.integers((whole - side) // 2 + 1)) for whole, side in zip(clips.size, sides, strict=True))
         window = tuple(slice(z, z + side) for z, side in zip(corner, sides, strict=True))
         seen = clip[None, ..., *window].to(device)
@@ -87,7 +87,7 @@ def make_lessons(student: Network, teacher: Network, clips: RecordingClips) -> L
             with torch.no_grad():
                 flows.append(student.estimate_flow(seen).cpu())
     white = clips.white / student.settings["alpha"]
-    return Lessons(torch.cat(spikes), torch.cat(pictures), torch.cat(flows) if flows else None, white)
+    return DistillationSet(torch.cat(spikes), torch.cat(pictures), torch.cat(flows) if flows else None, white)
 
 
 def _middle(spikes: Tensor, frames: int) -> Tensor:
