@@ -1,4 +1,4 @@
-"""Clips of a stream around the frames that pictures are made of."""
+"""Clips of a recording or a stream around its key frames."""
 
 from __future__ import annotations
 
@@ -19,29 +19,30 @@ from spikekit.recording import Recording, white_rate
 
 Item = TypeVar("Item")
 
-#: spike frames of a clip, and frames between two pictures, where nothing else is said
+#: default spike frames of a clip, and default distance of two pictures in spike frames
 FRAMES, EVERY = 41, 20
 
-# clips that are looked at for what is white, from the first to the last of the recording
+# clips, evenly spread over the recording, that the white level is measured on
 _LOOKS = 8
 
 
 class RecordingClips:
-    """Clips around some frames of a recording, which is read once, from its beginning to its end.
+    """Clips around key frames of a recording, which is read once, from beginning to end.
 
     Args:
-        recording: as :func:`spikekit.recording.open_recording` gives it.
-        frames: spike frames N of a clip, as the network takes them.
-        frame: which frames are in the middle of clips: N, or from A to B - 1 as A:B or A:B:STEP, 20 apart where STEP is
-            left out; all, 20 apart, when not given.
-        crop_to: Bayer phase that the network takes; clips begin with it, a row and a column less at most.
+        recording: recording, as :func:`spikekit.recording.open_recording` returns it.
+        frames: spike frames N of a clip.
+        frame: key frames, the middle frames of the clips: N, or A to B - 1 as A:B or A:B:STEP; STEP is 20 by default.
+            Default: all, 20 apart.
+        crop_to: Bayer phase that the network takes; up to one row and one column are cropped to begin with it.
 
     Attributes:
         size: (H, W) of a clip.
-        chosen: the frames in the middle of the clips, in order.
+        chosen: key frames, in order.
 
     Raises:
-        ValueError: the recording is shorter than a clip, less than 3 x 3 pixels are left, or frames that are not there.
+        ValueError: the recording is shorter than a clip, the crop is smaller than 3 x 3 pixels, or a key frame has no
+            whole clip around it.
     """
 
     def __init__(
@@ -52,7 +53,7 @@ class RecordingClips:
             raise ValueError(f"{path}: expected at least {frames} frames for a clip, got {total}")
         self.recording, self.frames = recording, frames
         self.top = self.left = 0
-        if recording.pattern != GREY and crop_to != GREY:  # where red is says which of the four phases it is
+        if recording.pattern != GREY and crop_to != GREY:  # the site of red identifies the phase
             phase = recording.pattern or "RGGB"
             (_, row, column), (_, to_row, to_column) = bayer_sites(phase)[0], bayer_sites(crop_to)[0]
             self.top, self.left = (row - to_row) % 2, (column - to_column) % 2
@@ -70,13 +71,13 @@ class RecordingClips:
         return len(self.chosen)
 
     def in_order(self, chosen: Iterable[int] | None = None) -> Iterator[tuple[int, Tensor]]:
-        """Yield the number and the clip (N, H, W) of some frames, which increase; of all chosen ones when not given."""
+        """Yield number and clip (N, H, W) of the given key frames, in increasing order; by default of all."""
         middles = self.chosen if chosen is None else list(chosen)
 
         def jump(start: int) -> Iterator[Tensor]:
             return self.recording.frames_from(start)
 
-        # what is packed is unpacked from its beginning, wherever reading begins
+        # .npz files are decompressed from their beginning, wherever reading begins
         packed = self.recording.path.suffix.lower() == ".npz"
         start = middles[0] - self.frames // 2 if middles else 0
         for middle, clip in clips_around(middles, self.frames, jump(start), start, None if packed else jump):
@@ -84,7 +85,7 @@ class RecordingClips:
 
     @cached_property
     def white(self) -> float:
-        """Spikes a frame of a white pixel: the side-car's, or else what 99.9 % of the pixels do not exceed."""
+        """White level in spikes per frame: the side-car's, else the level that 99.9 % of the pixels do not exceed."""
         if self.recording.alpha is not None:
             return self.recording.alpha
         clips = range(self.frames // 2, self.recording.frames - (self.frames - 1) // 2, EVERY)
@@ -99,19 +100,19 @@ def clips_around(
     first: int = 0,
     jump: Callable[[int], Iterator[Tensor]] | None = None,
 ) -> Iterator[tuple[int, Tensor]]:
-    """Yield every key frame's number and clip, as soon as the clip's last frame has come.
+    """Yield number and clip of every key frame as soon as the last frame of the clip is read.
 
-    At most ``length`` frames are held, beside a clip.
+    Memory: ``length`` frames and a clip.
 
     Args:
-        middles: numbers of the key frames, increasing, the first of them ``length // 2`` behind ``first`` or later.
+        middles: numbers of the key frames, increasing; the first is at least ``first + length // 2``.
         length: frames of a clip.
-        frames: the stream's frames (H, W), one after the other.
-        first: number of the first of them.
-        jump: gives the frames from a number on, where a stream can leave out those between two clips.
+        frames: frames (H, W) of the stream, in order.
+        first: number of the first frame of the stream.
+        jump: returns the frames from a given number on; if given, frames between two clips are skipped.
 
     Returns:
-        An iterator over numbers and clips (length, H, W), which ends with the middles or with the stream.
+        An iterator over numbers and clips (length, H, W); it ends with the key frames or with the stream.
 
     Example:
         >>> frames = iter(torch.arange(9.0).reshape(9, 1, 1))
@@ -134,12 +135,12 @@ def clips_around(
 
 
 def film_groups(items: Iterable[Item], future: int = 0, interpolated: int = 0) -> Iterator[list[Item]]:
-    """Yield the clips of a film, or what stands for them, group by group, each ending with a picture of the network.
+    """Yield the items of a film in groups that are made together; each group ends with a picture of the network.
 
     Args:
-        items: of every picture, in order.
-        future: key frames that a picture may wait for.
-        interpolated: pictures between two that the network makes; there are none before the first.
+        items: one item per picture, in order.
+        future: later key frames that a picture may wait for.
+        interpolated: pictures interpolated between two pictures of the network; none before the first.
 
     Example:
         >>> [*film_groups("abcdefg", interpolated=1)], [*film_groups("abcdefg", future=1, interpolated=1)]

@@ -1,4 +1,4 @@
-"""Export of networks for other programs, by torch.export and as ONNX."""
+"""Export networks as programs of torch.export or as ONNX."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from lightning_modules.inference.tiles import call
 from lightning_modules.networks import Network, RecurrentCSCSR
 from spikekit.io.whole_file import whole_file
 
-#: formats, and how their files end
+#: file endings of the formats
 FORMATS = {"torch": ".pt2", "onnx": ".onnx"}
 
-#: of ONNX
+#: opset of ONNX
 OPSET = 20
 
-_TRACED = 32, 44  # sensor pixels, of the clip that the network is followed on
+_TRACED = 32, 44  # size of the traced clip, in sensor pixels
 _SIZES = (32, 44), (20, 16), (24, 48)
 _WITHIN = 1e-4
 
 
 class _Still(nn.Module):
-    """A network of which nobody gives the motion."""
+    """A network without a flow input: nothing moves."""
 
     def __init__(self, network: Network) -> None:
         super().__init__()
@@ -39,14 +39,14 @@ class _Still(nn.Module):
 
 
 class _Moving(_Still):
-    """A network that is given the motion."""
+    """A network with a flow input."""
 
     def forward(self, spikes: Tensor, flow: Tensor) -> Tensor:
         return self.network(spikes, flow)
 
 
 class _StillFilm(nn.Module):
-    """A network for films that is given the state of the key frame before, zeros where there is none."""
+    """A network for films; its second input is the state of the previous key frame, zeros for the first."""
 
     def __init__(self, network: RecurrentCSCSR) -> None:
         super().__init__()
@@ -63,40 +63,40 @@ class _StillFilm(nn.Module):
 
 
 class _Film(_StillFilm):
-    """The same with the motion, and the number of clocks since the key frame before."""
+    """A network for films that takes the flow and the number of spike frames since the previous key frame, too."""
 
     def forward(self, spikes: Tensor, flow: Tensor, state: Tensor, every: Tensor) -> tuple[Tensor, Tensor]:
         return self._meet(spikes, flow, state, self.network.flow_to(flow, -1) * every)
 
 
 def export_network(network: Network, path: str | Path, kind: str, *, still: bool = False) -> str:
-    """Write a network as a program of torch.export or as ONNX, after a comparison with itself on three sizes.
+    """Export a network with torch.export or as ONNX, and compare the result with the network on three sizes.
 
-    Its inputs are ``spikes``, (1, N, H, W), float32 zeros and ones, H and W even and 16 or more, and ``flow``, as
-    ``network.estimate_flow(spikes)`` gives it, where the network follows motion. Its output is ``rgb``,
+    The exported program takes ``spikes``, (1, N, H, W), float32 zeros and ones, H and W even and at least 16. A network
+    that follows motion also takes ``flow``, as ``network.estimate_flow(spikes)`` returns it. The output is ``rgb``,
     (1, 3, s H, s W), not clamped.
 
-    A network for films has a second output, ``next_state``, (1, C, H, W), and takes that of the key frame before as
-    ``state``, zeros where there is none. Beside a flow it takes ``every``: how many clocks ago that key frame was, a
-    float32.
+    A network for films has a second output, ``next_state``, (1, C, H, W). Its input ``state`` is the ``next_state`` of
+    the previous key frame, zeros for the first. With a flow it also takes ``every``, the number of spike frames since
+    the previous key frame, a float32 scalar.
 
     Args:
-        network: any of :mod:`lightning_modules.networks`; what cannot be followed is refused.
-        path: where to, ``.pt2`` or ``.onnx``.
+        network: network of :mod:`lightning_modules.networks`.
+        path: file to write, ``.pt2`` or ``.onnx``.
         kind: ``"torch"`` or ``"onnx"``.
-        still: nothing moves: no flow is an input.
+        still: nothing moves; the program has no flow input.
 
     Returns:
-        What was written, in words.
+        Names and shapes of the inputs and the measured difference, in words.
 
     Raises:
-        ValueError: a network that cannot be exported, or whose export differs by more than 1e-4.
-        ImportError: a package that writes ONNX is missing; the message says how to install it.
+        ValueError: the network cannot be exported, or its export differs by more than 1e-4.
+        ImportError: a package for ONNX is missing; the message tells how to install it.
     """
     if kind == "onnx":
         _check_onnx()
     network = network.eval().cpu().float()
-    network.by_sites = False  # of other programs' operators, none looks temporal pixels up
+    network.by_sites = False  # site search has no operator in the exported formats
     films = isinstance(network, RecurrentCSCSR)
     module = as_exported(network, still)
     try:
@@ -104,14 +104,14 @@ def export_network(network: Network, path: str | Path, kind: str, *, still: bool
             warnings.simplefilter("ignore")
             clips = [example_inputs(network, size, still) for size in (_TRACED, *_SIZES)]
             if films:
-                clips[-1]["state"] = torch.zeros_like(clips[-1]["state"])  # as a film begins
+                clips[-1]["state"] = torch.zeros_like(clips[-1]["state"])  # first key frame of a film
             program = _program(module, clips[0])
             data = (_onnx if kind == "onnx" else _torch)(program, list(clips[0]), ["rgb", "next_state"][: 1 + films])
             run = exported(data, kind)
-            # of a tensor, as max() of numbers forgets NaN
+            # max() of a tensor keeps NaN, that of Python numbers does not
             tried = [difference(run(*clip.values()), module(*clip.values())) for clip in clips[1:]]
             worst = torch.stack(tried).max().item()
-    except Exception as error:  # what torch raises depends on what it cannot follow
+    except Exception as error:  # the type depends on the operator that torch cannot trace
         raise ValueError(f"{type(network).__name__}: cannot be exported ({_reason(error)})") from error
     if not worst <= _WITHIN:
         raise ValueError(
@@ -124,7 +124,7 @@ def export_network(network: Network, path: str | Path, kind: str, *, still: bool
 
 
 def as_exported(network: Network, still: bool = False) -> nn.Module:
-    """Return the module that is exported: it takes what :func:`example_inputs` gives, in this order."""
+    """Return the module to export; it takes the values of :func:`example_inputs`, in order."""
     kinds = (_StillFilm, _Film) if isinstance(network, RecurrentCSCSR) else (_Still, _Moving)
     return kinds[_moves(network, still)](network)
 
@@ -134,18 +134,18 @@ def _moves(network: Network, still: bool) -> bool:
 
 
 def example_inputs(network: Network, size: tuple[int, int], still: bool = False) -> dict[str, Tensor]:
-    """Return inputs of an export by their names: random spikes, motion and state, the same every time.
+    """Return reproducible example inputs by name: random spikes, flow and state.
 
     Args:
-        network: what is exported.
-        size: of the clip, in sensor pixels.
-        still: as of :func:`export_network`.
+        network: network to export.
+        size: size of the clip, (H, W) in sensor pixels.
+        still: nothing moves, see :func:`export_network`.
     """
     moves, films = _moves(network, still), isinstance(network, RecurrentCSCSR)
     generator = torch.Generator().manual_seed(0)
     found = {"spikes": (torch.rand(1, network.frames, *size, generator=generator) < 0.3).float()}
     if moves:
-        # The same in each quarter: of many motions, some lie between two positions of the search, and rounding decides.
+        # One motion per quarter: of many motions, some are midway between two search positions, where rounding decides.
         groups = network.estimate_flow(found["spikes"]).shape[:-2]
         quarters = torch.randn(*groups, 2, 2, generator=generator)
         found["flow"] = quarters.repeat_interleave(size[0] // 2, -2).repeat_interleave(size[1] // 2, -1)
@@ -166,7 +166,7 @@ def _program(module: nn.Module, inputs: dict[str, Tensor]) -> torch.export.Expor
 
 
 def difference(found: Tensor | Sequence[Tensor], expected: Tensor | Sequence[Tensor]) -> Tensor:
-    """Return the largest difference between an export's result and the network's; NaN if one of them is."""
+    """Return the largest absolute difference of two results; NaN if either contains NaN."""
     pairs = zip(*([one] if isinstance(one, Tensor) else one for one in (found, expected)), strict=True)
     return torch.stack([(got - wanted).abs().max() for got, wanted in pairs]).max()
 
@@ -176,28 +176,28 @@ def _shape(value: Tensor) -> str:
 
 
 def _reason(error: BaseException) -> str:
-    while error.__cause__ is not None:  # what was said first says why
+    while error.__cause__ is not None:  # the first error has the reason
         error = error.__cause__
     return ((str(error).strip() or type(error).__name__).splitlines())[0][:200]
 
 
 def exported(data: bytes, kind: str, threads: int | None = None) -> Callable[..., Any]:
-    """Return a function that runs an export in this process.
+    """Return a function that runs an exported program in this process.
 
     Args:
-        data: the file.
+        data: content of the file.
         kind: ``"torch"`` or ``"onnx"``.
-        threads: of onnxruntime, which takes all cores when not given; torch has its own.
+        threads: threads of onnxruntime; default: all cores. No effect on torch.
 
     Returns:
-        Takes the inputs in their order, and returns the picture; of a film, the picture and the state.
+        Function that takes the inputs in order and returns the picture; for films, the picture and the state.
     """
     if kind == "torch":
         return torch.export.load(io.BytesIO(data)).module()
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
-    options.log_severity_level = 3  # what it cannot fold at load time is nobody's affair
+    options.log_severity_level = 3  # hide warnings on constants that are not folded
     options.intra_op_num_threads = threads or 0
     session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     names = [one.name for one in session.get_inputs()]
@@ -217,8 +217,8 @@ def _torch(program: torch.export.ExportedProgram, inputs: list[str], outputs: li
 
 
 def _onnx(program: torch.export.ExportedProgram, inputs: list[str], outputs: list[str]) -> bytes:
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # that torchvision, which nothing here uses, is missing
-    # its optimizer takes minutes, and onnxruntime has one of its own
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # hide the hint to install torchvision, not needed
+    # the optimiser takes minutes, and onnxruntime has its own
     options = {"dynamo": True, "optimize": False, "verbose": False, "opset_version": OPSET}
     made = torch.onnx.export(program, input_names=inputs, output_names=outputs, **options)
     return made.model_proto.SerializeToString()

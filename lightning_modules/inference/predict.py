@@ -24,23 +24,26 @@ def predict(
     exposure: float | Tensor = 1.0,
     done: Callable[[float], object] | None = None,
 ) -> Tensor:
-    r"""Return the picture of the middle of a clip.
+    r"""Return the picture at the middle of a clip.
 
     Args:
-        network: any of :mod:`lightning_modules.networks`.
+        network: network of :mod:`lightning_modules.networks`.
         spikes: :math:`(B, N, H, W)`.
-        flow: from the middle to the first and to the last time point, :math:`(B, 2, 2, H, W)`, in sensor pixels; when
-            not given, what the network's estimator sees.
-        static: nothing moves, instead of a flow.
-        tile: side of the tiles in sensor pixels, 0 for none, see
+        flow: from the middle to the first and the last time point, :math:`(B, 2, 2, H, W)`, in sensor pixels; default:
+            the estimate of the network.
+        static: nothing moves; replaces a flow.
+        tile: side of a tile in sensor pixels, 0 for no tiles, see
             :func:`lightning_modules.inference.tiles.forward_in_tiles`.
-        self_ensemble: mean over so many views of the clip, 1, 2, 4 or 8, see
+        self_ensemble: number of views to average, 1, 2, 4 or 8, see
             :func:`lightning_modules.inference.self_ensemble.self_ensemble`.
-        exposure: what the picture is multiplied by before it is clamped, a number or (B, 1, 1, 1).
-        done: called after every tile and every view, with the share of the picture that is done.
+        exposure: factor of the picture before it is clamped, a number or (B, 1, 1, 1).
+        done: called after every tile and every view with the finished fraction of the picture.
 
     Returns:
         rgb :math:`(B, 3, s H, s W)`, clamped to [0, 1].
+
+    Raises:
+        ValueError: ``self_ensemble`` is not 1, 2, 4 or 8.
 
     Example:
         >>> import torch
@@ -56,7 +59,7 @@ def predict(
         told = done and (lambda share: done((before + share) / self_ensemble))
         rgb = forward_in_tiles(network, spikes, tile, flow, static, told)
         if told:
-            told(1)  # a small view has no tiles
+            told(1)  # small views have no tiles
         return rgb
 
     rgb = mean_of_views(run, spikes, flow, network.pattern, network.scale, self_ensemble)
@@ -64,10 +67,6 @@ def predict(
 
 
 def check_views(self_ensemble: int) -> None:
-    """Refuse a number of views that cannot be.
-
-    Raises:
-        ValueError: it is none of 1, 2, 4 and 8.
-    """
+    """Check a number of views: 1, 2, 4 or 8."""
     if isinstance(self_ensemble, bool) or self_ensemble not in COUNTS:
         raise ValueError(f"self_ensemble: expected one of {COUNTS}, got {self_ensemble!r}")

@@ -1,4 +1,4 @@
-"""Presets: weights with their settings, and the choice among them by speed or budget."""
+"""Presets of weights and settings, and the choice of one by speed or budget."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ _FOLDER = Path(__file__).parents[1] / "weights"
 
 _DECODER, _OF_MOTION = "ClassicalDecoder", ("motion_weights", "motion_iterations")
 
-#: spike frames of a clip, where nothing else is said
+#: default spike frames of a clip
 _FRAMES = 41
 
-#: how far a speed may be below the best, in dB of the table
+#: largest loss against the best preset, in dB
 SPEEDS = {"fastest": float("inf"), "fast": 1.2, "balanced": 0.3, "best": 0.005}
 
-#: spikes a frame of a white pixel below which light is little, and a table of its own is asked: between those of both
+#: white level, in spikes per frame, below which the table for dim scenes is used
 _LITTLE_LIGHT = 0.2
 
-#: times this close cannot be told apart, and the better preset is picked
+#: presets whose times differ by less than this factor count as equally fast
 _AS_FAST = 1.2
 
-#: MiB a sensor pixel that an estimate of motion takes, which is made on the whole frame: ClassicalFlow's, measured
+#: MiB per sensor pixel for the estimate of motion, which covers the whole frame (measured with ClassicalFlow)
 _MOTION = 240 / 2**20
 
 _UNITS = {
@@ -50,24 +50,24 @@ _UNITS = {
 
 @dataclass(frozen=True)
 class Preset:
-    """Weights, or a network without any of its own, and how they are used; ``None`` leaves all as it is by default.
+    """A network and its settings; ``None`` stands for the default.
 
     Args:
-        weights: those of a network: a name of the package, or a file.
-        network: instead of weights, ``"ClassicalDecoder"``.
-        method: of the decoder, ``"tfi"`` or ``"tfp"``.
-        window: of the decoder.
-        order: of the decoder.
-        scale: super-resolution factor of that network; weights know theirs.
-        frames: spike frames of a clip of that network; likewise.
-        motion: class of the estimator, such as ``"ZeroFlow"``, in place of the one that the weights were trained with.
-        motion_weights: of that estimator.
-        motion_iterations: of that estimator.
-        tile: see :func:`lightning_modules.inference.predict.predict`.
-        self_ensemble: number of views, see there.
-        interpolated: pictures of a film between two that the network makes, see
+        weights: name of weights of the package, or path of a weights file.
+        network: ``"ClassicalDecoder"``, in place of ``weights``.
+        method: ``"tfi"`` or ``"tfp"``; for the decoder only.
+        window: window of the decoder.
+        order: order of the decoder.
+        scale: super-resolution factor of the decoder; weights have their own.
+        frames: spike frames of a clip of the decoder; weights have their own.
+        motion: class name of a motion estimator, such as ``"ZeroFlow"``, that replaces the one used in training.
+        motion_weights: weights of that estimator.
+        motion_iterations: iterations of that estimator.
+        tile: side of a tile in sensor pixels, see :func:`lightning_modules.inference.predict.predict`.
+        self_ensemble: number of views, 1, 2, 4 or 8, see :func:`lightning_modules.inference.predict.predict`.
+        interpolated: pictures interpolated between two pictures of the network, see
             :class:`lightning_modules.inference.film.FilmMaker`.
-        precision: of the Trainer, such as ``"bf16-mixed"``.
+        precision: precision of the Trainer, such as ``"bf16-mixed"``.
 
     Example:
         >>> Preset("cscsr_small_x4", motion="ZeroFlow").build().motion
@@ -90,27 +90,27 @@ class Preset:
     precision: str | None = None
 
     def given(self, *names: str) -> dict[str, Any]:
-        """Return those of some arguments that are not ``None``."""
+        """Return the named arguments that are not ``None``."""
         values = {name: getattr(self, name) for name in names}
         return {name: value for name, value in values.items() if value is not None}
 
     @property
     def clip(self) -> int:
-        """How many spike frames a clip has; that of a file of weights which is not the package's is taken for 41."""
+        """Spike frames of a clip; 41 is assumed for weights from outside the package."""
         model = find_model(self.weights or "")
         return (model and model.frames) or self.frames or _FRAMES
 
     @classmethod
     def columns(cls) -> list[str]:
-        """Return the names of the arguments, which are columns of a table."""
+        """Return the names of the arguments, which are the columns of a table."""
         return [field.name for field in fields(cls)]
 
     @classmethod
     def read(cls, row: Mapping[str, str]) -> Preset:
-        """Make a preset of a row of a table, in which an empty cell is ``None``.
+        """Return the preset in a row of a table; an empty cell is ``None``.
 
         Raises:
-            ValueError: a cell that is no number where one is expected.
+            ValueError: a cell of a numeric column is not a number.
 
         Example:
             >>> Preset.read({"weights": "cscsr_small_x4", "tile": "64", "self_ensemble": ""})
@@ -120,18 +120,19 @@ class Preset:
         return cls(**{name: kind(row[name]) for name, kind in kinds.items() if row.get(name)})
 
     def write(self) -> dict[str, str]:
-        """Return the cells of a row, as :meth:`read` takes it."""
+        """Return a row of a table, the inverse of :meth:`read`."""
         return {name: "" if value is None else str(value) for name, value in vars(self).items()}
 
     def build(self) -> Network:
         """Build the network in evaluation mode, on the CPU.
 
-        Tiles, views and precision are not its own: see
-        :func:`lightning_modules.inference.predict.predict`.
+        ``tile``, ``self_ensemble`` and ``precision`` have no effect here: pass them to
+        :func:`lightning_modules.inference.predict.predict` and to the Trainer.
 
         Raises:
-            FileNotFoundError: there are no such weights.
-            ValueError: neither weights nor a decoder, weights of something else, or an unknown estimator.
+            FileNotFoundError: the weights do not exist.
+            ValueError: the preset has neither weights nor a decoder, the weights are of another kind of network, or
+                the estimator is unknown.
         """
         if self.network == _DECODER:
             return ClassicalDecoder(**self.given("method", "window", "order", "scale", "frames")).eval()
@@ -145,16 +146,16 @@ class Preset:
 
 @dataclass(frozen=True)
 class Choice:
-    """A preset that was measured.
+    """A measured preset and its expected cost.
 
     Args:
-        name: what it is called.
-        preset: it.
-        psnr: dB, on the clips of the table.
-        below: dB below the best of the table.
-        ms: expected for a frame.
-        mib: memory, expected for a frame.
-        where: on which machine.
+        name: name of the row in the table.
+        preset: network and settings.
+        psnr: PSNR on the clips of the table, in dB.
+        below: difference to the best preset of the table, in dB.
+        ms: expected milliseconds per frame.
+        mib: expected memory per frame, in MiB.
+        where: machine of the expected time, in words.
     """
 
     name: str
@@ -180,27 +181,25 @@ def choices(
     white: float = 0.4,
     noisy: bool = False,
 ) -> list[Choice]:
-    """Return the presets of the table for a scale that leave the precision as it is, fastest first.
+    """Return the measured presets for a scale that keep the default precision, fastest first.
 
-    Time is taken to grow with the number of pixels; times are the table's ratios, taken times that of the row which it
-    names as the reference. Memory grows with them, too, until a tile is full, with all that motion may reach over; from
-    there on only by what the leanest preset takes, such as the picture itself, and by an estimate of motion. A preset
-    without tiles is left out: on recordings larger than the table's clips its memory has no bound, and on the clips
-    themselves it is the first one.
+    The expected time grows with the number of pixels: the ratio in the table times the time of the table's reference
+    row. The expected memory grows with the number of pixels until a tile and the reach of motion around it are full.
+    Beyond that, only the part that covers the whole frame grows: the picture and the estimate of motion. Presets
+    without tiles are left out, as their memory has no bound.
 
     Args:
         scale: super-resolution factor.
-        size: of a frame, (H, W) in sensor pixels.
-        film: whether frames are made one after the other, as ``lightning trade --film`` measures them; where no such
-            table comes with the package, a frame in a film is taken for one by itself.
-        frames: spike frames that a clip may have; presets that need more are left out.
-        white: spikes a frame of a white pixel; below 0.2 the table is that of scenes at 0.1, where longer clips are
-            worth more, if the package has one for the scale.
-        noisy: whether the sensor may be noisy: of the table only the rows of networks of which the package has weights
-            that were trained for noise, with these weights; all rows, where it has none for the scale.
+        size: size of a frame, (H, W) in sensor pixels.
+        film: use the table of films (``lightning trade --film``), if the package has one for the scale.
+        frames: spike frames available for a clip; presets that need more are left out.
+        white: white level in spikes per frame; below 0.2 the table of dim scenes (0.1) is used, if the package has
+            one for the scale. Longer clips gain more there.
+        noisy: keep only networks with weights trained for noisy sensors, and use these weights; no effect if the
+            package has none for the scale.
 
     Raises:
-        ValueError: no table comes with the package for this scale.
+        ValueError: the package has no table for this scale.
     """
     rows = _table(scale, film, white)
     twins = _for_noise(scale) if noisy else {}
@@ -233,7 +232,7 @@ def choices(
 
 
 def _for_noise(scale: int) -> dict[str, str]:
-    """Return the names of weights that were trained for noise, by those of the same network that were not."""
+    """Map names of weights to those of the same network trained for noisy sensors."""
     models = list_models(scale)
     noisy = {(one.size, one.frames, one.pattern): one.name for one in models if one.noise}
     keys = {one.name: (one.size, one.frames, one.pattern) for one in models if not one.noise}
@@ -256,24 +255,26 @@ def _table(scale: int, film: bool = False, white: float = 0.4) -> list[dict[str,
                 if not 0 < (int if name in ("height", "width") else float)(row[name]) < float("inf"):
                     raise ValueError(f"{name}: expected a number above 0, got {row[name]}")
         _reference(rows)
-    except Exception as error:  # what is raised depends on the damage
+    except Exception as error:  # the type depends on the damage
         said = f"not a table of lightning trade, or a damaged one ({one_line(error)[:300]})"
         raise ValueError(f"{path}: {said}") from error
     return rows
 
 
 def _reference(rows: list[dict[str, str]]) -> dict[str, str]:
-    """Return the row that the ratios of all refer to."""
+    """Return the row that all ratios refer to."""
     return next(row for row in rows if row["setting"] == row["reference"])
 
 
 def pace(scale: int, film: bool = False, white: float = 0.4) -> float:
-    """Measure how many times longer a frame takes here than in the table: its reference, on a quarter of a clip.
+    """Measure the time of a frame on this machine, relative to the table.
+
+    Runs the reference preset on a quarter of the area of a clip.
 
     Args:
         scale: super-resolution factor.
-        film: whether it is the table of films.
-        white: which light it is for, see :func:`choices`.
+        film: use the table of films.
+        white: white level in spikes per frame, see :func:`choices`.
 
     Returns:
         1 on the machine of the table, 2 on one that takes twice as long.
@@ -302,23 +303,23 @@ def choose(
 ) -> Choice:
     """Choose the best preset for a speed or a budget.
 
-    For a time budget this machine is measured first, for about a second, and the times of the table are multiplied by
-    :func:`pace`.
+    A time budget first measures this machine (:func:`pace`), which takes about a second.
 
     Args:
         scale: super-resolution factor.
-        speed: ``"best"``, ``"balanced"`` or ``"fast"``, the fastest that is at most so many dB below the most exact as
-            :data:`SPEEDS` says, or ``"fastest"``; of those that take hardly longer the most exact.
-        budget: instead, what a frame may take: a time, such as ``"40ms"`` or ``"25fps"``, or memory, such as
-            ``"200MB"``. The best preset that fits is chosen.
-        size: of a frame, (H, W) in sensor pixels, which a budget depends on.
-        film: whether frames are made one after the other, see :func:`choices`.
-        frames: spike frames that a clip may have; 101 or more let longer clips be chosen, where that pays.
-        white: spikes a frame of a white pixel, see :func:`choices`.
-        noisy: whether the sensor may be noisy, see there.
+        speed: ``"best"``, ``"balanced"``, ``"fast"`` or ``"fastest"``: the fastest preset within the loss of
+            :data:`SPEEDS`. Of presets that are about as fast, the one with the highest PSNR.
+        budget: in place of ``speed``, the largest time or memory per frame, such as ``"40ms"``, ``"25fps"`` or
+            ``"200MB"``. The preset with the highest PSNR that fits is chosen.
+        size: size of a frame, (H, W) in sensor pixels; a budget depends on it.
+        film: use the table of films, see :func:`choices`.
+        frames: spike frames available for a clip; from 101 on, presets with longer clips take part.
+        white: white level in spikes per frame, see :func:`choices`.
+        noisy: the sensor may be noisy, see :func:`choices`.
 
     Raises:
-        ValueError: an unknown speed, a budget that cannot be read or that nothing fits, a scale without a table.
+        ValueError: the speed is unknown, the budget cannot be read, no preset fits it, or the package has no table for
+            the scale.
 
     Example:
         >>> choose(4, "fastest").ms <= choose(4, "best").ms
@@ -348,5 +349,5 @@ def choose(
     fitting = [choice for choice in found if getattr(choice, what) <= limit]
     if not fitting:
         least = min(found, key=lambda choice: getattr(choice, what))
-        raise ValueError(f"budget: nothing fits {budget} for {size[0]} x {size[1]} sensor pixels; least takes {least}")
+        raise ValueError(f"budget: no preset fits {budget} at {size[0]} x {size[1]} sensor pixels; leanest: {least}")
     return max(fitting, key=lambda choice: choice.psnr)

@@ -1,4 +1,4 @@
-"""From a recording to colour pictures, in one call."""
+"""Reconstruct the pictures of a recording in one call."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from spikekit.color.cfa import GREY, PATTERNS
 from spikekit.io.image_bytes import to_bytes
 from spikekit.recording import Recording, open_recording
 
-# how many times as long as its clips a recording is whose first and last pictures a longer clip may cost
+# a recording is at least this many times as long as its clips, as clips cost pictures at both ends
 _MANY = 10
-# dB that longer clips have to be worth to be mentioned where the recording leaves no room for them
+# smallest gain in dB for which a hint recommends longer clips
 _WORTH_ROOM = 0.3
-# clocks between two pictures of the network up to which those between, interpolated, lose nothing: in fast scenes, and
-# in slower ones
+# largest distance, in spike frames, of two pictures of the network between which pictures are interpolated: without
+# loss in fast scenes, and in slower ones
 _APART, _FARTHER_APART = 6, 12
-# white pixels between two pictures
+# width of the white gap between two pictures side by side, in pixels
 _GAP = 4
 
 
@@ -56,43 +56,43 @@ def reconstruct(
     precision: str | None = None,
     **how: Any,
 ) -> Reconstruction:
-    """Reconstruct the colour pictures of a recording.
+    """Reconstruct the pictures of a recording.
 
     Convention:
-        Without a ``network``, the weights of the package are chosen by speed, of those that the recording has room for.
-        Where nobody has measured the sensor, neither by a calibration nor as the side-car of a simulator says, they are
-        weights that were trained for noisy sensors; ``calibration="none"`` says that the pixels are ideal.
+        Without a ``network``, ``speed`` or ``budget`` chooses weights of the package whose clips fit the recording. If
+        the sensor has no calibration and the recording no simulator's side-car, the weights are those trained for
+        noisy sensors; ``calibration="none"`` declares the pixels ideal.
 
     Args:
         path: a ``.dat`` or ``.npz`` file, see :func:`spikekit.read_spikes`.
-        speed: ``"best"``, ``"balanced"`` (when nothing is given), ``"fast"`` or ``"fastest"``, see
+        speed: ``"best"``, ``"balanced"`` (default), ``"fast"`` or ``"fastest"``, see
             :func:`lightning_modules.inference.presets.choose`.
-        budget: instead, what a picture may cost, such as ``"40ms"`` or ``"200MB"``, see there.
-        network: instead, a network, the name of weights of the package, or a file of weights.
-        scale: super-resolution factor, of speed and budget; when not given, 4, or 1 for a grey camera.
-        height: rows; needed for a ``.dat`` without side-car or camera, as it has no header.
-        width: columns; likewise.
+        budget: in place of ``speed``, the largest time or memory per picture, such as ``"40ms"`` or ``"200MB"``.
+        network: in place of ``speed``, a network, the name of weights of the package, or the path of a weights file.
+        scale: super-resolution factor for ``speed`` and ``budget``; default 4, or 1 for a grey camera.
+        height: rows of a frame; needed for a ``.dat`` file without side-car or camera, as it has no header.
+        width: columns of a frame; needed in the same case.
         flip: turn the stored frames upside down, as real cameras need.
-        pattern: Bayer phase after the flip; that of the side-car or the camera, or else RGGB, when not given;
-            ``"grey"`` for a camera without colours, whose pictures are grey then.
-        camera: what recorded it, one of :data:`spikekit.CAMERAS` or a ``.json`` file; gives all these, and the gamma of
-            the pictures.
-        calibration: what spikekit calibrate measured of the pixels; the spikes are made those of an ideal sensor by it.
-            When not given, the recording's own, NAME.calibration.safetensors beside it.
-        frame: which spike frames are shown: N, or from A to B - 1 as A:B or A:B:STEP, 20 apart where STEP is left out.
-        white: spikes a frame of a pixel that is shown white; less makes pictures brighter. When not given, that of the
-            side-car, or else what 99.9 % of the pixels of the recording do not exceed, the same in all its pictures.
-        device: where the network runs; a GPU where there is one, when not given.
-        precision: ``"32-true"`` or ``"bf16-mixed"``; the latter where the device computes in it, when not given.
+        pattern: Bayer phase after the flip, or ``"grey"`` for a camera without colours, whose pictures are grey.
+            Default: the phase of the side-car or the camera, else RGGB.
+        camera: camera that made the recording, one of :data:`spikekit.CAMERAS` or a ``.json`` file; sets ``height``,
+            ``width``, ``flip``, ``pattern`` and the gamma of the pictures.
+        calibration: calibration file of ``spikekit calibrate``; the spikes are corrected to those of an ideal sensor.
+            Default: NAME.calibration.safetensors beside the recording.
+        frame: spike frames to show: N, or A to B - 1 as A:B or A:B:STEP; STEP is 20 by default.
+        white: white level in spikes per frame; smaller values give brighter pictures. Default: that of the side-car,
+            else the level that 99.9 % of the pixels do not exceed, the same in all pictures.
+        device: device of the network; default: a GPU if there is one.
+        precision: ``"32-true"`` or ``"bf16-mixed"``; default: the latter if the device computes in bfloat16.
         how: ``tile``, ``psnr_tolerance``, ``self_ensemble``, ``future`` and ``interpolated`` of
-            :class:`lightning_modules.inference.film.FilmMaker`, over those of the choice.
+            :class:`lightning_modules.inference.film.FilmMaker`; they override those of the chosen preset.
 
     Returns:
-        The pictures, which are made when they are asked for: iterate, or take all as an ``array``.
+        The pictures, computed on demand: iterate over them, or call :meth:`Reconstruction.array`.
 
     Raises:
         spikekit.SpikeFileError: the file cannot be read.
-        FileNotFoundError: there are no such weights.
+        FileNotFoundError: the weights do not exist.
         ValueError: the recording is shorter than a clip, or an argument is out of range.
 
     Example:
@@ -129,21 +129,21 @@ def reconstruct(
 
 
 class Reconstruction:
-    """Pictures of a recording, which are made when they are asked for.
+    """Pictures of a recording, computed on demand.
 
     Iterating yields them in order, as :class:`lightning_modules.inference.film.FilmFrame`.
 
     Args:
-        network: any of :mod:`lightning_modules.networks`.
-        clips: of the recording, as long as the network takes them.
-        white: spikes a frame of a white pixel; measured when not given.
-        device: as of :func:`reconstruct`.
-        precision: likewise.
-        notes: on how the network was chosen.
-        how: likewise.
+        network: network of :mod:`lightning_modules.networks`.
+        clips: clips of the recording, of the length that the network takes.
+        white: white level in spikes per frame; measured by default.
+        device: device of the network, see :func:`reconstruct`.
+        precision: ``"32-true"`` or ``"bf16-mixed"``, see :func:`reconstruct`.
+        notes: lines that explain the choice of the network.
+        how: options of :class:`lightning_modules.inference.film.FilmMaker`.
 
     Attributes:
-        notes: lines on what was chosen, and why.
+        notes: lines that explain the choice of the network.
     """
 
     def __init__(
@@ -164,7 +164,7 @@ class Reconstruction:
         self.precision = precision or precision_of(self.device)
         self.network = network.to(self.device).eval()
         self.clips, self.notes, self.how = clips, notes or [], how
-        self._maker()  # what is wrong with the arguments is said at once
+        self._maker()  # reports wrong arguments at once
         self.white = clips.white if white is None else white
 
     def __len__(self) -> int:
@@ -183,13 +183,13 @@ class Reconstruction:
         beside: str | None = None,
         done: Callable[[float], object] | None = None,
     ) -> Iterator[FilmFrame]:
-        """Yield the pictures that are not there already.
+        """Yield the pictures that do not exist yet.
 
         Args:
-            made: frames whose pictures are there.
-            part: which part of the recording, counted from 0, and of how many.
-            beside: ``"tfi"`` or ``"tfp"`` shows what this decoder makes of the same clip left of every picture.
-            done: called with the share of the present picture that is made.
+            made: spike frames whose pictures exist.
+            part: index of the part of the recording, from 0, and number of parts.
+            beside: decoder, ``"tfi"`` or ``"tfp"``, whose picture of the same clip is put to the left of every picture.
+            done: called with the finished fraction of the current picture.
         """
         maker = self._maker(done)
         exposure = self.network.settings["alpha"] / self.white
@@ -206,7 +206,7 @@ class Reconstruction:
                     yield FilmFrame(frame, torch.cat([*self._decoded(clip, beside), shown], dim=-1))
 
     def _groups(self, maker: FilmMaker, made: set[int], part: int, parts: int) -> list[tuple[list[int], bool]]:
-        """Groups of frames that are made together, and whether they are wanted, or only seen again by the network."""
+        """Groups of frames made together, and whether their pictures are wanted or they only warm up the network."""
         groups = list(film_groups(self.clips.chosen, maker.future, maker.interpolated))
         mine = range(*(len(groups) * n // parts for n in (part, part + 1)))
         wanted = {n for n in mine if not made.issuperset(groups[n])}
@@ -215,7 +215,7 @@ class Reconstruction:
         return [(groups[n], n in wanted) for n in seen]
 
     def _shown(self, rgb: Tensor) -> Tensor:
-        """Light (3, H, W) in [0, 1], white being 1, as the camera shows it."""
+        """Return light (3, H, W) in [0, 1], white being 1, as the camera displays it."""
         recording = self.clips.recording
         if recording.pattern == GREY and len(rgb) == 3:
             rgb = (rgb * rgb.new_tensor([0.25, 0.5, 0.25])[:, None, None]).sum(0, keepdim=True)
@@ -223,7 +223,7 @@ class Reconstruction:
         return rgb if recording.camera is None else replace(recording.camera, gain=1.0).display(rgb)
 
     def _decoded(self, clip: Tensor, method: str | None) -> list[Tensor]:
-        """What a decoder makes of a clip (N, H, W), and a white gap."""
+        """Return a decoder's picture of a clip (N, H, W), and a white gap."""
         if method is None:
             return []
         settings = self.network.settings
@@ -232,11 +232,11 @@ class Reconstruction:
         return [rgb, rgb.new_ones(3, rgb.shape[1], _GAP)]
 
     def array(self) -> np.ndarray:
-        """Return all pictures as a viewer takes them: (K, s H, s W, 3), uint8."""
+        """Return all pictures, (K, s H, s W, 3), uint8."""
         return np.stack([to_bytes(rgb).numpy() for _, rgb in self])
 
     def identity(self) -> dict[str, Any]:
-        """Return all that the pictures depend on, as plain values."""
+        """Return everything that the pictures depend on, as plain values."""
         recording, clips = self.clips.recording, self.clips
         measured = recording.calibration and sorted(vars(recording.calibration).items())
         return {
@@ -253,16 +253,16 @@ class Reconstruction:
 
 
 def _other_sensor(recording: Recording, pattern: str) -> str | None:
-    """What to say where a grey camera meets weights for colours, or the other way round."""
+    """Return a warning if the camera is grey and the weights are for colour, or the reverse."""
     if recording.pattern == GREY and pattern != GREY:
-        return f"the camera is grey, and the weights are for {pattern}: they see colours where there are none"
+        return f"the camera is grey, but the weights are for {pattern}: expect false colours"
     if recording.pattern in PATTERNS and pattern == GREY:
-        return f"the camera is {recording.pattern}, and the weights are for grey: they take its mosaic for texture"
+        return f"the camera is {recording.pattern}, but the weights are for grey: they take its mosaic for texture"
     return None
 
 
 def may_be_noisy(recording: Recording) -> bool:
-    """Whether nobody has measured the sensor, or not in the dark, and no simulator says what it was."""
+    """Whether the sensor has no calibration in the dark and the recording no simulator's side-car."""
     measured = recording.calibration
     return recording.alpha is None and (measured is None or not measured.dark.any())
 
@@ -274,7 +274,7 @@ def precision_of(device: torch.device) -> str:
 
 
 def _cpu_computes_in_bfloat16() -> bool:
-    """Whether the processor has instructions for it that torch may use: emulated, it is slower than float32."""
+    """Whether torch may use bfloat16 instructions of the processor; emulated, bfloat16 is slower than float32."""
     asked = getattr(torch.cpu, "get_capabilities", dict)()  # from torch 2.10 on
     allowed = os.environ.get("ONEDNN_MAX_CPU_ISA", "DEFAULT").upper()
     allowed = allowed in ("DEFAULT", "ALL") or "BF16" in allowed or "AMX" in allowed
@@ -282,7 +282,7 @@ def _cpu_computes_in_bfloat16() -> bool:
 
 
 def _digest(values: Any) -> str:
-    """Return a number that all of some named tensors have a share in."""
+    """Return a hash of named tensors or values."""
     total = hashlib.sha256()
     for name, value in values:
         total.update(name.encode())
@@ -295,7 +295,7 @@ def _digest(values: Any) -> str:
 
 
 def by_size(models: Sequence[Model], speed: str) -> Model | None:
-    """Return the weights that a speed stands for where no table was measured, from the smallest to the largest."""
+    """Return the weights for a speed if no table was measured: ``"fastest"`` the smallest, ``"best"`` the largest."""
     if speed not in SPEEDS:
         raise ValueError(f"speed: expected one of {', '.join(SPEEDS)}, got {speed!r}")
     able = sorted(models, key=lambda model: model.macs)
@@ -313,10 +313,10 @@ def _chosen(
     noisy: bool,
     resting: bool,
 ) -> tuple[Preset, list[str]]:
-    """Return the preset that speed or budget ask for, and lines that say what it is and costs."""
+    """Return the preset for a speed or a budget, and lines that tell its name and cost."""
     clips = RecordingClips(recording, frame=frame)
     every = min((later - clock for clock, later in pairwise(clips.chosen)), default=clips.frames + 1)
-    film = every <= clips.frames  # one picture knows the other
+    film = every <= clips.frames  # neighbouring clips overlap
     if recording.pattern == GREY or scale == 1:
         kind = GREY if recording.pattern == GREY else "RGGB"  # serves every phase
         model = by_size(list_models(scale, kind), speed or "balanced")
@@ -332,11 +332,11 @@ def _chosen(
     if speed not in (None, "fastest"):
         sooner = list(SPEEDS)[list(SPEEDS).index(speed) - 1]
         other = choose(speed=sooner, frames=room, **asked)
-        said += [f"sooner, --speed {sooner}: {other}"] if other != choice else []
+        said += [f"faster, --speed {sooner}: {other}"] if other != choice else []
     if interpolated:
         said.append(
-            f"{interpolated} of {interpolated + 1} pictures are interpolated, being {every} frames apart; "
-            "--interpolated 0 makes all by the network"
+            f"{interpolated} of {interpolated + 1} pictures are interpolated, as they are {every} frames apart; "
+            "--interpolated 0 computes all with the network"
         )
     if speed:
         said += _longer(choose(speed=speed, frames=recording.frames, **asked), choice, recording)
@@ -346,7 +346,7 @@ def _chosen(
 
 
 def _interpolated(preset: Preset, every: int, speed: str | None) -> int:
-    """How many pictures between two of the network's follow from these as well."""
+    """Return the number of pictures that may be interpolated between two of the network."""
     if preset.weights is None or preset.motion == "ZeroFlow":
         return 0
     apart = _APART if speed in (None, "best") else _FARTHER_APART
@@ -354,7 +354,7 @@ def _interpolated(preset: Preset, every: int, speed: str | None) -> int:
 
 
 def _longer(ideal: Choice, choice: Choice, recording: Recording) -> list[str]:
-    """Return a hint where clips at the ends of the recording keep longer ones from being chosen."""
+    """Return a hint if only the ends of the recording exclude longer, better clips."""
     gain, half = ideal.psnr - choice.psnr, ideal.preset.clip // 2
     if ideal.preset.clip <= choice.preset.clip or gain < _WORTH_ROOM:
         return []
@@ -363,10 +363,10 @@ def _longer(ideal: Choice, choice: Choice, recording: Recording) -> list[str]:
 
 
 def _unmeasured(preset: Preset, recording: Recording, scale: int) -> str:
-    """Return what follows for a camera whose pixels nobody measured."""
+    """Return a line on the weights used for a sensor without calibration."""
     model = find_model(preset.weights or "")
     dark = ", with a recording in the dark," if recording.calibration is not None else ""
     measure = f"spikekit calibrate{dark} measures it, --calibration none takes it for ideal"
-    noisy = "weights trained for noisy ones, dB as for ideal ones"
-    said = noisy if model and model.noise else f"there are no weights for noisy ones at scale {scale}"
-    return f"nobody has measured this sensor: {said}; {measure}"
+    noisy = "using weights trained for noisy sensors, with the dB of ideal ones"
+    said = noisy if model and model.noise else f"there are no weights for noisy sensors at scale {scale}"
+    return f"this sensor is not calibrated: {said}; {measure}"

@@ -1,4 +1,4 @@
-"""Self-ensemble: the mean of a network's pictures of a clip mirrored, turned and transposed."""
+"""Self-ensemble: the mean of a network's pictures of a mirrored, rotated and transposed clip."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class _View(NamedTuple):
     transposed: bool
 
 
-# those first that bring most: pairs, then half turns, then single mirrors
+# in order of their gain: transposition, half turn, single mirrors
 _VIEWS = [_View(*mirrored, transposed) for mirrored in ((0, 0), (1, 1), (0, 1), (1, 0)) for transposed in (0, 1)]
 
-#: from how many views a mean can be taken
+#: supported numbers of views
 COUNTS = (1, 2, 4, 8)
 
 
@@ -33,13 +33,14 @@ def self_ensemble(
     scale: int,
     views: int,
 ) -> Tensor:
-    r"""Mean of the pictures of a clip and of the same clip transposed (2), turned by half as well (4), mirrored (8).
+    r"""Return the mean of the pictures of transformed clips.
 
-    A network knows one Bayer phase. Where a view would begin with another colour, or, of an even side, end with
-    another, it leaves out the outermost sensor pixel at both ends, and the mean there is over the views that have it.
+    Two views are the clip and its transpose; four also have their half turns; eight also have the single mirrors.
+    A network takes one Bayer phase only. If a view would change the phase, the outermost sensor pixels at both ends
+    are cropped, and the mean there is over the remaining views.
 
     Args:
-        run: makes a picture :math:`(B, 3, s H, s W)` of spikes :math:`(B, N, H, W)` and a flow.
+        run: function that returns a picture :math:`(B, 3, s H, s W)` for spikes :math:`(B, N, H, W)` and a flow.
         spikes: :math:`(B, N, H, W)`.
         flow: from the middle to the first and the last time point, :math:`(B, 2, 2, H, W)`, or ``None``.
         pattern: Bayer phase of the clip.
@@ -50,7 +51,7 @@ def self_ensemble(
         rgb :math:`(B, 3, s H, s W)`.
 
     Raises:
-        ValueError: less than 5 x 5 sensor pixels.
+        ValueError: the clip is smaller than 5 x 5 sensor pixels.
 
     Reference:
         Timofte et al., Seven Ways to Improve Example-Based Single Image Super Resolution, CVPR 2016.
@@ -74,7 +75,7 @@ def self_ensemble(
 
 
 def _margins(view: _View, height: int, width: int, pattern: str) -> tuple[int, int]:
-    """Sensor pixels to leave out above and below, and left and right, so that red is where it was."""
+    """Return the sensor pixels to crop above and below, and left and right, to keep the Bayer phase."""
     if pattern == GREY:
         return 0, 0
     row, column = divmod(pattern.index("R"), 2)
@@ -85,7 +86,7 @@ def _margins(view: _View, height: int, width: int, pattern: str) -> tuple[int, i
 
 
 def _seen(planes: Tensor, view: _View, back: bool = False) -> Tensor:
-    """Planes mirrored, then transposed; or the way back."""
+    """Mirror planes, then transpose them; or the inverse."""
     if back and view.transposed:
         planes = planes.mT
     planes = planes.flip([axis for axis, mirrored in ((-2, view.top_down), (-1, view.left_right)) if mirrored])
@@ -93,7 +94,7 @@ def _seen(planes: Tensor, view: _View, back: bool = False) -> Tensor:
 
 
 def _moved(flow: Tensor, view: _View) -> Tensor:
-    """The flow of a view: (*, 2, H, W), its vectors (x, y) mirrored and transposed as the picture is."""
+    """Return the flow (*, 2, H, W) of a view: its vectors (x, y) are mirrored and transposed like the picture."""
     signs = flow.new_tensor([-1.0 if view.left_right else 1.0, -1.0 if view.top_down else 1.0])
     flow = _seen(flow * signs[:, None, None], view)
     return flow.flip(-3) if view.transposed else flow

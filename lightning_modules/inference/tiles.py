@@ -1,4 +1,4 @@
-"""Tiled inference: large recordings in bounded memory."""
+"""Tiled inference, for large recordings in bounded memory."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from torch import Tensor
 
 from lightning_modules.networks import Network
 
-#: side of a tile, in sensor pixels, where nothing else is asked for
+#: default side of a tile, in sensor pixels
 TILE = 200
-#: on a GPU, which has more memory, and needs larger ones to be busy
+#: default on a GPU, which has more memory and needs larger tiles to be busy
 TILE_ON_GPU = 512
-#: motion that is followed over the edge of a tile, in sensor pixels; what moves further is searched inside
+#: largest motion followed beyond the edge of a tile, in sensor pixels; larger motion is searched within the tile
 FAR = 48
 
 
@@ -29,19 +29,18 @@ def forward_in_tiles(
     static: bool = False,
     done: Callable[[float], object] | None = None,
 ) -> Tensor:
-    r"""Run a network on tiles that overlap, and put the results together.
+    r"""Run a network on overlapping tiles and join the results.
 
-    Motion, where none is given, is estimated once, on the whole clip. What a network sees around a tile, its ``halo``
-    and as far as motion reaches, is computed and thrown away. A network whose ``halo`` is None is run on the whole
-    picture, whatever the tile.
+    By default, motion is estimated once on the whole clip. Tiles overlap by the ``halo`` of the network plus the reach
+    of motion; the overlap is computed and discarded. A network whose ``halo`` is None runs on the whole picture.
 
     Args:
-        network: any of :mod:`lightning_modules.networks`.
+        network: network of :mod:`lightning_modules.networks`.
         spikes: :math:`(B, N, H, W)`.
-        tile: side of a tile in sensor pixels, even so that the Bayer phase is kept; 0 for no tiles.
-        flow: as the network takes it; when not given, the network's own estimate.
-        static: nothing moves, instead of a flow.
-        done: called after every tile, with the share of them that is done.
+        tile: side of a tile in sensor pixels, even to keep the Bayer phase; 0 for no tiles.
+        flow: flow in the network's shape; default: the network's own estimate.
+        static: nothing moves; replaces a flow.
+        done: called after every tile with the finished fraction.
 
     Returns:
         rgb :math:`(B, 3, s H, s W)`.
@@ -59,7 +58,7 @@ def forward_in_tiles(
 
 
 def call(network: Network, spikes: Tensor, flow: Tensor | None = None, static: bool = False) -> Tensor:
-    """Run a network; one of users' own may take spikes and a flow alone, or spikes alone."""
+    """Run a network; networks of users may take spikes and a flow, or spikes only."""
     takes = signature(network.forward).parameters
     if "static" in takes:
         return network(spikes, flow, static)
@@ -79,18 +78,18 @@ def tiled(
     scale: int = 1,
     done: Callable[[float], object] | None = None,
 ) -> Tensor:
-    """Put planes together of what is computed of tiles.
+    """Compute planes tile by tile.
 
     Args:
-        run: makes planes (..., s h, s w) of a box of h x w sensor pixels.
-        whole: box of all planes.
-        tile: side of a tile in sensor pixels, 0 for a single one.
-        around: how much around a box is to be seen.
-        scale: pixels of the planes for a sensor pixel, s.
-        done: called after every tile, with the share of them that is done.
+        run: function that returns planes (..., s h, s w) for a box of h x w sensor pixels.
+        whole: box of the whole planes.
+        tile: side of a tile in sensor pixels, 0 for a single tile.
+        around: function that returns the margin needed around a box, in sensor pixels.
+        scale: pixels of the planes per sensor pixel, s.
+        done: called after every tile with the finished fraction.
 
     Returns:
-        (..., s H, s W).
+        Planes (..., s H, s W).
     """
     height, width = whole.bottom - whole.top, whole.right - whole.left
     if not tile or max(height, width) <= tile:
@@ -124,18 +123,18 @@ class Box(NamedTuple):
     right: int
 
     def grown(self, margin: int, frame: Box) -> Box:
-        """Return the box with a margin, cut off at the edges of a frame."""
+        """Return the box enlarged by a margin and clipped to a frame."""
         outer = self.top - margin, self.left - margin, self.bottom + margin, self.right + margin
         return Box(*map(max, outer[:2], frame[:2]), *map(min, outer[2:], frame[2:]))
 
     def of(self, planes: Tensor, corner: tuple[int, int] = (0, 0), scale: int = 1) -> Tensor:
-        """Return this part of planes that begin at a corner and have ``scale`` pixels for one."""
+        """Return this part of planes that begin at ``corner`` and have ``scale`` pixels per sensor pixel."""
         rows = slice(scale * (self.top - corner[0]), scale * (self.bottom - corner[0]))
         return planes[..., rows, scale * (self.left - corner[1]) : scale * (self.right - corner[1])]
 
 
 def reach(flow: Tensor | None, box: Box, frame: Box, halo: int) -> int:
-    """Return how much around a box of a frame a network has to see: even, as the Bayer phase is kept."""
+    """Return the margin that a network needs around a box of a frame; even, to keep the Bayer phase."""
     if flow is None:
         return halo
     near = box.grown(halo, frame).of(flow, frame[:2])

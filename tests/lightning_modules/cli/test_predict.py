@@ -77,7 +77,7 @@ def test_a_picture_of_nan_is_no_picture(words, tmp_path, monkeypatch):
     """Weights may be finite and too large; a black picture would say nothing of it."""
     nan = torch.full((1, 3, 24, 32), float("nan"))
     monkeypatch.setattr(ClassicalDecoder, "forward", lambda *_, static=False: nan)
-    assert "frame_000020.png: expected a picture, the network makes NaN" in refused([*words, str(tmp_path / "out")])
+    assert "frame_000020.png: expected finite values, got NaN" in refused([*words, str(tmp_path / "out")])
     assert not pictures(tmp_path / "out")
 
 

@@ -146,8 +146,8 @@ def test_pace_is_measured_on_the_reference(monkeypatch):
         ({"speed": "quick"}, "speed: expected one of fastest, fast, balanced, best, got 'quick'"),
         ({"speed": "fast", "budget": "1s"}, "expected one of them"),
         ({"budget": "40"}, "budget: expected a time or memory"),
-        ({"budget": "1ms"}, "nothing fits 1ms for 250 x 400 sensor pixels; least takes tfp 5: about 190 ms"),
-        ({"budget": "1MB"}, "nothing fits 1MB for 250 x 400 sensor pixels; least takes tfi"),
+        ({"budget": "1ms"}, "no preset fits 1ms at 250 x 400 sensor pixels; leanest: tfp 5: about 190 ms"),
+        ({"budget": "1MB"}, "no preset fits 1MB at 250 x 400 sensor pixels; leanest: tfi"),
         ({"scale": 7, "speed": "fast"}, r"scale: expected one that was measured \(x3\), got 7"),
     ],
 )

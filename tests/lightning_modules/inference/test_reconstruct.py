@@ -68,7 +68,7 @@ def test_a_dim_recording_is_shown_bright(tmp_path):
 def test_weights_for_noise_are_chosen_where_nobody_has_measured_the_sensor(flat):
     pictures = reconstruct(flat(0.4), "fastest")
     assert find_model(pictures.notes[0].split(",")[0].split(":")[0]).noise
-    assert "nobody has measured this sensor" in pictures.notes[-1]
+    assert "this sensor is not calibrated" in pictures.notes[-1]
 
 
 def test_ideal_sensors_get_the_weights_for_them(flat, tmp_path, monkeypatch):
