@@ -21,7 +21,7 @@ _RISING = 10  # warm-up steps of the learning rate, which then falls linearly to
 
 
 def patch_of(examples: DistillationSet, pattern: str, scale: int, index: int) -> dict[str, Tensor]:
-    """Return a random patch of a example, with its picture and flow; the index is the random seed."""
+    """Return a random patch of an example, with its picture and flow; the index is the random seed."""
     rng = np.random.default_rng(index)
     one, sides = int(rng.integers(len(examples))), examples.spikes.shape[-2:]
     size = min(*sides, _PATCH)

@@ -72,7 +72,7 @@ def run_to_end(log: Path, words: Sequence[str], there: str) -> str | None:
     os.chdir(there)
     process = start(log, words, {})
     try:
-        return reason(log, process.wait())
+        return exit_reason(log, process.wait())
     finally:
         stop(process)
 
@@ -117,7 +117,7 @@ def end_with_parent() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def reason(log: Path, status: int) -> str | None:
+def exit_reason(log: Path, status: int) -> str | None:
     """Return why a process ended with a status, or None where nothing went wrong."""
     if status == 0:
         return None

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from lightning_modules.cli.processes import calls_on_ray, reason, run_to_end, start, stop
+from lightning_modules.cli.processes import calls_on_ray, exit_reason, run_to_end, start, stop
 from lightning_modules.sweep.state import LOG
 
 _A_MOMENT = 0.2  # seconds
@@ -30,7 +30,7 @@ def run_locally(folders: Sequence[Path], jobs: int | None, every: float) -> Iter
                 running[folder] = start(folder / LOG, _trial(folder, every), threads)
             time.sleep(_A_MOMENT)
             ended = [folder for folder, process in running.items() if process.poll() is not None]
-            yield {folder: reason(folder / LOG, running.pop(folder).returncode) for folder in ended}
+            yield {folder: exit_reason(folder / LOG, running.pop(folder).returncode) for folder in ended}
     finally:
         for process in running.values():
             stop(process)
