@@ -35,9 +35,9 @@ def parser() -> argparse.ArgumentParser:
     made = VerbParser(
         prog="lightning adapt",
         description="Fine-tune fast weights on a recording of your camera without ground truth. They learn from the "
-        "pictures of slower weights. The new weights are written if they improve the end of the recording, which is "
-        "held out. Use them with lightning predict --weights OUT/adapted.safetensors; for a noisy camera, also on "
-        "its other recordings.",
+        "pictures of slower weights. The end of the recording is held out, and the new weights are written only if "
+        "its pictures improve. Use them with lightning predict --weights OUT/adapted.safetensors; for a noisy "
+        "camera, also on its other recordings.",
     )
     recordings.add_arguments(made)
     add = made.add_argument

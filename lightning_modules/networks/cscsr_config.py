@@ -25,8 +25,8 @@ class CSCSRConfig:
         stride: spike frames between two time points; must divide frames - window. Default: that of the size, or the
             stride for eleven time points: 3 for 41 frames, 9 for 101.
         pattern: Bayer phase of the sensor, or ``"grey"`` for a sensor without colour filters.
-        size: preset in :data:`lightning_modules.networks.sizes.SIZES` for ``stride``, the widths and depths up to
-            ``end_width``, and ``resolution``. Weights store the values, not the name.
+        size: preset of ``stride``, the widths and depths up to ``end_width``, and ``resolution``, such as ``"small"``;
+            see :data:`lightning_modules.networks.sizes.SIZES`. Weights store the values, not the name.
         width: channels of refinement and reconstruction.
         representation_width: channels of the spike representation, at sensor resolution.
         features: feature channels per time point.

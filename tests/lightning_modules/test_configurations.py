@@ -1,4 +1,4 @@
-"""Configurations by name, from anywhere, and that each of them builds."""
+"""Lookup of configurations by name, and a test that each of them builds."""
 
 from pathlib import Path
 
@@ -16,13 +16,13 @@ NAMES = ["x1", "x2", "x3", "x4", "quick", "flow", "ablation/a", "grey", "data/fi
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("typed", ["{}", "{}.yaml", "configs/{}", "configs/{}.yaml"])
-def test_a_configuration_is_found_from_anywhere(name, typed, tmp_path, monkeypatch, configs):
+def test_configurations_are_found_from_any_folder(name, typed, tmp_path, monkeypatch, configs):
     monkeypatch.chdir(tmp_path)
     (found,) = find_configs(typed.format(name))
     assert Path(found).samefile(configs / f"{name}.yaml")
 
 
-def test_a_file_in_the_folder_comes_first(tmp_path, monkeypatch):
+def test_local_files_take_precedence(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("x4", "configs/x4.yaml"):
         Path(name).parent.mkdir(exist_ok=True)
@@ -31,18 +31,18 @@ def test_a_file_in_the_folder_comes_first(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["nowhere", "../x4", "/x4", "{model: {flow: scene}}", "", "a\nb", "x" * 5000])
-def test_what_is_no_name_stays_as_it_is(name):
+def test_unknown_names_are_returned_unchanged(name):
     assert find_configs(name) == [name]
 
 
-def test_every_way_to_type_it(configs):
+def test_all_forms_of_the_option(configs):
     x4 = str(configs / "x4.yaml")
     typed = ["fit", "-c", "x4", "--config", "x4", "--config=x4", "-cx4", "--ckpt_path", "x4"]
     expected = ["fit", "-c", x4, "--config", x4, f"--config={x4}", f"-c{x4}", "--ckpt_path", "x4"]
     assert with_found_configs(typed) == expected
 
 
-def test_the_command_finds_them_from_an_empty_folder(tmp_path, monkeypatch, capsys):
+def test_command_finds_configurations_from_an_empty_folder(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", ["lightning"])
     with pytest.raises(SystemExit):
@@ -52,7 +52,7 @@ def test_the_command_finds_them_from_an_empty_folder(tmp_path, monkeypatch, caps
 
 
 @pytest.mark.parametrize("scale", [1, 2, 3, 4])
-def test_every_scale_takes_every_size(scale, configs):
+def test_every_size_builds_at_every_scale(scale, configs):
     said, quick = (
         yaml.safe_load((configs / f"{name}.yaml").read_text())["model"]["network"]["init_args"]
         for name in (f"x{scale}", "quick")

@@ -1,4 +1,4 @@
-"""The registry of the weights that come with the package."""
+"""The registry of the weights in the package."""
 
 import pytest
 
@@ -10,14 +10,14 @@ MODELS = list_models()
 NETWORKS = [model for model in MODELS if model.scale]
 
 
-def test_every_file_of_weights_has_a_row_a_card_and_a_bounded_size():
+def test_weights_files_have_a_row_and_a_card_and_are_small():
     folder = MODELS[0].path.parent
     assert set(folder.glob("*.safetensors")) == {model.path for model in MODELS}
     assert {path.stem for path in folder.glob("*.md")} == {model.path.stem for model in MODELS}
     assert sum(path.stat().st_size for path in folder.glob("*.safetensors")) < 72e6  # what a wheel may hold
 
 
-def test_models_are_chosen_by_scale_and_pattern():
+def test_models_are_selected_by_scale_and_pattern():
     assert lightning_modules.list_models() == MODELS
     assert [model for scale in (1, 2, 3, 4) for model in list_models(scale)] == NETWORKS
     assert list_models(4, "RGGB") == list_models(4)
@@ -27,7 +27,7 @@ def test_models_are_chosen_by_scale_and_pattern():
 
 
 @pytest.mark.parametrize("model", NETWORKS, ids=lambda model: model.name)
-def test_a_row_says_what_the_network_is(model):
+def test_rows_agree_with_their_networks(model):
     network = CSCSR.from_pretrained(model.name)
     assert type(network) is (RecurrentCSCSR if model.film else CSCSR)
     assert (network.scale, network.frames, network.pattern) == (model.scale, model.frames, model.pattern)

@@ -1,4 +1,4 @@
-"""Constructors that take the arguments of another class."""
+"""Constructors that accept the arguments of another class."""
 
 from inspect import signature
 
