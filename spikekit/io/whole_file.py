@@ -32,8 +32,7 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
         write the same file, the last one wins.
 
         The file keeps the mode of the one that it replaces. A symbolic link is replaced and not followed, as folders
-        from other people may contain links. A device, such as ``/dev/stdout``, is written directly, and so is a pipe
-        with a reader.
+        from other people may contain links.
 
     Args:
         path: the file to write; its folder is created if needed.
@@ -56,11 +55,9 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
         (False, 'all of it')
     """
     path = home_path(path)
-    chosen = path.is_dir() or not path.is_symlink() or path.parent == Path("/dev")  # no other links to devices
-    if chosen and path.exists() and not path.is_file():
-        with open(path, mode, opener=_to_a_reader if path.is_fifo() else None, **how) as file:  # raises for a folder
-            yield file
-        return
+    if path.is_dir() or (path.exists() and not path.is_symlink() and not path.is_file()):
+        number = errno.EISDIR if path.is_dir() else errno.EINVAL
+        raise OSError(number, "expected a file, got a folder, a pipe or a device", str(path))
     target = Path(os.path.realpath(path.parent), path.name)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -88,13 +85,6 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
         raise
     file.close()  # only now, as this releases the lock
     flush_folder(target.parent)
-
-
-def _to_a_reader(path: str, flags: int) -> int:
-    """Open a pipe; raise instead of blocking if it has no reader."""
-    file = os.open(path, flags | os.O_NONBLOCK)
-    os.set_blocking(file, True)
-    return file
 
 
 def hidden_name(name: str) -> str:
