@@ -45,7 +45,7 @@ class Model:
 
     @property
     def path(self) -> Path:
-        """Where the file is."""
+        """Path of the file."""
         return _FOLDER / f"{self.name}.safetensors"
 
     @property
