@@ -7,13 +7,16 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import TypeVar
 
 import numpy as np
 import torch
 from pytorch_lightning import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
+
+T = TypeVar("T")
 
 _MOST_WORKERS = 16
 _A_MOMENT = 2.0  # seconds
@@ -101,7 +104,8 @@ class _ClipLoader(DataLoader):
     """A loader whose workers send arrays through pipes: tensors would need more shared memory than containers give."""
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
-        return ({name: torch.from_numpy(value) for name, value in batch.items()} for batch in super().__iter__())
+        batches = made_on_cpu(super().__iter__)
+        return ({name: torch.from_numpy(value) for name, value in batch.items()} for batch in batches)
 
     # Lightning takes a loader with these two for one that can be resumed. It can: training's step says where it stands.
     def state_dict(self) -> dict[str, object]:
@@ -109,6 +113,18 @@ class _ClipLoader(DataLoader):
 
     def load_state_dict(self, state: dict[str, object]) -> None:
         pass
+
+
+def made_on_cpu(batches: Callable[[], Iterator[T]]) -> Iterator[T]:
+    """Go through what a loader iterates, whose tensors are the CPU's, whatever the default device."""
+    with torch.device("cpu"):
+        iterator = batches()
+    while True:
+        with torch.device("cpu"):
+            batch = next(iterator, None)
+        if batch is None:
+            return
+        yield batch
 
 
 def default_workers() -> int:

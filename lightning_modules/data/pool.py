@@ -12,7 +12,7 @@ from pytorch_lightning import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from lightning_modules.data.loading import process, start_worker
+from lightning_modules.data.loading import made_on_cpu, process, start_worker
 from lightning_modules.data.margin import trim
 from lightning_modules.data.rendering import Gallery
 
@@ -136,7 +136,7 @@ class ScenePool:
             worker_init_fn=start_worker,
             collate_fn=_as_it_is,
         )
-        drawn, pools = iter(loader), [{} for _ in self.kinds]
+        drawn, pools = made_on_cpu(loader.__iter__), [{} for _ in self.kinds]
         for kind, turn, batch in self._events(first):
             pool, count = pools[kind], self.parts[kind]
             if batch is None:

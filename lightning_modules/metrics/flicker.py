@@ -37,9 +37,8 @@ def film_flicker(rgb: Tensor, then: Tensor, truth: Tensor, truth_then: Tensor, f
         Lai et al., Learning Blind Video Temporal Consistency, ECCV 2018.
     """
     height, width = flow.shape[-2:]
-    ends = flow + torch.stack(
-        torch.meshgrid(torch.arange(width).to(flow), torch.arange(height).to(flow), indexing="xy")
-    )
+    axes = (torch.arange(length, dtype=flow.dtype, device=flow.device) for length in (width, height))
+    ends = flow + torch.stack(torch.meshgrid(*axes, indexing="xy"))
     inside = ((ends >= 0) & (ends <= ends.new_tensor([width - 1, height - 1])[:, None, None])).all(dim=1)
     error = (flow_warp(then - truth_then, flow) - (rgb - truth)).square().mean(dim=1)
     return 255 * ((error * inside).sum(dim=(1, 2)) / inside.sum(dim=(1, 2))).sqrt()

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import torch
-from kornia.filters import filter2d_separable, gaussian_blur2d, get_gaussian_kernel1d
+from kornia.filters import filter2d_separable, get_gaussian_kernel1d
 from torch import Tensor
 
 from lightning_modules.motion.estimator import MotionEstimator, split_any_size
@@ -18,13 +18,13 @@ from spikekit.kernels import compiler_kept_out
 from spikekit.sensor.quantization_noise import flicker
 
 _GREY = 0.25, 0.5, 0.25  # kernel that averages the Bayer cells around a pixel
-_BLUR = tuple(get_gaussian_kernel1d(5, 0.5)[0].tolist())  # of a sub-stream's pictures, in Bayer cells
+_BLUR = tuple(get_gaussian_kernel1d(5, 0.5, device="cpu")[0].tolist())  # of a sub-stream's pictures, in Bayer cells
 _ORDER = 3  # averaging passes of TFP
 _LONGEST = 17  # longest TFP window in spike frames, beyond which motion blur outweighs the noise reduction
 _LIGHT = 0.1  # mean firing rate of a clip below which the window grows, as noise dominates
 _NOISE = 0.002  # standard deviation, in firing rates, that halves the weight of a pixel
 _RATES = 1024
-_NEAR = 2.0  # standard deviation of the window of the test for linear motion, in pixels
+_NEAR = tuple(get_gaussian_kernel1d(17, 2.0, device="cpu")[0].tolist())  # window of the test for linear motion
 _PART = 1.25, 1.75  # error ratios at which the flows begin to differ, and at which they are independent
 _UNSEEN = 1e-6  # negligible squared difference of two pictures, in firing rates
 
@@ -173,4 +173,4 @@ def noise_by_rate(window: int, device: torch.device | str = "cpu") -> Tensor:
 def _unlike(pictures: Tensor, flows: Tensor) -> Tensor:
     """Return the squared error (B, 1, h, w) between the middle picture and both others, warped by their flows."""
     error = flow_warp(pictures[:, ::2].unsqueeze(2), flows).squeeze(2) - pictures[:, 1:2]
-    return gaussian_blur2d(error.square().sum(dim=1, keepdim=True), 17, (_NEAR, _NEAR), "replicate")
+    return _filtered(error.square().sum(dim=1, keepdim=True), _NEAR, "replicate")

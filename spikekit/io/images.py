@@ -243,7 +243,8 @@ def panel(rows: Sequence[Sequence[Tensor]], gap: int = 4) -> Tensor:
     heights = [max(picture.shape[-2] for picture in row) for row in rows]
     columns = range(max(len(row) for row in rows))
     widths = [max(row[i].shape[-1] for row in rows if i < len(row)) for i in columns]
-    sheet = torch.ones(3, sum(heights) + gap * (len(heights) - 1), sum(widths) + gap * (len(widths) - 1))
+    size = sum(heights) + gap * (len(heights) - 1), sum(widths) + gap * (len(widths) - 1)
+    sheet = torch.ones(3, *size, device="cpu")
     top = 0
     for row, height in zip(rows, heights, strict=True):
         left = 0

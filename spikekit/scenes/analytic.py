@@ -289,7 +289,7 @@ class Scene:
         rows, columns = _axis(height) * scale + (scale - 1) / 2, _axis(width) * scale + (scale - 1) / 2
         device = self.layers[0].picture.device
         here = (columns + 1j * rows[:, None]).to(device)
-        still = Motion()._turn_and_shift(torch.zeros(1, dtype=torch.float64))
+        still = Motion()._turn_and_shift(torch.zeros(1, dtype=torch.float64, device="cpu"))
         moved = torch.zeros_like(here)
         for (planes, corner), moves in zip(self._planes, self._moves([clock]), strict=True):
             turn, shift = (part.to(device)[..., None] for part in moves)
@@ -303,7 +303,7 @@ class Scene:
 
     def _moves(self, clocks: Sequence[float]) -> list[tuple[Tensor, Tensor]]:
         """Return the turns and shifts of every layer, on the CPU."""
-        tau = torch.tensor(list(clocks), dtype=torch.float64) - self.middle
+        tau = torch.tensor(list(clocks), dtype=torch.float64, device="cpu") - self.middle
         return [layer.motion._turn_and_shift(tau) for layer in self.layers]
 
     def _picked(self, colours: list[int]) -> list[Tensor]:
@@ -338,7 +338,7 @@ class Scene:
 
 
 def _axis(length: int) -> Tensor:
-    return torch.arange(length, dtype=torch.float64)
+    return torch.arange(length, dtype=torch.float64, device="cpu")
 
 
 def _touched(
@@ -346,7 +346,7 @@ def _touched(
 ) -> tuple[slice, slice]:
     """Return the rows and columns of the view that moved planes can cover, in any scene and at any clock."""
     height, width = planes.shape[-2:]
-    ends = corner + torch.tensor([0, width - 1, 1j * (height - 1), width - 1 + 1j * (height - 1)]).to(turn)
+    ends = corner + turn.new_tensor([0, width - 1, 1j * (height - 1), width - 1 + 1j * (height - 1)])
     ends = turn[..., None] * ends[:, None, :] + shift[..., None]
 
     def between(axis: Tensor, position: Tensor) -> slice:

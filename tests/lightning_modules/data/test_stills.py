@@ -93,16 +93,17 @@ def test_spikes_reach_as_far_as_motion_is_estimated_on_with_a_cache_or_without(t
 
 
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")
-def test_same_clips_whatever_the_workers():
+def test_same_clips_whatever_the_workers_and_the_default_device():
     alone, data = scenes(), scenes(workers=2)
     expected = clips_of(alone.train_dataloader())
     assert expected[::-1] == [digest(alone.train_set[i]) for i in range(7, -1, -1)]
     assert len(set(expected)) == 8
     loader = data.train_dataloader()
     assert loader.num_workers == 2
-    for _ in range(2):  # workers stay, the second round starts anew
-        assert clips_of(loader) == expected
-        assert clips_of(data.val_dataloader()) == clips_of(alone.val_dataloader())
+    for device in ("cpu", "meta"):  # workers stay, the second round starts anew
+        with torch.device(device):
+            assert clips_of(loader) == expected
+            assert clips_of(data.val_dataloader()) == clips_of(alone.val_dataloader())
 
 
 def test_chance_of_others_does_not_matter():

@@ -31,10 +31,11 @@ def test_classical_flow_finds_a_translation(velocity, pattern):
         assert error.mean() < 0.2, error.mean()
 
 
-def test_classical_flow_ignores_autocast():
+@pytest.mark.parametrize("around", [torch.autocast("cpu", torch.bfloat16), torch.device("meta")])
+def test_classical_flow_ignores_autocast_and_the_default_device(around):
     spikes = moving((0.2, -0.1))
     expected = ClassicalFlow()(spikes, TIMES, "RGGB")
-    with torch.autocast("cpu", torch.bfloat16):
+    with around:
         got = ClassicalFlow()(spikes, TIMES, "RGGB")
     assert all(torch.equal(flow, other) for flow, other in zip(got, expected, strict=True))
     assert all(flow.isfinite().all() for flow in ClassicalFlow()(spikes.bfloat16(), TIMES, "RGGB"))
