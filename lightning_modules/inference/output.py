@@ -15,7 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 from spikekit import write_video
-from spikekit.io.image_bytes import PictureError, png_bytes, png_pixels
+from spikekit.io.image_bytes import PictureError, png_bytes, png_pixels, to_bytes
 from spikekit.io.quiet import quiet
 from spikekit.io.video import VIDEO_ENDINGS
 from spikekit.io.whole_file import whole_file
@@ -24,7 +24,7 @@ from spikekit.progress import progress
 #: name of the lock file in a folder of pictures
 LOCK = ".predict.lock"
 
-_NOTE = "spikekit"  # PNG text that identifies the inputs of a picture
+_NOTE = "spikekit"  # PNG text with digests of a picture's inputs and pixels
 
 
 def is_film(output: str | Path) -> bool:
@@ -75,9 +75,8 @@ class Output:
 
     def _is_there(self, path: Path) -> bool:
         with suppress(Exception), quiet(), Image.open(path, formats=["PNG"]) as picture:
-            if picture.info.get(_NOTE) == self._record:
-                picture.verify()  # all its checksums
-                return True
+            record, _, pixels = picture.info[_NOTE].partition(" ")
+            return record == self._record and pixels == _digest(png_pixels(path))
         return False
 
     def write(self, frame: int, rgb: Tensor) -> Path:
@@ -86,8 +85,9 @@ class Output:
         if not rgb.isfinite().all():  # saved, it would be black without explanation
             raise PictureError(f"{path}: expected finite values, got NaN from the network; the picture is not written")
         _check_picture(path)
+        pixels = to_bytes(rgb).movedim(-1, 0)
         with whole_file(path) as file:
-            file.write(png_bytes(rgb, {_NOTE: self._record}))
+            file.write(png_bytes(pixels, {_NOTE: f"{self._record} {_digest(pixels)}"}))
         return path
 
     def finish(self, fps: float) -> None:
@@ -112,6 +112,10 @@ class Output:
         with suppress(OSError):
             (self.folder / LOCK).unlink()
             self.folder.rmdir()
+
+
+def _digest(pixels: Tensor) -> str:
+    return hashlib.sha256(pixels.contiguous().numpy()).hexdigest()
 
 
 def check_place(path: Path, follow: bool = False) -> None:

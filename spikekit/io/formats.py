@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import zipfile
 from collections.abc import Iterable, Iterator
@@ -23,6 +24,8 @@ _ARRAY_NAMES = ("spk", "spikes")
 
 # Largest compression ratio of Deflate.
 _MOST_DEFLATED = 1032
+
+_MOST_HEADER = 16_384  # bytes; NumPy reads none above 10,000
 
 
 class SpikeFileError(ValueError):
@@ -221,6 +224,9 @@ def _check_array(path: Path, name: str, shape: tuple[int, ...], dtype: np.dtype,
 
 def _npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
     with quiet():
-        version = np.lib.format.read_magic(stream)
+        start = io.BytesIO(stream.read(_MOST_HEADER))  # NumPy would read all that a header claims to be
+        version = np.lib.format.read_magic(start)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        return read(stream)
+        header = read(start)
+        stream.seek(start.tell())
+        return header

@@ -7,6 +7,7 @@ import io
 import json
 import os
 import random
+import tracemalloc
 import zipfile
 
 import numpy as np
@@ -176,6 +177,17 @@ def test_damaged_headers_of_npz(fuzz):
         return file.getvalue()
 
     assert fuzz(read_all, make, "bad.npz", SpikeFileError) > 500
+
+
+def test_a_header_of_gigabytes_is_not_read(tmp_path):
+    with open(tmp_path / "a.npy", "wb") as file:
+        file.write(b"\x93NUMPY\x02\x00" + (2**30).to_bytes(4, "little"))
+        file.truncate(2**30 + 12)
+    tracemalloc.start()
+    with pytest.raises(SpikeFileError, match="header"):
+        read_all(tmp_path / "a.npy")
+    assert tracemalloc.get_traced_memory()[1] < 2**22
+    tracemalloc.stop()
 
 
 @pytest.mark.parametrize(
