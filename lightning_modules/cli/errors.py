@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from typing import NoReturn
 
 from spikekit.arguments import UsageError as SpikekitUsageError
-from spikekit.arguments import one_line
+from spikekit.arguments import one_line, printable
 from spikekit.extras import remedy
 from spikekit.standard_output import BROKEN_PIPE, FULL, Terminated, stop_printing
 
@@ -33,6 +33,7 @@ class Ended(SystemExit):
     """
 
     def __init__(self, line: str, status: int) -> None:
+        line = "\n".join(map(printable, line.splitlines()))  # names of files can hold escape sequences
         super().__init__(line)
         self.code = line if status == 1 else status  # a text is printed by Python, which then ends with 1
         if status != 1:

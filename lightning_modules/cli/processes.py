@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lightning_modules.cli.errors import InputError
-from spikekit.arguments import one_line
+from spikekit.arguments import one_line, printable
 
 _A_MOMENT = 0.2  # seconds
 
@@ -126,4 +126,4 @@ def exit_reason(log: Path, status: int) -> str | None:
         return f"killed by {name}" + (", perhaps for want of memory" if name == "SIGKILL" else "")
     lines = log.read_text(errors="replace").split("\n")
     last = next((line.strip() for line in reversed(lines) if line.strip()), f"status {status}")
-    return last.removeprefix("lightning: ")
+    return printable(last.removeprefix("lightning: "))

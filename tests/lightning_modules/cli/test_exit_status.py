@@ -28,6 +28,7 @@ FILES = {
     "list.yaml": b"[1, 2]",
     "deep.yaml": b"[" * 100_000,
     "odd.yaml": b"model: {network: {class_path: CSCSR, init_args: {motion: nonsense.Estimator}}}",
+    "red.yaml": b'data: {root: "\\e[31mred"}',
     "cut.ckpt": b"PK\3\4 and no more",
     "other.ckpt": _of_another_scale(),
     "cut.safetensors": b"\xff" * 30,
@@ -82,6 +83,7 @@ FAILED = {
     f"test {X4} --model.weights cut.safetensors -o out": "cut.safetensors",
     f"test {X4} --model.weights spike2flow": "expected weights of a network, got spike2flow, of",
     f"fit {X4} --data.root nowhere": "nowhere",
+    f"fit {X4} -c red.yaml": "?[31mred",
     "predict nowhere.dat -o out": "nowhere.dat",
     "predict --weights cscsr_tiny_x4 odd.dat --height 7 --width 9 -o out": "odd.dat",
     "predict odd.dat --height 7 --width 9 -o out -c bad.yaml": "bad.yaml",
@@ -107,6 +109,7 @@ def test_one_line(words, status, named, tmp_path, monkeypatch, capfd):
     assert len(said.splitlines()) == 1, said
     assert named in said
     assert "Traceback" not in said
+    assert "\x1b" not in said
     assert {path.name for path in tmp_path.iterdir()} == set(FILES)
 
 
