@@ -102,7 +102,7 @@ def test_dtype_and_device_are_kept(op, options, tensors, dtype, device):
 
 
 @EVERY
-def test_inputs_are_left_alone(op, options, tensors):
+def test_inputs_are_not_modified(op, options, tensors):
     kept = [tensor.clone() for tensor in tensors]
     for result in outputs(op(*tensors, **options)):
         if result.data_ptr() not in [tensor.data_ptr() for tensor in tensors]:
@@ -112,13 +112,13 @@ def test_inputs_are_left_alone(op, options, tensors):
 
 
 @EVERY
-def test_tensors_without_data_have_the_sizes_of_the_result(op, options, tensors):
+def test_meta_tensors_give_the_shapes_of_the_results(op, options, tensors):
     results = outputs(op(*[tensor.to("meta") for tensor in tensors[:2]], *tensors[2:], **options))
     assert [result.shape for result in results] == [result.shape for result in outputs(op(*tensors, **options))]
 
 
 @EVERY
-def test_what_is_no_tensor_of_the_kind_is_refused(op, options, tensors):
+def test_wrong_types_are_rejected(op, options, tensors):
     first, *others = tensors
     for wrong, error, said in (
         (first.numpy(), TypeError, r"torch\.from_numpy"),  # the remedy
@@ -145,7 +145,7 @@ def test_scales_of_motion_may_vary_in_compiled_code(dynamic):
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="Inductor needs a compiler of C++")
-def test_inductor_compiles_the_way_from_light_to_a_warped_picture():
+def test_inductor_compiles_the_pipeline_from_light_to_a_warped_picture():
     def picture(light, flow):
         spikes, _ = sk.spike_integrate_fire(light)
         return sk.flow_warp(sk.tfp(spikes, 5)[:, 4:5], flow)

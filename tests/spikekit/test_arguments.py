@@ -7,7 +7,7 @@ import pytest
 from spikekit.arguments import frames_of, positive, whole
 
 
-def test_numbers_above_0():
+def test_positive_numbers():
     assert positive("1e-300") == 1e-300
     for text in ("0", "-1", "inf", "nan", "x"):
         with pytest.raises(argparse.ArgumentTypeError, match=f"expected a number above 0, got {text}"):
@@ -21,7 +21,7 @@ def test_whole_numbers():
             whole(2)(text)
 
 
-def test_frames_at_the_ends():
+def test_frame_ranges_at_the_ends():
     assert frames_of("3:", 3, 9) == range(3, 10) == frames_of(":", 3, 9)
     assert frames_of("9", 3, 9) == range(9, 10)
     for text in ("2", "10", "3:11", "5:5", "-1", "3:9:0"):

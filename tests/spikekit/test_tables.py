@@ -3,7 +3,7 @@ import re
 from spikekit.tables import table
 
 
-def test_cells_stay_as_they_are_typed():
+def test_cells_are_not_reformatted():
     lines = table(["", "PSNR | dB"], [["one\ntwo", "1.50"], ["", None], [3, "1e3"]]).splitlines()
     assert len(lines) == 5
     assert len(set(map(len, lines))) == 1  # aligned

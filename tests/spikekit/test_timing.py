@@ -8,7 +8,7 @@ from spikekit.timing import peak_memory
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="peak memory is read from /proc")
-def test_peak_memory_sees_what_is_freed_and_what_is_returned():
+def test_peak_memory_includes_freed_and_returned_tensors():
     def passing():
         np.ones(16 << 20, np.uint8)
         return torch.ones(4 << 20, dtype=torch.uint8)

@@ -41,7 +41,7 @@ def brute_force(times, frames):
 
 
 @pytest.mark.parametrize(("share", "chunk"), [(0.004, 7), (0.05, 1), (0.6, 100)])
-def test_rates_are_those_between_the_first_and_the_last_spike(share, chunk):
+def test_rates_are_measured_between_the_first_and_the_last_spike(share, chunk):
     spikes = torch.rand(100, 5, 6, generator=chance()) < share
     found = PixelRates.of(spikes.split(chunk)).rate
     expected = [brute_force(pixel, 100) for pixel in spikes.flatten(1).T.tolist()]
@@ -89,7 +89,7 @@ def test_a_flat_recording_of_the_wrong_brightness(light, said):
 # What is done with it
 
 
-def test_corrected_by_the_truth_a_rate_is_that_of_an_ideal_sensor(truth):
+def test_true_calibration_recovers_the_rates_of_an_ideal_sensor(truth):
     light = torch.rand(3, *SIZE, generator=chance(7)) * 0.5
     light = torch.where(truth.defects != 0, 0.25, light)
     rate = truth.gain * light + truth.dark
@@ -99,7 +99,7 @@ def test_corrected_by_the_truth_a_rate_is_that_of_an_ideal_sensor(truth):
 
 
 @pytest.mark.parametrize("pattern", [None, "RGGB", "GBRG"])
-def test_defects_are_filled_from_the_nearest_of_their_colour(truth, pattern):
+def test_defects_are_filled_from_the_nearest_pixels_of_their_colour(truth, pattern):
     light = torch.rand(SIZE, generator=chance(8), dtype=torch.float64)
     found = Calibration(torch.ones(SIZE), torch.zeros(SIZE), truth.defects).correct(light, pattern)
     seen = torch.zeros(SIZE) if pattern is None else bayer_mask(*SIZE, pattern).argmax(0)
@@ -126,7 +126,7 @@ def test_defects_are_filled_from_the_nearest_of_their_colour(truth, pattern):
     assert found[works].equal(light[works])
 
 
-def test_spikes_fired_anew(truth):
+def test_corrected_spikes(truth):
     light = torch.linspace(0.05, 0.4, SIZE[1]).expand(41, *SIZE)
     spikes = SpikeSensor(SensorNoise(calibration=truth), seed=2).expose(light)
     found = correct_spikes(spikes, truth, "BGGR")
@@ -143,7 +143,7 @@ def test_spikes_fired_anew(truth):
     assert not again[0][:, truth.defects == HOT].all(0).any()
 
 
-def test_corrected_pictures_are_nearly_those_of_an_ideal_sensor(truth):
+def test_corrected_pictures_are_close_to_those_of_an_ideal_sensor(truth):
     y, x = torch.meshgrid(torch.linspace(0, 6, SIZE[0]), torch.linspace(0, 6, SIZE[1]), indexing="ij")
     light = (0.2 + 0.1 * torch.sin(x + y)).expand(101, *SIZE)
     ideal = SpikeSensor(seed=3).expose(light)
@@ -173,7 +173,7 @@ def test_corrected_pictures_are_nearly_those_of_an_ideal_sensor(truth):
         ({"defects": torch.full((2, 3), 3, dtype=torch.uint8)}, "defects: expected 0 to 2, got 3"),
     ],
 )
-def test_values_that_make_no_sense(changed, said):
+def test_invalid_values_are_rejected(changed, said):
     good = {"gain": torch.ones(2, 3), "dark": torch.zeros(2, 3), "defects": torch.zeros(2, 3, dtype=torch.uint8)}
     with pytest.raises(ValueError, match=said):
         Calibration(**(good | changed))
@@ -195,7 +195,7 @@ def test_noise_of_a_measured_sensor(truth):
         SensorNoise(gain_spread=0.1, calibration=truth)
 
 
-def test_a_scene_that_does_not_require_a_calibration_does_without(truth):
+def test_scene_that_does_not_require_a_calibration(truth):
     nearly = Calibration(1 + (truth.gain - 1) / 1000, torch.zeros(SIZE), torch.zeros(SIZE, dtype=torch.uint8))
     for known, kept in ((nearly, None), (truth, truth)):
         assert SensorNoise(photons=10, calibration=known).required(0.2, 41, 0.01).calibration is kept

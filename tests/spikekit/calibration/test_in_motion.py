@@ -94,13 +94,13 @@ def test_gains_are_found(truth, recording, pattern):
 
 
 @pytest.mark.parametrize(("motion", "ideal"), [((0.05, -0.03), True), ((0.0, 0.0), False), ((0.006, 0.004), False)])
-def test_an_ideal_sensor_stays_one_and_texture_at_rest_is_no_gain(truth, motion, ideal):
+def test_ideal_sensor_and_still_texture_give_no_gains(truth, motion, ideal):
     noise = SensorNoise(photons=3000) if ideal else SensorNoise(calibration=truth)
     light = 0.25 * raw(pictures(motion, range(FRAMES)), "BGGR")
     assert measured(SpikeSensor(noise, seed=6).expose(light), "BGGR") is None
 
 
-def test_light_that_flickers(truth, recording):
+def test_flickering_light(truth, recording):
     lamp = 1 + 0.3 * torch.sin(torch.arange(FRAMES) * 2 * torch.pi / 160)
     light = 0.2 * raw(recording[0], "BGGR") * lamp[:, None, None]
     known = measured(SpikeSensor(SensorNoise(calibration=truth), seed=7).expose(light), "BGGR").calibration
@@ -117,11 +117,11 @@ def test_counts_do_not_depend_on_the_chunks(chunk):
 
 @pytest.mark.parametrize(("size", "pattern"), [((1, 1), None), ((1, 40), "BGGR"), ((5, 40), "BGGR")])
 @pytest.mark.parametrize("share", [0.0, 0.3])
-def test_where_nothing_can_be_seen_to_move(size, pattern, share):
+def test_recordings_without_visible_motion(size, pattern, share):
     spikes = torch.rand(260, *size, generator=chance(10)) < share
     ideal = Calibration(torch.ones(size), torch.zeros(size), torch.zeros(size, dtype=torch.uint8))
     assert measured(spikes, pattern, ideal) is None
 
 
-def test_segments_are_as_long_as_light_requires():
+def test_segment_length_follows_the_light():
     assert [segment_length(rate) for rate in (0.5, 0.1, 0.05, 0.02, 0.0)] == [20, 20, 40, 100, 200]

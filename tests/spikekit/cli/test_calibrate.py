@@ -47,7 +47,7 @@ def measured():
     assert main(["calibrate", "scene.dat", *HOW, "--flat", "wall.dat", "--dark", "cap.dat"]) == 0
 
 
-def test_it_lies_beside_the_recording_and_is_told(capsys, truth):
+def test_calibration_is_stored_beside_the_recording_and_reported(capsys, truth):
     measured()
     said = capsys.readouterr().out
     assert "gain         SD 9." in said
@@ -80,13 +80,13 @@ def test_pictures_are_corrected(command, capsys):
         assert corrected < error * (0.4 if "tfp" in method else 0.7)  # light between 1/2 and 1/3 is rounded by tfi
 
 
-def test_a_scene_alone_tells_defects(capsys, truth):
+def test_defects_are_found_in_a_scene(capsys, truth):
     assert main(["calibrate", "scene.dat", *HOW, "-o", "alone.safetensors"]) == 0
     assert read_calibration("alone.safetensors").flip().defects.equal(truth.defects)
     assert "gain         not measured in 300 frames: too little motion, or gains are" in capsys.readouterr().out
 
 
-def test_a_scene_in_motion_tells_gains(capsys, truth):
+def test_gains_are_found_in_a_moving_scene(capsys, truth):
     y, x, t = torch.meshgrid(torch.arange(24), torch.arange(32), torch.arange(400), indexing="ij")
     across, down = x - 0.06 * t, y - 0.04 * t
     light = 0.25 + sum(
@@ -113,7 +113,7 @@ def test_a_scene_in_motion_tells_gains(capsys, truth):
         (["wide.npz", "--flat", "short.npz"], 1, "short.npz: expected 8 x 10 pixels, the size of wide.npz, got 8 x 8"),
     ],
 )
-def test_what_is_wrong_is_said_in_a_line(args, status, said, fails):
+def test_errors_are_one_line(args, status, said, fails):
     save_file({"weight": torch.ones(3)}, "weights.safetensors")
     write("short.npz", torch.ones(50, 8, 8, dtype=torch.uint8))
     write("wide.npz", torch.ones(200, 8, 10, dtype=torch.uint8))
@@ -142,7 +142,7 @@ KIND = {"kind": "spikekit calibration 1"}
     ],
     ids=lambda value: "",
 )
-def test_a_file_that_is_no_calibration(tensors, metadata, said, fails):
+def test_invalid_calibration_files(tensors, metadata, said, fails):
     save_file(tensors, "bad.safetensors", metadata)
     error = fails(1, "decode", "scene.dat", *HOW, "-o", "x.png", "--calibration", "bad.safetensors")
     assert error.startswith("spikekit: bad.safetensors: ")

@@ -76,7 +76,7 @@ def test_cameras(capsys):
         (30, "none of 250 x 250, 250 x 400, 250 x 416, 1000 x 1000, 1000 x 1024 divides its 30 bytes exactly"),
     ],
 )
-def test_headerless_without_its_size(tmp_path, fails, size, expected):
+def test_headerless_recording_without_size(tmp_path, fails, size, expected):
     path = tmp_path / "a.dat"
     path.touch()
     os.truncate(path, size)
@@ -115,7 +115,7 @@ def test_decode(clip, tmp_path, capsys, method, least):
     ],
 )
 @pytest.mark.parametrize("frames", ["0:500:83", "498:", "250"])
-def test_pictures_are_those_of_the_whole_recording(tmp_path, capsys, name, words, decode, frames):
+def test_pictures_equal_those_of_the_whole_recording(tmp_path, capsys, name, words, decode, frames):
     """Of one frame or of many, under their numbers, by the decoder that the options ask for."""
     spikes = expose(torch.rand(12, 9) * 0.5 + 0.05, 500)
     write_spikes(tmp_path / name, spikes)
@@ -201,7 +201,7 @@ def test_frames_that_are_likely_upside_down_are_noted(tmp_path, capsys, size, wo
 
 
 @pytest.mark.parametrize("save", [np.save, np.savez])
-def test_time_that_is_not_first_is_said(tmp_path, capsys, save):
+def test_recording_with_time_last_is_noted(tmp_path, capsys, save):
     path = tmp_path / ("a.npy" if save is np.save else "a.npz")
     for shape, words, status in (
         ((250, 400, 90), [], 1),  # the size of a camera
@@ -265,7 +265,7 @@ def process(*words, **how):
     return subprocess.run([*COMMAND, *map(str, words)], stderr=subprocess.PIPE, text=True, timeout=120, **how)
 
 
-def test_names_do_nothing_to_a_terminal_and_need_no_encoding(clip, tmp_path):
+def test_control_characters_in_names_are_not_printed(clip, tmp_path):
     name = tmp_path / "r\x1b[31med ä.dat"
     name.write_bytes(clip.read_bytes())
     ascii_only = os.environ | {"PYTHONIOENCODING": "ascii"}
@@ -275,7 +275,7 @@ def test_names_do_nothing_to_a_terminal_and_need_no_encoding(clip, tmp_path):
     assert done.stdout.isascii()
 
 
-def test_output_that_nobody_reads_or_that_finds_no_room(clip):
+def test_broken_pipe_and_full_standard_output(clip):
     reader, writer = os.pipe()
     os.close(reader)
     done = process("info", *sized(clip), stdout=writer)
@@ -288,7 +288,7 @@ def test_output_that_nobody_reads_or_that_finds_no_room(clip):
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-def test_what_is_whole_stays_when_it_is_stopped(tmp_path, number, status):
+def test_complete_files_are_kept_when_interrupted(tmp_path, number, status):
     with open(tmp_path / "a.dat", "wb") as file:
         file.truncate(250 * 400 // 8 * 9000)  # minutes of work, and no room on the disk
     words = ["decode", *map(str, sized(tmp_path / "a.dat", 250, 400)), "--flip", "--frame", ":", "--alpha", "1"]

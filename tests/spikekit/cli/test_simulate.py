@@ -110,14 +110,14 @@ def test_the_whole_film(film, capsys):
     assert known.plan["intervals"] == [{"latent": 0, "region": None}] * 4
 
 
-def test_one_picture_stands_still(film):
+def test_single_picture_is_a_still_scene(film):
     simulate("film/f1.png", "-o", "a.dat", "--scale", 2)
     assert believed(Path("a.dat"))
     spikes = read_spikes("a.dat", 16, 18)
     assert (spikes.sum(0) - 41 * FrameSequence(frames(2)[1:], scale=2).light()[0]).abs().max() < 1
 
 
-def test_noise_that_changes_nothing_is_left_out_and_the_plan_can_be_given(film, capsys):
+def test_negligible_noise_is_left_out_and_the_plan_can_be_given(film, capsys):
     words = film, "--scale", 2, "--photons", 20, "--dark-current", 1e-9
     for plan, said, dark in (
         ("scene", "left out     dark_current", 0),
@@ -167,7 +167,7 @@ def test_a_sidecar_edited_by_hand(tmp_path, monkeypatch, fails, capsys, part, va
     assert main(["info", "a.dat", "--height", "4", "--width", "8"]) == 0  # without it
 
 
-def test_two_at_once(film):
+def test_two_processes_with_one_output(film):
     """Processes that write one name, and one process with as many threads as there are, give the same files."""
     words = ["simulate", str(film), *QUICK, "--photons", "30", "-o", "a.dat"]
     started = [sys.executable, "-c", "from spikekit.cli.command import main; raise SystemExit(main())", *words]
@@ -185,7 +185,7 @@ def test_two_at_once(film):
 
 
 @pytest.mark.parametrize("step", [0, 1, 4, 6, 7])
-def test_killed_while_it_publishes(film, monkeypatch, step):
+def test_process_killed_while_publishing(film, monkeypatch, step):
     """Between any two of the moves, what lies there is the old set, the new set, or not believed."""
     simulate(film, "-o", "a.dat", "--all", *QUICK)
     old = Path("a.dat").read_bytes()
@@ -204,7 +204,7 @@ def test_killed_while_it_publishes(film, monkeypatch, step):
     assert (Path("a.dat").read_bytes() == old) == (step == 0)
 
 
-def test_what_was_killed_is_removed_and_who_comes_second_waits(film):
+def test_leftovers_are_removed_and_a_second_process_waits(film):
     Path(".a.json.part/killed").mkdir(parents=True)
     done = []
     with published(Path("a.dat")) as running:
@@ -228,7 +228,7 @@ def test_a_full_disk(film, fails, full_disk, room, words, name):
     assert not list(Path().glob(".*"))
 
 
-def test_nothing_of_others_is_replaced(film, fails):
+def test_other_files_are_not_overwritten(film, fails):
     simulate(film, "-o", "a.dat", *QUICK)
     Path("b.json").write_text("{}")
     Path("c.dat").mkdir()
@@ -283,7 +283,7 @@ def calibrated(path, width=18):
     write_calibration(path, Calibration(gains, torch.zeros(16, width), defects))
 
 
-def test_the_pixels_of_a_sensor_that_was_measured(film, fails):
+def test_pixels_of_a_calibrated_sensor(film, fails):
     Path("cameras").mkdir()
     calibrated("cameras/one.safetensors")
     words = [film, "--frames", 400, "--frame", 2, "--clocks", 200, "--alpha", 0.8, *QUICK]

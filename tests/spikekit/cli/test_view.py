@@ -61,7 +61,7 @@ def moment(path, **known):
 # --- what is shown ----------------------------------------------------------------------------------------------------
 
 
-def test_the_pictures_are_those_of_the_decoders(moving):
+def test_pictures_equal_those_of_the_decoders(moving):
     """TFP and TFI of the middle, its motion, and the spikes of a row."""
     here = moment("a.dat", frames=101, size=(40, 48))
     spikes = recording.Recording(Path("a.dat"), 101, (40, 48)).read(0, 101)
@@ -80,7 +80,7 @@ def test_the_pictures_are_those_of_the_decoders(moving):
     assert max(green, blue) < 0.6
 
 
-def test_a_sheet_by_its_sidecar(still, capsys):
+def test_metadata_come_from_the_sidecar(still, capsys):
     """Size, Bayer phase and brightness are known; colours are those of the scene."""
     capsys.readouterr()
     view("a.dat", "-o", "made/a.png", "--window", 5, "--frames", "10:30")
@@ -96,7 +96,7 @@ def test_a_sheet_by_its_sidecar(still, capsys):
 
 
 @pytest.mark.parametrize(("shape", "value"), [((1, 1, 1), 0), ((1, 1, 1), 1), ((30, 40, 40), 0)])
-def test_little_to_see(tmp_path, monkeypatch, shape, value):
+def test_dim_short_and_small_recordings(tmp_path, monkeypatch, shape, value):
     """A few pixels, one frame, no spike, nothing but spikes: there is always a picture."""
     monkeypatch.chdir(tmp_path)
     write_spikes("a.npz", torch.full(shape, value))
@@ -158,7 +158,7 @@ def test_mistakes(still, fails, words, status, said):
 
 
 @pytest.mark.parametrize("words", [["view", "a.dat"], ["decode", "a.dat"], ["view", "b.dat"], ["view", "sub/../a.dat"]])
-def test_what_a_sidecar_names_is_not_written_over(still, capsys, words):
+def test_files_of_a_sidecar_are_not_overwritten(still, capsys, words):
     shutil.copy("a.dat", "b.dat")
     Path("sub").mkdir()
     truth = Path("a.png").read_bytes()

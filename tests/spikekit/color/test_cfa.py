@@ -37,7 +37,7 @@ def test_kornia_cfa(cfa):
     assert torch.equal(sk.bayer_mask(4, 6, cfa), sk.bayer_mask(4, 6, pattern))
 
 
-def test_a_phase_in_small_letters():
+def test_pattern_in_lower_case():
     assert sk.bayer_mask(4, 4, "grbg").equal(sk.bayer_mask(4, 4, "GRBG"))
     assert sk.BinToSensor("bggr", scale=2).pattern == "BGGR"
 
@@ -62,7 +62,7 @@ def test_bin_to_sensor(pattern, scale, lead):
         assert np.array_equal(raw.double().numpy(), expected)
 
 
-def test_bin_to_sensor_sums_wide():
+def test_bin_to_sensor_sums_in_float32():
     rgb = torch.full((3, 4, 4), 60000.0, dtype=torch.float16)
     assert sk.bin_to_sensor(rgb, scale=4).item() == rgb[0, 0, 0].item()
 
@@ -105,7 +105,7 @@ def test_errors(error, call):
         call()
 
 
-def test_split_colors_keeps_a_bad_pixel_to_its_colour():
+def test_split_colors_keeps_nan_in_its_plane():
     raw = torch.ones(2, 2)
     raw[0, 0] = float("nan")
     red, green, blue = sk.split_colors(raw)

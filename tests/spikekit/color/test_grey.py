@@ -12,7 +12,7 @@ FLOAT = torch.float64
 
 
 @pytest.mark.parametrize("scale", [1, 3])
-def test_all_pixels_of_a_grey_sensor_are_known_in_one_plane(scale):
+def test_mask_of_a_grey_sensor(scale):
     assert torch.equal(sk.bayer_mask(5, 4, "grey", scale=scale), torch.ones(1, 5 * scale, 4 * scale))
     assert sk.BayerMask("grey", scale=scale)(torch.zeros(2, 5, 4)).shape == (1, 5 * scale, 4 * scale)
 
@@ -36,7 +36,7 @@ def test_a_grey_picture_is_copied_in_any_type():
         sk.mosaic(torch.zeros(3, 4, 4, dtype=torch.uint8), "grey")
 
 
-def test_of_grey_there_is_nothing_to_split_or_to_fill_in():
+def test_grey_is_neither_split_nor_demosaiced():
     raw = torch.rand(2, 5, 7)
     assert torch.equal(sk.split_colors(raw, "grey"), raw[None])
     assert torch.equal(sk.demosaic(raw, "grey"), raw[:, None])
@@ -46,7 +46,7 @@ def test_of_grey_there_is_nothing_to_split_or_to_fill_in():
 
 
 @pytest.mark.parametrize("operator", [sk.split_bayer, sk.bayer_sites, sk.bayer_pattern])
-def test_what_needs_a_bayer_cell_refuses_grey(operator):
+def test_grey_is_rejected_if_a_bayer_cell_is_required(operator):
     given = [torch.zeros(2, 2)] if operator is sk.split_bayer else []
     with pytest.raises(ValueError, match=r"pattern: expected one of RGGB.*got 'grey'"):
         operator(*given, "grey")

@@ -61,7 +61,7 @@ def test_tfi_in_chunks(cuts, overlap, rate, seed):
     assert got[exact].equal(whole[exact])
 
 
-def test_pieces_come_as_soon_as_they_can():
+def test_pieces_are_returned_as_early_as_possible():
     """Nothing is read ahead, and nothing is yielded before its context is there."""
     read = []
 

@@ -54,7 +54,7 @@ def test_the_gradient_of_tfi_is_its_own_adjoint():
     assert torch.allclose(again, expected, rtol=1e-12, atol=1e-12)
 
 
-def test_tfp_forgets_what_has_left_the_window():
+def test_large_values_leave_no_error_in_the_running_sum_of_tfp():
     """A large number must not leave its rounding error behind."""
     spikes = torch.zeros(60, 1, 1)
     spikes[5], spikes[20:] = 1e8, 0.1

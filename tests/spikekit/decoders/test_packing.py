@@ -51,7 +51,7 @@ def test_torch_path(width):
 
 
 @pytest.mark.parametrize("value", [2, -1, 0.5, float("nan"), float("inf")])
-def test_other_values(value):
+def test_values_other_than_0_and_1(value):
     for dtype in (torch.float32, torch.bfloat16, torch.float64, *([torch.uint8] if value == 2 else [])):
         with pytest.raises(ValueError, match="expected zeros and ones"):
             pack_spikes(torch.tensor([[0, 1, value]], dtype=dtype))

@@ -22,7 +22,7 @@ def test_against_one_pixel_at_a_time(frames, rate, seed, data):
 
 
 @pytest.mark.parametrize("dtype", [torch.bool, torch.uint8, torch.int32, torch.float16, torch.bfloat16, torch.float64])
-def test_equals_that_frame_of_the_whole(dtype):
+def test_equals_the_frame_of_the_dense_decoder(dtype):
     spikes = (torch.rand(2, 3, 30, 4, 5) < torch.rand(4, 5) * 0.3).to(dtype)
     for frame in (0, 14, 29):
         for got, whole in [
@@ -46,7 +46,7 @@ def test_long_silence(frames):
         assert spike_interval_at(spikes, frame).equal(whole[frame])
 
 
-def test_looks_no_further_than_needed():
+def test_reads_only_the_frames_it_needs():
     """Frames outwards, until every pixel has fired on both sides."""
     spikes = np.zeros((100, 2, 2), np.uint8)
     spikes[[40, 44, 50, 53], :, :] = 1
@@ -70,7 +70,7 @@ def test_strides_batches_and_gradients():
 
 @pytest.mark.parametrize("window", [1, 11, 61])
 @pytest.mark.parametrize("order", [1, 2, 3])
-def test_mean_equals_that_frame_of_the_whole(window, order):
+def test_mean_equals_the_frame_of_the_dense_decoder(window, order):
     spikes = torch.rand(2, 3, 30, 4, 5, generator=torch.Generator().manual_seed(0)) < 0.3
     for dtype in (torch.bool, torch.uint8, torch.float16, torch.bfloat16, torch.float64):
         for frame in (0, 14, 29):

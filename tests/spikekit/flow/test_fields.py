@@ -54,7 +54,7 @@ def test_linear_motion(lead, scale):
             assert (offsets[..., n, :, :, :] == 0).all()
 
 
-def test_ends_of_the_times_by_default():
+def test_first_and_last_time_are_the_defaults():
     to_first, to_last = torch.randn(2, 1, 2, 2, 2)
     times = range(5, 36, 3)
     offsets = linear_motion(to_first, to_last, times)
@@ -95,7 +95,7 @@ def test_errors(error, call):
         ([2, 1, 0], ValueError, r"first, middle, last: expected increasing times, got 2.0, 1.0, 0.0"),
     ],
 )
-def test_times_that_are_none(times, error, message):
+def test_invalid_times_are_rejected(times, error, message):
     """In the function, and in the module before it is called."""
     for call in (lambda: linear_motion(FLOW, FLOW, times), lambda: LinearMotion(times)):
         with pytest.raises(error, match=message):

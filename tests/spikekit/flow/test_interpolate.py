@@ -44,7 +44,7 @@ ALL = [Still(), Blend(), FlowInterpolation()]
 
 @pytest.mark.parametrize("method", ALL, ids=lambda method: type(method).__name__)
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
-def test_the_ends_are_the_frames(method, dtype):
+def test_ends_are_the_frames_bit_for_bit(method, dtype):
     first, second = (frame.to(dtype) for frame in ends(panning(3.0, 1.0)))
     between = method(first, second)
     assert isinstance(between, Between)
@@ -58,7 +58,7 @@ def test_the_ends_are_the_frames(method, dtype):
 
 
 @pytest.mark.parametrize("method", ALL, ids=lambda method: type(method).__name__)
-def test_equal_frames_stay(method):
+def test_equal_frames_are_returned_unchanged(method):
     frame = texture(40, 50)
     between = method(frame, frame.clone())
     for tau in (0, 0.25, 0.5, 0.9, 1):
@@ -70,7 +70,7 @@ def test_equal_frames_stay(method):
 
 
 @pytest.mark.parametrize("method", ALL, ids=lambda method: type(method).__name__)
-def test_what_are_no_frames(method):
+def test_invalid_frames_are_rejected(method):
     frame = torch.rand(3, 20, 20)
     for first, second, name in (
         (frame[None], frame[None], "first"),
@@ -81,7 +81,7 @@ def test_what_are_no_frames(method):
             method(first, second)
 
 
-def test_flow_refuses_what_is_not_finite():
+def test_frames_with_nan_or_infinity_are_rejected():
     frame = torch.rand(3, 20, 20)
     hole = frame.clone()
     hole[0, 3, 3] = float("nan")
@@ -120,7 +120,7 @@ def test_known_translation(x, y):
         assert error.abs().mean() < 0.1
 
 
-def test_what_an_object_hides():
+def test_occluded_background():
     scene, tau = passing(), 0.25
     truth = scene.rgb(20 * tau)
     made, blend = (method(*ends(scene)).at(tau) for method in (FlowInterpolation(), Blend()))
@@ -141,14 +141,14 @@ def ball(radius, pixels):
 
 
 @pytest.mark.parametrize(("radius", "pixels", "tau", "least"), [(4, 10, 0.5, 40), (6, 16, 0.5, 34)])
-def test_a_ball_that_moves_farther_than_it_is_wide(radius, pixels, tau, least):
+def test_object_that_moves_farther_than_its_width(radius, pixels, tau, least):
     # half way, both frames show only background where the ball is: its motion must be carried there
     scene = ball(radius, pixels)
     assert psnr(FlowInterpolation()(*ends(scene)).at(tau), scene.rgb(20 * tau)) > least
 
 
 @pytest.mark.parametrize("gain", [0.5, 1.3])
-def test_light_that_changes_is_not_motion(gain):
+def test_changing_light_is_not_taken_for_motion(gain):
     scene = panning(2.0, 1.0)
     first, second = ends(scene)
     between = FlowInterpolation()(first * 0.7, second * 0.7 * gain)
@@ -159,7 +159,7 @@ def test_light_that_changes_is_not_motion(gain):
 # --- cuts, chance -----------------------------------------------------------------------------------------------------
 
 
-def test_a_cut_shows_the_nearer_frame():
+def test_at_a_cut_the_nearest_frame_is_shown():
     first, second = texture(80, 100, seed=0), texture(80, 100, seed=7)
     between = FlowInterpolation()(first, second)
     assert between.cut
@@ -170,14 +170,14 @@ def test_a_cut_shows_the_nearer_frame():
 
 
 @pytest.mark.parametrize("scene", [panning(10.0, -8.0), passing((3.0, 0.0), (-5.0, 0.0))])
-def test_motion_and_noise_are_no_cut(scene):
+def test_motion_and_noise_are_not_taken_for_a_cut(scene):
     noise = torch.randn(2, 3, scene.height, scene.width) * 0.03
     first, second = ends(scene)
     assert not FlowInterpolation()(first, second).cut
     assert not FlowInterpolation()((first + noise[0]).clamp(0, 1), (second + noise[1]).clamp(0, 1)).cut
 
 
-def test_the_same_whatever_the_threads():
+def test_result_does_not_depend_on_the_number_of_threads():
     first, second = ends(panning(2.3, 1.1, size=(101, 99)))
     made, before = [], torch.get_num_threads()
     try:

@@ -29,7 +29,7 @@ def stored(tmp_path, **changes):
     return path
 
 
-def test_presets_say_what_is_known():
+def test_presets():
     known = {name: camera(name) for name in CAMERAS}
     assert {name for name, c in known.items() if c.flip} == {"m1k40", "m1k40-bayer", "vidar"}
     assert all(c.source and c.title and c.rate == 20_000 for c in known.values())
@@ -43,7 +43,7 @@ def test_presets_say_what_is_known():
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_stored_frames_become_what_the_camera_saw(name):
+def test_stored_frames_are_prepared(name):
     """Number the pixels, store them as the camera does, and find them again."""
     known = camera(name)
     seen = torch.arange(known.height * known.width).reshape(1, known.height, known.width)
@@ -79,7 +79,7 @@ def test_pictures_are_shown_with_gain_and_gamma():
     assert camera("m1k40-bayer").display(picture.double()).dtype == torch.float64
 
 
-def test_a_camera_of_ones_own(tmp_path):
+def test_camera_from_a_json_file(tmp_path):
     own = camera(stored(tmp_path, drop=[[0, 2], [5, 6]], crop=[1, 2, 0, 3]))
     assert own == Camera(**{**PLAIN, "name": "own", "drop": ((0, 2), (5, 6)), "crop": (1, 2, 0, 3)})
     raw = torch.arange(11).expand(6, 11)
@@ -100,7 +100,7 @@ def test_a_camera_of_ones_own(tmp_path):
         ('{"title": "a', "line 1"),
     ],
 )
-def test_a_file_that_describes_no_camera_says_why(tmp_path, given, message):
+def test_invalid_camera_files(tmp_path, given, message):
     path = tmp_path / "own.json"
     path.write_text(
         given if isinstance(given, str) else json.dumps(PLAIN | given if isinstance(given, dict) else given)

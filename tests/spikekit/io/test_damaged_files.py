@@ -202,7 +202,7 @@ def test_a_header_of_gigabytes_is_not_read(tmp_path):
         (lambda path: read_spikes(path, 4, 4), "a.dat"),
     ],
 )
-def test_a_pipe_is_not_waited_for(read, name, tmp_path):
+def test_pipes_are_rejected(read, name, tmp_path):
     os.mkfifo(tmp_path / name)
     with pytest.raises((ValueError, FileNotFoundError), match=f"{name}: ") as refused:
         read(tmp_path / name)
@@ -252,7 +252,7 @@ def test_folders_of_pictures(fuzz, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.bmp", "a.tif", "deep.tiff", "a.dat", "a.npz"])
-def test_a_few_bytes_that_claim_a_large_picture_or_frame(name, tmp_path, monkeypatch):
+def test_small_files_that_claim_huge_pictures_are_rejected(name, tmp_path, monkeypatch):
     """What is refused by its header takes no memory; a packed file of 260 kB could hold a frame of gigabytes."""
     read, make, error, _ = FILES[name]
     make(tmp_path / name)

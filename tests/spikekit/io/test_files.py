@@ -52,7 +52,7 @@ def test_bits_by_hand(tmp_path):
 @pytest.mark.parametrize("name", ["a.dat", "a.npy", "a.NPZ"])
 @pytest.mark.parametrize("width", [1, 5, 16])
 @pytest.mark.parametrize("flip", [False, True])
-def test_what_is_written_is_read_whole_and_in_parts(tmp_path, name, width, flip):
+def test_write_and_read_whole_and_in_parts(tmp_path, name, width, flip):
     """At once, in chunks of several types or frame by frame; unpacked or packed; all of it, a part, or in chunks."""
     spikes = random_spikes(11, 3, width).transpose(1, 2).contiguous().transpose(1, 2)
     dtypes = [torch.bool, torch.float32, torch.int64, torch.bfloat16, torch.float16, torch.float64] * 2
@@ -177,12 +177,12 @@ def test_wrong_files_and_sizes(clip, read):
         ({"frames": 6}, SpikeFileError, "got 6 from frame 0 on"),
     ],
 )
-def test_frames_that_are_not_there(clip, options, error, message):
+def test_frames_out_of_range(clip, options, error, message):
     with pytest.raises(error, match=message):
         iter_spikes(clip, **{"height": 3, "width": 5} | options)
 
 
-def test_truncated_while_it_is_read(clip):
+def test_file_truncated_while_it_is_read(clip):
     frames = iter_spikes(clip, 3, 5)
     clip.write_bytes(b"")
     with pytest.raises(SpikeFileError, match=r"clip\.dat: truncated while it was read, at frame 0"):
@@ -204,7 +204,7 @@ def test_truncated_while_it_is_read(clip):
         ("chunks", FileNotFoundError, "'picture_7.png'"),  # what the chunks raise stays as it is
     ],
 )
-def test_what_cannot_be_written_leaves_the_old_file(tmp_path, name, spikes, error, message):
+def test_failed_write_keeps_the_old_file(tmp_path, name, spikes, error, message):
     write_spikes(tmp_path / name, old := random_spikes(3, 4, 5))
     with pytest.raises(error, match=message):
         write_spikes(tmp_path / name, map(open, ["picture_7.png"]) if isinstance(spikes, str) else spikes)
@@ -213,7 +213,7 @@ def test_what_cannot_be_written_leaves_the_old_file(tmp_path, name, spikes, erro
 
 
 @pytest.mark.skipif(not SPIKES.is_dir(), reason="the shared recordings are not beside the repository")
-def test_the_fields_own_recordings(tmp_path):
+def test_public_recordings(tmp_path):
     file = SPIKES / "reds_sim_mono_203_250x400.dat"
     spikes = read_spikes(file, 250, 400, flip=True)
     assert spikes.shape == (301, 250, 400)

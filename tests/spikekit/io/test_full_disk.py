@@ -32,12 +32,12 @@ def calibration(path):
         *((f"a{ending}", film) for ending in (".mp4", ".mov", ".mkv", ".gif")),
     ],
 )
-def test_a_file_stays_whole(name, write, stays_whole):
+def test_existing_file_is_kept(name, write, stays_whole):
     stays_whole(name, write)
 
 
 @pytest.mark.parametrize("words", [("decode", "--method", "tfi"), ("view", "--window", "9")])
-def test_a_command_leaves_nothing_half_written(words, stays_whole, tmp_path_factory, capsys):
+def test_commands_leave_no_partial_files(words, stays_whole, tmp_path_factory, capsys):
     clip = tmp_path_factory.mktemp("clip") / "clip.npz"
     write_spikes(clip, SPIKES[:9])
 

@@ -100,7 +100,7 @@ def test_portable_maps_of_any_depth(tmp_path, kind, most):
 
 @pytest.mark.parametrize("ending", ["png", "jpg", "webp"])
 @pytest.mark.parametrize("turned", TURNED)
-def test_pictures_stand_as_their_exif_says(tmp_path, ending, turned):
+def test_exif_orientation_is_applied(tmp_path, ending, turned):
     exif = Image.Exif()
     exif[274] = turned
     Image.fromarray(np.kron(numbers(8, 3), np.ones((16, 16, 1), np.uint8))).save(tmp_path / f"a.{ending}", exif=exif)
@@ -147,7 +147,7 @@ def test_pngs_of_every_mode(tmp_path, mode, color, expected):
 
 @pytest.mark.parametrize(("ending", "bits"), [("png", 8), ("bmp", 8), ("ppm", 8), ("png", 16), ("TIFF", 16)])
 @pytest.mark.parametrize("shape", [(3, 6, 9), (6, 9)])
-def test_what_is_written_is_read(tmp_path, ending, bits, shape):
+def test_write_and_read(tmp_path, ending, bits, shape):
     image = torch.randint(0, 1 << bits, shape) / (2**bits - 1)
     write_picture(tmp_path / "made" / "on the way" / f"a.{ending}", image, bits=bits)
     reads(tmp_path / "made" / "on the way" / f"a.{ending}", image.expand(3, 6, 9).numpy(), 1e-6)
@@ -182,7 +182,7 @@ def test_pngs_carry_notes_and_quality_makes_jpegs_larger(tmp_path):
         *(("a.png", shape, {}, "image") for shape in ((4,), (1, 4, 4), (2, 3, 4, 4))),
     ],
 )
-def test_what_cannot_be_written(tmp_path, name, shape, how, said):
+def test_invalid_pictures_are_not_written(tmp_path, name, shape, how, said):
     with pytest.raises(ValueError, match=said):
         write_picture(tmp_path / name, torch.zeros(shape), **how)
     with pytest.raises(FileNotFoundError, match=name):

@@ -85,7 +85,7 @@ def test_a_folder_is_a_lazy_sequence(tmp_path, opened):
     assert (len(only), only.names, number(only[0])) == (1, ["f7.png"], 7)
 
 
-def test_natural_order_and_what_is_no_picture(tmp_path):
+def test_natural_order_and_ignored_files(tmp_path):
     names = ["a1b2.png", "a1b10.bmp", "a2.JPG", "a010.tif", "a11.jpeg", "b.png"]
     folder_of(tmp_path, names)
     folder_of(tmp_path, [".hidden.png", "deeper/a0.png"])
@@ -123,7 +123,7 @@ def test_a_damaged_picture_in_the_middle(tmp_path):
         assert frames[3].shape == (3, 40, 50)
 
 
-def test_what_is_no_film(tmp_path, monkeypatch):
+def test_invalid_films_are_rejected(tmp_path, monkeypatch):
     fails(tmp_path / "nothing", "no such file")
     fails(tmp_path, "expected pictures", "none")
     folder_of(tmp_path, ["walk/0.png", "city/0.png"])
@@ -209,7 +209,7 @@ assert frames[4].equal(in_order[4]), "the parent"
 """
 
 
-def test_a_fork_leaves_its_parent_where_it_was(tmp_path):
+def test_fork_does_not_disturb_its_parent(tmp_path):
     film = write_film(tmp_path / "a.mkv", codec="ffv1")
     done = subprocess.run([sys.executable, "-c", FORK, film], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -234,7 +234,7 @@ def test_threads_share_a_film(tmp_path):
 
 
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])
-def test_a_film_of_a_phone_is_upright(tmp_path, turns):
+def test_rotated_film_is_upright(tmp_path, turns):
     """As the matrix in its header says: by so many quarter turns clockwise."""
     seen = torch.linspace(0.2, 0.8, SIZE[0] * SIZE[1]).reshape(1, *SIZE).expand(3, -1, -1)
     write_video(tmp_path / "a.mp4", [seen] * 3)
@@ -256,7 +256,7 @@ def test_ten_bits_keep_their_depth(tmp_path):
     assert level_of(frames[11]) == pytest.approx(11, abs=0.1)
 
 
-def test_a_film_that_is_cut_off(tmp_path):
+def test_truncated_film(tmp_path):
     """What came before stays usable, and what is missing is told, not left out, each time."""
     write_film(tmp_path / "a.avi", codec="ffv1")
     write_film(tmp_path / "a.mp4", bf="0")
@@ -296,7 +296,7 @@ def decoded(path):
 @pytest.mark.parametrize(
     ("ending", "size"), [("mp4", (34, 48)), ("mov", (34, 48)), ("mkv", (34, 48)), ("gif", (33, 47))]
 )
-def test_a_film_has_the_frames_in_their_colours(tmp_path, ending, size):
+def test_written_film_has_the_colours_of_its_frames(tmp_path, ending, size):
     frames = dusk(12)
     write_video(tmp_path / "new" / f"dusk.{ending}", frames, fps=10)
     found, fps = decoded(tmp_path / "new" / f"dusk.{ending}")
@@ -308,7 +308,7 @@ def test_a_film_has_the_frames_in_their_colours(tmp_path, ending, size):
 
 
 @pytest.mark.parametrize("ending", ["mp4", "gif"])
-def test_frames_are_asked_for_one_by_one_and_let_go(tmp_path, ending):
+def test_frames_are_consumed_one_by_one(tmp_path, ending):
     alive, most = weakref.WeakSet(), 0
 
     def frames():
@@ -323,7 +323,7 @@ def test_frames_are_asked_for_one_by_one_and_let_go(tmp_path, ending):
     assert most <= 3
 
 
-def test_what_cannot_be_a_film_is_one_line_and_leaves_nothing(tmp_path, monkeypatch):
+def test_failed_film_gives_one_line_and_no_file(tmp_path, monkeypatch):
     good = dusk(2)
     (tmp_path / "file").touch()
     for path, frames, fps, error, said in (
@@ -343,7 +343,7 @@ def test_what_cannot_be_a_film_is_one_line_and_leaves_nothing(tmp_path, monkeypa
 
 
 @pytest.mark.parametrize("fps", [np.float32(25), np.int64(25), Fraction(25), torch.tensor(25.0)])
-def test_frames_a_second_are_any_kind_of_number_and_frames_may_be_bytes(tmp_path, fps):
+def test_fps_of_any_numeric_type_and_uint8_frames(tmp_path, fps):
     write_video(tmp_path / "a.mp4", frames := dusk(2), fps=fps)
     assert read_video(tmp_path / "a.mp4").fps == 25
     write_video(tmp_path / "b.mp4", [(255 * frame).round().to(torch.uint8) for frame in frames])

@@ -31,7 +31,7 @@ def files(folder):
     return {path.name: path.read_bytes() for path in Path(folder).iterdir()}
 
 
-def test_it_appears_when_it_is_complete(tmp_path):
+def test_file_appears_when_it_is_complete(tmp_path):
     with whole_file(tmp_path / "deep" / "er" / "a.bin") as file:
         file.write(b"one")
         file.flush()
@@ -43,7 +43,7 @@ def test_it_appears_when_it_is_complete(tmp_path):
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit, "fsync", "replace"])
-def test_an_error_or_a_full_disk_leaves_what_was_there(tmp_path, monkeypatch, error):
+def test_error_or_full_disk_keeps_the_old_file(tmp_path, monkeypatch, error):
     def fail(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -60,7 +60,7 @@ def test_an_error_or_a_full_disk_leaves_what_was_there(tmp_path, monkeypatch, er
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-def test_two_writers_that_are_killed(tmp_path):
+def test_two_killed_writers(tmp_path):
     """At random moments, seeded: the file is always one of theirs, whole, and their leftovers go."""
     target = tmp_path / "a.bin"
     chance = random.Random(24)
@@ -88,7 +88,7 @@ def test_two_writers_that_are_killed(tmp_path):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="locks of POSIX")
-def test_leftovers_go_but_not_what_is_being_written(tmp_path):
+def test_leftovers_are_removed_but_not_files_in_use(tmp_path):
     for n in (0, 3):
         (tmp_path / f".a[1].bin.{n}.part").write_bytes(b"left")
     (tmp_path / ".a1.bin.0.part").write_bytes(b"another's")
@@ -122,7 +122,7 @@ def test_modes_links_and_pipes(tmp_path):
     assert (tmp_path / "pipe").is_fifo()
 
 
-def test_what_cannot_be_written(tmp_path):
+def test_unwritable_paths(tmp_path):
     (tmp_path / "file").touch()
     for name in ("", "file/a"):
         with pytest.raises(OSError, match=str(tmp_path / name)), whole_file(tmp_path / name):
@@ -130,7 +130,7 @@ def test_what_cannot_be_written(tmp_path):
     assert files(tmp_path) == {"file": b""}
 
 
-def test_a_name_as_long_as_names_can_be(tmp_path):
+def test_longest_possible_name(tmp_path):
     for name in ("a" * 255, "ä" * 127):
         with whole_file(tmp_path / name) as file:
             file.write(b"1")

@@ -9,7 +9,7 @@ from numba import config
 from spikekit.kernels.compiled import compiled
 
 
-def test_a_full_disk_keeps_no_loop_from_being_compiled(full_disk, tmp_path, monkeypatch):
+def test_loops_compile_on_a_full_disk(full_disk, tmp_path, monkeypatch):
     def loop(x):
         return x + 1
 

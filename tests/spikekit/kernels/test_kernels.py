@@ -68,7 +68,7 @@ ARGUMENTS = {
 
 @of_the_cpu
 @pytest.mark.parametrize("name", ARGUMENTS)
-def test_the_kernel_is_what_runs(name, monkeypatch, without_kernels):
+def test_registered_kernel_runs(name, monkeypatch, without_kernels):
     def stop(*_):
         raise InterruptedError
 
@@ -80,7 +80,7 @@ def test_the_kernel_is_what_runs(name, monkeypatch, without_kernels):
 
 
 @of_the_cpu
-def test_the_compiler_is_kept_out():
+def test_operators_do_not_import_the_compiler():
     traced = []
 
     def inside(x):
@@ -142,7 +142,7 @@ def test_gradients(run, dtype):
             check(run, "tfp_grad", grad, window, 2.0, dtype, atol=64 * torch.finfo(dtype).eps)
 
 
-def test_what_is_no_bit(run):
+def test_nonbinary_spikes(run):
     """Any value but 0 is a spike of TFI, and TFP adds up what there is."""
     for spikes in (torch.tensor([0.0, -0.0, 1e-45, float("nan"), -2.0, 0.0]), torch.tensor([0, 2**40, 0])):
         check(run, "spike_interval", spikes.reshape(-1, 1, 1))

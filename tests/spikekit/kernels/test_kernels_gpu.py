@@ -1,7 +1,7 @@
 """The GPU kernels: by Triton's interpreter on the CPU, compiled where there is no GPU, and on a GPU where there is one.
 
 Triton decides when it is imported whether it interprets, so that the tests of what kernels compute run in a process of
-their own: :func:`test_by_the_interpreter`. Where there is a GPU they run on it as well.
+their own: :func:`test_in_the_triton_interpreter`. Where there is a GPU they run on it as well.
 """
 
 import os
@@ -25,7 +25,7 @@ from spikekit.kernels import gpu  # noqa: E402
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 DEVICE = "cpu" if INTERPRETED else "cuda"
 computes = pytest.mark.skipif(
-    not INTERPRETED and not torch.cuda.is_available(), reason="no GPU; test_by_the_interpreter runs it on the CPU"
+    not INTERPRETED and not torch.cuda.is_available(), reason="no GPU; see test_in_the_triton_interpreter"
 )
 FLOATS = [torch.float64, torch.float32, torch.bfloat16, torch.float16]
 
@@ -35,7 +35,7 @@ def version(package):
 
 
 @pytest.mark.skipif(INTERPRETED, reason="this is the interpreter")
-def test_by_the_interpreter():
+def test_in_the_triton_interpreter():
     if version(triton) < (3, 7) and version(np) >= (2, 4):
         pytest.skip("the interpreter of this Triton does not know this NumPy")
     files = [Path(__file__).with_name(name) for name in ("test_kernels.py", "test_kernels_gpu.py")]
@@ -116,7 +116,7 @@ def test_weighted(sizes, dtype, last):
 
 
 @computes
-def test_sums_in_any_order_are_refused_where_there_must_be_one():
+def test_atomic_sums_are_not_used_in_deterministic_mode():
     _, grad, index, weight = gathering(GATHERS[1], torch.float32)
     torch.use_deterministic_algorithms(True)
     try:

@@ -29,7 +29,7 @@ def profile_of(first, second, motion=None, **settings):
 MOVING = SceneProfile((64, 64), 20, 0.0, (0, 0, 64, 64), 0.1, 0.02)
 
 
-def test_where_nothing_changes_there_is_no_region():
+def test_static_scene_has_no_region():
     picture = torch.rand(3, 16, 24)
     profile = profile_of(picture, picture)
     assert (profile.static, profile.region, profile.displacement, profile.blending) == (1, None, 0, 0)
@@ -41,7 +41,7 @@ def test_displacement_is_in_sensor_pixels_per_clock():
     assert profile.displacement == pytest.approx(2 * 1.25 / 10)
 
 
-def test_only_what_changes_is_looked_at():
+def test_motion_is_estimated_only_around_changes():
     first = torch.rand(3, 160, 160)
     second = first.clone()
     second[:, 81:97, 60:62] = 1 - second[:, 81:97, 60:62]
@@ -55,13 +55,13 @@ def test_only_what_changes_is_looked_at():
 
 
 @pytest.mark.parametrize(("change", "static"), [(0.9, 1.0), (1.1, 0.0)])
-def test_a_change_below_the_tolerance_is_none(change, static):
+def test_change_below_the_tolerance_is_ignored(change, static):
     first = torch.full((3, 16, 16), 0.5)
     step = change * 0.05 * 0.2 / 20 / 0.4  # of the charge of 20 clocks, per spike
     assert profile_of(first, first + step).static == static
 
 
-def test_a_gain_is_no_motion():
+def test_gain_is_not_taken_for_motion():
     first = 0.2 + 0.3 * torch.rand(3, 32, 32)
     seen = []
 
@@ -83,7 +83,7 @@ def test_a_gain_is_no_motion():
         ((64, 64), np.s_[0, :, :4], 30.0, False, 1.0),  # there and back do not meet
     ],
 )
-def test_flow_that_does_not_count(shape, where, flow, back, typical):
+def test_inconsistent_or_invisible_flow_is_ignored(shape, where, flow, back, typical):
     first, second = torch.rand(2, 3, *shape).unbind()
     if where == np.s_[0, :, 10:]:
         first[..., 24:], second[..., 24:] = 0.5, 0.7  # flat, and brighter at the next frame
@@ -107,7 +107,7 @@ def test_blending_along_a_diagonal():
 
 
 @pytest.mark.parametrize("backward", [torch.ones(2, 16, 16), None])
-def test_where_motion_is_not_found_everything_is_modelled(backward):
+def test_everything_is_modelled_if_motion_is_not_found(backward):
     first, second = torch.rand(2, 3, 64, 64).unbind()
     forward = None if backward is None else torch.ones(2, 16, 16)  # there and back do not meet, or there is no flow
     profile = profile_of(first, second, lambda one, other: SimpleNamespace(forward=forward, backward=backward))
@@ -124,7 +124,7 @@ def test_steps_stay_below_a_fraction_of_a_pixel(displacement, step, latent):
     assert displacement * 20 / (plan.latent + 1) <= step
 
 
-def test_detail_asks_for_more_frames():
+def test_fine_detail_requires_more_latent_frames():
     assert replace(MOVING, blending=0.05 * 36).plan().latent == 5
     assert replace(MOVING, blending=0.05 * 36.1).plan().latent == 6
     assert replace(MOVING, blending=0.05 * 36).plan(spike_tolerance=0.2).latent == 3

@@ -96,7 +96,7 @@ def test_light_is_the_binned_view(pattern, scale):
 
 
 @pytest.mark.parametrize("frames", [1, 4, 41])
-def test_middle_is_the_pictures_own_pixels(frames):
+def test_middle_shows_the_original_pixels(frames):
     g = torch.Generator().manual_seed(3)
     picture, thing = torch.rand(3, 33, 50, generator=g), torch.rand(3, 6, 8, generator=g)
     motion = Motion((0.3, 0.7), 0.01, 1.01, (11.3, 7.7))
@@ -144,7 +144,7 @@ def test_flow_at_the_sensor_is_flow_at_the_centre_of_its_block(scale):
     torch.testing.assert_close(up[inner], fine[inner], atol=1e-9, rtol=0)
 
 
-def test_flow_is_that_of_the_object_on_top():
+def test_flow_of_the_topmost_object():
     ground = Layer(torch.rand(3, 40, 40), Motion((0.1, 0.0)))
     low = Layer(torch.rand(3, 16, 16), Motion((0.0, 0.2)), (8, 8), torch.ones(16, 16))
     high = Layer(torch.rand(3, 8, 8), Motion((-0.3, 0.0)), (8, 8), torch.ones(8, 8))

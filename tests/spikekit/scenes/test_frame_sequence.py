@@ -71,7 +71,7 @@ def moving(x, y=0.0, frames=3, size=64, scale=2, **settings):
 # --- truth and light --------------------------------------------------------------------------------------------------
 
 
-def test_truth_is_the_frame_from_the_top_left():
+def test_ground_truth_is_the_frame_cropped_from_the_top_left():
     frames = [torch.rand(3, 37, 50) for _ in range(3)]
     film = FrameSequence(frames, scale=3)
     assert (film.height, film.width, film.clock_count) == (36, 48, 41)
@@ -82,7 +82,7 @@ def test_truth_is_the_frame_from_the_top_left():
 
 @pytest.mark.parametrize("pattern", ["RGGB", "GBRG"])
 @pytest.mark.parametrize("latent", [1, 2, 19])
-def test_light_is_that_of_latent_frames_blended(pattern, latent):
+def test_light_is_blended_between_latent_frames(pattern, latent):
     frames = [torch.rand(3, 16, 12) for _ in range(3)]
     film = FrameSequence(frames, scale=2, pattern=pattern, alpha=0.7, interpolation=Fade(), plan=Plan(latent))
     light = film.light()
@@ -106,7 +106,7 @@ def test_light_is_that_of_latent_frames_blended(pattern, latent):
         assert light[7].equal(knot(0, 7))
 
 
-def test_a_region_is_interpolated_and_the_rest_blended():
+def test_region_is_interpolated_and_the_rest_blended():
     frames, interpolation = [torch.rand(3, 32, 48) for _ in range(2)], Fade()
 
     def light(plan):
@@ -121,7 +121,7 @@ def test_a_region_is_interpolated_and_the_rest_blended():
     assert part.equal(blended)
 
 
-def test_spans_change_nothing():
+def test_result_does_not_depend_on_spans():
     film = moving(3.0, frames=4)
     whole = film.light()
     assert whole.shape == (61, 32, 32)
@@ -130,7 +130,7 @@ def test_spans_change_nothing():
         assert film.light(first, count).equal(whole[first : first + count])
 
 
-def test_frames_are_read_when_they_are_needed():
+def test_frames_are_read_lazily():
     class Frames(list):
         read = ()
 
@@ -163,7 +163,7 @@ def test_a_static_film_costs_no_interpolation():
     assert light.equal(light[:1].expand_as(light))
 
 
-def test_a_cut_is_a_cut():
+def test_cut_shows_the_nearest_frame():
     frames = [smooth(64, 64, seed=n) for n in range(2)]
     light = FrameSequence(frames, scale=2).light()
     assert light[:10].equal(light[:1].expand(10, -1, -1))
@@ -181,7 +181,7 @@ def test_interpolations_without_motion_need_no_profile(interpolation):
 
 
 @pytest.mark.parametrize(("pixels", "latent"), [(0.9, 1), (2.4, 4), (4.9, 9)])
-def test_a_film_gets_the_frames_that_its_motion_requires(pixels, latent):
+def test_number_of_latent_frames_follows_the_motion(pixels, latent):
     film = moving(pixels, cut=0.03)
     film.light(0, 21)
     assert film.plan(0).latent == latent
@@ -210,7 +210,7 @@ def changed(light, other):
 @pytest.mark.parametrize("cut", [0.05, 0.5])
 @pytest.mark.parametrize("pixels", [0.2, 0.7, 6.0])
 @pytest.mark.parametrize("tolerance", [0.05, 0.01])
-def test_plans_keep_the_tolerance(pixels, cut, tolerance):
+def test_planned_streams_stay_within_the_tolerance(pixels, cut, tolerance):
     planned = moving(pixels, pixels / 3, cut=cut, spike_tolerance=tolerance, frames=3)
     everything = moving(pixels, pixels / 3, cut=cut, plan=Plan.everything(20))
     share, streams = changed(planned.light(), everything.light())
@@ -223,7 +223,7 @@ def test_plans_keep_the_tolerance(pixels, cut, tolerance):
 
 @pytest.mark.parametrize("cut", [0.08, 0.3])
 @pytest.mark.parametrize("pixels", [0.3, 0.6])
-def test_the_estimate_of_what_blending_changes(pixels, cut):
+def test_estimated_error_of_blending(pixels, cut):
     blended = moving(pixels, cut=cut, plan=Plan())
     found = changed(blended.light(), moving(pixels, cut=cut, plan=Plan.everything(20)).light())[0]
     assert found < blended.profile(0).blending < 5 * found
@@ -232,7 +232,7 @@ def test_the_estimate_of_what_blending_changes(pixels, cut):
 # --- flow, clips, spikes ----------------------------------------------------------------------------------------------
 
 
-def test_flow_is_that_of_the_scene():
+def test_flow_equals_that_of_the_scene():
     """Motion to the right and down, in sensor pixels, from the frame on and back, over two intervals."""
     motion = Motion((0.3, -0.15))
     scene = Scene([Layer(torch.rand(3, 80, 80), motion, (-20, -20))], 32, 32, frames=41)
@@ -243,7 +243,7 @@ def test_flow_is_that_of_the_scene():
         torch.testing.assert_close(film.clip(2).flow(clock), scene.flow(clock, scale=4), atol=1e-5, rtol=0)
 
 
-def test_flows_are_followed():
+def test_flows_of_several_intervals_are_concatenated():
     """Where the second interval's flow differs from place to place, it counts at the place that was moved to."""
     far = torch.zeros(2, 8, 32)
     far[0] = torch.arange(32.0)
@@ -279,7 +279,7 @@ def test_a_clip_is_a_scene():
         clip.rgb(19)
 
 
-def test_spikes_are_those_of_the_whole(tmp_path):
+def test_spikes_of_a_span_equal_those_of_the_whole(tmp_path):
     film, noise = moving(2.0), SensorNoise(photons=100.0, dark_current=0.01)
     whole = SpikeSensor(noise, seed=3).expose(film.light())
     for chunk in (1, 16, 64):

@@ -35,7 +35,7 @@ def test_grey_light_is_the_luminance_of_the_view(scale, channels):
         torch.testing.assert_close(light[clock], expected, rtol=1e-5, atol=1e-6)
 
 
-def test_scenes_of_grey_pictures_are_those_of_their_colours():
+def test_grey_pictures_equal_colour_pictures_with_equal_channels():
     torch.testing.assert_close(_scene(1).light("grey", scale=2), _scene(3).light("grey", scale=2), rtol=1e-5, atol=1e-6)
     assert torch.equal(_scene(1).flow(8, scale=2), _scene(3).flow(8, scale=2))
 

@@ -29,7 +29,7 @@ def loop(light, threshold, charge):
 @pytest.mark.parametrize("threshold", [0.3, 1, 7])
 @pytest.mark.parametrize("most", [0.2, 5])
 @pytest.mark.parametrize("lead", [(), (2, 1)])
-def test_loop(dtype, threshold, most, lead):
+def test_against_a_loop(dtype, threshold, most, lead):
     rng = np.random.default_rng(0)
     light = (rng.random((*lead, 17, 3, 2)) * most * threshold).astype(dtype)
     start = (rng.random((*lead, 3, 2)) * threshold * 0.99).astype(dtype)
@@ -95,7 +95,7 @@ def test_chunks_equal_one_run(data, threshold, dtype):
     assert torch.equal(left, charge)
 
 
-def test_charge_that_comes_in_gets_no_gradient():
+def test_initial_charge_gets_no_gradient():
     light = torch.rand(4, 2, 2, requires_grad=True)
     start = torch.rand(2, 2, requires_grad=True)
     spikes, charge = spike_integrate_fire(light, charge=start)

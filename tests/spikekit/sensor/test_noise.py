@@ -43,7 +43,7 @@ def close(values, expected, deviation):
 # What happens without noise
 
 
-def test_without_noise_nothing_is_done():
+def test_without_noise_light_and_spikes_are_unchanged():
     light = torch.rand(30, 9, 7)
     start = torch.rand(9, 7, generator=chance(3))
     expected, _ = spike_integrate_fire(light, charge=start)
@@ -55,7 +55,7 @@ def test_without_noise_nothing_is_done():
     assert 0 <= start.min() <= start.max() < 1
 
 
-def test_pixels_begin_with_a_charge_that_noise_does_not_move():
+def test_initial_charge_does_not_depend_on_noise():
     dark = torch.zeros(1, 80, 80)
     for noise in (SensorNoise(), *NOISES):
         sensor = SpikeSensor(noise, threshold=2.0, seed=5)
@@ -73,7 +73,7 @@ def test_pixels_begin_with_a_charge_that_noise_does_not_move():
 
 
 @pytest.mark.parametrize("threshold", [1.0, 2.5])
-def test_photons_have_the_mean_and_variance_of_poisson(threshold):
+def test_photon_noise_has_poisson_mean_and_variance(threshold):
     light = torch.full((60, 50, 50), 0.3 * threshold)
     found = arriving(SensorNoise(photons=20.0), light, threshold=threshold).double() * 20 / threshold
     counts = found.round()
@@ -96,7 +96,7 @@ def test_dark_current_adds_its_charge(threshold):
 
 
 @pytest.mark.parametrize("spread", [0.05, 0.4, 2.0])
-def test_pixels_spread_around_their_mean_and_stay_as_they_are(spread):
+def test_fixed_pattern_has_the_given_spread_and_is_constant(spread):
     light = torch.full((3, 300, 300), 0.3)
     gain = arriving(SensorNoise(gain_spread=spread), light) / light
     dark = arriving(SensorNoise(dark_current=0.1, dark_spread=spread), light * 0) / 0.1
@@ -133,7 +133,7 @@ def test_hot_pixels_always_fire_and_dead_ones_never():
 # Together
 
 
-def test_a_source_switched_on_leaves_the_others_alone():
+def test_sources_of_noise_are_independent():
     light, without = torch.rand(6, 40, 40), dict.fromkeys(("dark_current", "dark_spread", "gain_spread"), 0.0)
     photons = arriving(dataclasses.replace(EVERYTHING, **without), light)
     electrons = arriving(dataclasses.replace(EVERYTHING, gain_spread=0.0), light * 0)
@@ -157,7 +157,7 @@ def test_a_source_switched_on_leaves_the_others_alone():
     threshold=st.sampled_from([1.0, 0.7]),
     dtype=st.sampled_from([torch.float32, torch.float64, torch.float16]),
 )
-def test_chunks_make_the_whole(noise, cuts, threshold, dtype):
+def test_chunks_equal_one_run(noise, cuts, threshold, dtype):
     light = torch.rand(24, 5, 6, generator=chance(2)).to(dtype) * threshold
     settings = {"threshold": threshold, "seed": 7}
     whole = SpikeSensor(noise, **settings)
@@ -202,7 +202,7 @@ def test_seeds_repeat_and_differ():
         ("dead", SensorNoise(dead=0.2), 0.9),
     ],
 )
-def test_bits_change_as_foretold(source, noise, reached, light):
+def test_predicted_changes_bound_simulated_ones(source, noise, reached, light):
     rest = SensorNoise(photons=noise.photons if source != "photons" else None)
     for frames, pixels in ((2, 400), (41, 200)):
         lights = torch.full((frames, pixels, pixels), light)
@@ -218,7 +218,7 @@ def test_bits_change_as_foretold(source, noise, reached, light):
         assert (counts + left).abs().mean() == pytest.approx(change.charge, rel=0.04, abs=1e-5)
 
 
-def test_only_what_is_required_stays():
+def test_only_required_sources_are_kept():
     for light in (0.0, 0.02, 0.4):
         changes = EVERYTHING.spike_changes(light, 41)
         assert list(changes) == ["photons", "dark_current", "gain_spread", "hot", "dead"]
@@ -237,7 +237,7 @@ def test_only_what_is_required_stays():
 # Awkward input
 
 
-def test_light_that_is_no_number_of_photons_stays():
+def test_negative_and_infinite_light_is_unchanged():
     light = torch.tensor([-0.25, math.nan, math.inf, -math.inf, 1e30, 0.5]).reshape(1, 1, 6)
     noisy = arriving(SensorNoise(photons=10.0), light)
     torch.testing.assert_close(noisy[..., :5], light[..., :5], rtol=0, atol=0, equal_nan=True)
@@ -256,7 +256,7 @@ def test_light_that_is_no_number_of_photons_stays():
         ({"hot": 0.6, "dead": 0.5}, "hot, dead: expected shares that add up to at most 1, got 0.6, 0.5"),
     ],
 )
-def test_a_noise_that_cannot_be_says_so(settings, message):
+def test_invalid_noise_is_rejected(settings, message):
     with pytest.raises(ValueError, match=message):
         SensorNoise(**settings)
 

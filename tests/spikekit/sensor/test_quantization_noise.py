@@ -6,7 +6,7 @@ from spikekit.sensor.quantization_noise import flicker
 
 
 @pytest.mark.parametrize("frames", [1, 7, 41])
-def test_against_pixels_of_every_charge(frames):
+def test_against_simulated_pixels_of_all_charges(frames):
     generator = torch.Generator().manual_seed(0)
     weights = torch.rand(2, frames, generator=generator, dtype=torch.float64) - 0.3
     got = flicker(weights, (torch.arange(64) + 0.5) / 64)

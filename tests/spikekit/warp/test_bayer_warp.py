@@ -20,7 +20,7 @@ def rounded(flow):
     ("pattern", "neighbors", "scale"),
     [("RGGB", 4, 1), ("GBRG", 4, 2), ("BGGR", 1, 3), ("RGGB", 4, 4), ("grey", 4, 2), ("grey", 1, 1)],
 )
-def test_it_is_the_same_warp(pattern, neighbors, scale):
+def test_equals_flow_warp_idw(pattern, neighbors, scale):
     generator = torch.Generator().manual_seed(scale)
     for height, width in ((8, 10), (20, 14)):
         features = torch.rand(2, 3, scale * height, scale * width, generator=generator)

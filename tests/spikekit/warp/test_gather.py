@@ -72,7 +72,7 @@ def test_against_loops(batch, channels, bags, last, dtype):
 
 @pytest.mark.parametrize("channels", [1, 2, 9])
 @pytest.mark.parametrize("last", [False, True])
-def test_layout_is_that_of_the_values(channels, last):
+def test_result_has_the_memory_layout_of_the_values(channels, last):
     """As promised to the compiler, whatever the path: a result in another layout would be read wrongly."""
     values, grad, index, weight = draw(2, channels, 4, last=last)
     gathered, scattered, _ = results(values, grad, index, weight)
@@ -87,7 +87,7 @@ def test_layout_is_that_of_the_values(channels, last):
 
 
 @pytest.mark.parametrize("channels", [2, 9])
-def test_each_is_the_derivative_of_the_others(channels):
+def test_each_operator_is_the_derivative_of_the_others(channels):
     values, grad, index, weight = draw(1, channels, 3)
     for tensor in (values, grad, weight):
         tensor.requires_grad_()

@@ -62,7 +62,7 @@ def test_against_loops(pattern, widths):
 
 
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
-def test_one_mosaic_alone_is_residual_interpolation(pattern):
+def test_single_mosaic_equals_residual_interpolation(pattern):
     """What a time says of itself is that its samples are right."""
     raw = torch.rand(2, 1, 8, 9, dtype=torch.float64)
     got = demosaic_along_motion(raw, torch.zeros(2, 1, 2, 8, 9, dtype=torch.float64), pattern)
@@ -83,13 +83,13 @@ def scene(velocity):
 
 
 @pytest.mark.parametrize("velocity", [0.0, 0.15])
-def test_other_times_help_where_motion_is_known(velocity):
+def test_known_motion_improves_the_picture(velocity):
     raw, truth, flow = scene(velocity)
     one = psnr(demosaic_residual(raw[2]), truth)
     assert psnr(demosaic_along_motion(raw, flow), truth) > one + 1
 
 
-def test_what_does_not_fit_is_kept_out():
+def test_outliers_are_rejected():
     """A time that shows something else changes little."""
     raw, _, flow = scene(0.0)
     other = raw.clone()
@@ -100,7 +100,7 @@ def test_what_does_not_fit_is_kept_out():
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e4])
-def test_flow_that_leads_nowhere(value):
+def test_flow_out_of_the_sensor_or_not_finite(value):
     raw = torch.rand(3, 6, 8, dtype=torch.float64)
     flow = torch.zeros(3, 2, 6, 8, dtype=torch.float64)
     flow[0] = value

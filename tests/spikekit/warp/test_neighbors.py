@@ -70,7 +70,7 @@ def masks():
 
 
 @pytest.mark.parametrize("mask", list(masks()))
-def test_at_every_eighth_of_a_pixel(mask, path):
+def test_neighbours_at_every_eighth_of_a_pixel(mask, path):
     """The whole picture, its borders and what lies beyond them; ties are everywhere."""
     eighths = torch.cartesian_prod(torch.arange(8), torch.arange(8))[:, :, None, None] / 8
     for reach in (0, 2, 20):
@@ -78,12 +78,12 @@ def test_at_every_eighth_of_a_pixel(mask, path):
 
 
 @pytest.mark.parametrize("neighbors", [1, 3, 8, 30])
-def test_of_any_number(neighbors, path):
+def test_any_number_of_neighbours(neighbors, path):
     for mask in (*bayer_mask(3, 4, scale=2), torch.rand(6, 8) < 0.3):
         check(torch.randint(-4 * UNIT, 4 * UNIT, (5, 2, *mask.shape)) / UNIT, mask, neighbors)
 
 
-def test_float32_is_compared_in_double(path):
+def test_float32_distances_are_compared_in_double(path):
     """Two pixels whose distances differ by less than float32 can tell next to their size."""
     mask = torch.zeros(9, 9, dtype=torch.bool)
     mask[::4, ::4] = True

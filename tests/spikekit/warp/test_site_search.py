@@ -49,7 +49,7 @@ def searched(features, flow, pattern, color, scale, neighbors=4):
         (4, "GBRG", (12, 13)),
     ],
 )
-def test_sites_are_the_enlarged_features_searched_along_the_motion_up_to_the_border(scale, pattern, size):
+def test_equals_upsampling_followed_by_flow_warp_idw_up_to_the_border(scale, pattern, size):
     generator = torch.Generator().manual_seed(scale)
     features = torch.randn(2, 4, 2, *size, dtype=torch.float64, generator=generator)
     flow = rounded_flow(size, generator)
@@ -71,7 +71,7 @@ def test_a_single_neighbour_is_the_nearest(pattern):
         torch.testing.assert_close(found, expected, rtol=0, atol=2e-5)
 
 
-def test_flow_between_two_steps_is_rounded_to_the_nearer_one():
+def test_flow_is_rounded_to_the_nearest_step():
     size = 24, 24
     features = torch.randn(1, 4, 1, *size)
     flow = torch.full((1, 2, 2, *size), 8.0) / STEPS
@@ -82,7 +82,7 @@ def test_flow_between_two_steps_is_rounded_to_the_nearer_one():
     assert torch.equal(near[:, last][inside], exact[:, last][inside])
 
 
-def test_flow_that_is_not_finite_or_far_too_long_ends_at_the_border():
+def test_infinite_or_huge_flow_ends_at_the_border():
     size = 14, 12
     features, flow = torch.randn(1, 4, 2, *size), torch.zeros(1, 2, 2, *size)
     flow[0, :, :, 3, 4], flow[0, :, 0, 5, 5], flow[0, :, 0, 6, 6] = torch.nan, torch.inf, -1e30

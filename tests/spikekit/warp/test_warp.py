@@ -35,7 +35,7 @@ def test_idw_second_gradient_is_finite(channels):
         assert grad.isfinite().all()
 
 
-def test_idw_remembers_masks_but_not_too_well():
+def test_idw_cache_of_masks_follows_changes():
     """The tables of a mask are kept between calls; a mask that changes, or another number, must not get old ones."""
     features, flow = torch.randn(1, 1, 6, 8, dtype=torch.float64), flows(6, 8)[4:5]
     mask = (torch.rand(6, 8) < 0.3).double()
@@ -52,7 +52,7 @@ def test_idw_remembers_masks_but_not_too_well():
 
 
 @pytest.mark.parametrize("channels", [1, 9])
-def test_idw_sees_a_mask_change_through_other_names(channels):
+def test_idw_notices_changes_of_a_mask_through_views(channels):
     """NumPy's view of the same memory and ``mask.data`` do not count their changes."""
     features, flow = torch.rand(1, channels, 6, 8), 3 * torch.rand(1, 2, 6, 8) - 1.5
     for other in (lambda mask: mask.numpy(), lambda mask: mask.data):
