@@ -122,21 +122,15 @@ def cut_pictures(
         taken: most lines that any cut takes, of rows and of columns.
         turn: (B, 3) bool: turn rows around, columns, swap rows and columns.
     """
-    if len(cuts) == 1 and cuts.device.type == "cpu":  # a view serves
-        (top, height, *_), (left, width, *_) = cuts[0].tolist()
-        rows, columns = gallery.size[which[0]].tolist()
-        whole = gallery.shades[gallery.start[which[0]] :][: 3 * rows * columns].view(1, 3, rows, columns)
-        seen = whole[..., top : top + height, left : left + width].float()
-    else:
-        # what is taken beyond a cut has no weight, but it must lie inside the gallery
-        rows, columns = (
-            torch.minimum(cut[:, :1] + torch.arange(most, device=cuts.device), cut[:, :1] + cut[:, 1:2] - 1)
-            for cut, most in zip(cuts.unbind(dim=1), taken, strict=True)
-        )
-        height, width = gallery.size[which].unbind(dim=1)
-        start = gallery.start[which][:, None] + torch.arange(3, device=cuts.device) * (height * width)[:, None]
-        lines = start[:, :, None] + (rows * width[:, None])[:, None]  # (B, 3, rows)
-        seen = gallery.shades[lines[..., None] + columns[:, None, None]].float()
+    # what is taken beyond a cut has no weight, but it must lie inside the gallery
+    rows, columns = (
+        torch.minimum(cut[:, :1] + torch.arange(most, device=cuts.device), cut[:, :1] + cut[:, 1:2] - 1)
+        for cut, most in zip(cuts.unbind(dim=1), taken, strict=True)
+    )
+    height, width = gallery.size[which].unbind(dim=1)
+    start = gallery.start[which][:, None] + torch.arange(3, device=cuts.device) * (height * width)[:, None]
+    lines = start[:, :, None] + (rows * width[:, None])[:, None]  # (B, 3, rows)
+    seen = gallery.shades[lines[..., None] + columns[:, None, None]].float()
     down, across = (_resampling(cuts[:, axis], turn[:, axis], sides, side, taken[axis]) for axis in (0, 1))
     picture = down[:, None] @ (seen @ across.mT[:, None])
     picture = (picture / 255).clamp(0, 1)

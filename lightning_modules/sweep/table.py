@@ -58,12 +58,6 @@ def reference(row: VariantResults, rows: Sequence[VariantResults]) -> VariantRes
     return next((other for other in rows if other.labels in full), rows[0])
 
 
-def differences(row: VariantResults, other: VariantResults, name: str) -> list[float]:
-    """Return how much better a row scores than another, seed by seed."""
-    ours, theirs = row.scores(name), other.scores(name)
-    return [ours[seed] - theirs[seed] for seed in ours if seed in theirs]
-
-
 def markdown(rows: Sequence[VariantResults]) -> str:
     """Return the table as Markdown."""
     known = {measure.name: measure for measure in measures()}
@@ -79,8 +73,9 @@ def markdown(rows: Sequence[VariantResults]) -> str:
         for score in scores:
             cells[score.heading] = _mean(row.scores(score.name).values(), score.digits)
         for score in scores[:1]:
-            other = reference(row, rows)
-            gaps = differences(row, other, score.name) if other is not row else []
+            other, ours = reference(row, rows), row.scores(score.name)
+            theirs = {} if other is row else other.scores(score.name)
+            gaps = [ours[seed] - theirs[seed] for seed in ours if seed in theirs]
             cells[f"{score.heading} - {versus}"] = _mean(gaps, score.digits, "+")
         for name, heading, factor in zip(_COLUMNS, ("steps", "ms/step", "parameters"), (1, 1000, 1), strict=True):
             cells[heading] = _mean([factor * result[name] for result in row.results.values()], 0)

@@ -6,7 +6,6 @@ import gc
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
@@ -155,8 +154,3 @@ def _weigh(row: Measurement, spikes: Tensor) -> None:
     row.macs = counter.get_total_flops() / 2 / (spikes.shape[-2] * spikes.shape[-1])
     gc.collect()
     row.memory = peak_memory(lambda: row.runner(spikes), device)
-
-
-def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
-    """Return the first quartile, the median, and the third."""
-    return tuple(float(value) for value in np.quantile(values, [0.25, 0.5, 0.75]))

@@ -8,12 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean
 
+import numpy as np
 import torch
 
 from lightning_modules.inference.presets import Preset
 from lightning_modules.metrics.image import why_no_lpips
 from lightning_modules.trade.films import PICTURES
-from lightning_modules.trade.measure import Measurement, Timed, quartiles, running
+from lightning_modules.trade.measure import Measurement, Timed, running
 from spikekit.io.whole_file import whole_file
 from spikekit.tables import table
 from spikekit.timing import cpu_name, software
@@ -51,7 +52,9 @@ def figures(rows: Sequence[Measurement]) -> list[dict[str, float | None]]:
         scores = {name: getattr(row, name) for name in ("psnr", "ssim", "lpips", "flicker")}
         values = {name: mean(score) if score else None for name, score in scores.items()}
         for name, measured in (("ms", [1e3 * seconds for seconds in row.seconds]), ("ratio", ratios)):
-            values[f"{name}_q1"], values[name], values[f"{name}_q3"] = quartiles(measured)
+            values[f"{name}_q1"], values[name], values[f"{name}_q3"] = map(
+                float, np.quantile(measured, [0.25, 0.5, 0.75])
+            )
         cost = {"mib": row.memory, "parameters": row.parameters, "macs": row.macs, "latency": row.latency}
         found.append(values | cost)
     return found

@@ -8,8 +8,6 @@ import yaml
 
 from lightning_modules.__main__ import main
 from lightning_modules.data.cache import ClipCache
-from lightning_modules.inference import export
-from lightning_modules.networks import ClassicalDecoder
 from lightning_modules.storage.pretrained import Weights, write_weights
 from lightning_modules.sweep.trials import Trial
 from lightning_modules.tasks.checkpoint_io import Checkpoints
@@ -21,15 +19,6 @@ TRIAL = {
 }
 
 
-def program(path):
-    network = ClassicalDecoder("tfp", 2)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(torch.export, "export", lambda *_, **__: None)  # it takes half a minute
-        patch.setattr(export, "_torch", lambda *_: bytes(9999))
-        patch.setattr(export, "exported", lambda *_: network)
-        export.export_network(network, path, "torch")
-
-
 @pytest.mark.parametrize(
     ("name", "write"),
     [
@@ -38,7 +27,6 @@ def program(path):
             lambda path: Checkpoints(path.parent).save_checkpoint({"state_dict": {"a": torch.rand(9999)}}, path),
         ),
         ("a.safetensors", lambda path: write_weights(Weights(path, {}, {}, {"a": torch.rand(9999)}), path)),
-        ("a.pt2", program),
     ],
 )
 def test_a_file_stays_whole(name, write, stays_whole):
