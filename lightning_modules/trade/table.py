@@ -52,9 +52,8 @@ def figures(rows: Sequence[Measurement]) -> list[dict[str, float | None]]:
         scores = {name: getattr(row, name) for name in ("psnr", "ssim", "lpips", "flicker")}
         values = {name: mean(score) if score else None for name, score in scores.items()}
         for name, measured in (("ms", [1e3 * seconds for seconds in row.seconds]), ("ratio", ratios)):
-            values[f"{name}_q1"], values[name], values[f"{name}_q3"] = map(
-                float, np.quantile(measured, [0.25, 0.5, 0.75])
-            )
+            quarters = np.quantile(measured, [0.25, 0.5, 0.75]).tolist()
+            values |= zip((f"{name}_q1", name, f"{name}_q3"), quarters, strict=True)
         cost = {"mib": row.memory, "parameters": row.parameters, "macs": row.macs, "latency": row.latency}
         found.append(values | cost)
     return found
