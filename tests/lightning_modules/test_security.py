@@ -11,6 +11,7 @@ from safetensors.torch import save_file
 
 from lightning_modules import motion, networks
 from lightning_modules.__main__ import main
+from lightning_modules.cli.arguments import with_network_of_weights
 from lightning_modules.cli.errors import as_one_line
 from lightning_modules.motion import ESTIMATORS
 from lightning_modules.networks import CSCSR, NETWORKS
@@ -120,17 +121,13 @@ ESTIMATOR = {"class": "Spike2Flow", "window": 5}
         (SETTINGS, ["evilmod.X"]),
     ],
 )
-def test_settings_reach_only_what_is_known(settings, motion, trap, configs, tmp_path):
+def test_settings_reach_only_what_is_known(settings, motion, trap, tmp_path):
     for suffix in (".safetensors", ".ckpt"):
         path = write(tmp_path / f"odd{suffix}", settings, motion, CSCSR(**TINY).state_dict())
         with pytest.raises(ValueError, match=f"odd{suffix}: "):
             CSCSR.from_pretrained(path)
-    with pytest.raises(SystemExit) as stopped:
-        main(["test", "-c", str(configs / "x2.yaml"), "--model.weights", str(path), "-o", str(tmp_path / "o")])
-    said = str(stopped.value)
-    assert said.startswith(f"lightning: {path}: ")
-    assert "\n" not in said
-    assert len(said) < 700
+        with pytest.raises(ValueError, match=rf"^{path}: [^\n]{{1,600}}$"):
+            with_network_of_weights(["test", "--model.weights", str(path)])
     assert not trap.exists()
     assert "evilmod" not in sys.modules
 
@@ -211,7 +208,7 @@ def test_a_compressed_checkpoint_is_refused(content, tmp_path):
     with zipfile.ZipFile(tmp_path / "plain.ckpt") as plain, zipfile.ZipFile(tmp_path / "a.ckpt", "w") as packed:
         for member in plain.infolist():
             packed.writestr(member.filename, plain.read(member), zipfile.ZIP_DEFLATED)
-    with pytest.raises(ValueError, match=r"a.ckpt: .*compressed"):
+    with pytest.raises(ValueError, match=r"a.ckpt: .*compress"):
         read_checkpoint(tmp_path / "a.ckpt")
 
 
