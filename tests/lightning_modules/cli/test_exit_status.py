@@ -36,15 +36,6 @@ FILES = {
     "a.txt": b"text",
 }
 
-HOLDER = """
-import sys, time
-from lightning_modules.cli.folder_lock import locked_folder
-with locked_folder(sys.argv[1], "lightning predict", ".predict.lock"):
-    print("held", flush=True)
-    time.sleep(600)
-"""
-
-
 X4 = "-c x4 -c tiny.yaml"
 WRONG = {
     "": "expected a verb, one of fit, validate",
@@ -133,21 +124,6 @@ def test_two_runs_of_a_verb_in_one_folder(words, folder, name, tmp_path, monkeyp
     with locked_folder(folder, "run", name), pytest.raises(SystemExit, match=f"{folder}: another .* is at work here"):
         main(words.split())
     assert {path.name for path in (tmp_path / folder).iterdir()} == {name}
-
-
-def test_the_lock_of_another_process_goes_with_it(tmp_path, monkeypatch):
-    """That of a training keeps no predictions out."""
-    monkeypatch.chdir(tmp_path)
-    write_spikes("a.npz", torch.zeros(41, 4, 4))
-    words = [*SOON.split(), "out"]
-    with subprocess.Popen([sys.executable, "-c", HOLDER, "out"], stdout=subprocess.PIPE) as other:
-        assert other.stdout.readline() == b"held\n"
-        with pytest.raises(SystemExit, match="out: another lightning predict is at work here"):
-            main(words)
-        other.kill()
-    with locked_folder("out", "run"):
-        main(words)
-    assert (tmp_path / "out/frame_000020.png").is_file()
 
 
 def test_a_folder_that_cannot_be_locked(tmp_path, monkeypatch):
