@@ -160,14 +160,6 @@ def test_inductor_compiles_the_pipeline_from_light_to_a_warped_picture():
         torch.testing.assert_close(got, expected)
 
 
-@pytest.mark.parametrize("dtype", [torch.bool, torch.uint8])
-@pytest.mark.parametrize("op", [sk.spike_interval, sk.tfi, lambda s: sk.tfp(s, 3), sk.split_colors, sk.split_bayer])
-def test_compile_of_bits(op, dtype):
-    torch.compiler.reset()
-    spikes = SPIKES.to(dtype)
-    assert_same(torch.compile(op, fullgraph=True, backend="aot_eager")(spikes), op(spikes))
-
-
 @pytest.mark.parametrize(
     ("op", "arguments"),
     [

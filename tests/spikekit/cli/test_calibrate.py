@@ -136,8 +136,6 @@ KIND = {"kind": "spikekit calibration 1"}
     [
         (planes(), None, "expected spikekit calibration 1, got None"),
         (planes((24, 30)), KIND, "expected 24 x 32 pixels, the size of scene.dat, got 24 x 30"),
-        (planes((768,)), KIND, "expected (H, W) of at most"),
-        (planes(dark=torch.zeros(3)), KIND, "expected gain, dark and defects of one size"),
         (planes(defects=torch.full(SIZE, 9, dtype=torch.uint8)), KIND, "defects: expected 0 to 2, got 9"),
     ],
     ids=lambda value: "",

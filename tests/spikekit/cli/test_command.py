@@ -131,15 +131,6 @@ def test_pictures_equal_those_of_the_whole_recording(tmp_path, capsys, name, wor
         assert torch.equal((read_picture(out / f"a{n:03}.png")[0] * 255).round(), (whole[n] * 255).round())
 
 
-def test_decode_many_at_one_scale(tmp_path):
-    """A light that goes on stays darker than white before: pictures can be compared."""
-    spikes = torch.cat([expose(torch.full((6, 8), level), 100) for level in (0.1, 0.4)])
-    write_spikes(tmp_path / "a.npz", spikes)
-    command("decode", tmp_path / "a.npz", "--window", 21, "-o", tmp_path / "{frame}.png", "--frame", "50:200:50")
-    dark, bright = (read_picture(tmp_path / f"{n:03}.png").mean() for n in (50, 150))
-    assert dark < bright / 2
-
-
 BOUNDED = """
 import resource, sys
 from spikekit.cli.command import main

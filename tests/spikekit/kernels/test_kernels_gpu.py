@@ -184,13 +184,10 @@ def compile_calls():
 class Machine:
     """A GPU that is not there, as Triton's driver describes it."""
 
-    def __init__(self, *target):
-        self.target = target
-
     def get_current_target(self):
         from triton.backends.compiler import GPUTarget
 
-        return GPUTarget(*self.target)
+        return GPUTarget("cuda", 80, 32)
 
     def get_current_device(self):
         return 0
@@ -201,11 +198,8 @@ class Machine:
 
 @pytest.mark.slow
 @pytest.mark.skipif(INTERPRETED or torch.cuda.is_available(), reason="only where Triton has no GPU to compile for")
-@pytest.mark.parametrize("target", [("cuda", 80, 32), ("hip", "gfx942", 64)], ids=["cuda", "rocm"])
-def test_compiles(target, monkeypatch, tmp_path):
-    """On CUDA no product is fused with a sum, and no quotient is approximate."""
-    if target[0] == "hip" and version(triton) < (3, 6):
-        pytest.skip("this Triton needs the linker of an installed ROCm")
+def test_compiles(monkeypatch, tmp_path):
+    """No product is fused with a sum, and no quotient is approximate."""
     texts = []
 
     def compile_only(kernel, grid):
@@ -215,7 +209,7 @@ def test_compiles(target, monkeypatch, tmp_path):
     monkeypatch.setattr(triton.JITFunction, "__getitem__", compile_only)
     driver = triton.runtime.driver
     before = vars(driver).copy()
-    driver.set_active(Machine(*target))
+    driver.set_active(Machine())
     try:
         for name, *args in compile_calls():
             getattr(gpu, name)(*args)

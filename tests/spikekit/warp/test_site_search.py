@@ -111,16 +111,6 @@ def test_the_derivative_is_the_adjoint(scale, channels):
         torch.testing.assert_close((other * features.grad).sum(), ahead, rtol=tolerance, atol=tolerance)
 
 
-def test_half_precision_is_rounded_once():
-    size = 16, 16
-    features = torch.randn(1, 4, 2, *size).bfloat16()
-    flow = torch.randn(1, 2, 2, *size)
-    wide = search_sites(features.float(), flow, SHARES, table_for(size))
-    half = search_sites(features, flow, SHARES, table_for(size))
-    assert half.dtype is torch.bfloat16
-    torch.testing.assert_close(half.float(), wide, rtol=2**-8, atol=1e-6)
-
-
 def test_results_have_their_channels_last_and_compile_in_one_graph():
     size = 12, 12
     features, flow, table = torch.randn(1, 4, 1, *size), torch.randn(1, 2, 2, *size), table_for(size)
