@@ -74,14 +74,8 @@ def run(args: argparse.Namespace) -> None:
         picture = raw if recording.bayer is None else demosaic(raw, recording.bayer)
         picture = recording.show(picture, known=alpha is not None)
         write_picture(paths[n], picture, bits=args.bits, quality=args.quality)
-    if len(chosen) == 1:
-        first, last = _span(key, reach, frames)
-        say(f"{paths[key]}: frame {key} of {frames} by {args.method} from frames {first} .. {last}, {scaling}")
-    else:
-        say(
-            f"{args.output}: {len(chosen)} pictures of frames {chosen[0]} .. {chosen[-1]} of {frames}, {chosen.step} "
-            f"apart, by {args.method} from up to {reach} frames on each side, all {scaling}"
-        )
+    what = f"frame {key}" if len(chosen) == 1 else f"{len(chosen)} pictures of frames {chosen[0]} .. {chosen[-1]}"
+    say(f"{args.output}: {what} of {frames} by {args.method} from up to {reach} frames on each side, {scaling}")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

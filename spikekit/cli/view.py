@@ -5,14 +5,13 @@ from __future__ import annotations
 import argparse
 import io
 import math
-import re
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from spikekit.arguments import UsageError, ending_in, positive, whole
+from spikekit.arguments import UsageError, ending_in, frames_of, positive, whole
 from spikekit.cli import recordings
 from spikekit.color.demosaic import demosaic
 from spikekit.decoders.single_frame import search
@@ -38,7 +37,11 @@ def run(args: argparse.Namespace) -> None:
     Size, Bayer phase and brightness may be omitted if a side-car or --camera gives them.
     """
     shown = recordings.opened(args)
-    begin, end = _span(args.frames, shown)
+    try:
+        chosen = frames_of(args.frames or ":", 0, shown.frames - 1)
+    except ValueError as error:
+        raise UsageError(f"--frames: {error}") from error
+    begin, end = chosen.start, chosen.stop
     check_unclaimed([args.output], args.file)
     moment = Moment(shown, begin, end, args.window or _WINDOW, args.alpha or shown.alpha)
     data = moment.sheet()
@@ -146,17 +149,6 @@ class Moment:
         file = io.BytesIO()
         figure.savefig(file, format="png")
         return file.getvalue()
-
-
-def _span(text: str | None, recording: Recording) -> tuple[int, int]:
-    """Return the first frame to show and the one after the last."""
-    typed = re.fullmatch(r"(\d*):(\d*)", text or ":", re.ASCII)
-    first, stop = (int(typed[1] or 0), int(typed[2] or recording.frames)) if typed else (0, 0)
-    if not first < stop <= recording.frames:
-        raise UsageError(
-            f"--frames: expected A:B within 0:{recording.frames}, the frames of {recording.path}, got {text}"
-        )
-    return first, stop
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

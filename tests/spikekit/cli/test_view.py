@@ -147,7 +147,7 @@ def test_a_camera_is_known(tmp_path, monkeypatch, capsys, header):
         (["a.dat", "--camera", "vidar", "--width", "400"], 2, "--camera: it sets --height, --width and --flip"),
         (["a.dat", "--camera", "vidar"], 1, "a.dat: truncated, or not 250 x 4"),
         (["b.dat"], 1, "b.dat: expected 41 frames, as in its side-car, got 40"),
-        (["a.dat", "--frames", "40:42"], 2, "--frames: expected A:B within 0:41, the frames of a.dat, got 40:42"),
+        (["a.dat", "--frames", "40:42"], 2, "--frames: expected frames within 0 .. 40, got 40:42"),
     ],
 )
 def test_mistakes(still, fails, words, status, said):
