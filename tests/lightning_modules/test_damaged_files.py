@@ -44,7 +44,7 @@ def _read_results(path):
 
 
 def _read_trial(path):
-    """Names the folder, where the file is whole and says something else."""
+    """Write a trial over the file; the error names the folder if the file is valid but differs."""
     other = {"trial.yaml": "budget.json", "budget.json": "trial.yaml"}[path.name]
     (path.parent / other).write_bytes(GOOD[other])
     try:
@@ -54,7 +54,7 @@ def _read_trial(path):
 
 
 def _read_configuration(path):
-    """As ``lightning`` reads it before its parser does."""
+    """Read a configuration like ``lightning`` before it is parsed."""
     with_network_of_weights(["fit", "-c", str(path)])
 
 
@@ -65,7 +65,7 @@ def _read_presets(path):
 
 
 def _read_clip(path):
-    """A damaged clip is no clip, and said so once."""
+    """Read a damaged cached clip, which is ignored with one warning."""
     cache, made = ClipCache(path.parent), []
     place = path.parent / KEY[:2] / f"{KEY[2:]}.npz"
     place.parent.mkdir(exist_ok=True)
@@ -114,7 +114,7 @@ def test_odd_values(fuzz, name, value):
     assert fuzz(READ[name], lambda rng: _json(fuzz.values(value, rng)), name, InputError, 120) > 20
 
 
-def test_a_pipe_is_not_waited_for(tmp_path):
+def test_pipe_is_rejected_without_waiting(tmp_path):
     os.mkfifo(tmp_path / "a.yaml")
     with pytest.raises(ValueError, match=r"a.yaml: expected a file, got a pipe or a device$"):
         with_network_of_weights(["fit", "-c", str(tmp_path / "a.yaml")])

@@ -1,4 +1,4 @@
-"""Every file that lightning writes, on a full disk: an error that names it, what was there before, and nothing else."""
+"""Files that lightning writes, on a full disk: the error names the file, and the previous file stays intact."""
 
 import warnings
 
@@ -29,11 +29,11 @@ TRIAL = {
         ("a.safetensors", lambda path: write_weights(Weights(path, {}, {}, {"a": torch.rand(9999)}), path)),
     ],
 )
-def test_a_file_stays_whole(name, write, stays_whole):
+def test_existing_file_stays_intact(name, write, stays_whole):
     stays_whole(name, write)
 
 
-def test_a_trial_is_written_again_where_its_budget_is_missing(full_disk, tmp_path):
+def test_incomplete_trial_can_be_written_again(full_disk, tmp_path):
     for room, config, left in ((0, TRIAL, []), (20, {"a": 1}, ["trial.yaml"])):
         trial = Trial(("a",), None, tmp_path / "trial", config, {"steps": 10**100})
         with full_disk(room), pytest.raises(OSError, match="too large"):
@@ -43,7 +43,7 @@ def test_a_trial_is_written_again_where_its_budget_is_missing(full_disk, tmp_pat
     assert yaml.safe_load((tmp_path / "trial" / "trial.yaml").read_text()) == TRIAL
 
 
-def test_a_predicted_picture_is_there_whole_or_not_at_all(full_disk, tmp_path):
+def test_predicted_picture_is_complete_or_absent(full_disk, tmp_path):
     write_spikes(tmp_path / "clip.npz", torch.rand(41, 24, 32, generator=torch.Generator().manual_seed(0)) < 0.3)
     words = ["predict", str(tmp_path / "clip.npz"), "--weights", "cscsr_tiny_x4", "-o", str(tmp_path / "out")]
     with full_disk(6000), pytest.raises(SystemExit, match=r"frame_000020.png: File too large"):
@@ -53,7 +53,7 @@ def test_a_predicted_picture_is_there_whole_or_not_at_all(full_disk, tmp_path):
     assert (tmp_path / "out" / "frame_000020.png").stat().st_size > 6000
 
 
-def test_the_cache_goes_on_without(full_disk, tmp_path):
+def test_cache_is_skipped_on_a_full_disk(full_disk, tmp_path):
     cache = ClipCache(tmp_path)
     with full_disk(2000), warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
