@@ -1,4 +1,4 @@
-"""Files from strangers: nothing in weights and checkpoints is run, imported or believed beyond what fits."""
+"""Untrusted files: weights and checkpoints cannot run or import code, and their contents are checked."""
 
 import json
 import os
@@ -31,7 +31,7 @@ def _argv(monkeypatch):
 
 @pytest.fixture(name="content", scope="module")
 def _content():
-    """What is in a checkpoint, as a function, since tests change it."""
+    """A function that returns a new checkpoint, as tests modify it."""
 
     def make():
         torch.manual_seed(0)
@@ -45,7 +45,7 @@ def _content():
 
 @pytest.fixture(name="trap")
 def _trap(tmp_path, monkeypatch):
-    """A module that leaves a trace where it is imported, and where its function is called; returns the trace."""
+    """A module that writes a trace file on import and on a call of its function; returns the path of the trace."""
     trace = tmp_path / "trace"
     (tmp_path / "evilmod.py").write_text(
         f"import pathlib\npathlib.Path({str(trace)!r}).touch()\n\n\ndef X(*args, **kwargs):\n    return None\n"
@@ -88,7 +88,7 @@ def test_code_in_a_checkpoint_is_not_run_by_lightning(content, tmp_path, monkeyp
 
 
 def write(path, settings, motion, tensors):
-    """Weights with these settings, as safetensors or as a checkpoint."""
+    """Write weights with these settings, as safetensors or as a checkpoint."""
     if path.suffix == ".safetensors":
         save_file(tensors, path, {"network": json.dumps(settings), "motion": json.dumps(motion)})
     else:
@@ -119,7 +119,7 @@ ESTIMATOR = {"class": "Spike2Flow", "window": 5}
         (SETTINGS, ["evilmod.X"]),
     ],
 )
-def test_settings_reach_only_what_is_known(settings, motion, trap, tmp_path):
+def test_settings_can_only_name_known_classes_and_arguments(settings, motion, trap, tmp_path):
     for suffix in (".safetensors", ".ckpt"):
         path = write(tmp_path / f"odd{suffix}", settings, motion, CSCSR(**TINY).state_dict())
         with pytest.raises(ValueError, match=f"odd{suffix}: "):
@@ -140,7 +140,7 @@ def test_settings_reach_only_what_is_known(settings, motion, trap, tmp_path):
         {"representation": "spikes", "window": 1, "stride": 1, "frames": 4095, "width": 4096},
     ],
 )
-def test_large_settings_are_refused_before_they_take_memory(changes, tmp_path, monkeypatch):
+def test_large_settings_are_rejected_before_memory_is_allocated(changes, tmp_path, monkeypatch):
     made = []
     real = torch.nn.init.orthogonal_
     monkeypatch.setattr(torch.nn.init, "orthogonal_", lambda *args, **kwargs: made.append(1) or real(*args, **kwargs))
@@ -152,8 +152,8 @@ def test_large_settings_are_refused_before_they_take_memory(changes, tmp_path, m
     assert not made  # initial weights are what takes the time
 
 
-def test_the_networks_of_the_table_are_those_of_the_package():
-    """And shapes are compared without making any of them: a checkpoint of each is read."""
+def test_table_of_networks_is_complete():
+    """A checkpoint of each network is read, with shapes compared without building it."""
     kinds = {**NETWORKS, **ESTIMATORS}
     assert set(networks.__all__) - {"NETWORKS", "CSCSRConfig", "Network"} == set(NETWORKS)
     assert set(motion.__all__) - {"ESTIMATORS", "MotionEstimator"} == set(ESTIMATORS)
@@ -163,7 +163,7 @@ def test_the_networks_of_the_table_are_those_of_the_package():
 
 
 @pytest.mark.parametrize(("suffix", "bad"), [(".safetensors", float("nan")), (".ckpt", -float("inf"))])
-def test_weights_that_are_not_finite_are_refused(bad, suffix, tmp_path):
+def test_weights_that_are_not_finite_are_rejected(bad, suffix, tmp_path):
     tensors = CSCSR(**TINY).state_dict()
     tensors["reconstruction.rgb.bias"][1] = bad
     path = write(tmp_path / f"bad{suffix}", SETTINGS, {}, tensors)
@@ -171,7 +171,7 @@ def test_weights_that_are_not_finite_are_refused(bad, suffix, tmp_path):
         read_weights(path)
 
 
-def test_a_training_that_has_diverged_leaves_its_last_good_checkpoint(content, tmp_path):
+def test_diverged_training_keeps_its_last_good_checkpoint(content, tmp_path):
     path = tmp_path / "last.ckpt"
     Checkpoints(tmp_path).save_checkpoint(content(), path)
     before, bad = path.read_bytes(), content()
@@ -193,15 +193,15 @@ def test_a_training_that_has_diverged_leaves_its_last_good_checkpoint(content, t
         "text",
     ],
 )
-def test_tensors_are_no_more_than_the_file_holds(odd, tmp_path):
+def test_tensors_beyond_the_data_of_the_file_are_rejected(odd, tmp_path):
     path = tmp_path / "odd.ckpt"
     torch.save({"network": SETTINGS, "state_dict": {"network.reconstruction.rgb.bias": odd}}, path)
     with pytest.raises(ValueError, match=r"odd.ckpt: not a checkpoint of lightning fit \(TypeError"):
         read_checkpoint(path)
 
 
-def test_a_compressed_checkpoint_is_refused(content, tmp_path):
-    """A megabyte could become a gigabyte of memory."""
+def test_compressed_checkpoint_is_rejected(content, tmp_path):
+    """A megabyte could expand to a gigabyte of memory."""
     torch.save(content(), tmp_path / "plain.ckpt")
     with zipfile.ZipFile(tmp_path / "plain.ckpt") as plain, zipfile.ZipFile(tmp_path / "a.ckpt", "w") as packed:
         for member in plain.infolist():
@@ -210,7 +210,7 @@ def test_a_compressed_checkpoint_is_refused(content, tmp_path):
         read_checkpoint(tmp_path / "a.ckpt")
 
 
-def test_plain_values():
+def test_only_plain_values_are_accepted():
     check_plain("a", {"b": [1, 2.5, "c", None, True, (1, 2)], "d": {"e": {}}})
     nested = []
     nested.append(nested)
@@ -220,8 +220,8 @@ def test_plain_values():
         assert "\n" not in str(refused.value)
 
 
-def test_only_checkpoints_of_the_own_run_are_removed(content, tmp_path):
-    """A ModelCheckpoint that resumes removes what its state names."""
+def test_resumed_training_removes_only_checkpoints_of_its_own_run(content, tmp_path):
+    """ModelCheckpoint removes the files that its restored state names."""
     own, saved, other, notes = (tmp_path / name for name in ("run/a.ckpt", "b.ckpt", "other.ckpt", "run/notes.txt"))
     checkpoints = Checkpoints(tmp_path / "run")
     checkpoints.save_checkpoint(content(), saved)
@@ -234,7 +234,7 @@ def test_only_checkpoints_of_the_own_run_are_removed(content, tmp_path):
 
 
 @pytest.mark.parametrize("ending", [".ckpt", ".safetensors"])
-def test_random_damage_is_one_line_that_names_the_file(fuzz, content, tmp_path, ending):
+def test_random_damage_gives_a_one_line_error_with_the_file_name(fuzz, content, tmp_path, ending):
     good = tmp_path / f"good{ending}"
     if ending == ".ckpt":
         torch.save(content(), good)
