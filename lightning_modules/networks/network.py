@@ -98,8 +98,8 @@ class Network(nn.Module):
                 checkpoint of ``lightning fit``.
             motion: motion estimator, called when no flow is given. Default: the estimator in the weights file, or
                 :class:`lightning_modules.motion.ClassicalFlow`.
-            arguments: constructor options that do not affect the weights, such as ``alpha``. Default: those stored
-                with the weights.
+            arguments: constructor options that may differ from those of the weights, such as ``alpha``. Default:
+                those stored with the weights.
 
         Returns:
             The network, in evaluation mode, on the CPU.

@@ -22,7 +22,7 @@ from spikekit.io.whole_file import whole_file
 
 _MOTION = "motion."
 _COMPILED = "_orig_mod."  # prefix of parameter names after torch.compile
-_ADAPTED = "alpha", "motion_fusion"  # settings that do not affect the weights
+_ADAPTED = "alpha", "motion_fusion"  # settings that may differ from those of the weights
 
 
 class CheckpointMismatchError(ValueError):
