@@ -1,4 +1,4 @@
-"""Metrics, as the authors of CSCSR compute them: colour, float, no border crop, one figure a picture."""
+"""Metrics as computed by the authors of CSCSR: on float colour pictures, without border crop, one value per picture."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ def psnr(rgb: Tensor, target: Tensor) -> Tensor:
     .. math:: -10 \log_{10} \frac{1}{3 H W} \sum_{C, x, y} (a - b)^2
 
     Convention:
-        Both are clamped to [0, 1] and not rounded; one mean square error over all colours and pixels of a picture;
-        no border crop. Average the result over pictures: averaging errors first gives another number. Computed in
-        float32 or wider. The gradient is 0 where a value was clamped, and NaN where the two pictures are equal.
+        Both pictures are clamped to [0, 1] but not rounded. The mean square error is over all colours and pixels,
+        without border crop. For several pictures, average the PSNR, not the errors. Computed in float32 or wider. The
+        gradient is 0 for clamped values, and NaN if the two pictures are equal.
 
     Args:
         rgb: :math:`(*, 3, H, W)`, [0, 1].
-        target: the truth, of the same size.
+        target: ground truth of the same size.
 
     Returns:
-        dB, of shape :math:`(*)`; infinite where the two are equal.
+        PSNR in dB, of shape :math:`(*)`; infinite if the two pictures are equal.
 
     Raises:
         TypeError: ``rgb`` or ``target`` is not a floating-point tensor.
-        ValueError: fewer than three dimensions, or sizes that differ.
+        ValueError: there are fewer than three dimensions, or the sizes differ.
 
     Example:
         >>> round(psnr(torch.full((3, 8, 8), 0.5), torch.full((3, 8, 8), 0.6)).item(), 3)
@@ -54,20 +54,20 @@ def ssim(rgb: Tensor, target: Tensor) -> Tensor:
         {(\mu_a^2 + \mu_b^2 + 0.01^2) (\sigma_a^2 + \sigma_b^2 + 0.03^2)}
 
     Convention:
-        As ``skimage.metrics.structural_similarity`` with its defaults and ``channel_axis``: 7 x 7 uniform window,
-        sample covariance, only windows that lie inside, mean over pixels and colours. Both are clamped to [0, 1],
-        and a value that was clamped has gradient 0. Computed in float64.
+        Like ``skimage.metrics.structural_similarity`` with its defaults and ``channel_axis``: 7 x 7 uniform window,
+        sample covariance, only windows inside the picture, mean over pixels and colours. Both pictures are clamped to
+        [0, 1], and clamped values have gradient 0. Computed in float64.
 
     Args:
         rgb: :math:`(*, 3, H, W)`, [0, 1], H and W at least 7.
-        target: the truth, of the same size.
+        target: ground truth of the same size.
 
     Returns:
-        The similarity, of shape :math:`(*)`, float32 or wider.
+        SSIM, of shape :math:`(*)`, float32 or wider.
 
     Raises:
         TypeError: ``rgb`` or ``target`` is not a floating-point tensor.
-        ValueError: fewer than three dimensions, sizes that differ, or below 7 x 7.
+        ValueError: there are fewer than three dimensions, the sizes differ, or they are below 7 x 7.
 
     Example:
         >>> picture = torch.rand(2, 3, 16, 16)
@@ -83,13 +83,13 @@ def ssim(rgb: Tensor, target: Tensor) -> Tensor:
         raise ValueError(f"rgb: expected at least 7 x 7 pixels, got {tuple(rgb.shape)}")
     height, width = rgb.shape[-2:]
     planes = (picture.reshape(-1, height, width).unbind() for picture in (rgb, target))
-    # plane by plane, which stay in the cache
+    # plane by plane, to stay in the cache
     similar = torch.stack([_similarity(a.double(), b.double()) for a, b in zip(*planes, strict=True)])
     return similar.reshape(rgb.shape[:-2]).mean(dim=-1).to(rgb.dtype)
 
 
 def _similarity(a: Tensor, b: Tensor) -> Tensor:
-    """Mean over the windows of two planes; numerator and denominator are multiples of those of the formula."""
+    """Return the mean SSIM of two planes; numerator and denominator are multiples of those in the formula."""
     sum_a, sum_b, both = _windows(a), _windows(b), _windows(a * b)
     squares = _windows(torch.addcmul(a * a, b, b))
     c1, c2 = 49**2 * 0.01**2, 49 * 48 * 0.03**2  # sample covariance: 48 in place of 49
@@ -99,7 +99,7 @@ def _similarity(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _windows(plane: Tensor) -> Tensor:
-    """Sums of all windows of 7 x 7 that lie inside, from sums of 2 and of 4 along either axis."""
+    """Return the sums of all 7 x 7 windows inside the plane, from sums of 2 and 4 along each axis."""
     for dim in (-2, -1):
         length = plane.shape[dim]
         two = plane.narrow(dim, 0, length - 1) + plane.narrow(dim, 1, length - 1)

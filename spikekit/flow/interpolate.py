@@ -98,7 +98,7 @@ class Still:
     """
 
     def __call__(self, first: Tensor, second: Tensor) -> Between:
-        """Look at two frames."""
+        """Return the interpolation between two frames."""
         return _Still(first, second)
 
 
@@ -113,7 +113,7 @@ class Blend:
     """
 
     def __call__(self, first: Tensor, second: Tensor) -> Between:
-        """Look at two frames."""
+        """Return the interpolation between two frames."""
         return _Blend(first, second)
 
 

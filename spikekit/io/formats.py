@@ -25,7 +25,7 @@ _ARRAY_NAMES = ("spk", "spikes")
 # Largest compression ratio of Deflate.
 _MOST_DEFLATED = 1032
 
-_MOST_HEADER = 16_384  # bytes; NumPy reads none above 10,000
+_MOST_HEADER = 16_384  # bytes; NumPy rejects headers above 10,000
 
 
 class SpikeFileError(ValueError):
@@ -224,7 +224,7 @@ def _check_array(path: Path, name: str, shape: tuple[int, ...], dtype: np.dtype,
 
 def _npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
     with quiet():
-        start = io.BytesIO(stream.read(_MOST_HEADER))  # NumPy would read all that a header claims to be
+        start = io.BytesIO(stream.read(_MOST_HEADER))  # NumPy would read as much as a header claims
         version = np.lib.format.read_magic(start)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         header = read(start)

@@ -64,7 +64,7 @@ def _check(sidecar: Sidecar) -> None:
         if not isinstance(values, dict):
             raise ValueError(f"{part}: expected names and values, got {values!r}")
     if not isinstance(sidecar.stream["file"], str):
-        raise ValueError(f"stream.file: expected a text, got {sidecar.stream['file']!r}")
+        raise ValueError(f"stream.file: expected a string, got {sidecar.stream['file']!r}")
     for name in ("frames", "height", "width"):
         check_whole(f"stream.{name}", sidecar.stream[name])
     alpha, pattern = sidecar.settings.get("alpha", 1.0), sidecar.settings.get("pattern", "RGGB")

@@ -69,7 +69,7 @@ class _Output:
 
 
 def integrate_fire(light: Tensor, threshold: float, charge: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Two passes over memory: light in, spikes out."""
+    """Read the light once and write the spikes once."""
     spikes = _Output(light.shape, dtype)
     left = torch.from_numpy(charge.detach().numpy().copy())
     lights, charges = _flat(light), _flat(left.unsqueeze(-3))[:, 0].numpy()

@@ -65,7 +65,7 @@ def _divide(a, b):
 def _integrate_fire_kernel(
     light, threshold, charge, spikes, left, frames, pixels, light_b, light_t, light_p, block: tl.constexpr
 ):
-    """Integrate the light of a block of pixels, clock after clock: one read of the light, one write of the spikes."""
+    """Integrate the light of a block of pixels clock by clock: one read of the light, one write of the spikes."""
     b, pixel, inside = my_pixels(pixels, block)
     light += b * light_b + pixel * light_p
     light_t = tl.cast(light_t, tl.int64)
@@ -88,7 +88,7 @@ def _integrate_fire_kernel(
 
 
 def integrate_fire(light: Tensor, threshold: float, charge: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Two passes over memory: light in, spikes out."""
+    """Read the light once and write the spikes once."""
     flat, start = _flat(light), charge.detach().contiguous()
     spikes, left = flat.new_empty(flat.shape, dtype=dtype), torch.empty_like(start)
     theta = _scalar(threshold, light, charge.dtype)

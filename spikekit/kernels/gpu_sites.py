@@ -53,7 +53,7 @@ def _gather_kernel(
     channels: tl.constexpr, pixels: tl.constexpr, channels_up: tl.constexpr, pixels_up: tl.constexpr,
     block: tl.constexpr, back: tl.constexpr,
 ):  # fmt: skip
-    """Features (B, T, H, W, F), flow (B, 2, 2, H, W), out (B, H, W, T, F, s^2); ``back`` adds ``out`` to features."""
+    """Map features (B, T, H, W, F) to ``out`` (B, H, W, T, F, s^2), or, with ``back``, its adjoint back to features."""
     plane = height * width
     blocks = tl.cdiv(plane, block)
     program = tl.program_id(0)

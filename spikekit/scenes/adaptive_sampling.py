@@ -86,8 +86,8 @@ class SceneProfile:
         size: rows and columns of the sensor.
         clocks: clocks of an interval.
         static: share of static pixels.
-        region: the smallest rectangle, starting at even pixels, that contains all other pixels; ``None`` if there are
-            none.
+        region: smallest rectangle, starting at even pixels, that contains all pixels that are not static; ``None`` if
+            there are none.
         displacement: 99th percentile of the displacement per clock of pixels that are not static, weighted by the
             squared slope of the light along the motion, as motion without a slope is invisible.
         blending: conservative estimate of the share of spikes that change if the ends of the interval are blended, from
