@@ -16,7 +16,7 @@ def _seed():
 
 @pytest.fixture(name="without_kernels")
 def _without_kernels():
-    """A context in which custom operators run by their torch path on the CPU too."""
+    """Context in which custom operators use their torch path on the CPU."""
 
     @contextmanager
     def without_kernels(*operators):

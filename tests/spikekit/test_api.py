@@ -1,6 +1,6 @@
-"""What holds for every operator: its module, dtypes, inputs left alone, tensors without data, arrays by mistake.
+"""Properties of every operator: module, dtypes, unmodified inputs, meta tensors, wrong types.
 
-Strides, sizes, autocast, vmap, compiling and export are rows of the table of extremes.
+Strides, sizes, autocast, vmap, compilation and export are tested by the table of extremes.
 """
 
 import inspect
@@ -53,7 +53,7 @@ def assert_same(got, expected):
 
 
 def test_public_names_are_there():
-    """That they are the right ones, the pages of the documentation say; see tests/test_docs.py."""
+    """The documentation lists them, see tests/test_docs.py."""
     assert all(hasattr(sk, name) for name in sk.__all__)
 
 

@@ -1,4 +1,4 @@
-"""The checks that all operators share, at the limits of what they accept."""
+"""The checks shared by all operators, at the limits of what they accept."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Laws of the camera, on streams, pictures, masks and flows of any kind."""
+"""Properties of the operators on random streams, pictures, masks and flows."""
 
 import math
 
@@ -20,7 +20,7 @@ def rng(seed):
 
 @given(st.integers(16, 2048), st.integers(0, 2047), st.integers(0, 40), FLOATS)
 def test_constant_light_gives_its_rate(light, start, half, dtype):
-    """Of light in 2048ths of the threshold: TFP and TFI are as near to it as whole spikes and whole clocks allow."""
+    """For light in multiples of 1/2048, TFP and TFI are exact up to whole spikes and whole clocks."""
     frames = 2 * (2048 // light) + 2 * half + 3
     spikes, _ = sk.spike_integrate_fire(torch.full((frames, 1, 1), light / 2048), charge=torch.tensor([[start / 2048]]))
     rate, window = light / 2048, 2 * half + 1
@@ -50,7 +50,7 @@ def test_mosaic_keeps_what_the_mask_keeps(seed, pattern, height, width):
 
 @st.composite
 def warps(draw):
-    """A mask that knows at least one pixel, a flow on and off the grid, and how many neighbours count."""
+    """A mask with at least one known pixel, a flow on and off the grid, and a number of neighbours."""
     height, width, generator = draw(SIDES), draw(SIDES), rng(draw(SEEDS))
     known = torch.rand(height, width, generator=generator) < draw(st.floats(0, 1))
     known[draw(st.integers(0, height - 1)), draw(st.integers(0, width - 1))] = True

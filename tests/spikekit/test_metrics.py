@@ -42,7 +42,7 @@ def test_both_are_clamped(metric, judge):
 
 
 def test_ssim_of_flat_bright_pictures():
-    """Where variances cancel: float32 would lose them."""
+    """Variances cancel here; float32 would lose them."""
     rgb, target = (0.9 + 1e-3 * picture.float() for picture in pair())
     assert ssim(rgb, target).item() == pytest.approx(skimage_ssim(rgb.double(), target.double()), rel=1e-5)
 

@@ -1,6 +1,6 @@
-"""Every operator for long, with more threads, and from several threads at once: the same bits, and no more memory.
+"""Every operator in long runs, with several threads, and called from several threads: same bits, bounded memory.
 
-SPIKEKIT_FUZZ=N in the environment calls each N times.
+The environment variable SPIKEKIT_FUZZ=N sets the number of calls.
 """
 
 import os
@@ -39,7 +39,7 @@ def test_more_threads_give_the_same_bits(example, threads):
 
 @pytest.fixture(name="hasty")
 def _hasty():
-    """Threads take turns as often as they can."""
+    """Switch threads as often as possible."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
     yield
@@ -48,7 +48,7 @@ def _hasty():
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=names)
 def test_several_threads_do_not_disturb_each_other(example, hasty):
-    """Not even in caches, where every thread brings sizes of its own."""
+    """Even in caches, with different sizes in every thread."""
     inputs = [[t.float() for t in example.tensors((2,), (12 + 2 * n, 30 - 2 * n), seed=n)] for n in range(8)]
     with ThreadPoolExecutor(8) as pool:
         found = list(pool.map(lambda n: example.results(*inputs[n % 8]), range(32)))
@@ -57,7 +57,7 @@ def test_several_threads_do_not_disturb_each_other(example, hasty):
 
 
 def test_memory_stays_flat():
-    """Of all operators in turns, for long; the longest lives are those of caches that nobody empties."""
+    """Long runs of all operators in turn, with their caches."""
     rounds = int(os.environ.get("SPIKEKIT_FUZZ", "100"))
     inputs = [[tensor.float() for tensor in example.tensors((2,), (8, 12))] for example in EXAMPLES]
 

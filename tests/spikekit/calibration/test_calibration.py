@@ -1,4 +1,4 @@
-"""Calibration: rates against a brute force, a sensor that is known is recovered, corrected it is an ideal one."""
+"""Calibration: rates against brute force, recovery of a known sensor, and correction to an ideal one."""
 
 import pytest
 import torch
@@ -19,7 +19,7 @@ def chance(seed=0):
 
 @pytest.fixture(name="truth", scope="module")
 def _truth():
-    """A sensor: gains 8 % apart, whose mean is 1 in every colour, dark rates, a dead and a hot pixel in a hundred."""
+    """A sensor with gains of SD 8 % and mean 1 in every colour, dark rates, and 1 % dead and 1 % hot pixels."""
     gain = 1 + 0.08 * torch.randn(SIZE, generator=chance(1)).clamp(-3, 3)
     dark = 0.01 * torch.rand(SIZE, generator=chance(2))
     lot = torch.rand(SIZE, generator=chance(3))

@@ -1,4 +1,4 @@
-"""A sensor measured by a scene that moves across it: found where it can be, and never invented."""
+"""Gains from a moving scene: recovered if possible, and never invented."""
 
 import pytest
 import torch
@@ -50,7 +50,7 @@ def raw(rgb, pattern):
 
 @pytest.fixture(name="truth", scope="module")
 def _truth():
-    """Gains 6 % apart, dark rates, and a few pixels that do not work."""
+    """A sensor with gains of SD 6 %, dark rates and a few defects."""
     gain = 1 + 0.06 * torch.randn(SIZE, generator=chance(1)).clamp(-3, 3)
     dark = 0.004 * (1 + 0.4 * torch.randn(SIZE, generator=chance(2))).clamp(0, 2)
     lot = torch.rand(SIZE, generator=chance(3))
@@ -61,7 +61,7 @@ def _truth():
 
 @pytest.fixture(name="recording", scope="module")
 def _recording(truth):
-    """Record a scene in motion, by the phase of the sensor."""
+    """Record a moving scene, by Bayer phase."""
     rgb = pictures((0.05, -0.03), range(FRAMES))
     sensor = SpikeSensor(SensorNoise(photons=3000, calibration=truth), seed=4)
     return rgb, {pattern: sensor.expose(0.25 * raw(rgb, pattern)) for pattern in (None, "BGGR")}

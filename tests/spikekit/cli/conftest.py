@@ -5,7 +5,7 @@ from spikekit.cli.command import main
 
 @pytest.fixture(name="fails")
 def _fails(capsys):
-    """Run a command line that fails: one line on stderr, nothing on stdout."""
+    """Run a command line that must fail with one line on stderr and nothing on stdout."""
 
     def check(status, *words):
         capsys.readouterr()

@@ -1,4 +1,4 @@
-"""``spikekit calibrate``: measured, kept beside the recording, and used by the commands that make pictures."""
+"""``spikekit calibrate``: the calibration is measured, stored, and applied by the commands that decode."""
 
 import os
 import re
@@ -28,7 +28,7 @@ def _truth():
 
 @pytest.fixture(name="folder", scope="module")
 def _folder(tmp_path_factory, truth):
-    """A recording of a wall, one of a scene and one with the cap on, by a camera that stores frames upside down."""
+    """Recordings of a wall, of a scene and in the dark, by a camera that stores frames upside down."""
     folder, sensor = tmp_path_factory.mktemp("camera"), SpikeSensor(SensorNoise(calibration=truth))
     write(folder / "wall.dat", sensor.expose(torch.full((300, *SIZE), 0.3)), flip=True)
     write(folder / "cap.dat", sensor.expose(torch.zeros(500, *SIZE)), flip=True)

@@ -1,4 +1,4 @@
-"""The ``spikekit`` command as a user types it."""
+"""The ``spikekit`` command line."""
 
 import os
 import signal
@@ -18,7 +18,7 @@ COMMAND = [sys.executable, "-c", "from spikekit.cli.command import main; raise S
 
 
 def expose(light, frames):
-    """A still scene of a simulated camera, recorded."""
+    """Record a still scene with a simulated camera."""
     spikes, _ = spike_integrate_fire(light.expand(frames, *light.shape), charge=torch.rand(light.shape))
     return spikes
 
@@ -91,7 +91,7 @@ def test_headerless_recording_without_size(tmp_path, fails, size, expected):
 
 @pytest.mark.parametrize(("method", "least"), [("tfi", 20), ("tfp", 30)])
 def test_decode(clip, tmp_path, capsys, method, least):
-    """The scene comes back, at its own brightness with the gain, and with white at its brightest without."""
+    """The scene is recovered: with alpha at its own brightness, without it scaled to white."""
     out = tmp_path / "made" / "a.png"
     words = ["decode", *sized(clip), "--method", method, "-o", out]
     light = torch.linspace(0.1, 0.5, 20).repeat(3, 12, 1)
@@ -116,7 +116,7 @@ def test_decode(clip, tmp_path, capsys, method, least):
 )
 @pytest.mark.parametrize("frames", ["0:500:83", "498:", "250"])
 def test_pictures_equal_those_of_the_whole_recording(tmp_path, capsys, name, words, decode, frames):
-    """Of one frame or of many, under their numbers, by the decoder that the options ask for."""
+    """For one frame or many, with their numbers in the names, for every method."""
     spikes = expose(torch.rand(12, 9) * 0.5 + 0.05, 500)
     write_spikes(tmp_path / name, spikes)
     out = tmp_path / "out"
@@ -147,7 +147,7 @@ print(run("0::1000") - before)
 
 @pytest.mark.skipif(sys.platform != "linux", reason="kilobytes of ru_maxrss are Linux's")
 def test_decode_many_in_bounded_memory(tmp_path):
-    """20,000 frames, 80 MB as bytes, take no more than 8 MB beyond what 1000 take."""
+    """20,000 frames, or 80 MB, take at most 8 MB more than 1000 frames."""
     chunk = (torch.rand(200, 50, 80) < 0.2).byte()
     write_spikes(tmp_path / "a.dat", (chunk for _ in range(100)))
     done = subprocess.run(
@@ -162,7 +162,7 @@ def test_decode_many_in_bounded_memory(tmp_path):
 
 @pytest.mark.parametrize("pattern", ["GRBG", "bggr"])
 def test_decode_colour(tmp_path, pattern, monkeypatch):
-    """A coloured wall, stored upside down, comes back in its colour; home is known where no shell says it."""
+    """A coloured wall, stored upside down, keeps its colour; ``~`` is expanded."""
     monkeypatch.setenv("HOME", str(tmp_path))
     rgb = torch.tensor([0.9, 0.5, 0.2])[:, None, None].expand(3, 10, 14)
     raw = bin_to_sensor(rgb, pattern.upper(), scale=1)

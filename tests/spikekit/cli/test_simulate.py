@@ -1,4 +1,4 @@
-"""``spikekit simulate`` as a user types it: whole sets of files or none, the same every time."""
+"""``spikekit simulate``: complete and reproducible sets of files, or none."""
 
 import hashlib
 import json
@@ -22,7 +22,7 @@ QUICK = ["--scale", "2", "--interpolation", "Blend"]
 
 
 def frames(count, seed=0):
-    """A smooth picture that moves to the left, two pixels a frame, in whole 255ths."""
+    """A smooth picture, in multiples of 1/255, that moves to the left by two pixels per frame."""
     noise = torch.rand(1, 3, 5, 8, generator=torch.Generator().manual_seed(seed))
     picture = torch.nn.functional.interpolate(noise, size=(35, 60), mode="bicubic")[0].clamp(0, 1)
     return [(picture.roll(-2 * n, -1)[:, :, :37] * 255).round() / 255 for n in range(count)]
@@ -30,7 +30,7 @@ def frames(count, seed=0):
 
 @pytest.fixture
 def film(tmp_path, monkeypatch):
-    """A folder of five pictures of 35 x 37, of which a sensor at scale 2 sees 32 x 36."""
+    """A folder of five pictures of 35 x 37, which scale 2 crops to 32 x 36."""
     monkeypatch.chdir(tmp_path)
     for n, rgb in enumerate(frames(5)):
         write_picture(f"film/f{n}.png", rgb)
@@ -43,7 +43,7 @@ def simulate(*words):
 
 @pytest.fixture(name="fails")
 def _fails(fails):
-    """It leaves nothing, and changes nothing."""
+    """Run a command that must fail and leave all files unchanged."""
 
     def check(status, *words):
         before = everything()
@@ -55,12 +55,12 @@ def _fails(fails):
 
 
 def everything():
-    """All files below the working folder and what is in them."""
+    """Return the contents of all files below the working folder."""
     return {str(path): path.read_bytes() for path in Path().rglob("*") if path.is_file()}
 
 
 def believed(stream):
-    """Whether a set of files is complete: by its side-car, and then each of them."""
+    """Return whether a set of files has a side-car, and then check that it is complete."""
     sidecar = find_sidecar(stream)
     if sidecar is None:
         return False
@@ -95,7 +95,7 @@ def test_a_clip(film, capsys):
 
 
 def test_the_whole_film(film, capsys):
-    """The same spikes as at once, every frame as truth, in memory that does not grow."""
+    """The stream equals that of a single run, every frame has a ground truth, and memory is bounded."""
     simulate(film, "-o", "a.npz", "--all", *QUICK, "--photons", 50)
     assert "no source of noise" in capsys.readouterr().out
     known = read_sidecar(Path("a.json"))
@@ -146,7 +146,7 @@ def test_negligible_noise_is_left_out_and_the_plan_can_be_given(film, capsys):
     ids=str,
 )
 def test_a_sidecar_edited_by_hand(tmp_path, monkeypatch, fails, capsys, part, value, said):
-    """One line that names it, from every verb that reads it."""
+    """Every verb that reads it gives a one-line error that names it."""
     monkeypatch.chdir(tmp_path)
     write_spikes("a.dat", torch.ones(3, 4, 8))
     known = {
@@ -168,7 +168,7 @@ def test_a_sidecar_edited_by_hand(tmp_path, monkeypatch, fails, capsys, part, va
 
 
 def test_two_processes_with_one_output(film):
-    """Processes that write one name, and one process with as many threads as there are, give the same files."""
+    """Concurrent processes with one output, and a process with all threads, give the same files."""
     words = ["simulate", str(film), *QUICK, "--photons", "30", "-o", "a.dat"]
     started = [sys.executable, "-c", "from spikekit.cli.command import main; raise SystemExit(main())", *words]
     assert [process.wait() for process in [subprocess.Popen(started) for _ in range(2)]] == [0] * 2
@@ -186,7 +186,7 @@ def test_two_processes_with_one_output(film):
 
 @pytest.mark.parametrize("step", [0, 1, 4, 6, 7])
 def test_process_killed_while_publishing(film, monkeypatch, step):
-    """Between any two of the moves, what lies there is the old set, the new set, or not believed."""
+    """After every step, the files are the old set, the new set, or a set without side-car."""
     simulate(film, "-o", "a.dat", "--all", *QUICK)
     old = Path("a.dat").read_bytes()
     moves = iter(range(100))
@@ -220,7 +220,7 @@ def test_leftovers_are_removed_and_a_second_process_waits(film):
 
 @pytest.mark.parametrize(("room", "words", "name"), [(8000, ["--all", "--clocks", "200"], "a.dat"), (500, [], "a.png")])
 def test_a_full_disk(film, fails, full_disk, room, words, name):
-    """One line that names the file for which there is no room; what was there is untouched."""
+    """The error is one line that names the file; existing files are kept."""
     simulate(film, "-o", "a.dat", *QUICK)
     with full_disk(room):
         said = fails(1, film, "-o", "a.dat", *QUICK, *words)
@@ -276,7 +276,7 @@ def test_mistakes(film, fails, words, status, said):
 
 
 def calibrated(path, width=18):
-    """A sensor whose left half sees half of the light, with a dead pixel and a hot one."""
+    """A sensor with gain 0.5 in its left half, a dead pixel and a hot one."""
     gains, defects = torch.ones(16, width), torch.zeros(16, width, dtype=torch.uint8)
     gains[:, : width // 2] = 0.5
     defects[3, 5], defects[4, 6] = DEAD, HOT

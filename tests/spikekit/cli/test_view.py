@@ -1,4 +1,4 @@
-"""``spikekit view`` as a user types it, and what the verbs know of a recording by its side-car or its camera."""
+"""``spikekit view``, and the metadata from side-cars and cameras."""
 
 import json
 import shutil
@@ -32,7 +32,7 @@ def view(*words):
 
 @pytest.fixture
 def moving(tmp_path, monkeypatch):
-    """A colour recording of 101 frames of 40 x 48: a smooth picture moving to the right, 0.1 pixels a frame."""
+    """A colour recording of 101 frames of 40 x 48: a smooth picture that moves to the right by 0.1 pixels per frame."""
     monkeypatch.chdir(tmp_path)
     noise = torch.rand(1, 3, 9, 15, generator=torch.Generator().manual_seed(1))
     picture = torch.nn.functional.interpolate(noise, size=(60, 100), mode="bicubic")[0].clamp(0, 1)
@@ -62,7 +62,7 @@ def moment(path, **known):
 
 
 def test_pictures_equal_those_of_the_decoders(moving):
-    """TFP and TFI of the middle, its motion, and the spikes of a row."""
+    """TFP and TFI of the middle frame, motion, and the spikes of a row."""
     here = moment("a.dat", frames=101, size=(40, 48))
     spikes = recording.Recording(Path("a.dat"), 101, (40, 48)).read(0, 101)
     assert here.tfp().equal((tfp(spikes, 41)[50] / 0.5).clamp(0, 1))
@@ -81,7 +81,7 @@ def test_pictures_equal_those_of_the_decoders(moving):
 
 
 def test_metadata_come_from_the_sidecar(still, capsys):
-    """Size, Bayer phase and brightness are known; colours are those of the scene."""
+    """Size, Bayer phase and alpha are read, so the colours are those of the scene."""
     capsys.readouterr()
     view("a.dat", "-o", "made/a.png", "--window", 5, "--frames", "10:30")
     assert capsys.readouterr().out == "made/a.png: frames 10 .. 29 of 41, white: alpha 0.5\n"
@@ -97,7 +97,7 @@ def test_metadata_come_from_the_sidecar(still, capsys):
 
 @pytest.mark.parametrize(("shape", "value"), [((1, 1, 1), 0), ((1, 1, 1), 1), ((30, 40, 40), 0)])
 def test_dim_short_and_small_recordings(tmp_path, monkeypatch, shape, value):
-    """A few pixels, one frame, no spike, nothing but spikes: there is always a picture."""
+    """A few pixels, one frame, no spikes or only spikes still give a picture."""
     monkeypatch.chdir(tmp_path)
     write_spikes("a.npz", torch.full(shape, value))
     view("a.npz", "-o", "a.png", "--pattern", "RGGB")
@@ -109,7 +109,7 @@ def test_dim_short_and_small_recordings(tmp_path, monkeypatch, shape, value):
 
 @pytest.mark.parametrize("header", [True, False])
 def test_a_camera_is_known(tmp_path, monkeypatch, capsys, header):
-    """Columns of the header go, frames are turned, the border goes, in every verb."""
+    """Every verb drops the header columns, flips the frames and crops the border."""
     monkeypatch.chdir(tmp_path)
     known = {
         "title": "a small one", "height": 6, "width": 8, "drop": [[3, 5]], "rate": 20000, "flip": True,

@@ -115,7 +115,7 @@ def test_split_colors_keeps_nan_in_its_plane():
 
 
 def test_scale_of_numpy():
-    """A byte as the scale: sizes are no bytes, or they would run over."""
+    """A uint8 scale must not overflow sizes."""
     expected = sk.bayer_mask(100, 90, scale=3)
     assert torch.equal(sk.bayer_mask(100, np.uint8(90), scale=np.uint8(3)), expected)
     assert torch.equal(sk.BayerMask(scale=np.uint8(3))(torch.zeros(100, 90)), expected)

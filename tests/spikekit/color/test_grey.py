@@ -1,4 +1,4 @@
-"""A sensor without colour filters, ``pattern="grey"``, through the operators that take a pattern."""
+"""Grey sensors, ``pattern="grey"``, in all operators with a pattern."""
 
 from __future__ import annotations
 

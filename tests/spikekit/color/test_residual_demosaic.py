@@ -1,4 +1,4 @@
-"""Residual interpolation against loops over pixels in float64, and laws."""
+"""Residual interpolation against loops over pixels in float64, and its properties."""
 
 import math
 
@@ -16,7 +16,7 @@ def mirrored(plane):
 
 
 def guided(guide, known, mask, rows):
-    """Fit a line in every window, then average the lines of all windows that a pixel is in."""
+    """Fit a line in every window, and average the lines of all windows that contain a pixel."""
     height, width = guide.shape
     slope, offset = np.zeros(guide.shape), np.zeros(guide.shape)
 
@@ -36,7 +36,7 @@ def guided(guide, known, mask, rows):
 
 
 def rows_apart(known, green):
-    """Green less the other colour of the row."""
+    """Return green minus the other colour of the row."""
     height, width = known.shape
     beside = np.zeros_like(known)
     beside[:, 1:-1] = (known[:, :-2] + known[:, 2:]) / 2

@@ -1,4 +1,4 @@
-"""A stream decoded in chunks equals the whole, however it is cut, and takes bounded memory."""
+"""Decoding in chunks of any length equals decoding the whole, in bounded memory."""
 
 import pytest
 import torch
@@ -13,7 +13,7 @@ CUTS = st.lists(st.integers(1, 30), min_size=1, max_size=12)
 
 
 def stream(frames, rate, seed):
-    """Pixels of random rates up to ``rate``, some of them silent or always on."""
+    """Random pixels with rates up to ``rate``, some silent and some always firing."""
     generator = torch.Generator().manual_seed(seed)
     rates = rate * torch.rand(2, 5, generator=generator)
     rates[0, 0], rates[1, 4] = 0, 1
@@ -34,7 +34,7 @@ def test_tfp_in_chunks(cuts, window, rate, seed):
 
 
 def decided(spikes, overlap):
-    """Where the frames n - overlap .. n + overlap hold all that the interval at n is made from, pixel by pixel."""
+    """Return where the frames n - overlap .. n + overlap determine the interval at n."""
     frames = len(spikes)
     result = torch.zeros(spikes.shape, dtype=torch.bool)
     for y, x in [(y, x) for y in range(spikes.shape[1]) for x in range(spikes.shape[2])]:
@@ -52,7 +52,7 @@ def decided(spikes, overlap):
 
 @given(CUTS, st.integers(0, 30), st.floats(0, 1), SEEDS)
 def test_tfi_in_chunks(cuts, overlap, rate, seed):
-    """Exact wherever the docstring says so."""
+    """The result is exact wherever the docstring promises it."""
     spikes = stream(sum(cuts), rate, seed)
     exact = decided(spikes, overlap)
     got, whole = in_chunks(spike_interval, spikes, cuts, overlap), spike_interval(spikes)
@@ -62,7 +62,7 @@ def test_tfi_in_chunks(cuts, overlap, rate, seed):
 
 
 def test_pieces_are_returned_as_early_as_possible():
-    """Nothing is read ahead, and nothing is yielded before its context is there."""
+    """Chunks are not read ahead, and pieces are not returned before their context is known."""
     read = []
 
     def chunks():

@@ -1,4 +1,4 @@
-"""The decoders against loops over every pixel; what the table of extremes has is not here again."""
+"""The decoders against loops over every pixel; more cases are in the table of extremes."""
 
 import brute_force
 import pytest
@@ -55,7 +55,7 @@ def test_the_gradient_of_tfi_is_its_own_adjoint():
 
 
 def test_large_values_leave_no_error_in_the_running_sum_of_tfp():
-    """A large number must not leave its rounding error behind."""
+    """A large value must not leave a rounding error behind."""
     spikes = torch.zeros(60, 1, 1)
     spikes[5], spikes[20:] = 1e8, 0.1
     assert torch.allclose(tfp(spikes, 5)[30:], torch.tensor(0.1), rtol=1e-6)

@@ -1,4 +1,4 @@
-"""Packed spikes: bits by hand, round trips of every type and width, the torch path, and what cannot be packed."""
+"""Packed spikes: bits by hand, round trips of every dtype and width, the torch path, and errors."""
 
 import pytest
 import torch
@@ -15,7 +15,7 @@ def random_spikes(*shape):
 
 
 def packed_by_hand(spikes):
-    """One pixel at a time."""
+    """Pack one pixel at a time."""
     rows = spikes.reshape(-1, spikes.shape[-1]).tolist()
     packed = [[sum(bit << i for i, bit in enumerate(row[j : j + 8])) for j in range(0, len(row), 8)] for row in rows]
     return torch.tensor(packed, dtype=torch.uint8).reshape(*spikes.shape[:-1], -1)
@@ -41,7 +41,7 @@ def test_against_one_pixel_at_a_time(lead, width, dtype, strided):
 
 @pytest.mark.parametrize("width", [1, 7, 8, 9, 24])
 def test_torch_path(width):
-    """What runs on other devices than the CPU."""
+    """The torch path, which runs on devices other than the CPU."""
     spikes = random_spikes(2, 3, 4, width)
     packed = packed_by_hand(spikes)
     assert _pack_bits._init_fn(spikes.float()).equal(packed)

@@ -1,4 +1,4 @@
-"""One key frame equals that frame of the whole, and is found without looking at frames that do not matter."""
+"""A key frame equals that frame of the dense decoder, and only the necessary frames are read."""
 
 import brute_force
 import numpy as np
@@ -37,7 +37,7 @@ def test_equals_the_frame_of_the_dense_decoder(dtype):
 
 @pytest.mark.parametrize("frames", [255, 256, 40_000])
 def test_long_silence(frames):
-    """Counters of one byte do not run over."""
+    """One-byte counters must not overflow."""
     spikes = torch.zeros(frames, 1, 3, dtype=torch.uint8)
     spikes[3, 0, 0] = spikes[-1, 0, 0] = 1
     spikes[[0, frames // 2], 0, 1] = 1
@@ -47,7 +47,7 @@ def test_long_silence(frames):
 
 
 def test_reads_only_the_frames_it_needs():
-    """Frames outwards, until every pixel has fired on both sides."""
+    """Frames are read outwards until every pixel has fired on both sides."""
     spikes = np.zeros((100, 2, 2), np.uint8)
     spikes[[40, 44, 50, 53], :, :] = 1
     seen = []
@@ -93,7 +93,7 @@ def test_mean_is_linear_with_its_weights_as_gradient():
 
 
 def test_mean_of_a_pixel_that_always_fires_is_exact_at_the_extremes():
-    """A whole recording in one mean, half precision, a range near the end of the type."""
+    """A mean over a whole recording, half precision, and a range near the largest value of the dtype."""
     spikes = torch.ones(70_001, 1, 2, dtype=torch.uint8)
     assert tfp_at(spikes, 35_000, 2001, order=2).sub(1).abs().max() <= 2e-6
     assert tfp_at(spikes[:2001].half(), 1000, 2001).tolist() == [[1, 1]]

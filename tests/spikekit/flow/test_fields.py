@@ -1,4 +1,4 @@
-"""Flow averaged, brought to a finer grid, and spread over time."""
+"""Joint flow, upsampling and linear motion."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def test_joint_flow(lead):
 
 
 def upsample_loop(flow, scale):
-    """Bilinear with pixel areas aligned: fine centre X lies at (X + 1/2) / s - 1/2, the border is repeated."""
+    """Bilinear with aligned pixel areas: fine centre X lies at (X + 1/2) / s - 1/2; borders are replicated."""
     height, width = flow.shape[-2:]
     fine = np.zeros((*flow.shape[:-2], scale * height, scale * width))
     for y, x in np.ndindex(*fine.shape[-2:]):
@@ -96,7 +96,7 @@ def test_errors(error, call):
     ],
 )
 def test_invalid_times_are_rejected(times, error, message):
-    """In the function, and in the module before it is called."""
+    """By the function, and by the module at its construction."""
     for call in (lambda: linear_motion(FLOW, FLOW, times), lambda: LinearMotion(times)):
         with pytest.raises(error, match=message):
             call()

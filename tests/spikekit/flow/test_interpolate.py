@@ -1,4 +1,4 @@
-"""Latent frames: against scenes whose motion is known, at the ends, where something is hidden, and across cuts."""
+"""Latent frames: scenes of known motion, the ends, occlusions and cuts."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from spikekit.scenes.analytic import Layer, Motion, Scene
 
 
 def texture(height, width, seed=0, dtype=torch.float32):
-    """Blurred noise from 0 to 1: coarse shapes, as pictures have them, with finer and finer detail."""
+    """Sum of blurred noise from coarse to fine, in [0, 1]."""
     white = np.random.default_rng(seed).normal(size=(3, 3, height, width))
     layers = [gaussian_filter(noise, (0, sigma, sigma)) for noise, sigma in zip(white, (1.5, 5, 15), strict=True)]
     noise = sum(layer / layer.std() for layer in layers)
@@ -26,7 +26,7 @@ def panning(x, y, size=(96, 112), dtype=torch.float32):
 
 
 def passing(background=(-1.6, 1.2), front=(4.0, 0.0), size=(120, 120)):
-    """A square in front of a background; both move by so many pixels from the first to the last of 21 clocks."""
+    """A square before a background, which move by the given pixels from the first to the last of 21 clocks."""
     back = Layer(texture(200, 200), Motion((background[0] / 20, background[1] / 20)), (-40, -40))
     square = Layer(texture(48, 48, seed=1), Motion((front[0] / 20, front[1] / 20)), (36, 36), torch.ones(48, 48))
     return Scene([back, square], *size, frames=21)
@@ -133,7 +133,7 @@ def test_occluded_background():
 
 
 def ball(radius, pixels):
-    """A white ball that moves to the right, in front of a dark background that stands still."""
+    """A white ball that moves to the right before a dark, still background."""
     axis = torch.arange(2.0 * radius + 1) - radius
     disc = (axis[:, None] ** 2 + axis**2 < radius**2).float()
     ball = Layer(torch.full((3, *disc.shape), 0.95), Motion((pixels / 20, 0.0)), (50, 50), disc)

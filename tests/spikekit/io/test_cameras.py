@@ -1,4 +1,4 @@
-"""Cameras: presets say what the field knows, and are applied in the right order."""
+"""Camera presets and their application in the right order."""
 
 import json
 
@@ -44,7 +44,7 @@ def test_presets():
 
 @pytest.mark.parametrize("name", CAMERAS)
 def test_stored_frames_are_prepared(name):
-    """Number the pixels, store them as the camera does, and find them again."""
+    """Number the pixels, store them like the camera, and recover them."""
     known = camera(name)
     seen = torch.arange(known.height * known.width).reshape(1, known.height, known.width)
     top, bottom, left, right = known.crop

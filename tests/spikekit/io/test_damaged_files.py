@@ -1,6 +1,6 @@
-"""Damaged files of every kind that spikekit reads: a result, or an error of one line that names them; nothing is run.
+"""Damaged files of every kind: reading gives a result or a one-line error that names the file, and runs no code.
 
-SPIKEKIT_FUZZ=N in the environment gives each N cases, and SPIKEKIT_FUZZ_SEED=S others: those of the seeds from S.
+The environment variable SPIKEKIT_FUZZ=N sets the number of cases, SPIKEKIT_FUZZ_SEED=S their first seed.
 """
 
 import io
@@ -55,7 +55,7 @@ CAMERA = {
 
 
 def read_all(path):
-    """Read it as every command does; a .dat is told its size."""
+    """Read a file like the commands; the size of a .dat is given."""
     size = (5, 9) if path.suffix == ".dat" else ()
     for packed in (False, True):
         for _ in iter_spikes(path, *size, flip=True, chunk=4, packed=packed):
@@ -161,7 +161,7 @@ def test_damaged_json(fuzz, read, good):
 
 
 def test_damaged_headers_of_npz(fuzz):
-    """Where the archive is whole, and what it holds is not."""
+    """The archive is valid but its array is not."""
 
     def make(rng):
         header = io.BytesIO()
@@ -211,7 +211,7 @@ def test_pipes_are_rejected(read, name, tmp_path):
 
 
 def test_a_film_or_a_picture_opens_no_other_file(tmp_path):
-    """FFmpeg takes a list of files for a film, whatever its name is."""
+    """FFmpeg would read a playlist under any name."""
     other = film(tmp_path / "other.mp4")
     concat = b"ffconcat version 1.0\nfile other.mp4\n"
     for name, data in (("a.mp4", concat), ("a.png", concat), ("b.png", other)):
@@ -221,7 +221,7 @@ def test_a_film_or_a_picture_opens_no_other_file(tmp_path):
 
 
 def test_folders_of_pictures(fuzz, tmp_path):
-    """Links to itself, pipes, folders and nonsense among the pictures of a film."""
+    """Circular links, pipes, folders and invalid files among the pictures of a film."""
     good = [PICTURES["a.png"](tmp_path / "a.png"), PICTURES["a.jpg"](tmp_path / "a.jpg")]
     good += [good[0][:60], b"", b"\x89PNG"]
     refused = 0
@@ -253,7 +253,7 @@ def test_folders_of_pictures(fuzz, tmp_path):
 
 @pytest.mark.parametrize("name", ["a.png", "a.bmp", "a.tif", "deep.tiff", "a.dat", "a.npz"])
 def test_small_files_that_claim_huge_pictures_are_rejected(name, tmp_path, monkeypatch):
-    """What is refused by its header takes no memory; a packed file of 260 kB could hold a frame of gigabytes."""
+    """Headers are checked before memory is allocated; 260 kB could unpack to gigabytes."""
     read, make, error, _ = FILES[name]
     make(tmp_path / name)
     module, least, most = ("files", 45, 44) if read is read_all else ("images", 1000, 20)

@@ -1,4 +1,4 @@
-"""Recordings: bits, rows, flips, parts of files, and every way in which a file can be wrong."""
+"""Recordings: bits, rows, flips, parts of files, and invalid files."""
 
 import tracemalloc
 from pathlib import Path
@@ -25,7 +25,7 @@ def clip(tmp_path):
 
 
 def test_bits_by_hand(tmp_path):
-    """The leftmost pixel is the least significant bit, rows run on across bytes, frames are padded to whole ones."""
+    """The leftmost pixel is the least significant bit, rows share bytes, and frames are padded to whole bytes."""
     (tmp_path / "a.dat").write_bytes(bytes([0b00000001, 0b11000000, 0b00010010, 0b11111111]))
     expected = [
         [[1, 0, 0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0, 1, 1]],
@@ -53,7 +53,7 @@ def test_bits_by_hand(tmp_path):
 @pytest.mark.parametrize("width", [1, 5, 16])
 @pytest.mark.parametrize("flip", [False, True])
 def test_write_and_read_whole_and_in_parts(tmp_path, name, width, flip):
-    """At once, in chunks of several types or frame by frame; unpacked or packed; all of it, a part, or in chunks."""
+    """Written at once, in chunks or by frames; read packed or not, whole, in part or in chunks."""
     spikes = random_spikes(11, 3, width).transpose(1, 2).contiguous().transpose(1, 2)
     dtypes = [torch.bool, torch.float32, torch.int64, torch.bfloat16, torch.float16, torch.float64] * 2
     ways = {
@@ -82,7 +82,7 @@ def test_write_and_read_whole_and_in_parts(tmp_path, name, width, flip):
 
 @pytest.mark.parametrize("name", ["a.dat", "a.npy", "a.npz"])
 def test_memory_is_bounded(tmp_path, name):
-    """8 MB go through in chunks of 400 kB, written and read; of 10 GB, two frames take the memory of two frames."""
+    """8 MB are written and read in chunks of 400 kB; two frames of 10 GB take the memory of two frames."""
     tracemalloc.start()
     write_spikes(tmp_path / name, (torch.ones(10, 100, 400, dtype=torch.uint8) for _ in range(20)))
     assert sum(int(part[:, 0, 0].sum()) for part in iter_spikes(tmp_path / name, 100, 400, chunk=10)) == 200
@@ -142,7 +142,7 @@ def test_wrong_arrays(tmp_path, arrays, message):
 
 @pytest.mark.parametrize("read", [read_spikes, iter_spikes, spikes_shape])
 def test_wrong_files_and_sizes(clip, read):
-    """Whatever can be seen without the frames is said at the call."""
+    """Errors that do not depend on the frames are raised at the call."""
     folder = clip.parent
     for name in ("empty.dat", "empty.npz"):
         (folder / name).touch()

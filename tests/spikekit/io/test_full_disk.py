@@ -1,4 +1,4 @@
-"""Every file that spikekit writes, on a full disk; `spikekit simulate` has its own tests, as it writes several."""
+"""All files that spikekit writes, on a full disk; `spikekit simulate`, which writes several, is tested elsewhere."""
 
 import pytest
 import torch

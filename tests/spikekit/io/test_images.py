@@ -1,4 +1,4 @@
-"""Pictures to files and back, panels, flow as colour."""
+"""Picture files, panels, and flow as colour."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from spikekit.io.images import picture_size
 
 
 def over_white(pixels):
-    """The picture (3, H, W) that numbers (H, W, C) from 0 to 1 mean."""
+    """Return pixels (H, W, C), 0 to 1, as a picture (3, H, W) over white."""
     colors = pixels.shape[-1] - 1 + pixels.shape[-1] % 2
     alpha = pixels[..., colors:] if colors < pixels.shape[-1] else 1
     return np.broadcast_to(alpha * pixels[..., :colors] + 1 - alpha, (*pixels.shape[:2], 3)).transpose(2, 0, 1)
@@ -110,7 +110,7 @@ def test_exif_orientation_is_applied(tmp_path, ending, turned):
 
 
 def test_16_bits_of_packed_colours_are_kept(tmp_path):
-    """Of which Pillow keeps 8; where nothing here unpacks all, a line says so."""
+    """Pillow would keep 8 bits; if the depth cannot be read, there is a one-line error."""
     rgb, rgba = (numbers(16, channels) for channels in (3, 4))
     write_lzw_tiff(tmp_path / "a.tif", rgb)
     reads(tmp_path / "a.tif", over_white(rgb / 65535), 1e-7)

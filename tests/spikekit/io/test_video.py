@@ -1,4 +1,4 @@
-"""Frames in and out: folders and films, lazily, in order, in their colours, and what is wrong in one line."""
+"""Folders of pictures and films: lazy reading, order, colours, writing, and one-line errors."""
 
 import pickle
 import re
@@ -22,7 +22,7 @@ SIZE = (48, 64)
 
 
 def frame(n, height=6, width=8):
-    """A picture that says which one it is."""
+    """A picture that encodes its number."""
     return torch.full((3, height, width), n / 255)
 
 
@@ -37,7 +37,7 @@ def number(rgb):
 
 
 def fails(path, *words, **choice):
-    """One line that names the file and holds the words."""
+    """Check for a one-line error that names the file and contains the words."""
     with pytest.raises(VideoError) as info:
         list(read_video(path, **choice))
     said = str(info.value)
@@ -92,7 +92,7 @@ def test_mixed_sizes_name_both(tmp_path):
 
 
 def test_a_damaged_picture_in_the_middle(tmp_path):
-    """It raises when it is its turn, and so does one whose target is gone; the others can be read."""
+    """It raises when it is read, like a link without target; the others can be read."""
     for n in range(4):
         write_picture(tmp_path / f"{n}.png", torch.rand(3, 40, 50))
     whole = (tmp_path / "2.png").read_bytes()
@@ -130,7 +130,7 @@ def test_invalid_films_are_rejected(tmp_path, monkeypatch):
 
 
 def write_film(path, frames=12, codec="libx264", pixels="yuv420p", level=20, **options):
-    """A film whose frame n is grey of ``level * n``."""
+    """Write a film whose frame n is grey with value ``level * n``."""
     av = pytest.importorskip("av")
     muxing = {"movflags": "faststart"} if path.suffix == ".mp4" else {}  # the index before the frames
     with av.open(str(path), "w", options=muxing) as container:
@@ -160,7 +160,7 @@ def level_of(rgb):
     ],
 )
 def test_a_video_file(tmp_path, name, codec, options):
-    """Every frame is the same one in any order, in a part, and in a copy for another process."""
+    """Frames do not depend on the order of reading, on slices, or on pickling."""
     frames = read_video(write_film(tmp_path / name, codec=codec, **options))
     assert (len(frames), frames.height, frames.width, frames.fps) == (12, *SIZE, 25)
     assert (frames.names[0], frames.names[11]) == ("00", "11")
@@ -203,7 +203,7 @@ def test_fork_does_not_disturb_its_parent(tmp_path):
 
 
 def test_threads_share_a_film(tmp_path):
-    """Each gets the frames that it asks for, whatever others ask for."""
+    """Each thread gets its own frames."""
     film = read_video(write_film(tmp_path / "a.mp4", frames=6))
     expected = [film[n] for n in range(6)]
 
@@ -222,7 +222,7 @@ def test_threads_share_a_film(tmp_path):
 
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])
 def test_rotated_film_is_upright(tmp_path, turns):
-    """As the matrix in its header says: by so many quarter turns clockwise."""
+    """By the quarter turns in the display matrix of its header."""
     seen = torch.linspace(0.2, 0.8, SIZE[0] * SIZE[1]).reshape(1, *SIZE).expand(3, -1, -1)
     write_video(tmp_path / "a.mp4", [seen] * 3)
     data = (tmp_path / "a.mp4").read_bytes()
@@ -244,7 +244,7 @@ def test_ten_bits_keep_their_depth(tmp_path):
 
 
 def test_truncated_film(tmp_path):
-    """What came before stays usable, and what is missing is told, not left out, each time."""
+    """Earlier frames stay readable; missing ones raise every time."""
     write_film(tmp_path / "a.avi", codec="ffv1")
     write_film(tmp_path / "a.mp4", bf="0")
     for name, rest in (("a.avi", 0.8), ("a.mp4", 0.98)):

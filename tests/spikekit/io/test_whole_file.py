@@ -1,4 +1,4 @@
-"""Writing whole files: after an error, a full disk and kills, side by side, and what is no ordinary file."""
+"""Atomic writing: errors, full disks, killed and concurrent writers, links and devices."""
 
 import errno
 import os
@@ -61,7 +61,7 @@ def test_error_or_full_disk_keeps_the_old_file(tmp_path, monkeypatch, error):
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_two_killed_writers(tmp_path):
-    """At random moments, seeded: the file is always one of theirs, whole, and their leftovers go."""
+    """Killed at random times: the file is always complete, and leftovers are removed."""
     target = tmp_path / "a.bin"
     chance = random.Random(24)
     whole = {letter.encode() * 4096 * 50 for letter in "ab"}

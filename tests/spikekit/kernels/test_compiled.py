@@ -1,4 +1,4 @@
-"""Loops that Numba compiles, and keeps where it can."""
+"""Compilation and caching of loops by Numba."""
 
 import pytest
 

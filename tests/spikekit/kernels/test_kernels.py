@@ -1,6 +1,6 @@
-"""The kernels of the sensor and the decoders, on CPU and GPU, against the torch paths of the same operators.
+"""The kernels of the sensor and the decoders, on CPU and GPU, against the torch paths.
 
-On the CPU tiles are of any size. Without a GPU its kernels run by Triton's interpreter, see test_kernels_gpu.py.
+CPU kernels use tiles of any size here. Without a GPU, GPU kernels run in Triton's interpreter, see test_kernels_gpu.py.
 """
 
 import importlib.util
@@ -30,7 +30,7 @@ DEVICE = "cpu" if INTERPRETED else "cuda"
 
 @pytest.fixture(params=[*([] if INTERPRETED else ["tiles of 7", "one tile"]), *GPU], name="run")
 def _run(request, monkeypatch):
-    """Run a kernel and bring its results back, always several."""
+    """Run a kernel and return its results as a sequence on the CPU."""
     if request.param == "gpu":
         from spikekit.kernels import gpu as kernels
     else:
@@ -47,7 +47,7 @@ def _run(request, monkeypatch):
 
 
 def check(run, name, *args, rtol=0.0, atol=0.0):
-    """As the torch path, bit for bit unless told otherwise; the interpreter cuts bfloat16 instead of rounding it."""
+    """Compare with the torch path, bit for bit by default; the interpreter truncates bfloat16 instead of rounding."""
     plain = OPERATORS[name]._init_fn(*args)
     for got, expected in zip(run(name, *args), plain if isinstance(plain, tuple) else (plain,), strict=True):
         least = 2**-7 if INTERPRETED and got.dtype is torch.bfloat16 else 0
@@ -97,7 +97,7 @@ def test_operators_do_not_import_the_compiler():
 @pytest.mark.filterwarnings("ignore:invalid value")
 @pytest.mark.parametrize("dtype", FLOATS)
 def test_any_light(run, dtype):
-    """Three clocks of ordinary and of strange light, each after each."""
+    """Three clocks of ordinary and extreme light in all combinations."""
     wide, inf = torch.promote_types(dtype, torch.float32), float("inf")
     theta = torch.tensor(0.3, dtype=wide)
     below, nan = theta.nextafter(theta * 0), float("nan")
@@ -111,14 +111,14 @@ def test_any_light(run, dtype):
 
 
 def sizes(dtype):
-    """The interpreter is slow; 23 * 29 pixels are more than a block."""
+    """Small sizes for the slow interpreter; 23 * 29 pixels exceed a block."""
     if INTERPRETED:
         return [(2, 5, 2, 3), (3, 23, 29)] if dtype in (torch.uint8, torch.float64) else [(2, 5, 2, 3)]
     return [(1, 1, 1), (40, 23, 29), (2, 3, 9, 2, 3)]
 
 
 def draw(size, dtype):
-    """Pixels of every density, silent ones and ones that always fire among them."""
+    """Random pixels of every rate, including silent and always firing ones."""
     return (torch.rand(size) < 1.6 * torch.rand((*size[:-3], 1, *size[-2:])) - 0.3).to(dtype)
 
 
@@ -135,7 +135,7 @@ def test_decoders(run, dtype):
 
 @pytest.mark.parametrize("dtype", FLOATS)
 def test_gradients(run, dtype):
-    """On eighths, whose sums are exact."""
+    """With multiples of 1/8, whose sums are exact."""
     for size in sizes(dtype):
         grad = (torch.randint(-16, 17, size) / 8).to(dtype)
         for window in (3, 301):
@@ -143,7 +143,7 @@ def test_gradients(run, dtype):
 
 
 def test_nonbinary_spikes(run):
-    """Any value but 0 is a spike of TFI, and TFP adds up what there is."""
+    """Any value but 0 is a spike for TFI; TFP sums the values."""
     for spikes in (torch.tensor([0.0, -0.0, 1e-45, float("nan"), -2.0, 0.0]), torch.tensor([0, 2**40, 0])):
         check(run, "spike_interval", spikes.reshape(-1, 1, 1))
     for spikes in (torch.randint(0, 256, (20, 2, 3), dtype=torch.uint8), torch.randint(-(2**20), 2**20, (20, 2, 3))):
@@ -153,7 +153,7 @@ def test_nonbinary_spikes(run):
 
 
 def test_long_streams(run, monkeypatch):
-    """From T = 32767 on intervals need 32 bits; a frame takes the interpreter two milliseconds, and it sees fewer."""
+    """From T = 32767 on intervals need 32 bits; the interpreter, at two milliseconds per frame, gets fewer frames."""
     for frames in (32766, 32767):
         dtype = torch.int16 if frames < 32767 else torch.int32
         assert run("spike_interval", torch.zeros(0, frames, 1, 1))[0].dtype is dtype
@@ -170,7 +170,7 @@ def test_long_streams(run, monkeypatch):
 
 @pytest.mark.parametrize(("name", "args"), ARGUMENTS.items())
 def test_layouts(run, name, args):
-    """Of the input; a GPU's result has the same."""
+    """Any layout of the input; GPU results keep it."""
     x = torch.rand(2, 9, 5, 4)
     views = [x[:, :1].expand(2, 9, 5, 4), torch.rand(2, 9, 5, 8)[..., 1::2], x[0], x[:0]]
     for order in ([3, 2, 1, 0], [0, 1, 3, 2], [1, 2, 3, 0], [2, 3, 0, 1]):

@@ -1,4 +1,4 @@
-"""The GPU kernels: by Triton's interpreter on the CPU, compiled where there is no GPU, and on a GPU where there is one.
+"""The GPU kernels: in Triton's interpreter on the CPU, compiled without a GPU, and on a GPU if there is one.
 
 Triton decides when it is imported whether it interprets, so that the tests of what kernels compute run in a process of
 their own: :func:`test_in_the_triton_interpreter`. Where there is a GPU they run on it as well.
@@ -51,7 +51,7 @@ def test_in_the_triton_interpreter():
 
 
 def call(name, *args):
-    """Run a kernel on the device, and bring its results back."""
+    """Run a kernel on the device, and return its results on the CPU."""
     results = getattr(gpu, name)(*[a.to(DEVICE) if isinstance(a, torch.Tensor) else a for a in args])
     return tuple(r.cpu() for r in results) if isinstance(results, tuple) else results.cpu()
 
@@ -66,7 +66,7 @@ def known_pixels():
 @computes
 @pytest.mark.parametrize(("which", "dtype"), [*((w, FLOATS[0]) for w in known_pixels()), ("green", FLOATS[1])])
 def test_nearest_known(which, dtype):
-    """Of no, whole, half and any flow, and of flow far outside."""
+    """For zero, whole, half, arbitrary and very large flow."""
     mask, count = known_pixels()[which]
     unit = 64  # in these units all positions are whole numbers, so that ties are exact
     steps = ((0, 1), (3, unit), (3, unit // 2), (3, 1), (10000, unit // 4))
@@ -85,7 +85,7 @@ GATHERS = [(1, 1, 1, 1, 1), (2, 3, 10, 4, 7), (2, 11, 30, 5, 150), (1, 70, 13, 2
 
 
 def gathering(sizes, dtype, last=False):
-    """Arguments of the three operators; ``last`` has channels next to each other in memory."""
+    """Arguments of the three operators; ``last`` for channels-last layout."""
     batch, channels, size, count, points = sizes
     values, grad = (torch.randn(batch, channels, length).to(dtype) for length in (size, points))
     if last:
@@ -144,7 +144,7 @@ def test_the_site_wise_search_and_its_derivative(scale, channels, size):
 
 @computes
 def test_a_level_of_tvl1():
-    """The torch path in float32 is the reference; orders of sums differ."""
+    """Compared with the torch path in float32, up to the order of sums."""
     clips, height, width = 2, 9, 13
     smooth = torch.nn.functional.avg_pool2d(torch.rand(clips, 3, height + 8, width + 8), 9, 1)
     pictures = torch.cat([smooth[:, :1], smooth[:, :1].roll((1, 1), (2, 3)) + 0.01 * smooth[:, 1:2]], dim=1)
@@ -157,7 +157,7 @@ def test_a_level_of_tvl1():
 
 
 def compile_calls():
-    """Every kernel, every type of its arguments, and sizes that Triton specialises on."""
+    """Every kernel with every dtype, and sizes that Triton specialises on."""
     stream = torch.zeros(2, 3, 4, 8)
     for x, dtype in [*((stream, d) for d in FLOATS[:3]), (torch.zeros(1, 1, 1, 1), torch.float32)]:
         wide, x = torch.promote_types(dtype, torch.float32), x.to(dtype)
@@ -182,7 +182,7 @@ def compile_calls():
 
 
 class Machine:
-    """A GPU that is not there, as Triton's driver describes it."""
+    """A stand-in for Triton's description of a GPU."""
 
     def get_current_target(self):
         from triton.backends.compiler import GPUTarget

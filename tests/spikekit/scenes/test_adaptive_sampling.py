@@ -1,4 +1,4 @@
-"""What a scene requires: profiles of pairs whose motion is known, and the decisions made of them."""
+"""Profiles of pairs of known motion, and the plans made from them."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -11,7 +11,7 @@ from spikekit.scenes.adaptive_sampling import Plan, SceneProfile, profile_interv
 
 
 class Steady:
-    """Flow that is the same everywhere, in pixels of what it is called with."""
+    """Constant flow, in pixels of the given frames."""
 
     def __init__(self, x=0.0, y=0.0):
         self.velocity, self.sizes = torch.tensor([x, y]), []
@@ -99,7 +99,7 @@ def test_inconsistent_or_invisible_flow_is_ignored(shape, where, flow, back, typ
 
 
 def test_blending_along_a_diagonal():
-    """A wave bends along the way across it, and not at all along its crests."""
+    """A wave has curvature across its crests, and none along them."""
     y, x = torch.meshgrid(torch.arange(64.0), torch.arange(64.0), indexing="ij")
     first, second = ((0.5 + 0.4 * torch.sin((x + y) / 4 + phase)).expand(3, 64, 64) for phase in (0.0, 0.5))
     across, along = (profile_of(first, second, Steady(0.5, y)).blending for y in (0.5, -0.5))

@@ -1,4 +1,4 @@
-"""Scenes: against a renderer written as plain loops, and the laws that light, truth and flow obey."""
+"""Analytic scenes against a renderer in plain loops, and properties of light, ground truth and flow."""
 
 import math
 
@@ -11,14 +11,14 @@ from spikekit.scenes.analytic import Layer, Motion, Scene
 
 
 def smooth_picture(height, width, dtype=torch.float64):
-    """A picture of waves some twenty pixels long, in each colour others."""
+    """A picture of waves of about twenty pixels, different in each colour."""
     y, x = torch.meshgrid(torch.arange(height, dtype=dtype), torch.arange(width, dtype=dtype), indexing="ij")
     waves = [0.5 + 0.2 * torch.sin(x / a + 1) + 0.2 * torch.cos(y / b + x / 9) for a, b in ((3, 4), (4, 3), (5, 5))]
     return torch.stack(waves)
 
 
 def busy_scene(height, width, frames=41, dtype=torch.float64, seed=0):
-    """A moving, turning, growing background that is mirrored beyond its border, and two objects, which overlap."""
+    """A moving, rotating, growing background, mirrored at its border, and two overlapping objects."""
     g = torch.Generator().manual_seed(seed)
 
     def rand(*size):
@@ -44,7 +44,7 @@ def bilinear(value, x, y):
 
 
 def brute_look(layer, x, y):
-    """Colour and coverage of a layer at a position of its picture."""
+    """Return colour and opacity of a layer at a position of its picture."""
     picture = layer.picture.numpy()
     h, w = picture.shape[1:]
 
@@ -64,7 +64,7 @@ def brute_look(layer, x, y):
 
 
 def brute_rgb(scene, clock):
-    """The definition in loops: where does every pixel of the view come from, in every layer?"""
+    """Render by the definition, pixel by pixel and layer by layer."""
     tau = clock - scene.frames // 2
     image = np.zeros((3, scene.height, scene.width))
     for layer in scene.layers:

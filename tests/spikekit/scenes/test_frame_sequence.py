@@ -1,4 +1,4 @@
-"""Films: light against a plain loop over interpolated frames, the frames' own pixels, and what plans cost and save."""
+"""Films: light against a loop over interpolated frames, ground truth, plans, flow and spikes."""
 
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +17,7 @@ from spikekit.sensor.simulate import SpikeSensor, simulate_spikes
 
 
 class Shift:
-    """The exact interpolation of periodic pictures that move steadily, by Fourier's theorem; notes what is asked."""
+    """Exact interpolation of uniformly moving periodic pictures by Fourier shift; records its calls."""
 
     def __init__(self, x=0.0, y=0.0):
         self.velocity, self.calls, self.taus = (x, y), [], []
@@ -39,7 +39,7 @@ class Shift:
 
 
 class Fade:
-    """Something that is no straight line in time."""
+    """An interpolation that is not linear in time."""
 
     def __init__(self):
         self.calls = []
@@ -60,7 +60,7 @@ def smooth(height, width, cut=0.15, seed=0):
 
 
 def moving(x, y=0.0, frames=3, size=64, scale=2, **settings):
-    """A film of a picture that moves by (x, y) sensor pixels an interval, with exact interpolation and motion."""
+    """A film that moves by (x, y) sensor pixels per interval, with exact interpolation and motion."""
     exact = Shift(x * scale, y * scale)
     picture = smooth(size, size, settings.pop("cut", 0.15))
     shots = [exact.shifted(picture, float(n)).clamp(0, 1) for n in range(frames)]
@@ -233,7 +233,7 @@ def test_estimated_error_of_blending(pixels, cut):
 
 
 def test_flow_equals_that_of_the_scene():
-    """Motion to the right and down, in sensor pixels, from the frame on and back, over two intervals."""
+    """Motion to the right and down, in sensor pixels, forwards and backwards over two intervals."""
     motion = Motion((0.3, -0.15))
     scene = Scene([Layer(torch.rand(3, 80, 80), motion, (-20, -20))], 32, 32, frames=41)
     frames = [scene.rgb(clock) for clock in (0, 10, 20, 30, 40)]
@@ -244,7 +244,7 @@ def test_flow_equals_that_of_the_scene():
 
 
 def test_flows_of_several_intervals_are_concatenated():
-    """Where the second interval's flow differs from place to place, it counts at the place that was moved to."""
+    """The flow of the second interval is sampled at the displaced position."""
     far = torch.zeros(2, 8, 32)
     far[0] = torch.arange(32.0)
 

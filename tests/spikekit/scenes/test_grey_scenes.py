@@ -1,4 +1,4 @@
-"""Scenes that a grey sensor sees."""
+"""Scenes seen by a grey sensor."""
 
 from __future__ import annotations
 

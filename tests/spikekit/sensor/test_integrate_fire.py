@@ -1,4 +1,4 @@
-"""The sensor against a loop, and the laws of its charge."""
+"""The sensor against a loop, and properties of its charge."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ DTYPES = [torch.float64, torch.float32, torch.bfloat16, torch.float16]
 
 
 def loop(light, threshold, charge):
-    """Integrate and fire in the dtype of ``charge``, as the contract says it."""
+    """Integrate and fire in the dtype of ``charge``, by the definition."""
     threshold = charge.dtype.type(threshold)
     spikes, charge = np.zeros_like(light), charge.copy()
     for where in np.ndindex(charge.shape):
@@ -71,7 +71,7 @@ def test_dtype_of_the_spikes(dtype):
 
 
 def test_second_gradient():
-    """The gradient is linear in the one that comes: its own gradient is the same window of light again."""
+    """The gradient is linear in the incoming gradient, so its own gradient is the same mask."""
     light = (torch.rand(3, 2, 2, dtype=torch.float64) * 3 - 1).requires_grad_()
     weight = torch.randn(3, 2, 2, dtype=torch.float64, requires_grad=True)
     spikes, _ = spike_integrate_fire(light, 0.5)

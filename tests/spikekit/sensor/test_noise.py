@@ -1,4 +1,4 @@
-"""Noise: each source is what its formula says, at any cut in time, and leaves the others alone."""
+"""Noise: each source follows its formula, and depends neither on chunks nor on other sources."""
 
 import dataclasses
 import itertools
@@ -36,7 +36,7 @@ def arriving(noise, light, *, threshold=1.0, seed=0, clock=0):
 
 
 def close(values, expected, deviation):
-    """Whether a mean is within five standard errors."""
+    """Return whether a mean is within five standard errors."""
     return abs(values.double().mean().item() - expected) < 5 * deviation / math.sqrt(values.numel())
 
 

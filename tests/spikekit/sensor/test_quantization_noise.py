@@ -18,7 +18,7 @@ def test_against_simulated_pixels_of_all_charges(frames):
 
 
 def test_a_window_of_whole_intervals_is_exact():
-    """Four frames of light 1/4 hold one spike, whatever the charge; of light 1/8 none or one."""
+    """Four frames of light 1/4 contain exactly one spike for any charge; of light 1/8 none or one."""
     variance = flicker(torch.ones(1, 4), torch.tensor([0.25, 0.125]))[0]
     assert variance.tolist() == [0, 0.25]
 

@@ -1,4 +1,4 @@
-"""The warp that is exported, beside the one that is not."""
+"""The exportable warp against flow_warp_idw."""
 
 import pytest
 import torch
@@ -8,7 +8,7 @@ from spikekit.warp.bayer_warp import bayer_warp_idw
 
 
 def rounded(flow):
-    """Flow in sixteenths of a pixel, to half a pixel beyond the picture at most."""
+    """Flow in multiples of 1/16 pixel, at most half a pixel outside the picture."""
     height, width = flow.shape[-2:]
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     pixel, last = torch.stack([x, y]), torch.tensor([width, height]).reshape(2, 1, 1) - 0.5

@@ -1,4 +1,4 @@
-"""The three bilinear operators of the warp against loops in float64, by every path, layout and dtype."""
+"""The three bilinear operators against loops in float64, for every path, layout and dtype."""
 
 from contextlib import nullcontext
 
@@ -25,7 +25,7 @@ def path(request, monkeypatch, without_kernels):
 
 
 def draw(batch, channels, bags, dtype=torch.float64, last=False):
-    """Values, their gradient's like, indices and weights; the index leaves pixels out and names others often."""
+    """Values, a gradient, indices and weights; the index omits some pixels and repeats others."""
 
     def planes(size):
         if last:
@@ -73,7 +73,7 @@ def test_against_loops(batch, channels, bags, last, dtype):
 @pytest.mark.parametrize("channels", [1, 2, 9])
 @pytest.mark.parametrize("last", [False, True])
 def test_result_has_the_memory_layout_of_the_values(channels, last):
-    """As promised to the compiler, whatever the path: a result in another layout would be read wrongly."""
+    """On every path, as promised to the compiler, which would misread another layout."""
     values, grad, index, weight = draw(2, channels, 4, last=last)
     gathered, scattered, _ = results(values, grad, index, weight)
     for got in (gathered, scattered):

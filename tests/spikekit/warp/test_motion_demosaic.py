@@ -1,4 +1,4 @@
-"""Demosaicing along motion against loops over pixels in float64, and on scenes whose motion is known."""
+"""Demosaicing along motion against loops over pixels in float64, and on scenes of known motion."""
 
 import math
 
@@ -21,7 +21,7 @@ from spikekit.scenes.analytic import Layer, Motion, Scene
 
 
 def correct(estimate, raw, flow, mask, sigma_space, sigma_range, tau):
-    """One colour, pixel by pixel; raw (T, H, W), flow (T, 2, H, W)."""
+    """Correct one colour, pixel by pixel; raw (T, H, W), flow (T, 2, H, W)."""
     frames, height, width = raw.shape
     moved = [flow_warp(estimate[None], -flow[t])[0] for t in range(frames)]
     result = estimate.clone()
@@ -63,14 +63,14 @@ def test_against_loops(pattern, widths):
 
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
 def test_single_mosaic_equals_residual_interpolation(pattern):
-    """What a time says of itself is that its samples are right."""
+    """A mosaic does not deviate from its own samples."""
     raw = torch.rand(2, 1, 8, 9, dtype=torch.float64)
     got = demosaic_along_motion(raw, torch.zeros(2, 1, 2, 8, 9, dtype=torch.float64), pattern)
     torch.testing.assert_close(got, demosaic_residual(raw[:, 0], pattern))
 
 
 def scene(velocity):
-    """A photograph that moves steadily, in sensor pixels per clock: spikes, truth and offsets of five times."""
+    """A uniformly moving photograph: spikes, ground truth and offsets at five times."""
     from skimage import data
 
     picture = torch.tensor(data.astronaut()[:160, 160:320]).movedim(-1, 0) / 255
@@ -90,7 +90,7 @@ def test_known_motion_improves_the_picture(velocity):
 
 
 def test_outliers_are_rejected():
-    """A time that shows something else changes little."""
+    """A mosaic with other content changes little."""
     raw, _, flow = scene(0.0)
     other = raw.clone()
     other[0] = mosaic(torch.rand(3, 96, 96, generator=torch.Generator().manual_seed(1)) + 3)

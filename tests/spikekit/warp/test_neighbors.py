@@ -1,4 +1,4 @@
-"""The search of known pixels, by Numba and by PyTorch, against brute force in whole numbers."""
+"""The search for known pixels, by Numba and by PyTorch, against brute force in integers."""
 
 from contextlib import nullcontext
 
@@ -13,7 +13,7 @@ UNIT = 64  # flows below are multiples of 1 / UNIT, squared distances are whole 
 
 
 def brute(flow, mask, neighbors):
-    """Sorted indices (N, K, H W), the first of them, and their weights, from all squared distances."""
+    """Return sorted indices (N, K, H W), the nearest, and weights, from all squared distances."""
     height, width = mask.shape
     rows, columns = np.nonzero(np.asarray(mask))
     y, x = np.mgrid[:height, :width].reshape(2, -1, 1)
@@ -51,7 +51,7 @@ def path(request, without_kernels):
 
 
 def masks():
-    """Products of at least four rows and four columns, and unions of two."""
+    """Masks: products of at least four rows and four columns, and unions of two."""
     for pattern, scale in [("GRBG", 1), ("BGGR", 2), ("GBRG", 3)]:
         for colour, mask in zip(
             "RGB", bayer_mask(8 // min(scale, 2), 10 // min(scale, 2), pattern, scale=scale), strict=True
@@ -71,7 +71,7 @@ def masks():
 
 @pytest.mark.parametrize("mask", list(masks()))
 def test_neighbours_at_every_eighth_of_a_pixel(mask, path):
-    """The whole picture, its borders and what lies beyond them; ties are everywhere."""
+    """Inside the picture, at its borders and outside, with many ties."""
     eighths = torch.cartesian_prod(torch.arange(8), torch.arange(8))[:, :, None, None] / 8
     for reach in (0, 2, 20):
         check(eighths + torch.randint(-reach - 1, reach + 1, (64, 2, *mask.shape)), mask)
@@ -84,7 +84,7 @@ def test_any_number_of_neighbours(neighbors, path):
 
 
 def test_float32_distances_are_compared_in_double(path):
-    """Two pixels whose distances differ by less than float32 can tell next to their size."""
+    """Two distances whose difference is below the resolution of float32."""
     mask = torch.zeros(9, 9, dtype=torch.bool)
     mask[::4, ::4] = True
     tiny = 2.0**-26

@@ -1,4 +1,4 @@
-"""The site-wise search against bilinear enlargement and flow_warp_idw, and its derivative against autograd's."""
+"""The site-wise search against bilinear upsampling and flow_warp_idw, and its derivative against autograd."""
 
 import pytest
 import torch
@@ -17,13 +17,13 @@ def table_for(size, pattern="RGGB", color=0, scale=4, neighbors=4):
 
 
 def rounded_flow(size, generator, reach=5.0):
-    """Flows whose shares fall on the steps of the border's classes, so that nothing is rounded."""
+    """Flows on the steps of the border classes, so that nothing is rounded."""
     whole = torch.randint(round(-reach * STEPS / 8), round(reach * STEPS / 8), (2, 2, 2, *size), generator=generator)
     return whole * 8 / STEPS
 
 
 def searched(features, flow, pattern, color, scale, neighbors=4):
-    """Enlarge, move every temporal pixel by the flow of its site, half a pixel beyond the border at most, and fold."""
+    """Upsample, warp every temporal pixel by the flow of its site, at most half a pixel outside, and fold."""
     batch, times, channels, height, width = features.shape
     moved = torch.einsum("tk,bkchw->btchw", SHARES.double(), flow.double()).flatten(0, 1) * scale
     moved = moved.repeat_interleave(scale, -2).repeat_interleave(scale, -1)

@@ -1,4 +1,4 @@
-"""The warps: which pixels are read, what is kept of a mask, derivatives; their values are in the table of extremes."""
+"""The warps: pixels that are read, caching of masks, derivatives; values are tested by the table of extremes."""
 
 import brute_force
 import pytest
@@ -10,7 +10,7 @@ from spikekit.warp.warp import _bilinear
 
 
 def flows(height, width):
-    """Zero, whole, half (ties), quarter, any, far outside and very far outside: (7, 2, height, width)."""
+    """Flows (7, 2, height, width): zero, whole, half (ties), quarter, random, far outside and very far outside."""
 
     def draw(most, unit):
         return torch.randint(-most * unit, most * unit + 1, (2, height, width)).double() / unit
@@ -25,7 +25,7 @@ def exact(features, flow, mask, neighbors=4):
 
 @pytest.mark.parametrize("channels", [1, 9])
 def test_idw_second_gradient_is_finite(channels):
-    """On known pixels and at ties as well."""
+    """Including known pixels and ties."""
     features, flow = torch.randn(2, channels, 4, 6).requires_grad_(), torch.zeros(2, 2, 4, 6)
     flow[1] = 0.5
     flow.requires_grad_()
@@ -36,7 +36,7 @@ def test_idw_second_gradient_is_finite(channels):
 
 
 def test_idw_cache_of_masks_follows_changes():
-    """The tables of a mask are kept between calls; a mask that changes, or another number, must not get old ones."""
+    """Cached tables must not be used for a changed mask or another number of neighbours."""
     features, flow = torch.randn(1, 1, 6, 8, dtype=torch.float64), flows(6, 8)[4:5]
     mask = (torch.rand(6, 8) < 0.3).double()
     for neighbors in (2, 4, 4, 3):
@@ -53,7 +53,7 @@ def test_idw_cache_of_masks_follows_changes():
 
 @pytest.mark.parametrize("channels", [1, 9])
 def test_idw_notices_changes_of_a_mask_through_views(channels):
-    """NumPy's view of the same memory and ``mask.data`` do not count their changes."""
+    """Changes through NumPy or ``mask.data`` do not increment the version counter."""
     features, flow = torch.rand(1, channels, 6, 8), 3 * torch.rand(1, 2, 6, 8) - 1.5
     for other in (lambda mask: mask.numpy(), lambda mask: mask.data):
         mask = bayer_mask(6, 8)[0].clone()
