@@ -121,14 +121,12 @@ class StillClips(Dataset):
         ``spikes`` (K, N, H, W), ``rgb`` (K, 3, s h, s w) and ``every``, and no flow. The gain is ``alpha``, where there
         are ``gains``, and the level of the noise ``noise``, where there is any.
         """
-        return self._clip(index) | self._camera(index)
-
-    def _clip(self, index: int) -> dict[str, Tensor]:
         if self.cache is None:
             return self.cut(self.whole(index))
         packed = self.cache.packed(clip_key(source=self._source, index=index), lambda: self.whole(index))
-        side = self.patch + 2 * self.margin
-        return self.cut(unpack_clip(packed, (0, 0, side, side), self.scale))
+        side, drawn = self.patch + 2 * self.margin, self._sensor(index) if self._told else {}
+        told = {name: torch.tensor(drawn[name]) for name in self._told}
+        return self.cut(unpack_clip(packed, (0, 0, side, side), self.scale) | told)
 
     @cached_property
     def _source(self) -> str:
@@ -172,10 +170,6 @@ class StillClips(Dataset):
     def _told(self) -> list[str]:
         """What a clip says of its camera."""
         return [name for name, varies in (("alpha", self.gains), ("noise", self.noise)) if varies]
-
-    def _camera(self, index: int) -> dict[str, Tensor]:
-        drawn = self._sensor(index) if self._told else {}
-        return {name: torch.tensor(drawn[name]) for name in self._told}
 
     def cut(self, clip: dict[str, Tensor]) -> dict[str, Tensor]:
         """Cut what :meth:`whole` or :meth:`render` returned into a clip of each key frame."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from lightning_modules.cli.errors import InputError, UsageError, VerbParser
 from lightning_modules.cli.folder_lock import locked_folder
 from lightning_modules.trade.films import PICTURES, measure_films
-from lightning_modules.trade.measure import Measurement, measure, running
+from lightning_modules.trade.measure import Measurement, measure, running, single_clips
 from lightning_modules.trade.runner import CannotRunError, Runner, make_runner
 from lightning_modules.trade.settings import Setting, read_setting, usual_settings
 from lightning_modules.trade.table import COLUMNS, markdown, write_csv
@@ -96,7 +96,7 @@ def _measured(rows: Sequence[Measurement], base: Runner, asked: argparse.Namespa
         if row.reason is not None:
             print(f"{row.setting.name} cannot run: {row.reason}", flush=True)
     if asked.film is None:
-        timed = measure(rows, base.data.test_dataloader(), asked.rounds)
+        timed = measure(rows, single_clips(base.data.test_dataloader()), asked.rounds)
     else:
         try:
             timed = measure_films(rows, base.data, base.network.frames, asked.film, asked.rounds)

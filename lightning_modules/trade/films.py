@@ -5,20 +5,17 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from pytorch_lightning import LightningDataModule
 from torch import Tensor
-from tqdm import tqdm
 
 from lightning_modules.cli.errors import UsageError
 from lightning_modules.data import FilmScenes, StillScenes
 from lightning_modules.data.sequences import SequenceClips
 from lightning_modules.metrics.flicker import film_flicker
-from lightning_modules.metrics.image import measures
-from lightning_modules.trade.measure import Measurement, Timed, attempt, measure_costs, running
+from lightning_modules.trade.measure import Measurement, Timed, measure, running, score_pictures
 from lightning_modules.trade.runner import Runner
 from spikekit import Scene
 from spikekit.scenes.frame_sequence import SequenceClip
@@ -62,24 +59,17 @@ class FilmRunner:
         return torch.stack(pictures)
 
 
-class FilmScene(NamedTuple):
-    """A film with its truth: spikes (1, T, H, W), pictures that count, (3, 3, s H, s W), and the flow in their pixels.
-
-    That is from the picture in the middle to the one before it and to the one behind it, (2, 2, s H, s W).
-    """
-
-    spikes: Tensor
-    rgb: Tensor
-    flow: Tensor
-
-
 def film_length(frames: int, every: int) -> int:
     """Return how many clocks a film takes."""
     return frames + (PICTURES - 1) * every
 
 
-def film_scenes(data: LightningDataModule, frames: int, every: int) -> Iterator[FilmScene]:
-    """Yield the test scenes of data as films, moving as fast as the clips do."""
+def film_scenes(data: LightningDataModule, frames: int, every: int) -> Iterator[dict[str, Tensor]]:
+    """Yield the test scenes of data as films, moving as fast as the clips do.
+
+    A film is ``spikes`` (1, T, H, W), ``rgb``, the pictures that count, (3, 3, s H, s W), and ``flow`` from the one in
+    the middle to the one before it and to the one behind it, (2, 2, s H, s W), in their pixels.
+    """
     length = film_length(frames, every)
     if isinstance(data, StillScenes):
         stills = copy.copy(data.val_set)
@@ -99,12 +89,12 @@ def film_scenes(data: LightningDataModule, frames: int, every: int) -> Iterator[
         raise UsageError(f"--film: expected still pictures in motion or films at full size, got {type(data).__name__}")
 
 
-def _film_scene(spikes: Tensor, view: Scene | SequenceClip, every: int, scale: int) -> FilmScene:
+def _film_scene(spikes: Tensor, view: Scene | SequenceClip, every: int, scale: int) -> dict[str, Tensor]:
     before, after = view.middle - every, view.middle + every
     rgb = torch.stack([view.rgb(clock) for clock in (before, view.middle, after)])
     flow = torch.stack([view.flow(clock, scale=scale) for clock in (before, after)])
     flow = scale * F.interpolate(flow, rgb.shape[-2:], mode="bilinear", align_corners=False)
-    return FilmScene(spikes[None], rgb, flow)
+    return {"spikes": spikes[None], "rgb": rgb, "flow": flow}
 
 
 def measure_films(
@@ -113,25 +103,17 @@ def measure_films(
     """Measure settings as :func:`lightning_modules.trade.measure.measure` does, on films."""
     for row in running(rows):
         row.runner = FilmRunner(row.runner, every)
-    kept: list[Tensor] = []
-    for scene in tqdm(film_scenes(data, frames, every), "films", disable=None, leave=False):
-        if len(kept) < rounds and (not kept or scene.spikes.shape == kept[0].shape):
-            kept.append(scene.spikes)
-        for row in running(rows):
-            attempt(row, lambda row=row, scene=scene: _score(row, scene))
-    timed = measure_costs(rows, kept, rounds)
+    timed = measure(rows, film_scenes(data, frames, every), rounds, _score)
     for row in running(rows):
         row.seconds = [seconds / PICTURES for seconds in row.seconds]
         row.macs /= PICTURES
     return replace(timed, every=every)
 
 
-def _score(row: Measurement, scene: FilmScene) -> None:
-    rgb = row.runner(scene.spikes.to(row.runner.device))[_COUNTED]
-    truth = scene.rgb.to(rgb)
-    for measure in measures():
-        getattr(row, measure.name).extend(measure.of(rgb, truth).tolist())
-    middle, ends = slice(1, 2), slice(0, 3, 2)
+def _score(row: Measurement, film: dict[str, Tensor]) -> None:
+    rgb = row.runner(film["spikes"].to(row.runner.device))[_COUNTED]
+    truth, middle, ends = film["rgb"].to(rgb), slice(1, 2), slice(0, 3, 2)
+    score_pictures(row, rgb, truth)
     pair = rgb[middle].expand(2, -1, -1, -1), rgb[ends], truth[middle].expand(2, -1, -1, -1), truth[ends]
-    row.flicker.extend(film_flicker(*pair, scene.flow.to(rgb)).tolist())
+    row.flicker.extend(film_flicker(*pair, film["flow"].to(rgb)).tolist())
     row.latency = row.runner.latency

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -66,34 +66,30 @@ class Timed:
     every: int | None = None
 
 
-def measure(rows: Sequence[Measurement], scenes: DataLoader, rounds: int) -> Timed:
+def measure(
+    rows: Sequence[Measurement],
+    clips: Iterable[dict[str, Tensor]],
+    rounds: int,
+    score: Callable[[Measurement, dict[str, Tensor]], None] | None = None,
+) -> Timed:
     """Score and time the settings that can run; if one fails, its row gets the reason, and the others continue.
 
     All settings see a clip before the next one is made. That also warms them up. Then they are timed on the clips that
-    are of one size with the first. Times do not include moving the spikes to the device.
+    are of one size with the first, of which the first is also weighed. Times do not include moving the spikes to the
+    device.
     """
     kept: list[Tensor] = []
-    with progress(what="pictures scored", total=len(scenes.dataset) * len(running(rows))) as bar:
-        for clip in _clips(scenes):
-            if len(kept) < rounds and (not kept or clip["spikes"].shape == kept[0].shape):
-                kept.append(clip["spikes"])
-            for row in running(rows):
-                attempt(row, lambda row=row, clip=clip: _score(row, clip))
-                bar.update()
-    return measure_costs(rows, kept, rounds)
-
-
-def measure_costs(rows: Sequence[Measurement], clips: Sequence[Tensor], rounds: int) -> Timed:
-    """Measure the cost of settings that can run; one that fails on the way gets a reason, and the others go on.
-
-    The clips, spikes (1, N, H, W) of one size, take turns at being timed; the first of them is also weighed.
-    """
+    for clip in progress(clips, "clips scored"):
+        if len(kept) < rounds and (not kept or clip["spikes"].shape == kept[0].shape):
+            kept.append(clip["spikes"])
+        for row in running(rows):
+            attempt(row, lambda row=row, clip=clip: (score or _score)(row, clip))
     for row in progress(running(rows), "settings weighed"):
-        attempt(row, lambda row=row: _weigh(row, clips[0]))
+        attempt(row, lambda row=row: _weigh(row, kept[0]))
     rows = running(rows)
-    time_in_turns(rows, clips, rounds)
+    time_in_turns(rows, kept, rounds)
     units = dict.fromkeys(_timer(row)[1] for row in rows)
-    return Timed(len(clips), tuple(clips[0].shape[-2:]), rounds, ", ".join(units))
+    return Timed(len(kept), tuple(kept[0].shape[-2:]), rounds, ", ".join(units))
 
 
 def running(rows: Sequence[Measurement]) -> list[Measurement]:
@@ -122,8 +118,8 @@ def _timer(row: Measurement) -> tuple[Timer, str]:
     return timer_of(row.runner.device, torch.get_num_threads())
 
 
-def _clips(scenes: DataLoader) -> Iterator[dict[str, Tensor]]:
-    """One by one, as a recording has them: what a batch takes depends on its size."""
+def single_clips(scenes: DataLoader) -> Iterator[dict[str, Tensor]]:
+    """Yield clips one by one, as a recording has them: what a batch takes depends on its size."""
     for batch in scenes:
         for n in range(len(batch["spikes"])):
             yield {name: value[n : n + 1] for name, value in batch.items()}
@@ -139,10 +135,13 @@ def attempt(row: Measurement, work: Callable[[], None]) -> None:
 
 
 def _score(row: Measurement, clip: dict[str, Tensor]) -> None:
-    rgb = row.runner(clip["spikes"].to(row.runner.device))
-    truth = clip["rgb"].to(rgb.device)
+    score_pictures(row, row.runner(clip["spikes"].to(row.runner.device)), clip["rgb"])
+
+
+def score_pictures(row: Measurement, rgb: Tensor, truth: Tensor) -> None:
+    """Add the scores of pictures to a row."""
     for measure in measures():
-        getattr(row, measure.name).extend(measure.of(rgb, truth).tolist())
+        getattr(row, measure.name).extend(measure.of(rgb, truth.to(rgb.device)).tolist())
 
 
 def _weigh(row: Measurement, spikes: Tensor) -> None:

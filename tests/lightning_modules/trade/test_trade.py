@@ -129,11 +129,11 @@ def test_films(shared, base, tmp_path):
     assert "5 pictures each, 10 clocks apart" in text
     assert [(row["latency"], row["every"], row["failed"]) for row in rows.values()] == [("20", "10", "")] * 2
     scene = next(film_scenes(base.data, 41, 10))
-    clips = scene.spikes[0].unfold(0, 41, 10).movedim(-1, 1)[1:4]
+    clips = scene["spikes"][0].unfold(0, 41, 10).movedim(-1, 1)[1:4]
     rgb = torch.cat([base(clip[None]) for clip in clips])
-    assert float(rows["as it is"]["psnr"]) == pytest.approx(psnr(rgb, scene.rgb).mean().item(), abs=1e-4)
-    pairs = [film_flicker(*(part[None] for part in (rgb[1], rgb[n], scene.rgb[1], scene.rgb[n], scene.flow[n // 2])))
-             for n in (0, 2)]  # fmt: skip
+    assert float(rows["as it is"]["psnr"]) == pytest.approx(psnr(rgb, scene["rgb"]).mean().item(), abs=1e-4)
+    truth, flow = scene["rgb"], scene["flow"]
+    pairs = [film_flicker(*(part[None] for part in (rgb[1], rgb[n], truth[1], truth[n], flow[n // 2]))) for n in (0, 2)]
     assert float(rows["as it is"]["flicker"]) == pytest.approx(torch.cat(pairs).mean().item(), abs=1e-4)
     assert "--film 10" in text
     assert f"| {float(rows['TFI']['flicker']):.3f} " in text
@@ -142,11 +142,11 @@ def test_films(shared, base, tmp_path):
 def test_the_truth_of_a_film_follows_its_motion(base):
     middle, moved, still = (..., slice(16, 32), slice(16, 32)), 0.0, 0.0
     for scene in film_scenes(base.data, 41, 20):
-        assert scene.spikes.shape == (1, 121, 12, 12)
-        for n, flow in zip((0, 2), scene.flow, strict=True):
-            there = flow_warp(scene.rgb[n][None], flow[None])[0]
-            moved += (there - scene.rgb[1])[middle].abs().mean().item()
-            still += (scene.rgb[n] - scene.rgb[1])[middle].abs().mean().item()
+        assert scene["spikes"].shape == (1, 121, 12, 12)
+        for n, flow in zip((0, 2), scene["flow"], strict=True):
+            there = flow_warp(scene["rgb"][n][None], flow[None])[0]
+            moved += (there - scene["rgb"][1])[middle].abs().mean().item()
+            still += (scene["rgb"][n] - scene["rgb"][1])[middle].abs().mean().item()
     assert moved < 0.7 * still, (moved, still)
 
 
@@ -170,7 +170,7 @@ def test_films_need_scenes_that_go_on(base, tmp_path, write_film):
     data.setup("test")
     with pytest.raises(UsageError, match="--film: expected a multiple of the 20 clocks of a source frame, got 10"):
         next(film_scenes(data, 41, 10))
-    assert next(film_scenes(data, 41, 20)).rgb.shape == (3, 3, 32, 48)
+    assert next(film_scenes(data, 41, 20))["rgb"].shape == (3, 3, 32, 48)
     with pytest.raises(UsageError, match="--film: expected still pictures in motion or films at full size, got"):
         next(film_scenes(LightningDataModule(), 41, 20))
 
