@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from spikekit.arguments import home_path
-from spikekit.check import check_whole
 from spikekit.io.failures import no_pipe, reading
 from spikekit.io.images import MOST_PIXELS, picture_size, read_picture
 
@@ -80,7 +79,7 @@ class VideoFrames(Sequence[Tensor]):
         return f"VideoFrames({str(self._source.path)!r}, {len(self)} frames of {self.height} x {self.width})"
 
 
-def read_video(path: str | Path, *, start: int = 0, count: int | None = None) -> VideoFrames:
+def read_video(path: str | Path) -> VideoFrames:
     """Open a folder of pictures or a video file.
 
     Convention:
@@ -97,17 +96,13 @@ def read_video(path: str | Path, *, start: int = 0, count: int | None = None) ->
 
     Args:
         path: a folder, a picture or a video file.
-        start: the first frame.
-        count: number of frames; default: up to the end.
 
     Returns:
-        The lazy sequence of frames.
+        The lazy sequence of frames; a slice of it is another.
 
     Raises:
-        VideoError: the file is missing, a folder has no pictures or pictures of several sizes, PyAV is missing, or
-            there are too few frames. A damaged frame raises it when it is read.
-        TypeError: ``start`` is not a whole number.
-        ValueError: ``count`` is not a whole number >= 1.
+        VideoError: the file is missing, a folder has no pictures or pictures of several sizes, or PyAV is missing.
+            A damaged frame raises it when it is read.
 
     Example:
         >>> import tempfile
@@ -115,17 +110,12 @@ def read_video(path: str | Path, *, start: int = 0, count: int | None = None) ->
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     for n in range(12):
         ...         write_picture(f"{folder}/{n}.png", torch.full((3, 4, 6), n / 255))
-        ...     frames = read_video(folder, start=1)
+        ...     frames = read_video(folder)[1:]
         ...     len(frames), frames.height, frames.width, frames[3:9:4].names, round(frames[-1].max().item() * 255)
         (11, 4, 6, ['4.png', '8.png'], 11)
     """
-    start = operator.index(start)
     source = _open(home_path(path))
-    stop = source.count if count is None else start + check_whole("count", count)
-    if not 0 <= start < source.count or stop > source.count:
-        wanted = f"frame {start}" if count is None else f"{count} frames from frame {start} on"
-        raise VideoError(f"{path}: expected {wanted}, got {source.count} frame{'s' * (source.count != 1)}")
-    return VideoFrames(source, range(start, stop))
+    return VideoFrames(source, range(source.count))
 
 
 def _open(path: Path) -> _Pictures | _Film:
