@@ -20,7 +20,7 @@ from spikekit.color.residual_demosaic import guided_by_green, interpolate_green
 from spikekit.scenes.analytic import Layer, Motion, Scene
 
 
-def correct(estimate, raw, flow, mask, sigma_space, sigma_range, tau):
+def correct(estimate, raw, flow, mask):
     """Correct one colour, pixel by pixel; raw (T, H, W), flow (T, 2, H, W)."""
     frames, height, width = raw.shape
     moved = [flow_warp(estimate[None], -flow[t])[0] for t in range(frames)]
@@ -36,28 +36,23 @@ def correct(estimate, raw, flow, mask, sigma_space, sigma_range, tau):
                         if mask[b, a]:
                             off = (raw[t, b, a] - moved[t][b, a]).item()
                             square = (a - at_x) ** 2 + (b - at_y) ** 2
-                            weight = math.exp(-square / (2 * sigma_space**2) - abs(t - frames // 2) / tau)
-                            weight *= math.exp(-(off**2) / (2 * sigma_range**2))
+                            weight = math.exp(-square / (2 * 0.5**2) - abs(t - frames // 2) / 5)
+                            weight *= math.exp(-(off**2) / (2 * 0.5**2))
                             total, weights = total + weight * off, weights + weight
             result[y, x] += total / weights
     return result
 
 
-@pytest.mark.parametrize(
-    ("pattern", "widths"), [("RGGB", {}), ("GRBG", {"sigma_space": 0.8, "sigma_range": 0.2, "tau": 1.5})]
-)
-def test_against_loops(pattern, widths):
+@pytest.mark.parametrize("pattern", ["RGGB", "GRBG"])
+def test_against_loops(pattern):
     generator = torch.Generator().manual_seed(0)
     raw = torch.rand(3, 6, 7, dtype=torch.float64, generator=generator)
     flow = 3 * torch.randn(3, 2, 6, 7, dtype=torch.float64, generator=generator)
     flow[1] = 0
     red, green, blue = bayer_mask(6, 7, pattern, dtype=torch.bool)
-    chosen = {"sigma_space": 0.5, "sigma_range": 0.5, "tau": 5.0} | widths
-    greens = correct(interpolate_green(raw[1:2], green)[0], raw, flow, green, **chosen)
-    planes = [
-        correct(guided_by_green(raw[1:2], greens[None], mask)[0], raw, flow, mask, **chosen) for mask in (red, blue)
-    ]
-    got = demosaic_along_motion(raw, flow, pattern, **widths)
+    greens = correct(interpolate_green(raw[1:2], green)[0], raw, flow, green)
+    planes = [correct(guided_by_green(raw[1:2], greens[None], mask)[0], raw, flow, mask) for mask in (red, blue)]
+    got = demosaic_along_motion(raw, flow, pattern)
     torch.testing.assert_close(got, torch.stack([planes[0], greens, planes[1]]), rtol=0, atol=1e-7)
 
 
@@ -94,9 +89,7 @@ def test_outliers_are_rejected():
     raw, _, flow = scene(0.0)
     other = raw.clone()
     other[0] = mosaic(torch.rand(3, 96, 96, generator=torch.Generator().manual_seed(1)) + 3)
-    kept = demosaic_along_motion(other, flow, sigma_range=0.1) - demosaic_along_motion(raw, flow, sigma_range=0.1)
-    let_in = demosaic_along_motion(other, flow, sigma_range=1e6) - demosaic_along_motion(raw, flow, sigma_range=1e6)
-    assert kept.abs().mean() < 0.05 * let_in.abs().mean()
+    assert (demosaic_along_motion(other, flow) - demosaic_along_motion(raw, flow)).abs().mean() < 0.01
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e4])
@@ -105,10 +98,6 @@ def test_flow_out_of_the_sensor_or_not_finite(value):
     flow = torch.zeros(3, 2, 6, 8, dtype=torch.float64)
     flow[0] = value
     got = demosaic_along_motion(raw, flow.requires_grad_())
-    if value == value:  # nothing from there
-        alone = demosaic_along_motion(raw[1:2], flow[1:2])
-        rest = demosaic_along_motion(torch.cat([raw[1:2], raw[1:]]), flow * 0, tau=1e-3)
-        torch.testing.assert_close(rest, alone)
     (grad,) = torch.autograd.grad(got.sum(), flow)
     assert got.isfinite().all()
     assert grad.isfinite().all()
@@ -120,7 +109,6 @@ def test_flow_out_of_the_sensor_or_not_finite(value):
         (torch.rand(4, 5, 5), torch.zeros(4, 2, 5, 5), {}, r"raw: expected \(\*, T, H, W\) with T odd"),
         (torch.rand(3, 2, 5), torch.zeros(3, 2, 2, 5), {}, "raw: expected .* at least 3 x 3"),
         (torch.rand(3, 5, 5), torch.zeros(3, 2, 5, 4), {}, r"flow: expected \(3, 2, 5, 5\) for raw \(3, 5, 5\)"),
-        (torch.rand(3, 5, 5), torch.zeros(3, 2, 5, 5), {"tau": 0.0}, "tau: expected a finite number above 0"),
         (torch.rand(3, 5, 5), torch.zeros(3, 2, 5, 5), {"pattern": "RGBG"}, "pattern: expected one of"),
     ],
 )
