@@ -89,4 +89,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _plan(text: str) -> str | int:
-    return int(text) if text.isascii() and text.isdigit() else text
+    if text.isascii() and text.isdigit():
+        return int(text)
+    if text not in ("scene", "everything"):
+        raise argparse.ArgumentTypeError(f"expected scene, everything or a number of latent frames, got {text}")
+    return text

@@ -49,13 +49,6 @@ class Settings:
     noise: SensorNoise = field(default_factory=SensorNoise)
     calibration: str | None = None  #: file of the calibration in ``noise``
 
-    def __post_init__(self) -> None:
-        if not (self.plan in ("scene", "everything") or self.plan in range(self.clocks)):
-            raise ValueError(
-                f"plan: expected scene, everything or 0 to {self.clocks - 1} latent frames in {self.clocks} clocks, "
-                f"got {self.plan}"
-            )
-
     def film(self, frames: Sequence[Tensor]) -> FrameSequence:
         """Return the film of the given frames."""
         plan = None
