@@ -29,13 +29,11 @@ from spikekit.kernels import compiler_kept_out, custom_operator, gpu_kernel, reg
 from spikekit.kernels.loops import import_loops
 from spikekit.warp.neighbors import finite, products_of, search_and_weigh
 
-_loops = import_loops("spikekit.kernels.cpu_sites")
-
 STEPS = 32  #: positions per sensor pixel and axis that flow is rounded to
 SMALLEST = 12  #: smallest side of a sensor, in pixels, on which the borders have separate classes
 _SIDE = 16  # side of the sensor on which the table is computed
 _AROUND = 4, 6  # radius, in sensor pixels, that contains the known ones; the second if scale is 1
-_CHUNK = 1 << 13  # positions per search: fits in the cache
+_LEAST = 1e-7  # smallest weight that is kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,75 +135,63 @@ def _make_table(pattern: str, color: int, scale: int, odd: tuple[bool, bool], ne
     ends = step[[0, 1, STEPS // 2 - 1, STEPS // 2, STEPS // 2 + 1, -2, -1]]
     # offsets of sites inside on one axis and near a border on the other, where known pixels lie further apart
     near = [[*inside, -1, 0, 1, length, length - 1, length - 2] for length in size]
-    wide = _weights(mask, neighbors, scale, _steps(near[0], ends), _steps(inside, ends))[1][:, 1]
-    high_ones = _weights(mask, neighbors, scale, _steps(inside, ends), _steps(near[1], ends))[1][:, 0]
+    wide = _weights(mask, neighbors, scale, near[0], inside, ends)[1][:, 1]
+    high_ones = _weights(mask, neighbors, scale, inside, near[1], ends)[1][:, 0]
     low, high = int(min(wide.min(), high_ones.min())), int(max(wide.max(), high_ones.max()))
     axes = [[*inside, *range(-1, -low), *range(length, length - high - 1, -1)] for length in size]
-    found = [
-        _weights(mask, neighbors, scale, _steps(inside, step), _steps(inside, step)),
-        _weights(mask, neighbors, scale, *(_steps(axis, step[::2]) for axis in axes)),
-    ]
+    # row by row: fits in the cache
+    found = [_weights(mask, neighbors, scale, [row], inside, step) for row in inside]
+    found += [_weights(mask, neighbors, scale, [row], axes[1], step[::2]) for row in axes[0]]
     count, offset, weight = (torch.cat(parts) for parts in zip(*found, strict=True))
     start = F.pad(count.cumsum(0), (1, 0))
     return SiteTable(scale, low, high, int(count.max()), start.int(), offset.int(), weight)
 
 
-def _steps(bases: list[int], steps: Tensor) -> Tensor:
-    """Return positions (bases, steps) on an axis, in steps."""
-    return torch.tensor(bases)[:, None] * STEPS + steps
-
-
-def _weights(mask: Tensor, neighbors: int, scale: int, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute the weights for all pairs of places on both axes and all fractions.
+def _weights(
+    mask: Tensor, neighbors: int, scale: int, rows: list[int], columns: list[int], steps: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute the weights for all pairs of bases and all fractions.
 
     Args:
         mask: known temporal pixels, (s H, s W).
         neighbors: number of known pixels that are weighted.
         scale: super-resolution factor s.
-        rows: positions in steps, (I, S).
-        columns: positions in steps, (J, S).
+        rows: rows of the I bases.
+        columns: columns of the J bases.
+        steps: fractions on both axes, (S,).
 
     Returns:
         For the I J S^2 classes: number of features, (classes,), their offsets, (n, 2), and weights, (n, s^2).
     """
     height, width = (length // scale for length in mask.shape)
-    sub = torch.arange(scale)
-    # target of every temporal pixel of the site: (I, S, s) and (J, S, s), in temporal pixels
-    y = (rows[..., None] * (scale / STEPS) + sub).double().clamp(-0.5, scale * height - 0.5)
-    x = (columns[..., None] * (scale / STEPS) + sub).double().clamp(-0.5, scale * width - 0.5)
-    places = len(rows), len(columns), rows.shape[1], columns.shape[1]
-    y = y[:, None, :, None, :, None].expand(*places, scale, scale).reshape(-1)
-    x = x[None, :, None, :, None, :].expand(*places, scale, scale).reshape(-1)
-    base_y = (rows[:, 0] // STEPS)[:, None, None, None].expand(places).reshape(-1)
-    base_x = (columns[:, 0] // STEPS)[None, :, None, None].expand(places).reshape(-1)
-    products = products_of(mask, neighbors)
-    around, per_site = _AROUND[scale == 1], scale**2
+    # distinct targets of the temporal pixels of a site at all fractions, in steps of a temporal pixel
+    moved, which = (steps[:, None] * scale + STEPS * torch.arange(scale)).unique(return_inverse=True)
+    axes = torch.tensor(rows), torch.arange(len(moved)), torch.tensor(columns), torch.arange(len(moved))
+    base_y, down, base_x, right = (part.flatten() for part in torch.meshgrid(*axes, indexing="ij"))
+    y, x = (scale * base + moved[part] / STEPS for base, part in ((base_y, down), (base_x, right)))
+    at = torch.stack([x.clamp(-0.5, scale * width - 0.5), y.clamp(-0.5, scale * height - 0.5)]).double()
+    cell = at.round()
+    index, weight = search_and_weigh(products_of(mask, neighbors), neighbors, scale * width, cell.long(), at - cell)
+    around = _AROUND[scale == 1]
     side = 2 * around + 1
+    dense = torch.zeros(len(y), side * side)
+    # a known temporal pixel is a bilinear mixture of features, as in torch.nn.functional.interpolate
+    for i, weight_y in _mixture(index // (scale * width), scale, height):
+        for j, weight_x in _mixture(index % (scale * width), scale, width):
+            amount = weight * weight_y * weight_x
+            tap = (i - base_y + around) * side + j - base_x + around
+            # features of weight 0 may lie outside
+            dense.scatter_add_(1, tap.where(amount != 0, 0).T, amount.float().T)
+    dense = dense.reshape(len(rows), len(moved), len(columns), len(moved), -1).transpose(1, 2).flatten(0, 1)
     counts, offsets, weights = [], [], []
-    classes = max(1, _CHUNK // per_site)
-    for begin in range(0, len(base_y), classes):
-        part = slice(begin * per_site, (begin + classes) * per_site)
-        at = torch.stack([x[part], y[part]])
-        cell = at.round()
-        index, weight = search_and_weigh(products, neighbors, scale * width, cell.long(), at - cell)
-        chunk_y, chunk_x = base_y[begin : begin + classes], base_x[begin : begin + classes]
-        dense = torch.zeros(len(chunk_y), per_site, side * side)
-        # a known temporal pixel is a bilinear mixture of features, as in torch.nn.functional.interpolate
-        row, column = index // (scale * width), index % (scale * width)
-        for i, weight_y in _mixture(row, scale, height):
-            for j, weight_x in _mixture(column, scale, width):
-                away_y = i.unflatten(1, (-1, per_site)) - chunk_y[:, None] + around
-                away_x = j.unflatten(1, (-1, per_site)) - chunk_x[:, None] + around
-                amount = (weight * weight_y * weight_x).unflatten(1, (-1, per_site))
-                for k in range(neighbors):
-                    # features of weight 0 may lie outside
-                    where = (away_y[k] * side + away_x[k]).where(amount[k] != 0, 0)
-                    dense.scatter_add_(2, where.unsqueeze(-1), amount[k].float().unsqueeze(-1))
-        used = dense.amax(dim=1) > 1e-7
-        which, tap = used.nonzero(as_tuple=True)
+    for pair in dense:
+        near = (pair.amax(dim=(0, 1)) > _LEAST).nonzero()[:, 0]
+        part = pair[..., near][which][:, :, which].transpose(1, 2).flatten(2, 3).flatten(0, 1)
+        used = part.amax(dim=1) > _LEAST
+        site, tap = used.nonzero(as_tuple=True)
         counts.append(used.sum(dim=1))
-        offsets.append(torch.stack([tap // side - around, tap % side - around], dim=1))
-        weights.append(dense[which, :, tap])
+        offsets.append(torch.stack([near[tap] // side - around, near[tap] % side - around], dim=1))
+        weights.append(part[site, :, tap])
     return torch.cat(counts), torch.cat(offsets), torch.cat(weights)
 
 
@@ -280,8 +266,9 @@ def _operator(plain: Callable[..., Tensor], fake: Callable[..., Tensor]) -> Any:
     op = custom_operator(name, plain, fake)
 
     def on_cpu(first: Tensor, *others: Any) -> Tensor:
-        compiled = _loops is not None and first.dtype in (torch.float32, torch.bfloat16)
-        return (getattr(_loops, name) if compiled else plain)(first, *others)
+        loops = import_loops("spikekit.kernels.cpu_sites")
+        compiled = loops is not None and first.dtype in (torch.float32, torch.bfloat16)
+        return (getattr(loops, name) if compiled else plain)(first, *others)
 
     def on_gpu(first: Tensor, *others: Any) -> Tensor:
         return (plain if first.dtype is torch.float64 else gpu_kernel(name))(first, *others)
