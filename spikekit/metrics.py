@@ -7,6 +7,8 @@ from torch import Tensor
 
 from spikekit.check import check_planes
 
+_BAND = 1 << 14  # pixels
+
 
 def _pair(rgb: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     check_planes("rgb", rgb, 3, "(*, 3, H, W)", floating=True)
@@ -83,19 +85,25 @@ def ssim(rgb: Tensor, target: Tensor) -> Tensor:
         raise ValueError(f"rgb: expected at least 7 x 7 pixels, got {tuple(rgb.shape)}")
     height, width = rgb.shape[-2:]
     planes = (picture.reshape(-1, height, width).unbind() for picture in (rgb, target))
-    # plane by plane, to stay in the cache
-    similar = torch.stack([_similarity(a.double(), b.double()) for a, b in zip(*planes, strict=True)])
+    similar = torch.stack([_similarity(a, b) for a, b in zip(*planes, strict=True)])
     return similar.reshape(rgb.shape[:-2]).mean(dim=-1).to(rgb.dtype)
 
 
 def _similarity(a: Tensor, b: Tensor) -> Tensor:
-    """Return the mean SSIM of two planes; numerator and denominator are multiples of those in the formula."""
+    """Return the mean SSIM of two planes, in bands of rows that fit the cache."""
+    rows = max(1, _BAND // a.shape[-1])
+    bands = (slice(top, top + rows + 6) for top in range(0, len(a) - 6, rows))
+    return torch.cat([_of_windows(a[band].double(), b[band].double()) for band in bands]).mean()
+
+
+def _of_windows(a: Tensor, b: Tensor) -> Tensor:
+    """Return the SSIM of every window; numerator and denominator are multiples of those in the formula."""
     sum_a, sum_b, both = _windows(a), _windows(b), _windows(a * b)
     squares = _windows(torch.addcmul(a * a, b, b))
     c1, c2 = 49**2 * 0.01**2, 49 * 48 * 0.03**2  # sample covariance: 48 in place of 49
     product, norm = sum_a * sum_b + c1 / 2, torch.addcmul(c1 + sum_a * sum_a, sum_b, sum_b)
     numerator = product * (49 * both + (c1 / 2 + c2 / 2) - product)
-    return 4 * (numerator / (norm * (49 * squares + (c1 + c2) - norm))).mean()
+    return 4 * (numerator / (norm * (49 * squares + (c1 + c2) - norm)))
 
 
 def _windows(plane: Tensor) -> Tensor:
@@ -105,5 +113,5 @@ def _windows(plane: Tensor) -> Tensor:
         two = plane.narrow(dim, 0, length - 1) + plane.narrow(dim, 1, length - 1)
         four = two.narrow(dim, 0, length - 3) + two.narrow(dim, 2, length - 3)
         windows = length - 6
-        plane = four.narrow(dim, 0, windows) + two.narrow(dim, 4, windows) + plane.narrow(dim, 6, windows)
+        plane = (four.narrow(dim, 0, windows) + two.narrow(dim, 4, windows)).add_(plane.narrow(dim, 6, windows))
     return plane

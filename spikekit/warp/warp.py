@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from kornia.geometry import create_meshgrid
 from kornia.geometry.transform import remap
 from torch import Tensor, nn
 
@@ -53,8 +52,8 @@ def flow_warp(image: Tensor, flow: Tensor) -> Tensor:
     height, width = image.shape[-2:]
     wide = torch.promote_types(torch.promote_types(image.dtype, flow.dtype), torch.float32)
     planes = image.reshape(-1, *image.shape[-3:]).to(wide)
-    grid = create_meshgrid(height, width, normalized_coordinates=False, device=flow.device, dtype=wide)
-    x, y = (grid + finite(flow.reshape(-1, 2, height, width).to(wide)).movedim(1, -1)).unbind(-1)
+    x, y = finite(flow.reshape(-1, 2, height, width).to(wide)).unbind(1)
+    x, y = x + torch.arange(width, device=flow.device), y + torch.arange(height, device=flow.device)[:, None]
     if image.is_cuda and torch.are_deterministic_algorithms_enabled():
         warped = _bilinear(planes, x, y)
     else:
