@@ -126,13 +126,12 @@ class SceneProfile:
         """
         check_positive("spike_tolerance", spike_tolerance)
         check_positive("step", step)
-        height, width = self.size
         moves, steps, region = self.displacement * self.clocks, self.clocks, None
         if math.isfinite(moves):
             steps = max(1, math.ceil(moves / step), math.ceil(math.sqrt(self.blending / spike_tolerance)))
             steps = min(steps, self.clocks)
             region = _grown(self.region, self.size, math.ceil(moves) + _MARGIN) if steps > 1 and self.region else None
-            if region and region[2] * region[3] > _NEARLY_ALL * height * width:
+            if region and region[2] * region[3] > _NEARLY_ALL * math.prod(self.size):
                 region = None
         return Plan(steps - 1, region)
 
@@ -167,10 +166,8 @@ def profile_interval(
     :class:`spikekit.FrameSequence`. The default for ``motion`` is ``FlowInterpolation(shrink=1)``, as Bayer cells are
     already small.
     """
-    light = [alpha * bin_to_sensor(frame, pattern, scale=scale) for frame in (first, second)]
-    ends = torch.stack(light)
-    size = tuple(ends.shape[-2:])
-    mean = ends.mean().item()
+    light = torch.stack([alpha * bin_to_sensor(frame, pattern, scale=scale) for frame in (first, second)])
+    size, pixels, mean = tuple(light.shape[-2:]), light[0].numel(), light.mean().item()
     moving = (light[1] - light[0]).abs() * clocks > spike_tolerance * mean
     region = _bounds(moving)
     if region is None:
@@ -184,7 +181,7 @@ def profile_interval(
     cells = F.avg_pool2d(small, 2)
     motion = FlowInterpolation(shrink=1) if motion is None else motion
     found = motion(cells[0], (cells[1] / gain).clamp(0, 1))
-    lost = SceneProfile(size, clocks, 1 - moving.sum().item() / ends[0].numel(), region, math.inf, math.inf)
+    lost = SceneProfile(size, clocks, 1 - moving.sum().item() / pixels, region, math.inf, math.inf)
     if found.forward is None or found.backward is None:
         return lost
     forward, backward = (upsample_flow(flow[None], 2) for flow in (found.forward, found.backward))
@@ -198,7 +195,6 @@ def profile_interval(
         mosaic(plane.abs(), pattern) for plane in _derivatives(small[0], forward[0] / distance.clamp(min=_FINE))
     )
     error = (torch.minimum(distance.square(), distance) * bend * sure).sum() * (moving.sum() / sure.sum())
-    pixels = ends[0].numel()
     return replace(
         lost,
         displacement=_fast(distance, slope.square() * sure) / clocks,
