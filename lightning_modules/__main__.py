@@ -7,10 +7,8 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from lightning_modules.cli import errors
 from lightning_modules.cli.short_help import VERBS, overview, usage
 from lightning_modules.configurations import with_found_configs
-from spikekit.standard_output import stopped_by_sigterm
 
 #: modules of the verbs that Lightning does not provide
 _OURS = {
@@ -26,6 +24,14 @@ _OURS = {
 def main(args: Sequence[str] | None = None) -> None:
     """Run the command, given the arguments after ``lightning``. Default: those of ``sys.argv``."""
     typed = sys.argv[1:] if args is None else list(args)
+    # Set before torch is imported: its idle threads would spin and slow down the data workers.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    try:
+        from lightning_modules.cli import errors  # with torch, which takes seconds
+        from spikekit.standard_output import stopped_by_sigterm
+    except KeyboardInterrupt:
+        print("lightning: stopped by Ctrl-C", file=sys.stderr)  # noqa: T201
+        raise SystemExit(130) from None
     with errors.as_one_line():
         verb, *rest = typed or [""]
         if verb in ("-h", "--help"):
@@ -40,8 +46,6 @@ def main(args: Sequence[str] | None = None) -> None:
         elif verb not in _OURS and {"-h", "--help"} & {*rest}:
             print(usage(verb))  # noqa: T201
         else:
-            # Set before torch is imported: its idle threads would spin and slow down the data workers.
-            os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
             if "" not in sys.path and os.getcwd() not in sys.path:
                 sys.path.append(os.getcwd())  # for users' own networks; last, so that it shadows nothing
             if verb in _OURS:

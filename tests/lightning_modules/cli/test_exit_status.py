@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -165,3 +166,11 @@ def test_what_is_printed_is_not_read_or_finds_no_room():
         with open("/dev/full", "w") as full:
             done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120)
         assert (done.returncode, done.stderr) == (1, "lightning: No space left on device\n")
+
+
+def test_ctrl_c_while_torch_is_imported(monkeypatch, capsys):
+    with monkeypatch.context() as patch:
+        patch.setattr("builtins.__import__", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(SystemExit, match="130"):
+            main(["export"])
+    assert capsys.readouterr().err == "lightning: stopped by Ctrl-C\n"
