@@ -195,8 +195,8 @@ def choices(
         frames: spike frames available for a clip; presets that need more are left out.
         white: white level in spikes per frame; below 0.2 the table of dim scenes (0.1) is used, if the package has
             one for the scale. Longer clips gain more there.
-        noisy: keep only networks with weights trained for noisy sensors, and use these weights; no effect if the
-            package has none for the scale.
+        noisy: of the networks keep only those with weights trained for noisy sensors, and use these weights; no effect
+            if the package has none for the scale.
 
     Raises:
         ValueError: the package has no table for this scale.
@@ -209,7 +209,7 @@ def choices(
         preset = Preset.read(row)
         if preset.precision is not None or preset.tile == 0 or not (preset.weights or preset.network):
             continue
-        if preset.clip > frames or (twins and preset.weights not in twins):
+        if preset.clip > frames or (twins and preset.weights not in {*twins, None}):
             continue
         preset = replace(preset, weights=twins.get(preset.weights, preset.weights))
         measured = int(row["height"]) * int(row["width"])

@@ -340,7 +340,7 @@ def _chosen(
         )
     if speed:
         said += _longer(choose(speed=speed, frames=recording.frames, **asked), choice, recording)
-    if noisy:
+    if noisy and choice.preset.weights:
         said.append(_unmeasured(choice.preset, recording, scale))
     return replace(choice.preset, interpolated=interpolated or None), said
 
