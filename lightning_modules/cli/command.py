@@ -166,7 +166,8 @@ class Command(LightningCLI):
         except (SIGTERMException, RuntimeError) as error:  # Lightning's would end with status 0
             if not self.trainer.received_sigterm:
                 raise
-            goes_on = "; --ckpt_path last resumes" if subcommand == "fit" else ""
+            saved = subcommand == "fit" and Path(config.output, "checkpoints", "last.ckpt").is_file()
+            goes_on = "; --ckpt_path last resumes" if saved else ""
             raise Ended(f"lightning: {config.output}: {subcommand} was stopped by SIGTERM{goes_on}", 143) from error
         except SystemExit as error:
             if isinstance(error.__context__, KeyboardInterrupt):  # which Lightning turns into status 1
