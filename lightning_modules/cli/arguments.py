@@ -1,4 +1,4 @@
-"""Arguments of ``lightning`` before parsing: the settings stored with weights are filled in."""
+"""Preparation of the arguments of ``lightning`` before parsing: settings stored with weights are filled in."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ WEIGHTS = "--model.weights", "--model.init_args.weights"
 
 
 def with_network_of_weights(args: Sequence[str]) -> list[str]:
-    """Insert the network that belongs to ``--model.weights``, so that it need not be specified again.
+    """Insert the network of ``--model.weights``, so that it need not be specified again.
 
-    It stands behind all configurations, where other arguments still override it. Of these, the motion estimator and the
-    gain that they name are kept.
+    It comes after all configurations and overrides their network, except its ``motion`` and ``alpha``. Other arguments
+    override it.
     """
     asked, kept, place = None, {}, 1
     for end, option, value in options(args):
@@ -84,10 +84,10 @@ def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def read_config(path: str | Path) -> dict[str, Any]:
-    """Return what a configuration says; nothing is built.
+    """Return the content of a configuration file; nothing is built.
 
     Raises:
-        ValueError: no file, or no YAML in UTF-8; the message is one line and names it.
+        ValueError: the file cannot be read, or is not YAML in UTF-8; the message is one line that names the file.
     """
     path = Path(path).expanduser()
     try:
@@ -95,7 +95,7 @@ def read_config(path: str | Path) -> dict[str, Any]:
         content = yaml.safe_load(text)
     except OSError as error:
         raise ValueError(f"{path}: {one_line(error)}") from error
-    except Exception as error:  # what the parser raises depends on the text
+    except Exception as error:  # the type depends on the text
         said = "expected UTF-8" if isinstance(error, UnicodeError) else one_line(error)[:300]
         raise ValueError(f"{path}: not a configuration ({said})") from error
     if content is not None and not isinstance(content, dict):
@@ -104,7 +104,7 @@ def read_config(path: str | Path) -> dict[str, Any]:
 
 
 def inner_arguments(choice: Any) -> dict[str, Any]:
-    """Return the arguments of an object in a configuration, which may stand in it without ``init_args``."""
+    """Return the arguments of an object in a configuration, with or without ``init_args``."""
     if not isinstance(choice, dict):
         return {}
     inner = choice.get("init_args")

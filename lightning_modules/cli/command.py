@@ -1,4 +1,4 @@
-"""The ``lightning`` command: LightningCLI with one output folder, in which it finds its checkpoints again."""
+"""The ``lightning`` command: LightningCLI with one output folder, which also holds its checkpoints."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from spikekit.io import PictureError, SpikeFileError, VideoError
 from spikekit.io.whole_file import whole_file
 from spikekit.timing import duration
 
-# warnings about the insides of Lightning and jsonargparse, about seeds, and about data that need no processes to read
+# warnings that users cannot act upon: internals of Lightning and jsonargparse, seeds, and data without workers
 _NOTHING_TO_DO = (
     r".*does not have many workers",
     r".*isinstance\(treespec, LeafSpec\)",
@@ -51,11 +51,11 @@ _NOTHING_TO_DO = (
     r".*the `outputs` folder",
 )
 
-# numbers of batches where they are whole, and shares where they are not
+# an int is a number of batches, a float a fraction
 _COUNTS = {f"trainer.limit_{stage}_batches" for stage in ("train", "val", "test", "predict")}
 _COUNTS |= {"trainer.overfit_batches", "trainer.val_check_interval"}
 
-# environment variable: number of the process that starts the others, where a run has several
+# environment variable: id of the process that starts the others of a distributed run
 _FIRST = "SPIKEKIT_FIRST_PROCESS"
 
 
@@ -63,7 +63,7 @@ class Parser(LightningArgumentParser):
     """A parser whose errors are one line."""
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        """Report the error in one line: jsonargparse would show every option and everything it tried to build."""
+        """Report the error in one line; jsonargparse would show every option and every type it tried."""
         if not self.exit_on_error:
             super().error(message, ex)
         if "the following arguments are required: network" in message:
@@ -74,7 +74,7 @@ class Parser(LightningArgumentParser):
 
 
 class Configuration(SaveConfigCallback):
-    """Writes ``config.yaml``, whole or not at all; not to ``trainer.log_dir``, which waits for other processes."""
+    """Write ``config.yaml`` atomically; not to ``trainer.log_dir``, as reading it waits for other processes."""
 
     def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:  # noqa: D102
         with whole_file(Path(trainer.default_root_dir) / self.config_filename, "w", encoding="utf-8") as file:
@@ -82,7 +82,7 @@ class Configuration(SaveConfigCallback):
 
 
 class Command(LightningCLI):
-    """The ``lightning`` command, given its verb and arguments."""
+    """The ``lightning`` command with a verb and its arguments."""
 
     def __init__(self, typed: Sequence[str]) -> None:
         self.typed = with_found_configs("--help" if word == "--help=all" else word for word in typed)
@@ -99,7 +99,7 @@ class Command(LightningCLI):
         )
 
     def subcommands(self) -> dict[str, set[str]]:
-        """Return only the verb that was typed, because building the parser of every verb takes time."""
+        """Return only the given verb, as building the parsers of all verbs takes time."""
         return {verb: LightningCLI.subcommands()[verb] for verb in self.typed[:1]}
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:  # noqa: D102
@@ -111,7 +111,7 @@ class Command(LightningCLI):
             help="Folder of the run: checkpoints, TensorBoard files, config.yaml, tables and pictures.",
         )
         for action in parser._actions:
-            if action.dest in _COUNTS:  # 1 is one batch, which as 1.0 would be all of them
+            if action.dest in _COUNTS:  # 1 is one batch, 1.0 is all batches
                 action._typehint = int | float | None
         parser.set_defaults({"model": {"class_path": "SuperResolution"}})
         network = "model.init_args.network.init_args"
@@ -131,10 +131,10 @@ class Command(LightningCLI):
             raise UsageError(f"{error.code} (see lightning {self.typed[0]} --help)") from error
 
     def _parse_ckpt_path(self) -> None:
-        """Take no hyper-parameters out of a checkpoint: jsonargparse would build whatever they name."""
+        """Read no hyper-parameters from a checkpoint: jsonargparse would build any class that they name."""
 
     def before_instantiate_classes(self) -> None:
-        """Turn ``--ckpt_path best`` and ``last`` into files, and keep a run from being written over."""
+        """Turn ``--ckpt_path best`` and ``last`` into paths, and protect existing runs from being overwritten."""
         config = self.config[self.subcommand]
         if self.subcommand == "test":
             config.verbose = False  # Lightning's table; ours has all methods
@@ -144,36 +144,36 @@ class Command(LightningCLI):
             config.ckpt_path = requeued_checkpoint(config.output)
         asked = config.get("ckpt_path")
         if asked in ("best", "last"):
-            # a run that was killed before its first last.ckpt has best.ckpt alone
+            # a run that was killed before its first last.ckpt has only best.ckpt
             alone = asked == "last" and not (checkpoints / "last.ckpt").is_file() and any(checkpoints.glob("best.ckpt"))
             config.ckpt_path = str(run_checkpoint(checkpoints, "best" if alone else asked))
         if asked:
             with input_errors():
                 read_checkpoint(config.ckpt_path)
         elif self.subcommand == "fit" and not config.trainer.fast_dev_run and any(checkpoints.glob("*.ckpt")):
-            raise InputError(f"{checkpoints}: holds a run already; --ckpt_path last goes on with it, -o goes elsewhere")
+            raise InputError(f"{checkpoints}: holds a run already; --ckpt_path last resumes it, or choose another -o")
 
     def _run_subcommand(self, subcommand: str) -> None:
         config = self.config[subcommand]
         begin = perf_counter()
         try:
-            if config.ckpt_path:  # before a folder is made and scenes are loaded
+            if config.ckpt_path:  # before the folder is made and scenes are loaded
                 checkpoint = read_checkpoint(config.ckpt_path)
                 check_settings(self.model.network, checkpoint["network"], config.ckpt_path)
                 load_weights_of(checkpoint, config.ckpt_path, self.model)
             with _locked(subcommand, config):
                 super()._run_subcommand(subcommand)
-        except (SIGTERMException, RuntimeError) as error:  # Lightning's would end with status 0
+        except (SIGTERMException, RuntimeError) as error:  # Lightning would end with status 0
             if not self.trainer.received_sigterm:
                 raise
             saved = subcommand == "fit" and Path(config.output, "checkpoints", "last.ckpt").is_file()
             goes_on = "; --ckpt_path last resumes" if saved else ""
             raise Ended(f"lightning: {config.output}: {subcommand} was stopped by SIGTERM{goes_on}", 143) from error
         except SystemExit as error:
-            if isinstance(error.__context__, KeyboardInterrupt):  # which Lightning turns into status 1
+            if isinstance(error.__context__, KeyboardInterrupt):  # Lightning turns it into status 1
                 raise KeyboardInterrupt from None
             raise
-        except (MisconfigurationException, ModuleNotFoundError) as error:  # of Lightning's, such as a callback's
+        except (MisconfigurationException, ModuleNotFoundError) as error:  # raised by Lightning, such as by a callback
             raise InputError(one_line(error)) from error
         if rank_zero_only.rank == 0:
             print(f"{config.output}: {subcommand} took {duration(perf_counter() - begin)}")
@@ -182,13 +182,13 @@ class Command(LightningCLI):
         config = self.config[self.subcommand]
         try:
             super().instantiate_classes()
-            # here, so that what is wrong with it is known before anything is written
+            # here, so that errors are found before anything is written
             self.datamodule.setup(self.subcommand)
             if (workers := getattr(self.datamodule, "workers", 0)) < 0:
                 raise ValueError(f"data.workers: expected 0 or more, got {workers}")
             for name, expected in self.model.needs.items():
                 if (got := self.datamodule.options.get(name, expected)) != expected:
-                    raise ValueError(f"data.{name}: expected {expected}, as the model has it, got {got}")
+                    raise ValueError(f"data.{name}: expected {expected}, the value of the model, got {got}")
             if self.subcommand == "fit":
                 if not any(parameter.requires_grad for parameter in self.model.network.parameters()):
                     raise UsageError(f"fit: expected a network that learns, got {type(self.model.network).__name__}")
@@ -198,17 +198,17 @@ class Command(LightningCLI):
                 if config.ckpt_path:
                     _check_continuation(config.ckpt_path, self.model)
         except (OSError, ValueError, ModuleNotFoundError) as error:
-            # jsonargparse wraps what a class of a class says into pages about its own types
+            # jsonargparse wraps the errors of nested classes in pages about its own types
             said = reason(str(error))
             raise (InputError if _is_of_file(error, said) else UsageError)(said) from error
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
-        """Send everything to one folder, and use bfloat16 on a GPU that supports it."""
+        """Write everything to one folder, and use bfloat16 on a GPU that supports it."""
         output = Path(self._get(self.config_init, "output"))
         config = self._get(self.config_init, "trainer")
         kwargs["default_root_dir"] = output
         if config.get("logger") is None:
-            # the tables and pictures of the other commands are files of their own
+            # the other verbs write their tables and pictures to files
             kwargs["logger"] = TensorBoardLogger(output, name="", version="") if self.subcommand == "fit" else False
         kwargs["plugins"] = [Checkpoints(output), *_listed(config.get("plugins"))]
         if config.get("precision") is None:
@@ -217,10 +217,10 @@ class Command(LightningCLI):
         kwargs["callbacks"] = [*_listed(config.get("callbacks")), *self._callbacks(output)]
         if self.subcommand != "fit":
             self.save_config_callback = None  # config.yaml is the record of the training
-            kwargs["devices"] = 1  # several would share the clips, and judge some twice where they do not divide
+            kwargs["devices"] = 1  # several would score some clips twice if their number does not divide
         try:
             return super().instantiate_trainer(**kwargs)
-        except TypeError as error:  # such as of -1 devices, of a CPU
+        except TypeError as error:  # such as -1 devices on a CPU
             raise UsageError(f"trainer: {one_line(error)}") from error
 
     def _callbacks(self, output: Path) -> list[Callback]:
@@ -238,12 +238,12 @@ class Command(LightningCLI):
 
 
 def _ends(model: BaseTask) -> tuple[int, int]:
-    """The frames that the data's flow runs to; no lambda, which no process could be given."""
+    """Return the first and the last of the model's flow times; not a lambda, which cannot be pickled."""
     return model.flow_times[::2]
 
 
 def _locked(verb: str, config: Any) -> AbstractContextManager[None]:
-    """Keep a second run of a verb out of what it writes; processes of one distributed run share it."""
+    """Lock the output of a verb against a second run; processes of one distributed run share the lock."""
     if rank_zero_only.rank != 0 or verb == "validate" or (verb == "fit" and config.trainer.fast_dev_run):
         return nullcontext()
     if verb == "fit":
@@ -252,7 +252,7 @@ def _locked(verb: str, config: Any) -> AbstractContextManager[None]:
 
 
 def _is_of_file(error: BaseException | None, said: str) -> bool:
-    """Return whether a file is to blame, and not what was typed."""
+    """Whether an error is caused by a file rather than by the command line."""
     if Path(said.partition(": ")[0]).exists():
         return True
     while error is not None:
@@ -267,35 +267,35 @@ def _listed(value: Any) -> list[Any]:
 
 
 def _check_continuation(path: str, model: BaseTask) -> None:
-    """Refuse to go on with another network, optimizer or schedule: the checkpoint's would win without a word."""
+    """Check that network, optimiser and schedule are the checkpoint's, which would silently replace others."""
     checkpoint = read_checkpoint(path)
     check_settings(model.network, checkpoint["network"], path)
     here = dict(flatten(model.recipe))
-    there = dict(flatten(checkpoint["recipe"] or model.recipe))  # older checkpoints do not say
+    there = dict(flatten(checkpoint["recipe"] or model.recipe))  # older checkpoints have no recipe
     for key in sorted({**there, **here}):
         if there.get(key) != here.get(key):
             name, expected = key.replace(".init_args", ""), f"{there.get(key)}, as {path} was trained with"
-            anew = "--model.weights starts anew with other settings"
+            anew = "to start anew with other settings, use --model.weights"
             raise UsageError(f"model.{name}: expected {expected}, got {here.get(key)}; {anew}")
     check_resume(path, model)
 
 
 def without_chatter() -> None:
-    """Let Lightning say nothing that a user cannot act upon."""
+    """Silence messages of Lightning that users cannot act upon."""
     for says in ("pytorch_lightning.utilities.rank_zero", "lightning_fabric.utilities.seed"):
-        logging.getLogger(says).setLevel(logging.WARNING)  # tips, and which devices there are
+        logging.getLogger(says).setLevel(logging.WARNING)  # tips and lists of devices
     for nothing_to_do in _NOTHING_TO_DO:
         warnings.filterwarnings("ignore", nothing_to_do)
 
 
 def _quiet_about_disks(failed: threading.ExceptHookArgs) -> None:
-    """Say nothing of a thread that finds no room on a disk: TensorBoard's raises the same where it is written to."""
+    """Hide errors of a full disk in threads: TensorBoard raises them again in the main thread."""
     if not isinstance(failed.exc_value, OSError):
         threading.__excepthook__(failed)
 
 
 def run(typed: Sequence[str], command: type[Command] = Command) -> Command:
-    """Run what was typed after ``lightning``, with one of Lightning's verbs; errors are raised."""
+    """Run one of Lightning's verbs with the arguments given after ``lightning``; errors are raised."""
     without_chatter()
     threading.excepthook = _quiet_about_disks
     if not rank_zero_only.rank:

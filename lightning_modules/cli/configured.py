@@ -1,4 +1,4 @@
-"""Networks that ``-c`` describes, built without Lightning, for the verbs that need no Trainer."""
+"""Build the network of a configuration without Lightning, for verbs that need no Trainer."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from lightning_modules.storage.pretrained import load_weights, read_weights
 def configured_network(
     configs: Sequence[str] = (), weights: str | None = None, checkpoint: str | Path | None = None
 ) -> Network:
-    """Build the network of configurations or of weights, with its weights.
+    """Build the network of configurations, weights or a checkpoint, and load its weights.
 
-    Weights know the network of this package that they are of; of a configuration they then take the estimator of motion
-    alone. A checkpoint has to be of the network of the configuration, where there is one.
+    Weights of a network of this package describe it; configurations then only replace the motion estimator. A
+    checkpoint has to match the network of the configurations, if they have one.
 
     Args:
-        configs: files, later ones over earlier ones; of each, what it says of the model.
-        weights: the name of weights, or a file of them, over those that a configuration names.
-        checkpoint: instead, a checkpoint.
+        configs: configuration files; later ones override earlier ones, and only ``model`` is read.
+        weights: name or path of weights; overrides the weights of the configurations.
+        checkpoint: path of a checkpoint, in place of weights.
     """
     chosen, named = None, weights
     parser = ArgumentParser(exit_on_error=False)
@@ -59,7 +59,7 @@ def configured_network(
 
 
 def checkpoint_of(asked: str | None, configs: Sequence[str], output: Path) -> Path | None:
-    """Return the file of ``--ckpt_path``; best and last are of a run of a configuration, or in ``output``."""
+    """Return the path of ``--ckpt_path``; best and last belong to the run of a configuration, or to ``output``."""
     if asked not in ("best", "last"):
         return None if asked is None else Path(asked).expanduser()
     said = [read_config(config).get("output") for config in configs]
@@ -67,7 +67,7 @@ def checkpoint_of(asked: str | None, configs: Sequence[str], output: Path) -> Pa
     runs = [folder / "checkpoints" for folder in folders if (folder / "checkpoints").is_dir()]
     if not runs:
         where = " or ".join(str(folder / "checkpoints") for folder in folders)
-        raise InputError(f"--ckpt_path {asked}: expected a run of lightning fit in {where}, there is none")
+        raise InputError(f"--ckpt_path {asked}: expected a run of lightning fit in {where}, got none")
     return run_checkpoint(runs[-1], asked)
 
 

@@ -1,4 +1,4 @@
-"""User errors, which the ``lightning`` command shows as one line."""
+"""Errors of users, which the ``lightning`` command shows as one line."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from spikekit.standard_output import BROKEN_PIPE, FULL, Terminated, stop_printin
 
 
 class InputError(ValueError):
-    """Unusable input from the user; shown as one line, and the command ends with status 1."""
+    """Unusable input; the command shows one line and ends with status 1."""
 
 
 class UsageError(InputError, SpikekitUsageError):
-    """A command line that asks for something impossible; shown as one line, and the command ends with status 2."""
+    """An invalid command line; the command shows one line and ends with status 2."""
 
 
 class Ended(SystemExit):
-    """The end of the command with a line on stderr.
+    """End of the command with a line on stderr.
 
     Args:
-        line: what is wrong.
-        status: 2 for a command line that cannot be, 130 and 143 for one that was stopped, 1 for all else.
+        line: error message.
+        status: exit status: 2 for an invalid command line, 130 or 143 after a signal, 1 otherwise.
     """
 
     def __init__(self, line: str, status: int) -> None:
         line = "\n".join(map(printable, line.splitlines()))  # names of files can hold escape sequences
         super().__init__(line)
-        self.code = line if status == 1 else status  # a text is printed by Python, which then ends with 1
+        self.code = line if status == 1 else status  # Python prints a text and exits with 1
         if status != 1:
             print(line, file=sys.stderr)
 
 
 class VerbParser(argparse.ArgumentParser):
-    """The arguments of one of our own verbs; errors in them are one line."""
+    """Parser of a verb that is not Lightning's; its errors are one line."""
 
     def error(self, message: str) -> NoReturn:  # noqa: D102
         raise UsageError(f"{self.prog.removeprefix('lightning ')}: {message}")
@@ -49,7 +49,7 @@ class VerbParser(argparse.ArgumentParser):
 
 @contextmanager
 def input_errors() -> Iterator[None]:
-    """Take a file that cannot be used, or a value that cannot be, for a mistake of the user and not of the program."""
+    """Turn errors about files and values into errors of the user."""
     try:
         yield
     except (InputError, ModuleNotFoundError):
@@ -62,10 +62,10 @@ def input_errors() -> Iterator[None]:
 
 @contextmanager
 def as_one_line() -> Iterator[None]:
-    """End the program with one line, and no traceback, if the user made a mistake, stopped it, or a disk is full.
+    """End the program with one line and no traceback after an error of the user, a signal, or on a full disk.
 
-    Where the reader of standard output is gone, as in ``lightning models | head -1``, it ends without a word. What the
-    terminal cannot show, such as a file's name, is printed with escapes.
+    If the reader of standard output is gone, as in ``lightning models | head -1``, the program ends silently.
+    Characters that the terminal cannot show are escaped.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -87,13 +87,13 @@ def as_one_line() -> Iterator[None]:
     except Exception as error:
         if isinstance(error, ModuleNotFoundError) and (line := remedy(error)):
             raise Ended(f"lightning: {line}", 1) from error
-        # errors of kinds that are defined here are users', such as a damaged file; Lightning's are of a bad Trainer
+        # our own error classes mean errors of the user, such as a damaged file; Lightning's mean wrong Trainer options
         if not type(error).__module__.startswith(("lightning_modules.", "spikekit.", "lightning_fabric.")):
             raise
-        # what a worker of a loader raises comes with its traceback, whose last line it is
+        # the error of a worker of a loader is the last line of a traceback
         text = str(error).strip()
         said = text.splitlines()[-1].split("Error: ", 1)[-1] if "Traceback (" in text else text
         raise Ended(f"lightning: {said}", 2 if isinstance(error, SpikekitUsageError) else 1) from error
     except (Terminated, KeyboardInterrupt) as error:
         name, status = ("Ctrl-C", 130) if isinstance(error, KeyboardInterrupt) else ("SIGTERM", 143)
-        raise Ended(f"lightning: stopped by {name}; what is whole has been written", status) from None
+        raise Ended(f"lightning: stopped by {name}; complete results are saved", status) from None

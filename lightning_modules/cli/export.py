@@ -27,29 +27,29 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the verb."""
     made = VerbParser(
         prog="lightning export",
-        description="Write a network for other programs. safetensors are weights that know what network they are of, "
-        "for lightning predict --weights FILE and CSCSR.from_pretrained(FILE). torch is a program of "
-        "torch.export, which needs torch alone; onnx is for onnxruntime and others (the extra export writes it). "
-        "Both take a clip of any even height and width, and the motion as a second input where the network follows "
-        "motion: an estimate of motion cannot be exported. They are compared with the network on three sizes.",
+        description="Export a network for other programs. safetensors: weights with the settings of their network, "
+        "for lightning predict --weights FILE and CSCSR.from_pretrained(FILE). torch: a program of torch.export, which "
+        "needs only torch. onnx: for onnxruntime and others (needs the extra 'export'). Programs take a clip of any "
+        "even height and width; a network that follows motion takes the flow as a second input, as motion estimation "
+        "cannot be exported. Programs are compared with the network on three sizes.",
     )
-    made.add_argument("weights", help="a name that lightning models lists, a .safetensors, a checkpoint")
+    made.add_argument("weights", help="name listed by lightning models, .safetensors file or checkpoint")
     made.add_argument(
-        "-c", "--config", action="append", default=[], metavar="FILE", help="says what network, where it is your own"
+        "-c", "--config", action="append", default=[], metavar="FILE", help="configuration of your own network"
     )
-    made.add_argument("--format", choices=("safetensors", *FORMATS), default="safetensors", help="safetensors")
-    made.add_argument("--still", action="store_true", help="nothing moves: no motion as an input, for torch and onnx")
-    made.add_argument("-o", "--output", required=True, metavar="FILE", help="name.safetensors, .pt2 or .onnx")
+    made.add_argument("--format", choices=("safetensors", *FORMATS), default="safetensors", help="default: safetensors")
+    made.add_argument("--still", action="store_true", help="nothing moves: no flow input (torch, onnx)")
+    made.add_argument("-o", "--output", required=True, metavar="FILE", help=".safetensors, .pt2 or .onnx file")
     return made
 
 
 def export(args: Sequence[str]) -> None:
-    """Write a network as a file for other programs, given what was typed after ``lightning export``."""
+    """Run ``lightning export`` with the given arguments."""
     asked = parser().parse_args(args)
     begin = perf_counter()
     ending = FORMATS.get(asked.format, ".safetensors")
     if Path(asked.output).suffix != ending:
-        raise InputError(f"-o: expected a name that ends in {ending} for {asked.format}, got {asked.output}")
+        raise InputError(f"-o: expected a file name ending in {ending} for {asked.format}, got {asked.output}")
     said = ""
     with input_errors():
         if asked.format in FORMATS:

@@ -1,4 +1,4 @@
-"""The verb ``lightning models``."""
+"""The command ``lightning models``."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from lightning_modules.registry import list_models
 from spikekit.tables import table
 
 _LEGEND = """
-clip: spike frames of a clip. film: also uses the neighbouring pictures of a film. MMAC/px: million multiplications per
-sensor pixel, for the picture of a single clip or one motion estimate. PSNR in dB at alpha 0.4, to be compared at one
+clip: spike frames of a clip. film: also uses neighbouring pictures of a film. MMAC/px: million multiplications per
+sensor pixel, for the picture of a single clip or one motion estimate. PSNR in dB at alpha 0.4, comparable within a
 scale. Kodak: 24 stills in motion, single clips. Vid4: foliage and walk, 20 clocks per source frame, as films."""
 
 

@@ -33,67 +33,67 @@ def parser() -> argparse.ArgumentParser:
     made = VerbParser(
         prog="lightning predict",
         allow_abbrev=False,
-        description="Make colour pictures of a recording. Without weights, --speed balanced chooses them: weights "
-        "trained for noisy sensors where nobody has measured this one. What is there already is not made again.",
+        description="Make pictures of a recording. By default, --speed balanced chooses the weights; without a "
+        "calibration of the sensor, these are trained for noisy sensors. Existing pictures are not made again.",
         epilog="example: lightning predict FILE.dat --height 250 --width 400 --flip -o film.mp4",
     )
     recordings.add_arguments(made)
     add = made.add_argument
-    add("-o", "--output", required=True, metavar="OUT", help="a folder, a film (.mp4, .mov, .mkv, .gif) or a .png")
+    add("-o", "--output", required=True, metavar="OUT", help="folder, film (.mp4, .mov, .mkv, .gif) or .png")
     add(
         "--frame",
         metavar="N|A:B[:STEP]",
-        help="which frames to make pictures of, from A to B - 1; every 20th if not given",
+        help="spike frames to make pictures of: N, or A to B - 1; default: every 20th",
     )
-    add("--white", type=float, help="spikes a frame of a pixel that is shown white; measured if not given")
-    group = made.add_argument_group("the network")
+    add("--white", type=float, help="white level in spikes per frame; default: measured")
+    group = made.add_argument_group("network")
     add = group.add_argument
     add(
         "--speed",
         choices=list(SPEEDS),
-        help=f"the best weights of the package; the fastest at most {SPEEDS['balanced']:g} dB (balanced) or "
-        f"{SPEEDS['fast']:g} dB (fast) below them; the fastest",
+        help=f"weights of the package: best; the fastest at most {SPEEDS['balanced']:g} dB (balanced) or "
+        f"{SPEEDS['fast']:g} dB (fast) below best; fastest",
     )
-    add("--budget", help="instead, what a picture may cost, such as 2s, 25fps or 200MB: the best that fits")
+    add("--budget", help="the best weights within a cost per picture, such as 2s, 25fps or 200MB")
     add(
         "--scale",
         type=whole(1),
-        help="super-resolution factor, of speed and budget; 4 if not given, 1 for a grey camera",
+        help="super-resolution factor for --speed and --budget; default: 4, or 1 for a grey camera",
     )
-    add("--weights", metavar="NAME", help="instead, a name that lightning models lists, a .safetensors, a .ckpt")
-    add("-c", "--config", action="append", default=[], metavar="FILE", help="instead, the network of a configuration")
-    add("--ckpt_path", metavar="FILE", help="its checkpoint; best and last are those of its output, or of -o")
-    add = made.add_argument_group("how it is used").add_argument
+    add("--weights", metavar="NAME", help="a name listed by lightning models, a .safetensors or a .ckpt file")
+    add("-c", "--config", action="append", default=[], metavar="FILE", help="the network of a configuration")
+    add("--ckpt_path", metavar="FILE", help="checkpoint of the configuration; best and last: of its output, or of -o")
+    add = made.add_argument_group("inference").add_argument
     sides = f"{TILE}, on a GPU {TILE_ON_GPU}"
     add(
         "--tile",
         type=whole(0),
         metavar="N",
-        help=f"side of the tiles in pixels, 0 for none; {sides} if not given",
+        help=f"side of the tiles in sensor pixels, 0 for none; default: {sides}",
     )
     add(
         "--tolerance",
         type=float,
         dest="psnr_tolerance",
         metavar="DB",
-        help="in a film: the PSNR that a picture may lose where this saves work; with any but 0 the network is asked "
-        "only where the spikes say that something moves, and no picture is interpolated",
+        help="films: PSNR in dB that a picture may lose to save work; above 0, the network runs only where the spikes "
+        "show motion, and no picture is interpolated; default: 0",
     )
-    add("--self_ensemble", type=int, metavar="N", help="2, 4 or 8: the mean over so many views of a clip")
-    add("--interpolated", type=whole(0), metavar="N", help="pictures between two that the network makes")
-    add("--future", type=whole(0), metavar="N", help="pictures that one may wait for, of weights for films")
-    add("--device", help="such as cpu or cuda:1; a GPU where there is one")
-    add("--precision", choices=["32-true", "bf16-mixed"], help="bf16-mixed where the device has it, if not given")
-    add = made.add_argument_group("the output").add_argument
-    add("--fps", type=positive, default=25.0, help="pictures shown in a second of a film; 25 if not given")
-    add("--beside", choices=("tfi", "tfp"), help="show what this decoder makes of the clip left of every picture")
-    add("--engine", choices=["local", "ray"], default="local", help="make them here, or in parts on a Ray cluster")
-    add("--jobs", type=whole(1), help="parts at once on the cluster; one a GPU, or a node, if not given")
+    add("--self_ensemble", type=int, metavar="N", help="average 2, 4 or 8 views of a clip")
+    add("--interpolated", type=whole(0), metavar="N", help="pictures interpolated between two of the network")
+    add("--future", type=whole(0), metavar="N", help="later pictures that a picture waits for; weights for films only")
+    add("--device", help="such as cpu or cuda:1; default: a GPU if there is one")
+    add("--precision", choices=["32-true", "bf16-mixed"], help="default: bf16-mixed if the device supports it")
+    add = made.add_argument_group("output").add_argument
+    add("--fps", type=positive, default=25.0, help="pictures per second of a film; default: 25")
+    add("--beside", choices=("tfi", "tfp"), help="also show the picture of this decoder, to the left of every picture")
+    add("--engine", choices=["local", "ray"], default="local", help="this machine, or a Ray cluster; default: local")
+    add("--jobs", type=whole(1), help="parts at once on the cluster; default: one per GPU, or per node")
     return made
 
 
 def predict(args: Sequence[str]) -> None:
-    """Make pictures of a recording, given what was typed after ``lightning predict``."""
+    """Run ``lightning predict`` with the given arguments."""
     asked, begin = parser().parse_args(args), perf_counter()
     output = Path(asked.output).expanduser()
     if is_film(output):
@@ -116,10 +116,10 @@ def predict(args: Sequence[str]) -> None:
         there.finish(asked.fps)
     there.clear()
     total, new = len(pictures), len(pictures) - len(before)
-    said = f"{total} {'picture' if total == 1 else 'pictures'}" + (f", {new} of them new" if before else "")
+    said = f"{total} {'picture' if total == 1 else 'pictures'}" + (f", {new} new" if before else "")
     took = perf_counter() - begin
     each = f" ({duration(took / new)} each)" if new > 1 else ""
-    print(f"{output}: {said}, in {duration(took)}{each}; {pictures.white:.4g} spikes a frame are white")
+    print(f"{output}: {said}, in {duration(took)}{each}; white level {pictures.white:.4g} spikes per frame")
 
 
 def _arguments(asked: argparse.Namespace, output: Path) -> dict[str, Any]:
@@ -128,7 +128,7 @@ def _arguments(asked: argparse.Namespace, output: Path) -> dict[str, Any]:
     named = [option for option, value in own.items() if value]
     chosen = [option for option in ("speed", "budget") if getattr(asked, option) is not None]
     if named and chosen:
-        raise UsageError(f"--{chosen[0]}: it chooses from the weights of the package, got {named[0]} as well")
+        raise UsageError(f"--{chosen[0]}: chooses weights of the package, got {named[0]} as well")
     names = ("speed", "budget", "scale", "frame", "white", "device", "precision")
     arguments = {name: getattr(asked, name) for name in names} | recordings.known(asked)
     if named:
@@ -138,7 +138,7 @@ def _arguments(asked: argparse.Namespace, output: Path) -> dict[str, Any]:
 
 
 def _check_output(output: Path, pictures: Reconstruction) -> None:
-    """Refuse a file for several pictures, and one that the recording needs."""
+    """Check that a single file is not to take several pictures, and is no file of the recording."""
     if is_picture(output) and len(pictures) != 1:
         several = f"a folder or a film for {len(pictures)} pictures"
         raise UsageError(f"-o: expected {several}, got {output}; --frame chooses one")
@@ -152,7 +152,7 @@ def _check_output(output: Path, pictures: Reconstruction) -> None:
 def _make(
     pictures: Reconstruction, there: Output, made: set[int], beside: str | None, part: tuple[int, int] = (0, 1)
 ) -> None:
-    """Make the pictures that are not there; say how far they are, by a line a picture where nobody watches bars."""
+    """Make the missing pictures, with progress bars on a terminal and one line per picture elsewhere."""
     left, number = len(pictures) - len(made), count(1)
     watched = sys.stderr.isatty()
     bar = progress(what="pictures", total=left, unit="picture", delay=0)
@@ -187,7 +187,7 @@ def _on_ray(asked: argparse.Namespace, arguments: dict[str, Any], output: Path) 
 
 
 def _make_part(file: Path, arguments: dict[str, Any], output: Path, beside: str | None, part: tuple[int, int]) -> None:
-    """Make a part of the pictures, in a process of a cluster."""
+    """Make a part of the pictures in a process of a cluster."""
     pictures = reconstruct(file, **arguments)
     there = Output(output, pictures.clips.chosen, {**pictures.identity(), "beside": beside})
     _make(pictures, there, there.made(), beside, part)

@@ -1,4 +1,4 @@
-"""Python in separate processes, on this machine or on a Ray cluster, such as those that make parts of a recording."""
+"""Run Python in separate processes, on this machine or on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -20,22 +20,23 @@ _A_MOMENT = 0.2  # seconds
 def calls_on_ray(
     calls: Callable[[int], dict[Any, tuple[Any, ...]]], jobs: int | None
 ) -> Iterator[dict[Any, str | None]]:
-    """Call functions on the Ray cluster that ``RAY_ADDRESS`` names or that runs here, else on this machine's own.
+    """Call functions on the Ray cluster of ``RAY_ADDRESS``, else on a running one, else on a new one on this machine.
 
-    It repeatedly yields the names of the calls that ended, with the reason of a failure: what was returned, or raised.
+    Repeatedly yields the names of finished calls, each with its return value or its error: the reason of a failure, or
+    ``None``.
 
     Args:
-        calls: given how many run at once, functions and their arguments by name.
-        jobs: calls at once; as many as there are GPUs, or else nodes, if ``None``.
+        calls: function that takes the number of calls at once and returns functions and their arguments by name.
+        jobs: calls at once; default: the number of GPUs, else of nodes.
     """
     try:
         import ray
     except ImportError as error:
-        raise InputError("--engine ray: Ray is not installed; pip install 'spikekit[ray]' brings it") from error
+        raise InputError("--engine ray: Ray is not installed; run pip install 'spikekit[ray]'") from error
 
     try:
         ray.init(log_to_driver=False, include_dashboard=False, logging_level="ERROR")
-    except Exception as error:  # Ray raises its plainest kind where a machine is too busy to start it
+    except Exception as error:  # Ray raises plain exceptions if a machine is too busy
         raise InputError(f"--engine ray: {one_line(error)}") from error
     try:
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
@@ -51,7 +52,7 @@ def calls_on_ray(
 
 
 def _share(nodes: Sequence[dict[str, float]], jobs: int | None) -> dict[str, Any]:
-    """Return what a call takes of a cluster: of its GPUs, where it has any, or else of the cores of its nodes.
+    """Return the resources of one call: a share of the GPUs if the cluster has any, else cores of a node.
 
     Example:
         >>> _share([{"CPU": 16, "GPU": 2}, {"CPU": 8, "GPU": 2}], None)
@@ -68,7 +69,7 @@ def _share(nodes: Sequence[dict[str, float]], jobs: int | None) -> dict[str, Any
 
 
 def run_to_end(log: Path, words: Sequence[str], there: str) -> str | None:
-    """Run Python in a process of its own and in a folder, see :func:`start`; return what :func:`reason` does."""
+    """Run Python in a separate process and in a folder, see :func:`start`; return the :func:`reason` of a failure."""
     os.chdir(there)
     process = start(log, words, {})
     try:
@@ -87,8 +88,8 @@ def _outcome(ray: Any, reference: Any) -> str | None:
 
 
 def start(log: Path, words: Sequence[str], environment: dict[str, str]) -> subprocess.Popen:
-    """Start Python with its output appended to a file, and with additions to its environment."""
-    # Threads that spin while they wait hold up the workers that make clips.
+    """Start Python with additional environment variables, and append its output to a file."""
+    # waiting threads that spin would slow down the workers that make clips
     environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ, **environment}
     with open(log, "ab") as file:
         return subprocess.Popen(
@@ -101,13 +102,13 @@ def start(log: Path, words: Sequence[str], environment: dict[str, str]) -> subpr
 
 
 def stop(process: subprocess.Popen) -> None:
-    """End a process that was started here, see :func:`end_with_parent`, and wait for it."""
+    """End a process of :func:`start`, see :func:`end_with_parent`, and wait for it."""
     process.stdin.close()
     process.wait()
 
 
 def end_with_parent() -> None:
-    """End when the process that started this one does, even if it is killed: our standard input then closes."""
+    """End this process when its parent ends, even if killed: standard input closes then."""
 
     def wait() -> None:
         while os.read(0, 1):
@@ -123,7 +124,7 @@ def exit_reason(log: Path, status: int) -> str | None:
         return None
     if status < 0:
         name = signal.Signals(-status).name
-        return f"killed by {name}" + (", perhaps for want of memory" if name == "SIGKILL" else "")
+        return f"killed by {name}" + (", perhaps out of memory" if name == "SIGKILL" else "")
     lines = log.read_text(errors="replace").split("\n")
     last = next((line.strip() for line in reversed(lines) if line.strip()), f"status {status}")
     return printable(last.removeprefix("lightning: "))

@@ -1,20 +1,20 @@
-"""Errors in arguments, as one line."""
+"""Error messages of jsonargparse, as one line."""
 
 from __future__ import annotations
 
 import re
 
-# what jsonargparse writes around a cause
+# lines of jsonargparse around the cause
 _AROUND = re.compile(
     r"\s*(- )?(Expected a <class 'NoneType'>|Given value|.*arser key|Does not validate|Subtypes|Errors:|Problem with|$)"
 )
-_MOST = 500  # characters of it that are shown
-# alternatives that nobody meant
+_MOST = 500  # characters shown of the cause
+# unlikely alternatives
 _UNLIKELY = re.compile(r"\s*- Expected a (<class|path|collections)")
 
 
 def reason(message: str) -> str:
-    r"""Return jsonargparse's message, which is a tree of alternatives, as one line: the cause, and where it is.
+    r"""Return the place and the cause from a message of jsonargparse, which is a tree of alternatives, as one line.
 
     Example:
         >>> lines = "    - Expected a <class 'int'>", "    - Expected a <class 'NoneType'>", "  Given value: high"
@@ -25,7 +25,7 @@ def reason(message: str) -> str:
     if lines[0].startswith("Problems parsing config"):
         return " ".join(message.split())[:_MOST]
     if not any(line and _AROUND.match(line) for line in lines):
-        return message.strip()  # of somebody else, who may show a list
+        return message.strip()  # not from jsonargparse; may show a list
     where = [key for line in lines for key in re.findall(r'[Pp]arser key "([^"]+)"', line)]
     inner = [line for line in lines if not _AROUND.match(line)]
     likely = [line for line in inner if not _UNLIKELY.match(line)]

@@ -10,7 +10,7 @@ from lightning_modules.cli.command import Command
 
 
 class Rehearsal(Command):
-    """Parses and builds what a verb would, and raises any errors; runs and writes nothing."""
+    """A command that parses and builds everything and raises any errors, but runs and writes nothing."""
 
     verb = "test"
 
@@ -22,5 +22,5 @@ class Rehearsal(Command):
 
 
 def resolved(command: Rehearsal) -> dict[str, Any]:
-    """Return the whole configuration of a verb, as plain values."""
+    """Return the complete configuration of a command, as plain values."""
     return yaml.safe_load(command.parser.dump(command.config, skip_none=False, skip_validation=True))[command.verb]

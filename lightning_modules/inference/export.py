@@ -63,7 +63,7 @@ class _StillFilm(nn.Module):
 
 
 class _Film(_StillFilm):
-    """A network for films that takes the flow and the number of spike frames since the previous key frame, too."""
+    """A network for films that takes the flow and the number of clocks since the previous key frame, too."""
 
     def forward(self, spikes: Tensor, flow: Tensor, state: Tensor, every: Tensor) -> tuple[Tensor, Tensor]:
         return self._meet(spikes, flow, state, self.network.flow_to(flow, -1) * every)
@@ -77,7 +77,7 @@ def export_network(network: Network, path: str | Path, kind: str, *, still: bool
     (1, 3, s H, s W), not clamped.
 
     A network for films has a second output, ``next_state``, (1, C, H, W). Its input ``state`` is the ``next_state`` of
-    the previous key frame, zeros for the first. With a flow it also takes ``every``, the number of spike frames since
+    the previous key frame, zeros for the first. With a flow it also takes ``every``, the number of clocks since
     the previous key frame, a float32 scalar.
 
     Args:

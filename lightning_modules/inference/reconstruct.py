@@ -30,7 +30,7 @@ from spikekit.recording import Recording, open_recording
 _MANY = 10
 # smallest gain in dB for which a hint recommends longer clips
 _WORTH_ROOM = 0.3
-# largest distance, in spike frames, of two pictures of the network between which pictures are interpolated: without
+# largest distance, in clocks, of two pictures of the network between which pictures are interpolated: without
 # loss in fast scenes, and in slower ones
 _APART, _FARTHER_APART = 6, 12
 # width of the white gap between two pictures side by side, in pixels

@@ -1,4 +1,4 @@
-"""Base class of the LightningModules: optimizer, schedule, checkpoints that know their network."""
+"""Base class of the LightningModules: optimiser, schedule and checkpoints with the settings of their network."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lightning_modules.storage.pretrained import check_settings, motion_of, sett
 
 
 def step_schedule(optimizer: torch.optim.Optimizer) -> torch.optim.lr_scheduler.StepLR:
-    """Times 0.8 every 7500 steps, as in the paper."""
+    """Return the schedule of the paper: times 0.8 every 7500 steps."""
     return torch.optim.lr_scheduler.StepLR(optimizer, 7500, 0.8)
 
 
@@ -25,23 +25,24 @@ class BaseTask(LightningModule):
     """Base of the LightningModules.
 
     Args:
-        network: what learns; its ``settings`` say, as plain values, what it was built with.
-        needs: options of the data, by name, that must be as they are here.
-        flow_times: frames that flow runs between, the first, the middle and the last; ``lightning`` tells the data.
-        optimizer: builds the optimizer from the parameters.
-        lr_scheduler: builds the schedule from the optimizer, counted in steps; ReduceLROnPlateau is asked after every
-            validation instead, and watches what ``best`` names unless it has a ``monitor`` of its own.
+        network: network to train; its ``settings`` are its constructor arguments as plain values.
+        needs: required values of data options, by name.
+        flow_times: spike frames between which the flow runs: first, middle and last; ``lightning`` passes them to the
+            data.
+        optimizer: builds the optimiser from the parameters.
+        lr_scheduler: builds the schedule from the optimiser, counted in steps. ReduceLROnPlateau steps after every
+            validation instead and monitors ``best`` by default.
 
     Attributes:
-        recipe: what a configuration says of optimizer and schedule, which ``lightning fit`` fills in; a checkpoint
-            remembers it, because it resumes with its own.
+        recipe: configuration of optimiser and schedule, set by ``lightning fit``. Checkpoints store it, as a resumed
+            training keeps both.
     """
 
-    #: the figure of validation that says which checkpoint is the best, and whether it is the "min" or the "max"
+    #: validation metric of the best checkpoint, and "min" or "max"
     best: ClassVar[tuple[str, str]]
-    #: shows clips of every validation in TensorBoard
+    #: callback that shows clips of every validation in TensorBoard
     pictures: ClassVar[type[Callback]]
-    #: prints the table of ``test``; made with the folder of the run
+    #: callback that prints the table of ``test``; takes the folder of the run
     report: ClassVar[type[Callback]]
 
     def __init__(
@@ -61,16 +62,16 @@ class BaseTask(LightningModule):
 
     @classmethod
     def load_from_checkpoint(cls, checkpoint_path: str | Path, **arguments: Any) -> Self:
-        """Build a module from arguments and give it the weights of a checkpoint, and its network, if none is given.
+        """Build a module from arguments and load the weights of a checkpoint.
 
         Args:
-            checkpoint_path: a checkpoint of ``lightning fit``.
-            arguments: those of the constructor; Lightning would take them out of the file, and build what it names.
-                Without a ``network`` it is that of the checkpoint, which is then one of this package.
+            checkpoint_path: checkpoint of ``lightning fit``.
+            arguments: constructor arguments; unlike Lightning's method, none are read from the file. Default for
+                ``network``: that of the checkpoint, if it is a network of this package.
 
         Raises:
-            FileNotFoundError: no such file.
-            ValueError: the file is damaged or of something else.
+            FileNotFoundError: the file does not exist.
+            ValueError: the file is damaged or no checkpoint.
         """
         checkpoint = read_checkpoint(checkpoint_path)
         if "network" not in arguments:
@@ -84,7 +85,7 @@ class BaseTask(LightningModule):
         return self.optimizers_of(self.network.parameters())
 
     def optimizers_of(self, parameters: Iterable[nn.Parameter]) -> dict[str, Any]:
-        """Return the optimizer and the schedule of parameters, as Lightning takes them."""
+        """Return optimiser and schedule for parameters, in the form that Lightning takes."""
         optimizer = self.make_optimizer(parameters)
         schedule = self.make_lr_scheduler(optimizer)
         how = {"scheduler": schedule, "interval": "step"}
@@ -95,7 +96,7 @@ class BaseTask(LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": how}
 
     def on_train_batch_start(self, batch: Any, batch_index: int) -> None:
-        """Let loggers have the step that training stands at; resumed, Lightning's own count may be one off."""
+        """Log the true step; Lightning's own count may be off by one after a resume."""
         self.trainer.fit_loop.epoch_loop._batches_that_stepped = self.trainer.global_step
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:  # noqa: D102

@@ -1,4 +1,4 @@
-"""Callbacks for super-resolution: pictures in TensorBoard, the table of a test."""
+"""Callbacks for super-resolution: pictures in TensorBoard and the table of a test."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from spikekit.tables import table
 
 
 def middle_clip(batch: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return the clip of a batch, of a film that around the key frame in its middle, with its truth."""
+    """Return the clip of a batch with its ground truth; for films, the clip around the middle key frame."""
     if "every" not in batch:
         return batch
     middle = batch["rgb"].shape[1] // 2
@@ -29,7 +29,7 @@ def middle_clip(batch: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def middle_half(batch: dict[str, Tensor]) -> slice:
-    """Return which key frames of a film are judged: not those that have few neighbours."""
+    """Return the key frames of a film that are scored: the middle half, which has neighbours on both sides."""
     count = batch["rgb"].shape[1]
     return slice(count // 4, count - count // 4)
 
@@ -44,7 +44,7 @@ class ValidationPictures(Callback):
         self._rows: list[list[Tensor]] = []
 
     def rows(self, module: LightningModule, outputs: Any, batch: dict[str, Tensor]) -> list[list[Tensor]]:
-        """Return the pictures of every clip of a batch."""
+        """Return one row of pictures per clip of a batch."""
         settings, batch = module.network.settings, middle_clip(batch)
         decoded = ClassicalDecoder("tfi", settings["scale"], settings["pattern"], settings["alpha"])(batch["spikes"])
         return [list(row) for row in zip(decoded.clamp(0, 1), outputs, batch["rgb"], strict=True)]
@@ -63,15 +63,15 @@ class ValidationPictures(Callback):
 
 
 class TestReport(Callback):
-    """Print one table of a test, every method on the same clips, and write ``test.csv`` and ``test.png``.
+    """Print the table of a test, with all methods on the same clips, and write ``test.csv`` and ``test.png``.
 
-    PSNR and SSIM as :func:`spikekit.psnr` and :func:`spikekit.ssim`, averaged over clips, and LPIPS where it is to be
-    had, see :mod:`lightning_modules.metrics.image`. In ``test.csv`` every clip has a row, too, with its name where the
-    data have ``test_names``.
+    The columns are :func:`spikekit.psnr`, :func:`spikekit.ssim` and, if available, LPIPS, averaged over clips, see
+    :mod:`lightning_modules.metrics.image`. ``test.csv`` also has a row per clip, named after the ``test_names`` of the
+    data if there are any.
 
     Args:
-        output: the folder that they are written to.
-        clips: how many clips the picture shows.
+        output: folder of the run.
+        clips: number of clips in the picture.
     """
 
     __test__ = False  # not a test for pytest
@@ -81,15 +81,15 @@ class TestReport(Callback):
         self.clips = clips
 
     def columns(self) -> list[tuple[str, str, int]]:
-        """Columns of ``test.csv``, their headings in the table, and how many digits it shows."""
+        """Return columns of ``test.csv``, their headings in the table, and their decimal places there."""
         return [(measure.name, measure.heading, measure.digits) for measure in measures()]
 
     def missing(self) -> str | None:
-        """Return in a line what was not measured, and why."""
+        """Return a line that tells which metric is missing, and why; ``None`` if none is."""
         return why_no_lpips()
 
     def rows(self, pictures: dict[str, Tensor], batch: dict[str, Tensor]) -> list[list[Tensor]]:
-        """Return the pictures of every clip of a batch: one of every method, and the truth; those amid a film."""
+        """Return one row per clip of a batch: a picture of every method, and the truth; of films, the middle one."""
         if "every" in batch:
             pictures = {method: rgb[:, rgb.shape[1] // 2] for method, rgb in pictures.items()}
             batch = middle_clip(batch)

@@ -1,4 +1,4 @@
-"""Checkpoints of ``lightning fit`` as Lightning reads, writes and removes them."""
+"""Reading, writing and removal of the checkpoints of ``lightning fit``."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from pytorch_lightning.utilities.exceptions import SIGTERMException
 from lightning_modules.storage.checkpoint import DivergedError, check_tensors, read_checkpoint
 from spikekit.io.whole_file import whole_file
 
-#: weights that forked or spawned processes of Lightning hand on to the one that started them
+#: file by which forked or spawned processes of Lightning pass weights to their parent
 _HANDED_ON = ".temp.ckpt"
 
 
 class LastCheckpoint(ModelCheckpoint):
-    """Also saves where SIGTERM ends a training: Lightning then ends it between two steps."""
+    """Checkpoint that is also saved on SIGTERM, after which Lightning ends the training between two steps."""
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:  # noqa: D102
         self.save_on_exception = isinstance(exception, SIGTERMException)
@@ -28,9 +28,9 @@ class LastCheckpoint(ModelCheckpoint):
 
 
 def requeued_checkpoint(output: str | Path) -> str | None:
-    """Return the newest checkpoint that a SLURM job which was requeued has left in its folder, None for other runs."""
+    """Return the newest checkpoint of a requeued SLURM job; ``None`` for other runs."""
     output = Path(output)
-    saved = [*output.glob("hpc_ckpt_*.ckpt")]  # Lightning writes them before it asks for the job to be queued again
+    saved = [*output.glob("hpc_ckpt_*.ckpt")]  # written by Lightning before it requeues the job
     if "SLURM_JOB_ID" not in os.environ or not (saved or int(os.environ.get("SLURM_RESTART_COUNT") or 0)):
         return None
     found = [path for path in (*saved, output / "checkpoints" / "last.ckpt") if path.is_file()]
@@ -38,27 +38,27 @@ def requeued_checkpoint(output: str | Path) -> str | None:
 
 
 class Checkpoints(TorchCheckpointIO):
-    """How Lightning reads, writes and removes checkpoints: without running code, whole, and nothing else than them."""
+    """Checkpoint I/O for Lightning: reads without running code, writes atomically, removes only own checkpoints."""
 
     def __init__(self, folder: str | Path) -> None:
         super().__init__()
         self._folder, self._saved = Path(os.path.abspath(folder)), set()
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
-        """Write a checkpoint; one that was there stays until the new one is complete.
+        """Write a checkpoint atomically.
 
         Raises:
-            DivergedError: its weights are not finite; the checkpoint that was there is what training can go on from.
+            DivergedError: the weights are not finite; training can resume from the previous checkpoint.
         """
         try:
-            # processes that Lightning forks or spawns hand on the weights alone
+            # files of forked or spawned processes are plain weights
             check_tensors(checkpoint.get("state_dict", checkpoint))
         except ValueError as error:
             raise DivergedError(f"{path}: not written, as the training has diverged ({error})") from error
         with whole_file(path) as file:
             try:
                 torch.save(checkpoint, file)
-            except RuntimeError as error:  # torch's own writer, when the disk is full
+            except RuntimeError as error:  # from torch's writer if the disk is full
                 if isinstance(error.__context__, OSError):
                     raise error.__context__ from None
                 raise
@@ -71,7 +71,7 @@ class Checkpoints(TorchCheckpointIO):
         return read_checkpoint(path)
 
     def remove_checkpoint(self, path: str | Path) -> None:
-        """Remove a checkpoint of this run; anything else that a checkpoint may name as one of its own stays."""
+        """Remove a checkpoint of this run; other files, which a checkpoint may name as well, are kept."""
         path = Path(os.path.abspath(path))
         if path.suffix == ".ckpt" and path.is_file() and (path in self._saved or self._folder in path.parents):
             path.unlink()

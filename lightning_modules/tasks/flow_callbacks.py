@@ -1,4 +1,4 @@
-"""Callbacks for optical flow: colour-coded flow in TensorBoard, and the table of a test."""
+"""Callbacks for optical flow: colour-coded flow in TensorBoard and the table of a test."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from spikekit import flow_to_rgb
 
 
 class FlowPictures(ValidationPictures):
-    """Show the first clips of every validation in TensorBoard: the estimated flow to the last time point, and the true.
+    """Show the first clips of every validation in TensorBoard: estimated and true flow to the last time point.
 
-    The direction is the hue and the length the saturation; both pictures of a clip have one scale.
+    Hue is the direction and saturation the length, on the same scale for both pictures of a clip.
     """
 
     title = "flow, truth"
@@ -24,11 +24,11 @@ class FlowPictures(ValidationPictures):
 
 
 class FlowReport(TestReport):
-    """Print one table of a test, every estimator on the same clips, and write ``test.csv`` and ``test.png``.
+    """Print the table of a test, with all estimators on the same clips, and write ``test.csv`` and ``test.png``.
 
-    The end-point error and the share of pixels where it is above one pixel are in sensor pixels, and so are KITTI's
-    outliers, :func:`lightning_modules.metrics.flow.outliers`; both flows of a clip count. The time is that of a batch,
-    shared by its clips.
+    The columns are the end-point error in sensor pixels, the share of pixels with an error above one sensor pixel,
+    KITTI's outliers (:func:`lightning_modules.metrics.flow.outliers`), all over both flows of a clip, and the time of a
+    batch divided by its clips.
     """
 
     def columns(self) -> list[tuple[str, str, int]]:  # noqa: D102
@@ -40,7 +40,7 @@ class FlowReport(TestReport):
         ]
 
     def missing(self) -> None:
-        """Nothing is missing."""
+        """Return ``None``: no metric is missing."""
 
     def rows(self, pictures: dict[str, Tensor], batch: dict[str, Tensor]) -> list[list[Tensor]]:  # noqa: D102
         flows = [flow[:, 1] for flow in pictures.values()]
@@ -48,6 +48,6 @@ class FlowReport(TestReport):
 
 
 def flow_row(flows: list[Tensor], truth: Tensor) -> list[Tensor]:
-    """Return pictures of estimated flows (2, H, W) and of the true one, all of one scale: the longest true one."""
+    """Return pictures of estimated flows (2, H, W) and of the true one, all scaled by the longest true vector."""
     longest = max(truth.norm(dim=0).max().item(), 1.0)
     return [flow_to_rgb(flow.float().cpu(), longest) for flow in (*flows, truth)]

@@ -1,4 +1,4 @@
-"""Muon for networks of convolutions: fewer steps from random weights than with Adam."""
+"""Muon for convolutional networks; it needs fewer steps from random weights than Adam."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-# of an odd polynomial whose repeated application brings singular values between 0 and 1 close to 1
+# coefficients of an odd polynomial; applied repeatedly, it brings singular values in (0, 1] close to 1
 _QUINTIC = 3.4445, -4.7750, 2.0315
 _REPEATS = 5
 
@@ -17,13 +17,13 @@ _REPEATS = 5
 def orthogonalized(matrix: Tensor) -> Tensor:
     r"""Bring all singular values of a matrix close to 1, between 0.6 and 1.3, by Newton-Schulz iterations.
 
-    Singular values that are much smaller than the largest, a thousandth or less, stay smaller.
+    Singular values of a thousandth of the largest or less stay smaller.
 
     Args:
         matrix: :math:`(*, M, N)`.
 
     Returns:
-        :math:`(*, M, N)`, near to :math:`U V^T` where the matrix is :math:`U S V^T`; zeros where it is zero.
+        :math:`(*, M, N)`, close to :math:`U V^T` for a matrix :math:`U S V^T`; zeros for a zero matrix.
 
     Example:
         >>> torch.linalg.svdvals(orthogonalized(torch.diag(torch.tensor([3.0, 2.0, 1.0])))).round(decimals=1)
@@ -40,21 +40,21 @@ def orthogonalized(matrix: Tensor) -> Tensor:
 
 
 class MuonWithAdam(torch.optim.Optimizer):
-    """Muon for the weights of layers, Adam for biases and for layers to or from three channels or fewer.
+    """Muon for weights of layers; Adam for biases and for layers with at most three input or output channels.
 
-    Muon takes the momentum of a weight's gradient as a matrix, a row for every output channel, and makes the step
-    equally large in all its directions. It is ``torch.optim.Muon``, which takes matrices alone, for convolutions too:
-    without weight decay, with its ``match_rms_adamw``, by which a learning rate for Adam suits Muon as well.
+    Muon orthogonalises the momentum of a weight as a matrix with one row per output channel, so that the step is
+    equally large in all its directions. It extends ``torch.optim.Muon``, which takes only matrices, to convolutions,
+    without weight decay and with ``match_rms_adamw``, so that learning rates for Adam fit.
 
     Args:
-        params: parameters, or groups of them.
+        params: parameters or parameter groups.
         lr: learning rate.
-        momentum: share of the momentum that the next step keeps, of Muon.
-        betas: decays of the mean and of the mean square, of Adam.
-        eps: added to the root of the mean square, of Adam.
+        momentum: momentum of Muon.
+        betas: decay rates of mean and mean square of Adam.
+        eps: term of Adam that is added to the root of the mean square.
 
     Raises:
-        ValueError: an argument out of its range.
+        ValueError: an argument is out of range.
 
     Example:
         >>> layer = torch.nn.Conv2d(8, 8, 3)
@@ -87,13 +87,13 @@ class MuonWithAdam(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:
-        """Change the parameters by their gradients.
+        """Perform one optimisation step.
 
         Args:
-            closure: computes the loss and the gradients anew.
+            closure: function that reevaluates the model and returns the loss.
 
         Returns:
-            The loss that ``closure`` returned.
+            The loss of ``closure``, if given.
         """
         loss = None
         if closure is not None:
@@ -110,7 +110,7 @@ class MuonWithAdam(torch.optim.Optimizer):
                     alike.setdefault((matrix, parameter.dtype, parameter.device), []).append(parameter)
                 else:
                     others.append(parameter)
-            # a GPU takes longer to start an operation than to do it for all of them
+            # on a GPU, one operation on all parameters is faster than one for each
             for parameters in alike.values():
                 torch._foreach_add_(parameters, self._muon(parameters, group), alpha=-group["lr"])
             if others:
@@ -118,14 +118,14 @@ class MuonWithAdam(torch.optim.Optimizer):
         return loss
 
     def _muon(self, parameters: list[Tensor], group: dict[str, Any]) -> list[Tensor]:
-        """Changes of weights whose matrices are of one size."""
+        """Return the steps for weights whose matrices have the same size."""
         for parameter in parameters:
             if not self.state[parameter]:
                 self.state[parameter]["momentum"] = torch.zeros_like(parameter)
         momenta = [self.state[parameter]["momentum"] for parameter in parameters]
         gradients = [parameter.grad for parameter in parameters]
         torch._foreach_lerp_(momenta, gradients, 1 - group["momentum"])
-        ahead = torch._foreach_lerp(gradients, momenta, group["momentum"])  # Nesterov's
+        ahead = torch._foreach_lerp(gradients, momenta, group["momentum"])  # Nesterov momentum
         matrices = torch.stack([one.flatten(1) for one in ahead])
         changes = 0.2 * math.sqrt(max(matrices.shape[1:])) * orthogonalized(matrices)
         return [change.reshape(parameter.shape) for change, parameter in zip(changes, parameters, strict=True)]

@@ -1,4 +1,4 @@
-"""The LightningModule that trains and judges estimators of motion, on clips whose flow is known exactly."""
+"""LightningModule that trains and tests motion estimators on clips with exactly known flow."""
 
 from __future__ import annotations
 
@@ -16,30 +16,29 @@ from lightning_modules.tasks.base import BaseTask, step_schedule
 from lightning_modules.tasks.flow_callbacks import FlowPictures, FlowReport
 from spikekit import bayer_pattern, split_bayer
 
-_DISCOUNT = 0.8  # of every iteration against the one after it
+_DISCOUNT = 0.8  # weight of an iteration relative to the next
 
 
-# no lambda, so that a module can be pickled
+# not a lambda, so that a module can be pickled
 def _adamw(parameters: Iterable[nn.Parameter]) -> torch.optim.AdamW:
     return torch.optim.AdamW(parameters, lr=1e-3)
 
 
 class FlowTraining(BaseTask):
-    """Train Spike2Flow on clips whose flow is known, judge it beside the estimators without weights.
+    """Train Spike2Flow on clips with known flow and compare it with the estimators without weights.
 
-    Every sub-stream learns its own flow, on the way of every iteration: the mean absolute error of the last one counts
-    fully, that of every one before 0.8 times as much (RAFT's sequence loss). The flows on the way to the ends are
-    compared with the shares of the true one that steady motion would have. Validation measures the joint flow, in
-    sensor pixels.
+    Every colour sub-stream learns its own flow. The loss is the mean absolute error of all iterations; each counts 0.8
+    times as much as the next (RAFT's sequence loss). Flows to intermediate times are compared with the fractions of the
+    true flow that linear motion has. Validation measures the joint flow, in sensor pixels.
 
     Args:
         network: the estimator.
         frames: spike frames of a clip, odd.
-        window: spike frames that a time point of CSCSR sees, odd: the flow runs from the middle frame to the middle of
-            the first and of the last window.
-        pattern: Bayer phase of the streams; the data's must be the same.
-        optimizer: builds the optimizer from the parameters.
-        lr_scheduler: builds the schedule from the optimizer, counted in steps.
+        window: spike frames of a time point of CSCSR, odd. The flow runs from the middle frame to the middle of the
+            first and of the last window.
+        pattern: Bayer phase; must match the data.
+        optimizer: builds the optimiser from the parameters.
+        lr_scheduler: builds the schedule from the optimiser, counted in steps.
     """
 
     best = ("val/epe", "min")
@@ -85,7 +84,7 @@ class FlowTraining(BaseTask):
         return flow
 
     def test_step(self, batch: dict[str, Tensor], batch_index: int) -> dict[str, dict[str, Any]]:
-        """Return the joint flows of every estimator, (B, 2, 2, H, W), as ``pictures`` by name, and their ``scores``."""
+        """Return the joint flows of all estimators, (B, 2, 2, H, W), as ``pictures`` by name, and their ``scores``."""
         flows, scores = {}, {}
         for estimator in (self.network, ClassicalFlow(), ZeroFlow()):
             start, name = time.perf_counter(), type(estimator).__name__
@@ -103,7 +102,7 @@ class FlowTraining(BaseTask):
 
 
 def _scores(flow: Tensor, truth: Tensor) -> dict[str, Tensor]:
-    """End-point error, and shares of wrong pixels, of every clip."""
+    """Return end-point error and fractions of wrong pixels for every clip."""
     error = end_point_error(flow, truth)
     measures = {"epe": error, "over_1px": (error > 1).float(), "outliers": outliers(error, truth).float()}
     return {name: values.flatten(1).mean(dim=1) for name, values in measures.items()}

@@ -1,4 +1,4 @@
-"""A callback for training at a GPU's pace: schedule by time, lines without a terminal, weights that outlive a kill."""
+"""A callback for training on a GPU: schedule by time, progress lines, and weights that are written regularly."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from lightning_modules.storage.pretrained import Weights, motion_of, settings_of
 
 
 class Pace(Callback):
-    """Let the rate fall along a cosine, by steps or time, print how training goes, and write weights now and then.
+    """Schedule the learning rate by steps or time, print progress, and write weights at intervals.
 
-    The rate rises to what the optimizer was given in ``warm_up`` steps and falls to a hundredth when ``max_steps`` or
-    ``max_time`` of the trainer is reached, whichever is nearer; any schedule in the configuration has no say. Weights
-    are ``weights.safetensors`` in the folder of the run, in half precision: their average, where a callback of the
-    trainer averages them. On a GPU convolutions are computed channels last.
+    The rate rises to that of the optimiser during ``warm_up`` steps, then falls along a cosine to a hundredth at
+    ``max_steps`` or ``max_time`` of the trainer, whichever comes first; it overrides any schedule of the configuration.
+    The weights are written to ``weights.safetensors`` in the folder of the run, in half precision, averaged if a
+    callback of the trainer averages them. On a GPU, the network uses channels-last memory.
 
     Args:
-        warm_up: steps.
-        line_every: seconds from one line to the next.
-        weights_every: seconds from one writing of the weights to the next; they are also written in the end.
+        warm_up: steps until the full learning rate.
+        line_every: seconds between progress lines.
+        weights_every: seconds between two writes of the weights; they are also written at the end.
     """
 
     def __init__(self, warm_up: int = 200, line_every: float = 10.0, weights_every: float = 60.0) -> None:
@@ -57,7 +57,7 @@ class Pace(Callback):
         self._clips += batch["rgb"].shape[:-3].numel() * trainer.world_size
         self._loss = loss if self._loss is None else self._loss.lerp(loss, 0.02)
         if now - self._said >= self.line_every:
-            loss = float(self._loss)  # waits for the device, so that the rate is that of steps that were taken
+            loss = float(self._loss)  # waits for the device, so that only finished steps count
             took = time.monotonic() - self._said
             rate = self._clips / took
             steps = (trainer.global_step - self._step) / took
@@ -92,7 +92,7 @@ class Pace(Callback):
 
 
 def averaged(trainer: Trainer, module: LightningModule) -> nn.Module:
-    """Return the average that a callback keeps of a module, or the module."""
+    """Return the averaged module of a callback, or the module itself."""
     for callback in trainer.callbacks:
         if isinstance(callback, WeightAveraging) and getattr(callback, "_average_model", None) is not None:
             return callback._average_model.module
@@ -100,7 +100,7 @@ def averaged(trainer: Trainer, module: LightningModule) -> nn.Module:
 
 
 def share_done(trainer: Trainer) -> float:
-    """Share of the training that is done, by steps or by time."""
+    """Return the finished fraction of the training, by steps or by time."""
     shares = [trainer.global_step / trainer.max_steps] if trainer.max_steps > 0 else []
     for callback in trainer.callbacks:
         if isinstance(callback, Timer) and callback.time_remaining() is not None:

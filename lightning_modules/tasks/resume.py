@@ -1,4 +1,4 @@
-"""Resuming a training: a checkpoint that Lightning would fail on midway is rejected before training starts."""
+"""Check that a training can resume from a checkpoint, before it starts."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from spikekit.arguments import one_line
 
 
 def check_resume(path: str | Path, module: BaseTask) -> None:
-    """Take a step from a checkpoint with an optimizer and a schedule on which nothing depends.
+    """Check a checkpoint by one step with a temporary optimiser and schedule.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: no checkpoint, or one that this training cannot resume from; the message is one line and names it.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is no checkpoint, or the training cannot resume from it; the message is one line that
+            names the file.
     """
     checkpoint = read_checkpoint(path)
     weights = [torch.nn.Parameter(weight.detach().clone()) for weight in module.network.parameters()]
@@ -35,15 +36,15 @@ def check_resume(path: str | Path, module: BaseTask) -> None:
         made["optimizer"].step()
         for name in ("epoch", "global_step", "loops"):
             checkpoint[name]
-    except Exception as error:  # what torch raises depends on what is wrong
+    except Exception as error:  # the type depends on the damage
         raise ValueError(f"{path}: training cannot resume from this checkpoint: {one_line(error)[:300]}") from error
 
 
 def load_weights_of(checkpoint: Mapping[str, Any], path: str | Path, module: BaseTask) -> None:
-    """Give a module the weights of a checkpoint.
+    """Load the weights of a checkpoint into a module.
 
     Raises:
-        ValueError: weights of another network; the message is one line and names the file.
+        ValueError: the weights are of another network; the message is one line that names the file.
     """
     try:
         module.on_load_checkpoint(dict(checkpoint))

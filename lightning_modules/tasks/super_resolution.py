@@ -1,4 +1,4 @@
-"""The LightningModule that trains and judges super-resolution networks."""
+"""LightningModule that trains and tests super-resolution networks."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from lightning_modules.tasks.callbacks import TestReport, ValidationPictures, mi
 from spikekit import psnr, ssim
 
 
-# no lambda, so that a module can be pickled
+# not a lambda, so that a module can be pickled
 def _adam(parameters: Iterable[nn.Parameter]) -> torch.optim.Adam:
     return torch.optim.Adam(parameters, lr=1e-4)
 
 
 def _loss(rgb: Tensor, batch: dict[str, Tensor]) -> Tensor:
-    """L1; in clips of many gains, times the root of the gain, by which what noise leaves of it falls."""
+    """L1 loss; for clips of different gains, weighted by the root of the gain, as noise falls with it."""
     error = (rgb - batch["rgb"]).abs()
     if "alpha" not in batch:
         return error.mean()
@@ -36,23 +36,23 @@ def _loss(rgb: Tensor, batch: dict[str, Tensor]) -> Tensor:
 
 
 class SuperResolution(BaseTask):
-    """Train a network on clips whose truth is known, and judge it beside the classical decoders.
+    """Train a network on clips with ground truth and compare it with the classical decoders.
 
-    Everything but training uses the network's own estimator of motion, as a recording would; ``test`` shows the result
-    with the scene's flow in a row of its own. A checkpoint holds the weights of the estimator, too; those of another
-    kind of estimator than this run's are passed over, and this run's stay as they were built.
+    Validation and prediction use the network's own motion estimator, as recordings need; ``test`` also has a row with
+    the flow of the scene. A checkpoint includes the weights of the estimator; they are ignored if this run has another
+    kind of estimator.
 
     Args:
-        network: the network, such as CSCSR. ``lightning`` builds it as the weights want it, where some are given.
-        optimizer: builds the optimizer from the parameters; the paper uses Adam at 1e-4.
-        lr_scheduler: builds the schedule from the optimizer, counted in steps; the paper multiplies by 0.8 every 7500.
-        flow: the motion that training uses. "scene" is that of the data, where they have it: the true one of analytic
-            scenes, or that which the frames of a film were interpolated with. "estimated" is that of the network's own
-            estimator, which learns as well unless it is frozen; it sees what there is of a scene around a patch.
-        frozen: parts of the network that do not learn, such as ``representation``.
-        future: key frames that a picture of a film may wait for, where the network makes films.
-        weights: what the network starts with: the name of weights that come with the package, such as
-            ``cscsr_small_x4``, a file of safetensors, or a checkpoint of which only the weights are taken.
+        network: the network, such as CSCSR. With ``weights``, ``lightning`` builds it from their settings.
+        optimizer: builds the optimiser from the parameters; the paper uses Adam at 1e-4.
+        lr_scheduler: builds the schedule from the optimiser, counted in steps; the paper multiplies by 0.8 every 7500.
+        flow: source of the motion in training. "scene" is the flow of the data, if they have one: the true flow of
+            analytic scenes, or the flow that a film was interpolated with. "estimated" is the estimate of the network's
+            own estimator, which is trained as well unless it is frozen; it also sees the surroundings of a patch.
+        frozen: names of submodules that are not trained, such as ``representation``.
+        future: later key frames that a picture of a film may wait for; only for networks for films.
+        weights: initial weights: a name of the package such as ``cscsr_small_x4``, a safetensors file, or a checkpoint,
+            of which only the weights are used.
     """
 
     best = ("val/psnr", "max")
@@ -75,11 +75,11 @@ class SuperResolution(BaseTask):
         fusion = network.settings.get("motion_fusion", "joint")
         if flow == "scene" and fusion != "joint":
             raise ValueError(
-                f"flow: expected 'estimated' with motion_fusion {fusion!r}, the scene's is one for all colours"
+                f"flow: expected 'estimated' with motion_fusion {fusion!r}, as the scene has one flow for all colours"
             )
-        FilmMaker(network, future)  # what is wrong with it is said at once
+        FilmMaker(network, future)  # reports a wrong ``future`` at once
         self.flow, self.future = flow, future
-        self._told = ["alpha", "noise"] if network.settings.get("noise") else ["alpha"]  # what it hears of the camera
+        self._told = ["alpha", "noise"] if network.settings.get("noise") else ["alpha"]  # inputs about the camera
         parts = dict(network.named_modules())
         for name in frozen:
             if name not in parts:
@@ -90,9 +90,9 @@ class SuperResolution(BaseTask):
             load_weights(network, read_weights(weights))
 
     def forward(self, spikes: Tensor, flow: Tensor | None = None) -> Tensor:
-        """Return the picture of the middle of a clip, tile by tile: (B, N, H, W) to (B, 3, s H, s W), in [0, 1].
+        """Return the picture at the middle of a clip, tile by tile: (B, N, H, W) to (B, 3, s H, s W), in [0, 1].
 
-        The motion is ``flow``, (B, 2, 2, H, W), or else what the network's estimator sees.
+        ``flow`` is (B, 2, 2, H, W); default: the estimate of the network.
         """
         return predict(self.network, spikes, flow)
 
@@ -105,7 +105,7 @@ class SuperResolution(BaseTask):
         return loss
 
     def _with_motion(self, batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor | None]:
-        """Clips of patches, and the motion in them: what is around them serves its estimate alone."""
+        """Return a batch without margins, and its flow; margins around patches only serve motion estimation."""
         spikes, flow = batch["spikes"], batch.get("flow" if self.flow == "scene" else "motion")
         margin = (spikes.shape[-1] - batch["rgb"].shape[-1] // self.network.scale) // 2
         if not margin:
@@ -116,10 +116,7 @@ class SuperResolution(BaseTask):
         return {**batch, "spikes": trim(spikes, margin)}, flow
 
     def _pictures(self, batch: dict[str, Tensor], flow: Tensor | None = None) -> list[Tensor]:
-        """Pictures of clips; of films after every time that they were read.
-
-        A film that was read from its end is the mirror image of one that is read but once: both learn.
-        """
+        """Return the pictures of clips; of films, one result per pass, forwards and backwards, as both are trained."""
         spikes = batch["spikes"]
         told = {name: batch[name] for name in self._told if name in batch}
         if "every" not in batch:
@@ -132,14 +129,14 @@ class SuperResolution(BaseTask):
 
     def validation_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:  # noqa: D102
         rgb = self._pictures(batch)[-1]
-        if "every" in batch:  # of a film, the key frame in the middle stands for all
+        if "every" in batch:  # the middle key frame represents a film
             rgb, batch = rgb[:, rgb.shape[1] // 2], middle_clip(batch)
         self.log("val/psnr", psnr(rgb, batch["rgb"]).mean(), prog_bar=True, sync_dist=True)
         self.log("val/ssim", ssim(rgb, batch["rgb"]).mean(), sync_dist=True)
         return rgb.clamp(0, 1)
 
     def test_step(self, batch: dict[str, Tensor], batch_index: int) -> dict[str, dict[str, Any]]:
-        """Return ``pictures`` by method, of a film those that are judged, (B, K, 3, s H, s W), and their ``scores``."""
+        """Return ``pictures`` by method, of a film the scored ones, (B, K, 3, s H, s W), and their ``scores``."""
         spikes, settings = batch["spikes"], self.network.settings
         name, decoder = type(self.network).__name__, (settings["scale"], settings["pattern"], settings["alpha"])
         film = "every" in batch
@@ -163,7 +160,7 @@ class SuperResolution(BaseTask):
         return {"pictures": pictures, "scores": scores}
 
     def _film(self, clips: Tensor, every: int) -> Tensor:
-        """Pictures (K, 3, s H, s W) of clips (K, N, H, W), every so many clocks."""
+        """Return the pictures (K, 3, s H, s W) of clips (K, N, H, W) that are ``every`` clocks apart."""
         maker, groups = FilmMaker(self.network, self.future), film_groups(range(len(clips)), self.future)
         return torch.cat([maker(clips[group], [every * n for n in group]) for group in groups])
 

@@ -1,1 +1,1 @@
-"""``lightning trade``: cost and quality of every setting, measured side by side."""
+"""Measurement of cost and quality of settings, side by side: ``lightning trade``."""

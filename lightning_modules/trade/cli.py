@@ -29,18 +29,18 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         usage="lightning trade -c CONFIG [-c OVERLAY ...] [arguments of lightning test] [--setting SETTING ...] "
         "[--rounds N] [-o DIR]",
-        description="Measure the cost and the quality of every setting, on this machine and these scenes.",
+        description="Measure cost and quality of settings on this machine and the test scenes.",
         epilog=f"""\
-A setting is arguments of `lightning test`, put behind those that all settings share. Its pictures are those of
-`lightning predict`, tiles included, on the test clips; a network of fewer frames than the shared
-arguments give the clips takes those in the middle. All settings are parsed and built before the first one runs. One
-that cannot run here, for want of a file, say, is reported as a row, and the others go on. Time is taken in one process
-and in turns: every setting once in every round, on the same clip.
+A setting is a list of arguments of `lightning test`, appended to the shared ones. Its pictures are computed as by
+`lightning predict`, with tiles, on the test clips; a network with fewer frames than the clips takes the middle ones.
+All settings are parsed and built before the first one runs. A setting that cannot run here, such as with a missing
+file, gets a row with the reason; the others are measured. Times are taken in one process, in turns: in every round,
+every setting once, on the same clip.
 
-With --film EVERY, the test scenes are films of {PICTURES} pictures, EVERY clocks apart, and time and work are
-those of a picture in a film; PSNR, SSIM and LPIPS are of the pictures between the first and the last.
+With --film EVERY, the test scenes are films of {PICTURES} pictures, EVERY clocks apart. Time and work are per picture;
+PSNR, SSIM and LPIPS leave out the first and the last picture.
 
-The result is trade.md and trade.csv, with the Pareto front of time and PSNR.
+Results: trade.md and trade.csv, with the Pareto front of time and PSNR.
 
 columns:
 {COLUMNS}
@@ -59,17 +59,17 @@ examples:
         action="append",
         default=[],
         metavar="SETTING",
-        help="'ARGS' or 'NAME: ARGS'; given again, one more. Without any: the networks whose weights come with the "
-        "package, or that of --ckpt_path or --model.weights; variants of the first of them; the decoders",
+        help="'ARGS' or 'NAME: ARGS', repeatable; default: the networks of the package, or that of --ckpt_path or "
+        "--model.weights; variants of the first network; the decoders",
     )
-    add("--rounds", type=whole(1), default=_ROUNDS, metavar="N", help=f"timings of every setting; default {_ROUNDS}")
-    add("--film", type=whole(1), metavar="EVERY", help="measure films, with a picture every so many clocks")
+    add("--rounds", type=whole(1), default=_ROUNDS, metavar="N", help=f"timings of every setting; default: {_ROUNDS}")
+    add("--film", type=whole(1), metavar="EVERY", help="measure films with one picture every EVERY clocks")
     add("-o", "--output", type=home_path, default=_OUTPUT, metavar="DIR", help=f"default: {_OUTPUT}")
     return made
 
 
 def trade(args: Sequence[str]) -> None:
-    """Run the verb with what was typed after it."""
+    """Run ``lightning trade`` with the given arguments."""
     asked, shared = parser().parse_known_args(args)
     given = [read_setting(text) for text in asked.setting]
     try:
@@ -83,7 +83,7 @@ def trade(args: Sequence[str]) -> None:
     names = [setting.name for setting in settings]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise UsageError(f"trade: two settings are called {twice!r}; 'NAME: ARGS' gives them names")
+        raise UsageError(f"trade: two settings have the name {twice!r}; name them with 'NAME: ARGS'")
     rows = [_row(setting, shared, base) for setting in progress(settings, "settings built")]
     _check_any(rows)
     with locked_folder(asked.output, "lightning trade"):
@@ -91,7 +91,7 @@ def trade(args: Sequence[str]) -> None:
 
 
 def _measured(rows: Sequence[Measurement], base: Runner, asked: argparse.Namespace, command: str) -> None:
-    """Measure the rows, and write them in three ways."""
+    """Measure the rows, then print and write the tables."""
     for row in rows:
         if row.reason is not None:
             print(f"{row.setting.name} cannot run: {row.reason}", flush=True)
@@ -114,7 +114,7 @@ def _measured(rows: Sequence[Measurement], base: Runner, asked: argparse.Namespa
 
 
 def _own_weights(base: Runner) -> list[str]:
-    """Options by which the shared arguments give weights to the network."""
+    """Return the shared options that give weights to the network."""
     given = {
         "--ckpt_path": base.config["ckpt_path"],
         "--model.weights": base.config["model"]["init_args"].get("weights"),
@@ -133,4 +133,4 @@ def _row(setting: Setting, shared: Sequence[str], base: Runner) -> Measurement:
 
 def _check_any(rows: Sequence[Measurement]) -> None:
     if not running(rows):
-        raise InputError(f"trade: nothing can run; {rows[0].setting.name}: {rows[0].reason}")
+        raise InputError(f"trade: no setting can run; {rows[0].setting.name}: {rows[0].reason}")

@@ -1,4 +1,4 @@
-"""Films in a trade: what a picture costs and is worth as one of several, made one after the other."""
+"""Cost and quality of settings on films, whose pictures are computed one after the other."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from lightning_modules.trade.runner import Runner
 from spikekit import Scene
 from spikekit.scenes.frame_sequence import SequenceClip
 
-#: pictures of a film; those between the first and the last count, which all have a neighbour on either side
+#: pictures of a film; the first and the last, which lack a neighbour, are not scored
 PICTURES = 5
 
 _COUNTED = slice(1, PICTURES - 1)
 
 
 class FilmRunner:
-    """A setting that makes films, with a picture ``every`` so many clocks.
+    """A setting that makes films with a picture every ``every`` clocks.
 
-    ``latency`` is how many clocks had come after a picture's own when it was made, in the last film at most.
+    ``latency`` is the largest number of later clocks that a picture of the last film waited for.
     """
 
     def __init__(self, runner: Runner, every: int) -> None:
@@ -40,7 +40,7 @@ class FilmRunner:
     def __call__(self, spikes: Tensor) -> Tensor:
         """Return the pictures of a film, (PICTURES, 3, s H, s W), in [0, 1].
 
-        Of more spikes (1, T, H, W) than the network needs, those in the middle.
+        If the spikes (1, T, H, W) are longer than needed, the middle ones are used.
         """
         length = film_length(self.network.frames, self.every)
         first = (spikes.shape[1] - length) // 2
@@ -60,7 +60,7 @@ class FilmRunner:
 
 
 def film_length(frames: int, every: int) -> int:
-    """Return how many clocks a film takes."""
+    """Return the length of a film in clocks."""
     return frames + (PICTURES - 1) * every
 
 
@@ -100,7 +100,7 @@ def _film_scene(spikes: Tensor, view: Scene | SequenceClip, every: int, scale: i
 def measure_films(
     rows: Sequence[Measurement], data: LightningDataModule, frames: int, every: int, rounds: int
 ) -> Timed:
-    """Measure settings as :func:`lightning_modules.trade.measure.measure` does, on films."""
+    """Measure settings on films, as :func:`lightning_modules.trade.measure.measure` does on clips."""
     for row in running(rows):
         row.runner = FilmRunner(row.runner, every)
     timed = measure(rows, film_scenes(data, frames, every), rounds, _score)

@@ -1,4 +1,4 @@
-"""Measure quality and time of every setting on the same clips, times in turns."""
+"""Measure quality and time of all settings on the same clips, with times taken in turns."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from spikekit.timing import Timer, peak_memory, timer_of
 
 @dataclass
 class Measurement:
-    """A setting, and its measurements so far; why it cannot run, if it cannot.
+    """A setting and its measurements so far, or the ``reason`` why it cannot run.
 
     Args:
-        psnr: dB, of every clip.
-        ssim: of every clip.
-        lpips: of every clip; empty where it is not to be had.
-        seconds: of one clip, which is one frame, round by round.
-        memory: MiB, by how much a clip raises the memory in use; None where that is not to be had.
-        macs: multiplications of convolutions and matrices, by sensor pixel.
-        flicker: of pairs of pictures in films, see :func:`lightning_modules.metrics.flicker.film_flicker`.
-        latency: clocks that a film is late; None where it is no film.
+        psnr: PSNR of every clip, in dB.
+        ssim: SSIM of every clip.
+        lpips: LPIPS of every clip; empty if not available.
+        seconds: time of one picture, for every round.
+        memory: increase of the memory in use by a clip, in MiB; ``None`` if not available.
+        macs: multiplications of convolutions and matrix products per sensor pixel.
+        flicker: flicker of pairs of pictures in films, see :func:`lightning_modules.metrics.flicker.film_flicker`.
+        latency: latency of a film in clocks; ``None`` for single clips.
     """
 
     setting: Setting
@@ -48,15 +48,15 @@ class Measurement:
 
     @property
     def parameters(self) -> int:
-        """Weights of the network and of its estimator of motion."""
+        """Number of parameters of the network and its motion estimator."""
         return sum(parameter.numel() for parameter in self.runner.network.parameters())
 
 
 @dataclass(frozen=True)
 class Timed:
-    """How time was taken: clips that took turns, their size in sensor pixels, rounds, and what was counted.
+    """How times were taken: number of clips, their size in sensor pixels, rounds, and the kind of time.
 
-    ``every`` is how many clocks are between two pictures of the films that they are; None where they are single clips.
+    ``every`` is the number of clocks between two pictures of a film; ``None`` for single clips.
     """
 
     clips: int
@@ -93,14 +93,14 @@ def measure(
 
 
 def running(rows: Sequence[Measurement]) -> list[Measurement]:
-    """Return the rows that can run, as far as is known."""
+    """Return the rows without a failure so far."""
     return [row for row in rows if row.reason is None]
 
 
 def time_in_turns(rows: Sequence[Measurement], clips: Sequence[Tensor], rounds: int) -> None:
-    """Time all rows once in every round, on the round's clip, each round beginning with the next row.
+    """Time all rows once per round, on the same clip; each round begins with another row.
 
-    Other work on the machine and the demands of a clip then affect all rows alike, and no row is always the first.
+    Other load on the machine and differences between clips then affect all rows alike, and no row is always first.
     """
     turns = [(turn, row) for turn in range(rounds) for row in _from(rows, turn)]
     for turn, row in progress(turns, "timings"):
@@ -126,12 +126,12 @@ def single_clips(scenes: DataLoader) -> Iterator[dict[str, Tensor]]:
 
 
 def attempt(row: Measurement, work: Callable[[], None]) -> None:
-    """Do some work for a row; if it fails, the row gets the reason."""
+    """Run a function for a row; if it fails, the row gets the reason."""
     try:
         work()
-    except Exception as error:  # the others are worth their rows
+    except Exception as error:  # the other rows continue
         row.reason = f"{type(error).__name__}: {one_line(error)[:200]}"
-        row.runner = None  # its memory
+        row.runner = None  # frees its memory
 
 
 def _score(row: Measurement, clip: dict[str, Tensor]) -> None:
@@ -145,7 +145,7 @@ def score_pictures(row: Measurement, rgb: Tensor, truth: Tensor) -> None:
 
 
 def _weigh(row: Measurement, spikes: Tensor) -> None:
-    """Memory and work of one clip."""
+    """Measure memory and multiplications for one clip."""
     device = row.runner.device
     spikes = spikes.to(device)
     with FlopCounterMode(display=False) as counter:

@@ -1,4 +1,4 @@
-"""Runners: settings built as ``lightning test`` builds them, and run as ``lightning predict`` does."""
+"""Runners: settings that are built as by ``lightning test`` and run as by ``lightning predict``."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lightning_modules.storage.pretrained import load_weights, read_weights
 from lightning_modules.tasks.super_resolution import SuperResolution
 from spikekit.arguments import one_line, whole
 
-# What the clips of a test do not depend on; and frames, as a network of fewer gets the middle of the clips of all.
+# data options without effect on test clips; and frames, as shorter networks take the middle of the shared clips
 _WITHOUT_EFFECT = ("patch", "train_clips", "batch_size", "workers", "frames", "flow_times")
 
 
@@ -33,27 +33,27 @@ class _Test(Rehearsal):
         trainer = super().instantiate_trainer(**kwargs)
         asked = self.config[self.verb].trainer.precision
         if asked == "16-mixed" and trainer.precision != asked:  # Lightning only warns
-            raise MisconfigurationException(f"{asked}: not on this device, Lightning has {trainer.precision} instead")
+            raise MisconfigurationException(f"{asked}: not on this device, Lightning uses {trainer.precision} instead")
         return trainer
 
 
 class Runner:
-    """A network, its precision and its device, and ``data`` and ``config``, those of a test.
+    """A network with its precision and device, and the ``data`` and ``config`` of its test.
 
     Args:
-        args: of ``lightning test``, in the order in which they are typed; and how pictures are made, as of ``predict``:
-            ``--tile``, ``--tolerance``, ``--self_ensemble``, ``--interpolated`` and ``--future``.
+        args: arguments of ``lightning test``, and these of ``lightning predict``: ``--tile``, ``--tolerance``,
+            ``--self_ensemble``, ``--interpolated`` and ``--future``.
 
     Raises:
-        InputError: arguments that make no sense.
-        CannotRunError: a file is missing, or the machine lacks what is asked for.
+        InputError: the arguments are invalid.
+        CannotRunError: a file is missing, or the machine lacks a required device or precision.
     """
 
     def __init__(self, args: Sequence[str]) -> None:
         how, args = _how().parse_known_args(args)
         if how.tile is not None and how.tile % 2:
             raise UsageError(f"tile: expected an even number of sensor pixels, or 0 for no tiles, got {how.tile}")
-        logging.disable(logging.INFO)  # Lightning would say for every setting anew what machine this is
+        logging.disable(logging.INFO)  # Lightning would describe the machine for every setting
         try:
             command = _built(args)
         finally:
@@ -68,22 +68,22 @@ class Runner:
         self.network = self.precision.convert_module(module).to(self.device).eval().network
         self.how = {name: value for name, value in vars(how).items() if value is not None}
         try:
-            self._maker()  # what is wrong with them is said at once
+            self._maker()  # reports wrong options at once
         except ValueError as error:
             raise UsageError(str(error)) from error
 
     @property
     def scenes(self) -> dict[str, Any]:
-        """The data arguments that decide which scenes the test clips show."""
+        """Data arguments that determine the test scenes."""
         data = self.config["data"]
         arguments = {key: value for key, value in data["init_args"].items() if key not in _WITHOUT_EFFECT}
         linked = {name: self.network.settings[name] for name in ("scale", "alpha")}
         return {"class": data["class_path"], **arguments, **linked}
 
     def __call__(self, spikes: Tensor) -> Tensor:
-        """Return what ``lightning predict`` makes of a clip: rgb (1, 3, s H, s W), in [0, 1].
+        """Return the picture of ``lightning predict`` for a clip: rgb (1, 3, s H, s W), in [0, 1].
 
-        Of more frames in spikes (1, N, H, W), on the device, than the network takes, those in the middle.
+        If the spikes (1, N, H, W), on the device, have more frames than the network takes, the middle ones are used.
         """
         first = (spikes.shape[1] - self.network.frames) // 2
         clip = spikes[:, first : first + self.network.frames]
@@ -101,7 +101,7 @@ class Runner:
 
 
 def _how() -> VerbParser:
-    """The options of a setting that say how pictures are made, as of ``lightning predict``."""
+    """Return a parser of the options of a setting that ``lightning predict`` has as well."""
     parser = VerbParser(prog="lightning trade", add_help=False, allow_abbrev=False)
     for name in ("tile", "self_ensemble", "interpolated", "future"):
         parser.add_argument(f"--{name}", type=whole(0))
@@ -110,11 +110,11 @@ def _how() -> VerbParser:
 
 
 def make_runner(shared: Sequence[str], args: Sequence[str], base: Runner) -> Runner:
-    """Build a setting, and check that it runs on the scenes of all the others, which ``base`` has."""
+    """Build a setting and check that its test scenes are those of ``base``, which all settings share."""
     runner = Runner([*shared, *args])
     if runner.scenes != base.scenes:
         key = next(key for key in base.scenes if runner.scenes.get(key) != base.scenes[key])
-        got = f"got {runner.scenes.get(key)}; what goes for all stands outside of --setting"
+        got = f"got {runner.scenes.get(key)}; options of the scenes belong outside --setting"
         raise UsageError(f"data.{key}: expected {base.scenes[key]}, the same scenes for all, {got}")
     frames = base.network.frames
     if runner.network.frames > frames:

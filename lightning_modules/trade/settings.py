@@ -1,4 +1,4 @@
-"""Settings to compare: names with arguments of ``lightning test``, the user's or the default ones."""
+"""Settings to compare, given by the user or by default: names with arguments of ``lightning test``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lightning_modules.inference.presets import Preset
 from lightning_modules.networks import Network
 from lightning_modules.registry import Model, list_models
 
-#: columns of a table, by the options that say the same
+#: columns of a table, by option
 _COLUMNS = {f"--model.network.{name}": name for name in ("method", "window", "order", "scale", "frames", "motion")}
 _COLUMNS |= {f"--model.network.motion.{name}": f"motion_{name}" for name in ("weights", "iterations")}
 _COLUMNS |= {f"--{name}": name for name in ("tile", "self_ensemble", "interpolated")}
@@ -21,14 +21,14 @@ _COLUMNS |= {"--model.weights": "weights", "--model.network": "network", "--trai
 
 
 class Setting(NamedTuple):
-    """What a setting is called, and the arguments of ``lightning test`` that make it, behind those that all share."""
+    """Name of a setting, and its arguments of ``lightning test``, which are appended to the shared ones."""
 
     name: str
     args: list[str]
 
     @property
     def preset(self) -> Preset | None:
-        """The same as columns of a table; ``None`` where the arguments say what a preset cannot.
+        """The setting as a preset; ``None`` if it has arguments that a preset lacks.
 
         Example:
             >>> Setting("small", ["--model.weights=cscsr_small_x4"]).preset.weights
@@ -50,10 +50,10 @@ class Setting(NamedTuple):
 
 
 def read_setting(text: str) -> Setting:
-    """Read a setting as it is typed: ``ARGS``, or ``NAME: ARGS``.
+    """Parse a setting: ``ARGS`` or ``NAME: ARGS``.
 
     Raises:
-        UsageError: it is neither.
+        UsageError: the text has neither form.
 
     Example:
         >>> read_setting("my own: -c my.yaml").args
@@ -66,23 +66,23 @@ def read_setting(text: str) -> Setting:
     try:
         args = shlex.split(typed)
     except ValueError as error:
-        raise UsageError(f"--setting: {text!r} cannot be read ({error})") from error
+        raise UsageError(f"--setting: {text!r} cannot be parsed ({error})") from error
     if not named and not typed.lstrip().startswith("-"):
         expected = "expected arguments of lightning test, or a name, a colon and such arguments"
         raise UsageError(f"--setting: {expected}, as in 'small tiles: --tile 32', got {text!r}")
     return Setting(named[1].strip() if named else shlex.join(args), args)
 
 
-#: options of the decoders that stand beside the networks
+#: options of the decoders in the table
 _DECODERS = {"TFI": {}, "TFP 41": {"window": 41}, "TFP 13, order 3": {"window": 13, "order": 3}}
 
-#: what is tried on every network: behind its name, and what is typed for it
+#: variants of every network: name and arguments
 _NO_MOTION, _TWO_VIEWS = ("no motion", "--model.network.motion ZeroFlow"), ("self-ensemble of 2", "--self_ensemble 2")
 
-#: what is tried on the largest, besides: a larger network is worth more than more views of a smaller one
+#: further variants of the largest network only, as a larger network gains more than more views of a smaller one
 _MOST = [(f"self-ensemble of {views}", f"--self_ensemble {views}") for views in (4, 8)]
 
-#: what is tried on the reference, besides
+#: further variants of the reference
 _SPIKE2FLOW = "--model.network.motion Spike2Flow --model.network.motion.weights spike2flow"
 _VARIANTS = [
     ("Spike2Flow", _SPIKE2FLOW),
@@ -97,21 +97,21 @@ _VARIANTS = [
 def usual_settings(
     scale: int, own: Sequence[str] = (), network: Network | None = None, film: bool = False, frames: int = 41
 ) -> list[Setting]:
-    """Return what is measured where nothing else is asked for.
+    """Return the default settings.
 
-    The networks whose weights come with the package, as they are: the reference first, then the others by their
-    multiplications. Then the same without motion and as a self-ensemble, the reference faster and more exact in other
-    ways, and the largest as larger self-ensembles; then the decoders without learning.
+    First the networks of the package: the reference, then the others by their multiplications. Then variants: every
+    network without motion and as a self-ensemble, the reference also with other estimators, precisions and tiles, the
+    largest network also with larger self-ensembles. Last the classical decoders.
 
     Args:
         scale: super-resolution factor.
-        own: arguments that give weights to the network of all settings, such as ``--ckpt_path``: that network then
-            stands in the place of those in the package.
-        network: that network, of which only what it has arguments for is changed.
-        film: pictures of films are measured, as they are and without motion.
-        frames: spike frames of the scenes; networks of longer clips are left out.
+        own: options that give weights to the shared network, such as ``--ckpt_path``; this network then replaces those
+            of the package.
+        network: that network; variants that it has no options for are left out.
+        film: settings for films: only the networks, with and without motion.
+        frames: spike frames of the scenes; networks with longer clips are left out.
     """
-    # noisy sensors would need other scenes
+    # weights for noisy sensors would need other scenes
     models = [one for one in list_models(scale) if not one.noise and one.frames <= frames]
     models.sort(key=lambda model: model.macs)
     largest = models[-1].name if models else None
@@ -122,7 +122,7 @@ def usual_settings(
     lacking: tuple[str, ...] = ()
     if network is not None and "motion" not in signature(type(network)).parameters:
         lacking += ("--model.network.motion",)
-    if network is not None and network.halo is None:  # it is never cut into tiles
+    if network is not None and network.halo is None:  # never runs in tiles
         lacking += ("--tile",)
     typed = dict(networks)
     for place, (weights, text) in enumerate(networks.items()):
@@ -134,7 +134,7 @@ def usual_settings(
         name: {"method": name[:3].lower(), "scale": scale, **({"frames": 41} if frames > 41 else {}), **options}
         for name, options in _DECODERS.items()
     }
-    if frames > 41:  # in little light a decoder, too, gains by what it sees of a longer clip
+    if frames > 41:  # in dim light decoders gain from longer clips, too
         window = 2 * ((frames - 1) // 6) + 1
         longer = {"method": "tfp", "scale": scale, "window": window, "order": 3, "frames": frames}
         decoders[f"TFP {window}, order 3"] = longer
@@ -146,7 +146,7 @@ def usual_settings(
 
 
 def _reference(models: Sequence[Model]) -> Model:
-    """Return what ratios refer to and is tried in more ways than the others: of a middle size, for a short clip."""
+    """Return the reference of the ratios, which also gets most variants: a network of medium size with short clips."""
     short = min(one.frames for one in models)
     those = [one for one in models if one.frames == short]
     return those[(len(those) - 1) // 2]

@@ -19,29 +19,29 @@ from spikekit.io.whole_file import whole_file
 from spikekit.tables import table
 from spikekit.timing import cpu_name, software
 
-#: what the columns mean, for the table and for ``--help``
+#: descriptions of the columns, for the table and for ``--help``
 COLUMNS = """\
-PSNR, SSIM  spikekit.psnr and spikekit.ssim of every test clip, averaged; the network estimates its motion itself
-LPIPS       likewise, with AlexNet's features, where its weights are at hand (see lightning_modules.metrics.lpips)
-ms a frame  one clip, one picture: median of the rounds, and its quartiles; without reading the clip
-ratio       the same time over that of the first row, round by round: median. Other machines are nearer in this column
-MiB         by how much a clip raises the memory in use at its worst moment
-parameters  weights, with those of a learned estimator of motion
-MAC a pixel multiplications of convolutions and matrices by sensor pixel, those of a learned estimator included; not
-            counted: the search along the motion, classical motion, decoding, whatever is done element by element
-flicker     of films: error of the difference of two neighbouring pictures, the one warped onto the other by the true
-            motion, in steps of 8 bits; what moves with the scene is none
-latency     of films: clocks that have to come behind a picture before it is made
-front       nothing else here is as fast and, to 0.01 dB, as good"""
+PSNR, SSIM  mean of spikekit.psnr and spikekit.ssim over the test clips, with the network's own estimate of motion
+LPIPS       mean over the test clips, with AlexNet, if its weights are available (see lightning_modules.metrics.lpips)
+ms a frame  time of one picture, without reading the clip: median of the rounds, with quartiles
+ratio       time relative to the first row, median of the rounds; varies less between machines than the time
+MiB         peak increase of the memory in use by a clip
+parameters  number of parameters, including a learned motion estimator
+MAC a pixel multiplications of convolutions and matrix products per sensor pixel, including a learned motion estimator;
+            not counted: the search along the motion, classical motion, decoding, elementwise operations
+flicker     films: error of the difference of neighbouring pictures, one warped onto the other by the true motion, in
+            8-bit steps; correct motion of the scene is no flicker
+latency     films: later clocks that a picture waits for
+front       on the Pareto front: no other setting is as fast and, to 0.01 dB, as good"""
 
 _OF_FILMS = "flicker", "latency"
 
-#: columns that are left out where no setting has anything in them
+#: columns that are left out if empty for all settings
 _PERHAPS = ("LPIPS", *_OF_FILMS)
 
 
 def figures(rows: Sequence[Measurement]) -> list[dict[str, float | None]]:
-    """Return what was measured, a dictionary a row; an empty one where a setting could not run."""
+    """Return the measurements as one dictionary per row; empty for settings that could not run."""
     reference = running(rows)[0].seconds
     found = []
     for row in rows:
@@ -60,7 +60,7 @@ def figures(rows: Sequence[Measurement]) -> list[dict[str, float | None]]:
 
 
 def front(rows: Sequence[Measurement]) -> list[int]:
-    """Return which rows are on the Pareto front of time and PSNR, to 0.01 dB, fastest first."""
+    """Return the indices of the rows on the Pareto front of time and PSNR, to 0.01 dB, fastest first."""
     points = {n: (values["ms"], -round(values["psnr"], 2)) for n, values in enumerate(figures(rows)) if values}
     found: list[int] = []
     for n in sorted(points, key=points.get):
@@ -71,7 +71,7 @@ def front(rows: Sequence[Measurement]) -> list[int]:
 
 
 def machine(rows: Sequence[Measurement], timed: Timed) -> str:
-    """Return, line by line, on what and how it was measured."""
+    """Return lines that describe machine, software and measurement."""
     devices = dict.fromkeys(row.runner.device for row in running(rows))
     gpus = [torch.cuda.get_device_name(device) for device in devices if device.type == "cuda"]
     clips, (height, width) = timed.clips, timed.size
@@ -90,7 +90,7 @@ def machine(rows: Sequence[Measurement], timed: Timed) -> str:
 
 
 def markdown(rows: Sequence[Measurement], command: str, timed: Timed) -> str:
-    """Return the table as Markdown, with the command that was typed."""
+    """Return the table as Markdown, with the command that made it."""
     best = front(rows)
     cells = [_cells(values, n in best) if values else {} for n, values in enumerate(figures(rows))]
     header = [name for name in cells[best[0]] if name not in _PERHAPS or any(own.get(name) for own in cells)]
@@ -121,11 +121,10 @@ def _cells(values: dict[str, float | None], best: bool) -> dict[str, str]:
 
 
 def write_csv(rows: Sequence[Measurement], timed: Timed, path: Path) -> None:
-    """Write a row a setting: the preset that it is, and its figures.
+    """Write one row per setting: its preset and its measurements.
 
-    ``reference`` is the setting that the ratios refer to. The columns of a preset are empty where a setting says what
-    a preset cannot. A table in this form comes with the weights, for :mod:`lightning_modules.inference.presets` to
-    choose from.
+    ``reference`` is the setting that the ratios refer to. The columns of the preset are empty for a setting with
+    arguments that a preset lacks. :mod:`lightning_modules.inference.presets` reads tables in this form.
     """
     height, width = timed.size
     best, reference = front(rows), running(rows)[0].setting.name

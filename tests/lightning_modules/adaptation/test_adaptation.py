@@ -114,7 +114,7 @@ def test_weights_without_gain_are_not_written(recording, tmp_path, monkeypatch, 
     [
         (["--teacher", "cscsr_base_x2"], "--teacher: expected scale 4, as in --weights, got 2"),
         (["--teacher", "cscsr_huge_long_x4"], "expected at least 303 frames, 3 clips of 101, got 160"),
-        (["-o", "out.safetensors"], "-o: expected a folder, got out.safetensors, which ends like a file"),
+        (["-o", "out.safetensors"], "-o: expected a folder, got out.safetensors, which has the ending of a file"),
     ],
 )
 def test_errors_are_one_line(recording, tmp_path, capsys, more, expected):

@@ -50,7 +50,7 @@ WRONG = {
     f"fit {X4} --model.optimizer.lr -1": "Invalid learning rate",
     f"fit {X4} --data.patern RGGB": "data: Option 'patern' is not accepted",
     f"fit {X4} --data.pattern BGGR": "data.pattern: expected RGGB",
-    "fit -c flow --data.frames 51": "data.frames: expected 41, as the model has it, got 51",
+    "fit -c flow --data.frames 51": "data.frames: expected 41, the value of the model, got 51",
     f"fit {X4} --data.workers -1": "workers: expected 0 or more, got -1",
     f"fit {X4} --trainer.logger WandbLogger": "Requirement 'wandb",
     f"fit {X4} --trainer.accelerator cpu --trainer.devices -1": "devices",
@@ -79,7 +79,7 @@ FAILED = {
     "predict odd.dat --height 7 --width 9 -o out -c bad.yaml": "bad.yaml",
     "adapt nowhere.dat -o out": "nowhere.dat",
     "export cut.ckpt -o a.safetensors": "cut.ckpt",
-    "export cscsr_tiny_x4 --format onnx -o a.pt2": "-o: expected a name that ends in .onnx for onnx, got a.pt2",
+    "export cscsr_tiny_x4 --format onnx -o a.pt2": "-o: expected a file name ending in .onnx for onnx, got a.pt2",
 }
 ROWS = [(words, 2, said) for words, said in WRONG.items()] + [(words, 1, said) for words, said in FAILED.items()]
 
@@ -122,7 +122,7 @@ def test_two_runs_of_a_verb_in_one_folder(words, folder, name, tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     (tmp_path / "tiny.yaml").write_bytes(FILES["tiny.yaml"])
     write_spikes("a.npz", torch.zeros(41, 4, 4))
-    with locked_folder(folder, "run", name), pytest.raises(SystemExit, match=f"{folder}: another .* is at work here"):
+    with locked_folder(folder, "run", name), pytest.raises(SystemExit, match=f"{folder}: another .* uses this folder"):
         main(words.split())
     assert {path.name for path in (tmp_path / folder).iterdir()} == {name}
 
@@ -130,7 +130,7 @@ def test_two_runs_of_a_verb_in_one_folder(words, folder, name, tmp_path, monkeyp
 def test_a_folder_that_cannot_be_locked(tmp_path, monkeypatch):
     (tmp_path / "lock").mkdir()
     with (
-        pytest.raises(InputError, match=rf"^-o: {tmp_path}/lock: expected the file of a lock"),
+        pytest.raises(InputError, match=rf"^-o: {tmp_path}/lock: expected a lock file"),
         locked_folder(tmp_path, "run"),
     ):
         pass

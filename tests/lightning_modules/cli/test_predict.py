@@ -283,7 +283,7 @@ def test_ray_makes_what_one_process_makes(words, tmp_path, monkeypatch):
 def test_mistakes_are_usage_errors(words, tmp_path, capsys):
     for more, said in (
         (["-o", str(tmp_path / "one.png")], "-o: expected a folder or a film for 6 pictures, got"),
-        (["--speed", "fast"], "--speed: it chooses from the weights of the package, got -c as well"),
+        (["--speed", "fast"], "--speed: chooses weights of the package, got -c as well"),
         (["--engine", "ray", "--budget", "2s"], "--budget"),
     ):
         refused([*words, str(tmp_path / "out"), *more], 2)

@@ -347,7 +347,7 @@ def test_trials_end_as_their_processes_do(started, tmp_path, monkeypatch):
     ends = {
         "fine": ("pass", None),
         "fails": ("import sys; print('before'); sys.exit('lightning: no such thing')", "no such thing"),
-        "killed": ("import os; os.kill(os.getpid(), 9)", "killed by SIGKILL, perhaps for want of memory"),
+        "killed": ("import os; os.kill(os.getpid(), 9)", "killed by SIGKILL, perhaps out of memory"),
         "threads": ("import os, sys; sys.exit(os.environ['OMP_NUM_THREADS'])", "2"),
     }
     monkeypatch.setattr(torch, "get_num_threads", lambda: 6)

@@ -264,7 +264,7 @@ def test_a_table_is_read_as_it_is_written(tmp_path, monkeypatch):
 
 MISTAKES = [
     (["--setting", "cscsr_small_x4"], "expected arguments of lightning test, or a name, a colon and such arguments"),
-    (["--setting", "a:", "--setting", "a: --tile 8"], "two settings are called 'a'"),
+    (["--setting", "a:", "--setting", "a: --tile 8"], "two settings have the name 'a'"),
     (["--setting", "good:", "--setting", "a: --model.network.widht 3"], "widht"),
     (["--setting", "a: --data.motion 9"], "a: data.motion: expected 3.0, the same scenes for all, got 9.0"),
     (["--setting", "a: --model.network.frames 47"], "a: frames: expected at most the 41 of the clips, got 47"),
@@ -293,7 +293,7 @@ def test_what_fails_while_it_runs_does_not_take_the_others_along(shared, tmp_pat
     assert rows["learned"]["failed"] == "NotImplementedError: not for this dtype"
     assert (rows["learned"]["psnr"], rows["learned"]["front"]) == ("", "")
     assert (rows["moving"]["ratio"], rows["moving"]["front"]) == ("1", "1")  # the first that ran
-    with pytest.raises(SystemExit, match="nothing can run; learned: NotImplementedError: not for this dtype"):
+    with pytest.raises(SystemExit, match="no setting can run; learned: NotImplementedError: not for this dtype"):
         main(["trade", *shared, *settings[:2], "-o", str(tmp_path)])
 
 
