@@ -1,1 +1,1 @@
-"""``lightning sweep``: every combination of overlays, values and seeds, trained and tested under the same budget."""
+"""Training and test of every combination of overlays, values and seeds under one budget: ``lightning sweep``."""

@@ -1,4 +1,4 @@
-"""Training budgets of a sweep, in steps, wall time or FLOPs, with a schedule that ends with them."""
+"""Training budgets of a sweep in steps, wall time or FLOPs; learning-rate schedules end with them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from copy import deepcopy
 from typing import Any
 
-#: arguments of learning-rate schedules that say at which step they end
+#: arguments of learning-rate schedules for their last step
 _ENDS = ("T_max", "total_steps")
 
 _CONSTANT = {"class_path": "torch.optim.lr_scheduler.ConstantLR", "init_args": {"factor": 1.0}}
@@ -14,22 +14,22 @@ _PACE = {"class_path": "lightning_modules.tasks.pace.Pace", "init_args": {}}
 
 
 def seconds(text: str) -> float:
-    """Read a time, ``HH:MM:SS`` or ``DD:HH:MM:SS``; ``ValueError`` where it is not one, or no time at all."""
+    """Parse a time above 0, ``HH:MM:SS`` or ``DD:HH:MM:SS``; raise ``ValueError`` for anything else."""
     if not re.fullmatch(r"(\d+:)?\d+:[0-5]?\d:[0-5]?\d", text):
         raise ValueError(f"expected HH:MM:SS or DD:HH:MM:SS, got {text}")
     time = sum(int(part) * unit for part, unit in zip(text.split(":")[::-1], (1, 60, 3600, 86400), strict=False))
     if time == 0:
-        raise ValueError(f"expected more than no time, got {text}")
+        raise ValueError(f"expected a time above 0, got {text}")
     return time
 
 
 def with_budget(config: dict[str, Any], budget: dict[str, float]) -> dict[str, Any]:
-    """Return a configuration of ``lightning fit`` that trains as long as a budget says.
+    """Return a configuration of ``lightning fit`` with a training budget.
 
-    The budget is nothing, for what the configuration says; or ``steps``; or ``seconds``, in which training stops,
-    validation included; or ``flops``, of which :mod:`lightning_modules.sweep.worker` makes steps once it has counted
-    those of one. Steps are also those at which a schedule ends that has an end, such as ``CosineAnnealingLR``; where
-    time is given, :class:`lightning_modules.tasks.pace.Pace` takes its place, whose cosine ends with the time.
+    The budget is empty, for that of the configuration, or ``steps``, or ``seconds`` of wall time including validation,
+    or ``flops``, which :mod:`lightning_modules.sweep.worker` converts to steps. With ``steps``, a schedule with an end,
+    such as ``CosineAnnealingLR``, ends at the last step. With ``seconds``, :class:`lightning_modules.tasks.pace.Pace`
+    replaces it; its cosine ends with the time.
     """
     if not budget:
         return config
@@ -51,7 +51,7 @@ def _duration(time: float) -> str:
 
 
 def _ends(config: dict[str, Any]) -> list[str]:
-    """Return which arguments of a configuration's schedule say at which step it ends."""
+    """Return the arguments of a configuration's schedule for its last step."""
     schedule = config["model"].get("init_args", {}).get("lr_scheduler")
     arguments = schedule.get("init_args", {}) if isinstance(schedule, dict) else {}
     return [name for name in _ENDS if arguments.get(name) is not None]

@@ -22,7 +22,7 @@ from spikekit.io.whole_file import whole_file
 
 _ENGINES = {"local": run_locally, "ray": run_on_ray}
 
-_A_WHILE = 60  # seconds between two lines about a trial that is running
+_A_WHILE = 60  # seconds between two progress lines of a trial
 
 
 def _time(text: str) -> float:
@@ -40,16 +40,15 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Train and test every combination of overlays, values and seeds under the same budget.",
         epilog="""\
-A trial is `lightning fit`, then `lightning test` of the weights it ended with, in a process of its own and on one
-device; one that fails is reported, and the others go on. All configurations are parsed and built before the first one
-trains. The same command typed again goes on where it was stopped, in whatever way: finished trials are not run again,
-failed ones are tried again, the others go on from their last checkpoint. A folder with a trial of other settings is
-refused.
+A trial is `lightning fit`, then `lightning test` of the last weights, in a separate process on one device. A trial that
+fails is reported, and the others continue. All configurations are parsed and built before the first one is trained.
+The same command resumes a sweep that was stopped or killed: finished trials are kept, failed ones are repeated, the
+others resume from their last checkpoint. A folder that holds a trial with other settings is rejected.
 
-The result is sweep.md and sweep.csv: a row a variant, mean and spread over seeds, and the difference from J or from the
-first row. `lightning trade` measures what the variants cost.
+Results: sweep.md and sweep.csv with one row per variant: mean and spread over seeds, and the difference from overlay J
+or from the first row. `lightning trade` measures the cost of the variants.
 
-Every trial lies in a folder of its own:
+Every trial has its own folder:
   lightning test -c runs/sweep/c-s-seed1/trial.yaml --ckpt_path last
 
 examples:
@@ -61,22 +60,22 @@ examples:
     )
     add = made.add_argument
     add("configs", nargs="*", metavar="CONFIG", help="configuration of all trials, as for lightning fit -c")
-    add("-c", "--config", action="append", default=[], metavar="OVERLAY", help="more of them, over those before")
-    what = made.add_argument_group("what is combined")
+    add("-c", "--config", action="append", default=[], metavar="OVERLAY", help="further ones, which override these")
+    what = made.add_argument_group("combinations")
     what.add_argument(
         "--over",
         action="append",
         nargs="+",
         default=[],
         metavar="OVERLAY",
-        help="overlays of which a trial takes one; given again, one of these, too",
+        help="group of overlays; each trial takes one of each group; repeatable",
     )
     what.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="KEY=VALUE,...",
-        help="values of any argument of lightning fit, of which a trial takes one; a single value goes for all",
+        help="values of an argument of lightning fit; each trial takes one of them",
     )
     what.add_argument(
         "--seeds",
@@ -84,24 +83,24 @@ examples:
         nargs="+",
         default=[],
         metavar="SEED",
-        help="seeds of the initial weights (seed_everything); clips stay those of data.seed, the same for all trials",
+        help="seeds of the initial weights (seed_everything); the clips depend only on data.seed",
     )
-    group = made.add_argument_group("budget of each trial; without one, what the configuration says")
+    group = made.add_argument_group("budget of each trial; default: that of the configuration")
     budget = group.add_mutually_exclusive_group()
     budget.add_argument("--steps", type=whole(1), help="training steps; a schedule with an end (T_max) ends with them")
     budget.add_argument(
         "--time",
         type=_time,
         metavar="HH:MM:SS",
-        help="wall clock of training, validation included; a schedule with an end becomes a cosine that ends with it",
+        help="wall time of training with validation; a schedule with an end becomes a cosine that ends with it",
     )
     budget.add_argument(
         "--flops",
         type=positive,
-        help="floating-point operations of training: as many steps as they pay for, going by those counted in one step "
-        "(convolutions and matrix products, forward and backward; not what is done element by element, nor the warp)",
+        help="floating-point operations of training; the number of steps follows from the FLOPs of one step "
+        "(convolutions and matrix products, forward and backward, without elementwise operations and the warp)",
     )
-    how = made.add_argument_group("how")
+    how = made.add_argument_group("execution")
     how.add_argument(
         "-o", "--output", type=home_path, default=Path("runs/sweep"), metavar="DIR", help="default: runs/sweep"
     )
@@ -109,22 +108,22 @@ examples:
         "--engine",
         choices=_ENGINES,
         default="local",
-        help="local: on this machine, one after another; ray: on the Ray cluster of RAY_ADDRESS, or Ray on this "
-        "machine, one trial a GPU, or a node without",
+        help="local: this machine, one trial after another (default); ray: the Ray cluster of RAY_ADDRESS, or Ray on "
+        "this machine, one trial per GPU, or per node without GPUs",
     )
-    how.add_argument("--jobs", type=whole(1), metavar="N", help="trials at once, which share cores or GPUs")
+    how.add_argument("--jobs", type=whole(1), metavar="N", help="trials at once; they share cores or GPUs")
     how.add_argument(
         "--every",
         type=positive,
         default=60.0,
         metavar="SECONDS",
-        help="time between two checkpoints, besides those at the end of each epoch (default: 60)",
+        help="time between two checkpoints, besides those after each epoch; default: 60",
     )
     return made
 
 
 def sweep(args: Sequence[str]) -> None:
-    """Run the verb with what was typed after it."""
+    """Run ``lightning sweep`` with the given arguments."""
     asked = parser().parse_args(args)
     configs = [find_configs(name)[0] for name in asked.configs] + asked.config
     over = [[file for name in group for file in find_configs(name)] for group in asked.over]
@@ -135,13 +134,13 @@ def sweep(args: Sequence[str]) -> None:
     budget = {name: value for name, value in budget.items() if value is not None}
     trials = make_trials(configs, over, asked.set, asked.seeds, budget, asked.output)
     if asked.engine == "ray" and find_spec("ray") is None:
-        raise InputError("sweep: --engine ray: Ray is not installed; pip install '.[ray]' in a clone brings it")
+        raise InputError("sweep: --engine ray: Ray is not installed; run pip install '.[ray]' in a clone")
     with locked_folder(asked.output, "sweep"):
         for trial in trials:
             trial.write()
         failed = _run(trials, asked)
     if failed:
-        raise InputError(f"sweep: {len(failed)} of {len(trials)} trials failed; the same command tries them again")
+        raise InputError(f"sweep: {len(failed)} of {len(trials)} trials failed; the same command repeats them")
 
 
 def _run(trials: Sequence[Trial], asked: argparse.Namespace) -> dict[Path, str]:
@@ -157,7 +156,7 @@ def _run(trials: Sequence[Trial], asked: argparse.Namespace) -> dict[Path, str]:
                 said.pop(folder)
                 result = read_result(folder) if reason is None else None
                 if result is None:
-                    failed[folder] = one_line(ValueError(reason or "it ended without a result"))
+                    failed[folder] = one_line(ValueError(reason or "ended without a result"))
                     print(f"{folder.name}  FAILED: {failed[folder]} ({folder / LOG})", flush=True)
                 else:
                     scores = ", ".join(f"{name} {value:.4g}" for name, value in result["scores"].items())

@@ -14,12 +14,12 @@ from lightning_modules.sweep.state import LOG
 
 _A_MOMENT = 0.2  # seconds
 
-#: the trials that ended, with what went wrong: ``None`` if nothing did
+#: finished trials, each with the reason of its failure or ``None``
 Ended = dict[Path, str | None]
 
 
 def run_locally(folders: Sequence[Path], jobs: int | None, every: float) -> Iterator[Ended]:
-    """Run trials on this machine, ``jobs`` at once, which share the cores, and repeatedly yield those that ended."""
+    """Run trials on this machine, ``jobs`` at once with a share of the cores; repeatedly yield the finished ones."""
     jobs = jobs or 1
     threads = {"OMP_NUM_THREADS": str(max(1, torch.get_num_threads() // jobs))} if jobs > 1 else {}
     waiting, running = list(folders), {}
@@ -37,10 +37,10 @@ def run_locally(folders: Sequence[Path], jobs: int | None, every: float) -> Iter
 
 
 def run_on_ray(folders: Sequence[Path], jobs: int | None, every: float) -> Iterator[Ended]:
-    """Run trials on the Ray cluster that ``RAY_ADDRESS`` names or that runs here, else on a Ray of this machine's own.
+    """Run trials on the Ray cluster of ``RAY_ADDRESS``, else on a running one, else on a new one on this machine.
 
-    A trial takes a GPU where the cluster has any, else the cores of a node; with ``jobs``, such a share of all that as
-    many run at once. All nodes need this package, the working directory and the folders, under the same paths.
+    A trial takes one GPU, or all cores of a node if the cluster has no GPU; with ``jobs``, a share that lets as many
+    run at once. All nodes need this package, the working directory and the folders under the same paths.
     """
     here = os.getcwd()
     calls = {

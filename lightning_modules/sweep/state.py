@@ -1,4 +1,4 @@
-"""State of a sweep on disk: small files, written whole, and checked when they are read."""
+"""State of a sweep on disk: small files, written atomically and checked on reading."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ PROGRESS, RESULT, LOG = "progress.txt", "result.json", "log.txt"
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a file completely or not at all."""
+    """Write a JSON file atomically."""
     with whole_file(path, "w") as file:
         file.write(json.dumps(value, indent=1))
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return what :func:`write_json` wrote."""
+    """Return the content of a JSON file."""
     return _read(path, json.loads)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Return the configuration in a file."""
+    """Return the content of a YAML file."""
     return _read(path, yaml.safe_load)
 
 
 def read_result(folder: Path) -> dict[str, Any] | None:
-    """Return the result of a trial, None where there is none yet."""
+    """Return the result of a trial, ``None`` if it has none yet."""
     path = folder / RESULT
     return _read(path, lambda text: check_result(json.loads(text))) if path.is_file() else None
 
 
 def check_result(result: dict[str, Any]) -> dict[str, Any]:
-    """Return ``scores``, ``steps``, ``seconds_per_step`` and ``parameters``; raise where one is no number."""
+    """Return ``scores``, ``steps``, ``seconds_per_step`` and ``parameters``; raise if one is not a finite number."""
     for name, value in {**result, "scores": 0, **result["scores"]}.items():
         if not isinstance(value, (int, float)) or not abs(value) < 1 << 53:
             raise ValueError(f"{name}: expected a number, got {value!s:.80}")
@@ -47,13 +47,13 @@ def check_result(result: dict[str, Any]) -> dict[str, Any]:
 
 
 def say_progress(folder: Path, text: str) -> None:
-    """Leave a line about a trial that is running."""
+    """Write the progress line of a trial."""
     with whole_file(folder / PROGRESS, "w") as file:
         file.write(text)
 
 
 def read_progress(folder: Path) -> str:
-    """Return that line; nothing where there is none."""
+    """Return the progress line of a trial, empty if there is none."""
     path = folder / PROGRESS
     return printable(path.read_text(encoding="utf-8", errors="replace")[:200]) if path.is_file() else ""
 
@@ -63,6 +63,6 @@ def _read(path: Path, parse: Any) -> dict[str, Any]:
         value = parse(no_pipe(path).read_text(encoding="utf-8"))
         if not isinstance(value, dict):
             raise ValueError(f"expected names and values, got {type(value).__name__}")
-    except Exception as error:  # what the parser of YAML raises depends on the text
+    except Exception as error:  # the type depends on the text
         raise InputError(f"{path}: damaged ({one_line(error)[:300]}); delete it, or the folder") from error
     return value

@@ -1,4 +1,4 @@
-"""The table of a sweep: a row a variant, seeds averaged."""
+"""The table of a sweep, with one row per variant, averaged over seeds."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _COLUMNS = "steps", "seconds_per_step", "parameters"
 
 @dataclass
 class VariantResults:
-    """A variant, the trials of it, a seed each, and what became of them, by seed: results, or why they failed."""
+    """A variant, its trials with one seed each, and their results or reasons of failure, by seed."""
 
     labels: tuple[str, ...]
     trials: list[Trial] = field(default_factory=list)
@@ -30,11 +30,11 @@ class VariantResults:
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """Name of the variant."""
         return self.trials[0].variant
 
     def scores(self, name: str) -> dict[int | None, float]:
-        """Return a score by seed, where the test gave it."""
+        """Return a score by seed, for the tests that have it."""
         return {seed: result["scores"][name] for seed, result in self.results.items() if name in result["scores"]}
 
 
@@ -53,7 +53,7 @@ def collect(trials: Sequence[Trial], failed: dict[Path, str]) -> list[VariantRes
 
 
 def reference(row: VariantResults, rows: Sequence[VariantResults]) -> VariantResults:
-    """Return the row that another is compared with: that of the overlay J, with all else the same, or the first."""
+    """Return the row to compare with: the same variant with overlay J, or the first row."""
     full = [(*row.labels[:place], "j", *row.labels[place + 1 :]) for place in range(len(row.labels))]
     return next((other for other in rows if other.labels in full), rows[0])
 
@@ -81,7 +81,7 @@ def markdown(rows: Sequence[VariantResults]) -> str:
             cells[heading] = _mean([factor * result[name] for result in row.results.values()], 0)
         lines.append(cells)
     text = [table(list(lines[0]), [list(cells.values()) for cells in lines])]
-    text.append("Means over seeds ± sample standard deviation; differences seed by seed. Tested weights: the last.")
+    text.append("Means over seeds ± sample standard deviation; differences per seed. The last weights are tested.")
     text += [
         f"{row.name}{'' if seed is None else f', seed {seed}'}, failed: {why}"
         for row in rows
@@ -93,7 +93,7 @@ def markdown(rows: Sequence[VariantResults]) -> str:
 
 
 def write_csv(rows: Sequence[VariantResults], path: Path) -> None:
-    """Write every trial, and the mean and the spread of every variant."""
+    """Write all trials, and the mean and the spread of every variant."""
     names = _score_names(rows)
     with whole_file(path, "w", newline="") as file:
         writer = csv.DictWriter(file, ["variant", "seed", *names, *_COLUMNS, "failed"])
@@ -112,12 +112,12 @@ def write_csv(rows: Sequence[VariantResults], path: Path) -> None:
 
 
 def _score_names(rows: Sequence[VariantResults]) -> list[str]:
-    """What was measured, the first of it what variants are compared by."""
+    """Return the names of all scores; variants are compared by the first."""
     return list(dict.fromkeys(name for row in rows for result in row.results.values() for name in result["scores"]))
 
 
 def _mean(values: Iterable[float], digits: int, sign: str = "") -> str:
-    """Mean and, of several fractions, spread."""
+    """Return the mean and, for several values with decimal places, their spread."""
     values = list(values)
     if not values:
         return ""

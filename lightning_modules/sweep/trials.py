@@ -1,4 +1,4 @@
-"""Trials of a sweep: every combination, its name, and its resolved configuration."""
+"""Trials of a sweep: all combinations with their names and resolved configurations."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ class Trial:
     """One training and its test.
 
     Args:
-        labels: what it takes from each group of overlays or values.
-        seed: of the initial weights; ``None`` for what the configuration says.
-        folder: where everything lies that it leaves.
-        config: its configuration, resolved.
-        budget: as :func:`lightning_modules.sweep.budget.with_budget` takes it.
+        labels: overlay or value chosen from each group.
+        seed: seed of the initial weights; ``None`` for that of the configuration.
+        folder: output folder.
+        config: resolved configuration.
+        budget: training budget, see :func:`lightning_modules.sweep.budget.with_budget`.
     """
 
     labels: tuple[str, ...]
@@ -46,19 +46,19 @@ class Trial:
 
     @property
     def variant(self) -> str:
-        """The row of the table that the trial belongs to; trials of one variant differ in their seeds."""
+        """Name of the variant, a row of the table; trials of one variant differ only in their seeds."""
         return "-".join(self.labels)
 
     def write(self) -> None:
-        """Record in the folder what the trial is; refuse one that holds another."""
+        """Write configuration and budget to the folder, which must not hold another trial."""
         config, budget = self.folder / "trial.yaml", self.folder / "budget.json"
-        if budget.is_file():  # it is written last
+        if budget.is_file():  # written last
             there = {**read_yaml(config), "budget": read_json(budget)}
             asked = {**yaml.safe_load(yaml.safe_dump(self.config)), "budget": self.budget}
             if there != asked:
-                raise InputError(f"{self.folder}: {_difference(there, asked)}; -o goes elsewhere, or delete the folder")
+                raise InputError(f"{self.folder}: {_difference(there, asked)}; choose another -o, or delete the folder")
         elif self.folder.is_dir() and any(path != config for path in self.folder.iterdir()):
-            raise InputError(f"{self.folder}: is not empty, and holds no trial; -o goes elsewhere")
+            raise InputError(f"{self.folder}: is not empty, and holds no trial; choose another -o")
         else:
             with whole_file(config, "w") as file:
                 file.write(yaml.safe_dump(self.config, sort_keys=False))
@@ -73,21 +73,21 @@ def make_trials(
     budget: dict[str, float],
     output: Path,
 ) -> list[Trial]:
-    """Make all combinations, parse and build each of them, and write nothing.
+    """Parse and build all combinations; nothing is written.
 
     Args:
         configs: configurations of all trials, in the order of ``lightning fit -c``.
         over: groups of overlays; a trial takes one of each.
         settings: ``KEY=VALUE,VALUE,...``; a trial takes one value of each.
-        seeds: of the initial weights.
-        budget: as :func:`lightning_modules.sweep.budget.with_budget` takes it.
+        seeds: seeds of the initial weights.
+        budget: training budget, see :func:`lightning_modules.sweep.budget.with_budget`.
         output: folder of the sweep.
     """
     common = [word for config in configs for word in ("-c", str(config))]
     groups = [[(Path(path).stem, ["-c", str(path)]) for path in group] for group in over]
     for key, values in map(_key_and_values, settings):
         choices = [[f"--{key}={value}"] for value in values]
-        if len(choices) == 1:  # the same for all: not part of any name
+        if len(choices) == 1:  # the same for all, so not part of the names
             common += choices[0]
         else:
             short = key.rpartition(".")[2]
@@ -107,13 +107,13 @@ def make_trials(
     folders = [trial.folder for trial in trials]
     twice = next((folder for folder in folders if folders.count(folder) > 1), None)
     if twice:
-        raise UsageError(f"two trials are called {twice.name}: give overlays and values names that differ")
+        raise UsageError(f"two trials have the name {twice.name}: give overlays and values different names")
     _check_differences(trials)
     return trials
 
 
 def _folder_name(name: str) -> str:
-    """A name that a file system takes, which has room for 255 bytes."""
+    """Return a valid name of a folder; file systems allow 255 bytes."""
     return re.sub(r"[^\w.=+-]+", "_", name, flags=re.ASCII)[:_LONGEST]
 
 
@@ -124,13 +124,13 @@ def _check_differences(trials: Sequence[Trial]) -> None:
         other = seen.setdefault(what, trial)
         if other is not trial:
             weights = trial.config["model"]["init_args"].get("weights")
-            why = f"; model.weights={weights} says what the network is, whatever overlays say" if weights else ""
+            why = f"; the network of model.weights={weights} overrides that of overlays" if weights else ""
             names = f"{other.folder.name} and {trial.folder.name}"
-            raise UsageError(f"sweep: expected trials that differ, got the same settings for {names}{why}")
+            raise UsageError(f"sweep: expected different trials, got the same settings for {names}{why}")
 
 
 def _key_and_values(setting: str) -> tuple[str, list[str]]:
-    """Split at the commas that are in no bracket."""
+    """Split a setting into key and values, at commas outside brackets."""
     key, equals, values = setting.partition("=")
     split = re.findall(r"(?:[^,\[{]|\[.*?\]|\{.*?\})+", values)
     if not (key and equals and split):
@@ -149,11 +149,11 @@ class _Resolver(Rehearsal):
     def before_instantiate_classes(self) -> None:
         path = self.config[self.verb].ckpt_path
         if path:
-            instead = "a trial goes on from its own; model.weights=FILE starts from weights"
+            instead = "as trials resume from their own; model.weights=FILE sets initial weights"
             raise UsageError(f"ckpt_path: expected none, {instead}, got {path}")
 
     def instantiate_trainer(self, **kwargs: Any) -> None:
-        """None: the machine that trains may be another one."""
+        """Build no trainer, as the training may run on another machine."""
 
 
 def _resolve(args: Sequence[str], trial: str) -> dict[str, Any]:
@@ -164,9 +164,9 @@ def _resolve(args: Sequence[str], trial: str) -> dict[str, Any]:
         raise kind(trial + reason(str(error))) from error
     config = resolved(command)
     if config["trainer"]["devices"] not in ("auto", 1, "1"):
-        raise UsageError(f"{trial}trainer.devices: expected 1, the one of a trial, got {config['trainer']['devices']}")
+        raise UsageError(f"{trial}trainer.devices: expected 1 for a trial, got {config['trainer']['devices']}")
     config["trainer"]["devices"] = 1
-    # not part of what the trial is
+    # not part of the trial
     return {key: value for key, value in config.items() if key not in ("ckpt_path", "weights_only")}
 
 
@@ -175,4 +175,4 @@ def _difference(there: dict[str, Any], asked: dict[str, Any]) -> str:
     key = min((key for key in {**there, **asked} if there.get(key) != asked.get(key)), default="its form")
     holds, wanted = (" ".join(str(values.get(key, "none")).split())[:80] for values in (there, asked))
     shown = " ".join(key.replace(".init_args", "").split())[:80]
-    return f"holds a trial with {shown}={holds}, and this sweep asks for {wanted}"
+    return f"holds a trial with {shown}={holds}, expected {wanted} for this sweep"

@@ -1,4 +1,4 @@
-"""One trial, in a process of its own: ``python -m lightning_modules.sweep.worker FOLDER SECONDS``."""
+"""One trial in a separate process: ``python -m lightning_modules.sweep.worker FOLDER SECONDS``."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ _A_MOMENT = 0.5  # seconds between two reports
 
 
 class Report(Callback):
-    """Say in a file where training stands, and stop it where the loss is no number any more."""
+    """Write the progress of training to a file, and stop it if the loss is not finite."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.steps, self.seconds = 0, 0.0  # without validation; of all runs that went on with each other
+        self.steps, self.seconds = 0, 0.0  # without validation; over all resumed runs
 
     def on_train_start(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
         self._began = self._reported = time.monotonic()
@@ -87,7 +87,7 @@ class Report(Callback):
 
 
 class _Cost(Callback):
-    """Count the FLOPs of batches, without those of making the clips in between."""
+    """Count the FLOPs of training batches, without those of rendering clips."""
 
     flops = 0
 
@@ -109,11 +109,11 @@ def _command(callbacks: list[Callback]) -> type[Command]:
 
 
 def plan(folder: Path) -> Path:
-    """Return the configuration that a trial trains with: its own, or one with the steps that its budget pays for.
+    """Return the configuration file to train with: that of the trial, or one with a budget of FLOPs as steps.
 
-    One training step is run to count its FLOPs, forward, backward and optimizer, as
-    :class:`torch.utils.flop_counter.FlopCounterMode` does: convolutions and matrix products, two for each product and
-    sum, and nothing that is done element by element, such as the warp. A resumed trial has the plan that it began with.
+    One training step is run to count its FLOPs (forward, backward and optimiser) with
+    :class:`torch.utils.flop_counter.FlopCounterMode`: convolutions and matrix products, two per multiply-add, without
+    elementwise operations such as the warp. A resumed trial keeps its first plan.
     """
     own, planned = folder / "trial.yaml", folder / "plan.yaml"
     config, budget = read_yaml(own), read_json(folder / "budget.json")
@@ -136,12 +136,12 @@ def plan(folder: Path) -> Path:
 
 
 def train_and_test(folder: Path, every: float) -> None:
-    """Train a trial, from where it was stopped if it was, and test the weights that it ends with."""
+    """Train a trial, or resume it, and test its last weights."""
     config = plan(folder)
     report = Report(folder)
     checkpoints = folder / "checkpoints"
     last = checkpoints / "last.ckpt"
-    if not last.is_file():  # stopped before there was one to go on from
+    if not last.is_file():  # stopped before the first checkpoint
         shutil.rmtree(checkpoints, ignore_errors=True)
     often = ModelCheckpoint(
         checkpoints, "last", train_time_interval=timedelta(seconds=every), enable_version_counter=False
@@ -167,9 +167,9 @@ def _result(folder: Path, last: Path, report: Report) -> dict[str, Any]:
 
 
 def _scores(path: Path, network: str) -> dict[str, float]:
-    """Return the means of a test's row for the network, of a network for films that for films."""
+    """Return the mean scores of the network in a test; for a network for films, those of films."""
     if not path.is_file():
-        return {}  # a module whose test writes no table
+        return {}  # the module writes no table
     with open(path, newline="") as file:
         means = [row for row in csv.DictReader(file) if row["clip"] == "mean"]
     own = [row for row in means if row["method"] in (network, f"{network}, film")] or means

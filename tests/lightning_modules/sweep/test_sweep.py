@@ -154,8 +154,8 @@ def test_finished_trials_are_not_run_again_and_those_of_other_settings_refused(s
     assert "4 trials, 4 of them finished before" in capsys.readouterr().out
     steps = command.index("--steps") + 1
     for words, message in (
-        ([*command[:steps], "5", *command[steps + 1 :]], "budget.steps=4, and this sweep asks for 5"),
-        ([*command, "--set", "model.network.width=5"], "model.network.width=4, and this sweep asks for 5"),
+        ([*command[:steps], "5", *command[steps + 1 :]], "budget.steps=4, expected 5 for this sweep"),
+        ([*command, "--set", "model.network.width=5"], "model.network.width=4, expected 5 for this sweep"),
     ):
         with pytest.raises(SystemExit, match=f"c-seed0: holds .*{message}"):
             main(words)
@@ -269,13 +269,13 @@ def _written(trial):
     [
         ([], "expected a configuration, such as configs/x4.yaml"),
         (["X", "--time", "1:60:00"], "--time: expected HH:MM:SS or DD:HH:MM:SS, got 1:60:00"),
-        (["X", "--time", "00:00:00"], "--time: expected more than no time, got 00:00:00"),
+        (["X", "--time", "00:00:00"], "--time: expected a time above 0, got 00:00:00"),
         (["X", "--set", "width"], "--set: expected KEY=VALUE"),
         (["X", "--set", "model.network.widht=8,16"], "widht=8: model.network: Option 'widht' is not accepted"),
         (["X", "--set", "data.motion=1,-1"], "motion=-1: motion: expected 0 or more, got -1.0"),
-        (["X", "--set", "trainer.devices=2"], "trainer.devices: expected 1, the one of a trial, got 2"),
+        (["X", "--set", "trainer.devices=2"], "trainer.devices: expected 1 for a trial, got 2"),
         (["X", "--over", "nowhere.yaml"], "nowhere: config: File does not exist"),
-        (["X", "--over", "X", "X"], "two trials are called x4"),
+        (["X", "--over", "X", "X"], "two trials have the name x4"),
         (["X", "--set", "ckpt_path=last"], "ckpt_path: expected none, "),
         (["X", "--set", "output=there"], "--set: expected the folder of the sweep as -o DIR, got output=there"),
         (["X", "--set", "trainer.max_steps=5,6", "--steps", "4"], "same settings for max_steps=5 and max_steps=6"),
@@ -380,9 +380,9 @@ def test_what_is_shown(typed, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(cli._ENGINES, "local", engine)
     with pytest.raises(SystemExit, match="1 of 1 trials failed; the same command"):
         main([*typed, "-o", str(tmp_path)])
-    failed = f"tiny  FAILED: it ended without a result ({tmp_path / 'tiny' / 'log.txt'})"
+    failed = f"tiny  FAILED: ended without a result ({tmp_path / 'tiny' / 'log.txt'})"
     assert capsys.readouterr().out.splitlines()[1:3] == ["tiny  step 30?[31m", failed]
-    assert "failed: it ended without a result" in (tmp_path / "sweep.md").read_text()
+    assert "failed: ended without a result" in (tmp_path / "sweep.md").read_text()
 
 
 def test_ray_that_is_missing_is_said(typed, tmp_path, monkeypatch):
