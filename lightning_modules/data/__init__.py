@@ -1,4 +1,4 @@
-"""Clips to train on, to judge by, and to reconstruct."""
+"""Clips for training, validation and tests."""
 
 from lightning_modules.data.sequences import FilmScenes, SequenceClips
 from lightning_modules.data.stills import StillClips, StillScenes

@@ -1,4 +1,4 @@
-"""Cache of simulated clips on disk: packed, keyed by what they were made of."""
+"""Cache of simulated clips on disk, packed and keyed by their inputs."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from spikekit.io.whole_file import whole_file
 class ClipCache:
     """A folder of clips that are slow to make.
 
-    A clip is an npz file, named after its key, whose own checksums say whether it is whole. One that cannot be read is
-    made again; one that cannot be written, as on a full disk, will be the next time. The first of them is warned of.
+    A clip is an npz file, named after its key and protected by checksums. A clip that cannot be read is made again; one
+    that cannot be written, as on a full disk, is not kept. Only the first such failure gives a warning.
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -31,21 +31,21 @@ class ClipCache:
         self._warned = False
 
     def packed(self, key: str, make: Callable[[], Mapping[str, Tensor]]) -> dict[str, np.ndarray]:
-        """Return a clip that is here, or make it and keep it, as :func:`pack_clip` does."""
+        """Return a clip from the folder, or make and keep it, in the form of :func:`pack_clip`."""
         path = self.folder / key[:2] / f"{key[2:]}.npz"
         try:
             with open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
                 return dict(arrays)
         except FileNotFoundError:
             pass
-        except Exception as error:  # what numpy raises depends on the damage
+        except Exception as error:  # the type depends on the damage
             self._warn(f"{path}: cannot be read ({one_line(error)[:300]}), made again")
         packed = pack_clip(make())
         try:
             with whole_file(path) as file:
                 np.savez(file, **packed)
         except OSError as error:
-            self._warn(f"{path}: cannot be written ({one_line(error)}), goes on without")
+            self._warn(f"{path}: cannot be written ({one_line(error)}), not kept")
         return packed
 
     def _warn(self, message: str) -> None:
@@ -55,7 +55,7 @@ class ClipCache:
 
 
 def clip_key(**what: object) -> str:
-    """Return the name of a clip: a digest of all that it was made of, plain values, lists and dictionaries of them.
+    """Return the key of a clip: a digest of its inputs, which are plain values, lists and dictionaries.
 
     Example:
         >>> clip_key(scale=4, alpha=0.4) == clip_key(alpha=0.4, scale=4) != clip_key(alpha=0.4, scale=2)
@@ -65,7 +65,7 @@ def clip_key(**what: object) -> str:
 
 
 def file_digest(path: Path) -> str:
-    """Return a digest of a file, computed once per process as long as the file does not change."""
+    """Return a digest of a file, computed once per process while the file does not change."""
     stat = path.stat()
     return _file_digest(path, stat.st_size, stat.st_mtime_ns)
 
@@ -77,10 +77,10 @@ def _file_digest(path: Path, size: int, time_ns: int) -> str:
 
 
 def pack_clip(clip: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
-    """Pack a clip, losslessly except for flow, which is rounded to half precision.
+    """Pack a clip, losslessly except for the flow, which is rounded to half precision.
 
-    Spikes become bits. A picture of at most 256 (65,536) values, as one that was read from a file of 8 (16) bits,
-    becomes numbers of 8 (16) bits and a table, ``shades``.
+    Spikes are packed to bits. A picture with at most 256 (65,536) different values, as from a file with 8 (16) bits,
+    becomes integers of 8 (16) bits and their table of values, ``shades``.
     """
     shades, rgb = np.unique(clip["rgb"].numpy(), return_inverse=True)
     packed = {"spikes": pack_spikes(clip["spikes"]).numpy()}
@@ -95,7 +95,7 @@ def pack_clip(clip: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
 
 
 def unpack_clip(packed: Mapping[str, np.ndarray], part: tuple[int, int, int, int], scale: int) -> dict[str, Tensor]:
-    """Undo :func:`pack_clip` for a part of the sensor: its first row, first column, rows and columns."""
+    """Unpack a part of the sensor (first row, first column, rows, columns) from a clip of :func:`pack_clip`."""
     top, left, height, width = part
     rows, first = slice(top, top + height), left // 8
     bits = np.ascontiguousarray(packed["spikes"][:, rows, first : -(-(left + width) // 8)])

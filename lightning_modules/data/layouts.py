@@ -11,7 +11,7 @@ from pathlib import Path
 from lightning_modules.data.pictures import existing_folder
 from spikekit.io.video import PICTURE_ENDINGS
 
-#: What a folder may look like, for messages.
+#: description of the layouts, for messages
 EXPECTED = """\
   REDS 120 fps   train/train_orig/000/00000000.png ...    240 scenes (train_orig_part0.zip to part15.zip)
                  val/val_orig/000/00000000.png ...        30 scenes (val_orig_part0.zip and part1.zip)
@@ -24,19 +24,21 @@ EXPECTED = """\
 
 _VID4 = ("calendar", "city", "foliage", "walk")
 
-# Where the scenes of REDS lie when its archives are unpacked together, each in a folder of its own, or below.
+# places of the REDS scenes, with the archives unpacked together, into separate folders, or one folder up
 _REDS = ("{0}/{0}_orig", "{0}_orig", "{0}_orig_part*/{0}/{0}_orig", "{0}_orig_part*/{0}_orig", "{0}")
 
 
 @dataclass(frozen=True)
 class SequenceFiles:
-    """A frame sequence as files: its name, such as ``walk`` or ``00001/0266``, its folder, and the names of its frames.
+    """The files of a frame sequence.
 
     Args:
-        truth: folder of pictures that are sharper than the frames, under the same names; ``None`` where the frames are
-            the truth.
-        shrink: by how much the frames must be reduced before the sensor sees them.
-        middle: the only frame that may be the middle of a clip; ``None`` where any may.
+        name: name of the sequence, such as ``walk`` or ``00001/0266``.
+        folder: folder of the frames.
+        frames: file names of the frames.
+        truth: folder of ground-truth pictures with the same file names; ``None`` if the frames are the ground truth.
+        shrink: factor by which the frames are reduced before the sensor sees them.
+        middle: the only frame that may be the middle of a clip; ``None`` for any.
     """
 
     name: str
@@ -49,11 +51,11 @@ class SequenceFiles:
 
 @dataclass(frozen=True)
 class Collection:
-    """The contents of a folder: the name of the data set, and its sequences.
+    """Name and sequences of a data set in a folder.
 
     Args:
-        clips: clips of a sequence, as the paper has it.
-        scale: the only super-resolution factor that the sequences are for, if there is only one.
+        clips: clips per sequence, as in the paper.
+        scale: the only super-resolution factor that the sequences support; ``None`` for any.
     """
 
     name: str
@@ -65,19 +67,19 @@ class Collection:
 
 
 def find_sequences(root: str | Path, hold_out: Callable[[list], tuple[list, list]]) -> Collection:
-    """Find out what is in a folder, by its files.
+    """Recognise the data set in a folder by its files.
 
     Args:
-        root: the folder: what the archives of a data set were unpacked into, or one folder further down.
-        hold_out: splits sequences that have no official split into those to train on and those to validate by.
+        root: folder into which the archives of a data set were unpacked, or one folder further down.
+        hold_out: splits sequences without an official split into training and validation.
 
     Returns:
         The sequences; frames are not opened.
 
     Raises:
-        FileNotFoundError: there is no such folder, none of the layouts fits, or a listed sequence is missing; the
-            message shows what was expected.
-        NotADirectoryError: it is a file.
+        FileNotFoundError: the folder does not exist, no layout fits, or a listed sequence is missing; the message
+            shows the expected layouts.
+        NotADirectoryError: the path is a file.
     """
     root = existing_folder(root, "films")
     found = _reds(root) or _vimeo(root) or _vid4(root) or _others(root, hold_out)
@@ -87,7 +89,7 @@ def find_sequences(root: str | Path, hold_out: Callable[[list], tuple[list, list
 
 
 def natural(name: str) -> list[tuple[bool, int, str]]:
-    """Sort key that puts ``f2`` before ``f10``."""
+    """Return a sort key that puts ``f2`` before ``f10``."""
     parts = re.findall(r"[0-9]+|[^0-9]+", name)
     return [(part.isdecimal(), int(part) if part.isdecimal() else 0, part) for part in parts]
 
@@ -132,7 +134,7 @@ def _vimeo(root: Path) -> Collection | None:
 
 
 def _septuplets(folder: Path, small: Path | None, listed: str, large: str = "sequences") -> tuple[SequenceFiles, ...]:
-    """Return the sequences of a list, which has ``00001/0001`` and the like in its lines."""
+    """Return the sequences of a list file with lines such as ``00001/0001``."""
     if not (folder / listed).is_file():
         return ()
     try:
@@ -141,7 +143,7 @@ def _septuplets(folder: Path, small: Path | None, listed: str, large: str = "seq
         raise ValueError(f"{folder / listed}: expected a list of sequences ({error})") from error
     parents = sorted({name.partition("/")[0] for name in names})
     for place in filter(None, (small, folder / large)):
-        # one look at each folder of folders: there are 96 of them, but 91,701 sequences
+        # lists 96 parent folders instead of checking 91,701 sequences
         there = {f"{parent}/{name}" for parent in parents for name in _subfolders(place / parent)}
         missing = [name for name in names if name not in there]
         if missing:
@@ -159,7 +161,7 @@ def _septuplets(folder: Path, small: Path | None, listed: str, large: str = "seq
 
 
 def _films(folders: Iterable[Path], only: str | None = None) -> tuple[SequenceFiles, ...]:
-    """Return the folders inside some folders that hold pictures."""
+    """Return the subfolders with pictures, as films."""
     films: dict[str, SequenceFiles] = {}
     for folder in folders:
         for name in [only] if only else _subfolders(folder):

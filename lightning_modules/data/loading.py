@@ -1,4 +1,4 @@
-"""Data loaders for clips: fresh ones every epoch, made by workers."""
+"""Data loaders for clips, which workers make anew in every epoch."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _GRACE = 10.0  # seconds
 
 
 class FreshClips(DistributedSampler[int]):
-    """Consecutive indices from where training stands, so that a resumed run sees the clips of an unbroken one.
+    """Consecutive indices that continue at the current training step, so a resumed run sees the same clips.
 
-    Where several processes train, each takes its batch of every step, so that every clip is seen once: two processes
-    see in a step what one of twice the batch size would.
+    With several processes, each takes its own batch of every step, so every clip is seen once: a step of two processes
+    equals a step of one with twice the batch size.
     """
 
     def __init__(self, data: LightningDataModule, batch_size: int, length: int) -> None:
-        super().__init__(range(length), 1, 0, shuffle=False)  # Lightning would cut any other kind into parts itself
+        super().__init__(range(length), 1, 0, shuffle=False)  # Lightning would split other samplers itself
         self.data, self.batch_size = data, batch_size
         _, processes = process(data)
         a_batch = batch_size * processes
@@ -52,13 +52,13 @@ class FreshClips(DistributedSampler[int]):
 
 
 def process(data: LightningDataModule) -> tuple[int, int]:
-    """Return which process this is, and of how many."""
+    """Return the rank of this process and the number of processes."""
     trainer = data.trainer
     return (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
 
 
 class ClipScenes(LightningDataModule):
-    """Loads clips that are made while training runs: ``train_set``, ``val_set`` and ``test_set`` of ``setup``."""
+    """Data module for clips that are made during training; ``setup`` sets ``train_set``, ``val_set``, ``test_set``."""
 
     train_clips: int
 
@@ -101,13 +101,13 @@ def load_clips(clips: Dataset, batch_size: int, workers: int, **options: object)
 
 
 class _ClipLoader(DataLoader):
-    """A loader whose workers send arrays through pipes: tensors would need more shared memory than containers give."""
+    """A loader whose workers send arrays through pipes, as tensors need more shared memory than containers have."""
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
         batches = made_on_cpu(super().__iter__)
         return ({name: torch.from_numpy(value) for name, value in batch.items()} for batch in batches)
 
-    # Lightning takes a loader with these two for one that can be resumed. It can: training's step says where it stands.
+    # these two methods mark the loader as resumable for Lightning; its position follows from the training step
     def state_dict(self) -> dict[str, object]:
         return {}
 
@@ -128,9 +128,9 @@ def made_on_cpu(batches: Callable[[], Iterator[T]]) -> Iterator[T]:
 
 
 def default_workers() -> int:
-    """Return how many processes make clips: all cores but one, sixteen at most."""
-    # Thirteen did not suffice for an H100; each takes half a GB. A lone core makes its clips between the steps: a
-    # process beside it would only take turns with it.
+    """Return the default number of workers: all cores but one, at most sixteen."""
+    # Thirteen were too few for an H100; each needs half a GB. With one core, clips are made between the steps, as a
+    # worker would compete with training.
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(0, min(_MOST_WORKERS, cores - 1))
 
@@ -140,14 +140,14 @@ def _to_arrays(clips: list[dict[str, Tensor]]) -> dict[str, np.ndarray]:
 
 
 def start_worker(_: int) -> None:
-    """Begin a process that makes clips."""
-    # schedulers send it to all processes of a run: training ends its step and saves, for which it needs its workers
+    """Prepare a worker process."""
+    # schedulers send SIGTERM to all processes, but training needs its workers to finish its step and save
     signal.signal(signal.SIGTERM, lambda *_: threading.Timer(_GRACE, os._exit, (0,)).start())
-    end_when_orphaned()  # torch's own watch does not reach a worker that waits for its clip to leave a full pipe
+    end_when_orphaned()  # torch's own watchdog does not reach workers that wait for a full pipe
 
 
 def end_when_orphaned() -> None:
-    """End this process soon after the one that started it, even if that is killed."""
+    """End this process soon after its parent, even if the parent is killed."""
     threading.Thread(target=_end_without, args=(os.getppid(),), daemon=True).start()
 
 

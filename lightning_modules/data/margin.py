@@ -6,7 +6,7 @@ from torch import Tensor
 
 
 def flow_margin(patch: int, flow_patch: int) -> int:
-    """Return how far spikes reach beyond a patch for motion to be estimated on ``flow_patch``; it is even.
+    """Return the even margin around a patch that lets motion be estimated on at least ``flow_patch`` pixels.
 
     Example:
         >>> flow_margin(24, 48), flow_margin(26, 48), flow_margin(96, 48)
@@ -16,6 +16,6 @@ def flow_margin(patch: int, flow_patch: int) -> int:
 
 
 def trim(planes: Tensor, margin: int) -> Tensor:
-    """Cut off a margin: (*, H, W) to (*, H - 2 margin, W - 2 margin)."""
+    """Crop a margin: (*, H, W) to (*, H - 2 margin, W - 2 margin)."""
     height, width = planes.shape[-2:]
     return planes[..., margin : height - margin, margin : width - margin]

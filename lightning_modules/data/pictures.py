@@ -1,4 +1,4 @@
-"""Source pictures of the scenes: any folder, or the photographs inside scikit-image's wheel."""
+"""Source pictures of scenes, from a folder or from the photographs in scikit-image."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from spikekit import read_picture
 
 _ENDINGS = {".png", ".jpg", ".jpeg", ".jpe", ".tif", ".tiff", ".bmp", ".webp", ".ppm", ".pgm", ".pnm"}
 
-# Colour first, then grey. motorcycle_right is left out: it shows what is held out.
+# colour first, then grey; without motorcycle_right, which shows the scene of a held-out picture
 _TRAIN = [
     "astronaut.png",
     "rocket.jpg",
@@ -41,13 +41,13 @@ def existing_folder(root: str | Path, what: str) -> Path:
 
 
 def folder_pictures(root: str | Path) -> list[Path]:
-    """List the pictures of a folder and of all folders in it, linked ones too, sorted; hidden ones are left out."""
+    """List the pictures of a folder and its subfolders, sorted; links are followed, hidden files left out."""
     root = existing_folder(root, "pictures")
     found, seen = [], set()
     for folder, folders, names in os.walk(root, followlinks=True):
         real = os.path.realpath(folder)
         folders[:] = [] if real in seen else [name for name in folders if not name.startswith(".")]
-        if real not in seen:  # a link may lead back
+        if real not in seen:  # links may form a cycle
             paths = [Path(folder, name) for name in names if not name.startswith(".")]
             found += [path for path in paths if path.suffix.lower() in _ENDINGS and path.is_file()]
         seen.add(real)
@@ -58,24 +58,25 @@ def folder_pictures(root: str | Path) -> list[Path]:
 
 
 def embedded_pictures(held_out: bool = False) -> list[Path]:
-    """List the photographs inside scikit-image's wheel, for training or the four held out; nothing is ever downloaded.
+    """List the photographs installed with scikit-image, for training or the four held out; nothing is downloaded.
 
     Raises:
-        FileNotFoundError: this build of scikit-image came without any of them.
+        FileNotFoundError: this build of scikit-image has no photographs.
     """
     import skimage.data
 
     here = Path(skimage.data.__file__).parent
     found = [here / name for name in (_HELD_OUT if held_out else _TRAIN) if (here / name).is_file()]
     if not found:
-        raise FileNotFoundError(f"{here}: scikit-image came without its photographs; give a folder of pictures instead")
+        raise FileNotFoundError(f"{here}: scikit-image has no photographs here; give a folder of pictures instead")
     return found
 
 
 def split_pictures(pictures: list[Path], seed: int) -> tuple[list[Path], list[Path]]:
-    """Hold out one picture in twenty at random, but four where there are eight or more, and half of fewer.
+    """Split pictures at random into training and held-out ones, each in the given order.
 
-    Returns what stays, and what is held out, each in the order given. One picture alone is in both.
+    One picture in twenty is held out, but at least four, or half if there are fewer than eight. A single picture is in
+    both parts.
     """
     if len(pictures) == 1:
         return pictures, pictures
@@ -89,10 +90,10 @@ def split_pictures(pictures: list[Path], seed: int) -> tuple[list[Path], list[Pa
 
 @lru_cache(maxsize=64)
 def read_shades(path: Path) -> Tensor:
-    """Read a picture as numbers of 8 bits, (3, h, w), or give the one in memory; not to be written to."""
+    """Read a picture as uint8, (3, h, w); recent ones are shared from memory, so do not modify them."""
     return to_shades(read_picture(path))
 
 
 def to_shades(rgb: Tensor) -> Tensor:
-    """Turn values of [0, 1] into numbers of 8 bits."""
+    """Convert values in [0, 1] to uint8."""
     return (rgb * 255).round().byte()

@@ -1,4 +1,4 @@
-"""Scenes that are made where training runs, many at once, and used a few times: training then waits for none."""
+"""Pools of scenes that are rendered in bulk on the training device and reused, so that training does not wait."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from lightning_modules.data.margin import trim
 from lightning_modules.data.rendering import Gallery
 
 _AT_ONCE = 128  # scenes rendered together
-_SYMMETRIC = "RGGB", "BGGR", "grey"  # phases that stay what they are when rows become columns
+_SYMMETRIC = "RGGB", "BGGR", "grey"  # phases that transposition keeps
 
 
 class _Drawn(Dataset):
-    """The numbers of many scenes of one kind."""
+    """Random numbers of many scenes of one kind."""
 
     def __init__(self, kinds: Sequence[Any]) -> None:
         self.kinds = kinds
@@ -33,24 +33,23 @@ class _Drawn(Dataset):
 
 
 class ScenePool:
-    """Batches of clips for training, on its device: :class:`StillClips` rendered there, in pools.
+    """Training batches of :class:`StillClips` that are rendered on the training device, in pools.
 
-    Every kind of scenes has a pool of ``reuse`` parts, each of ``size`` clips. When all of a pool was trained on once,
-    in random order, its oldest part makes way for a new one: a clip is used ``reuse`` times, and not soon again. Half
-    of the batches run backwards in time, and half of them have rows for columns, where the Bayer phase allows it.
-    Which batch is the n-th, only n and the seed say.
+    Every kind of scene has a pool of ``reuse`` parts with ``size`` clips each. After one random pass over the pool, a
+    new part replaces the oldest, so a clip is used ``reuse`` times at long intervals. Half of the batches are reversed
+    in time, and half are transposed if the Bayer phase allows it. Batch n depends only on n and the seed.
 
-    Where the network estimates motion, and does not learn to, it is estimated for a whole part at once.
+    If the network has a fixed motion estimator, motion is estimated once for a whole part.
 
     Args:
-        data: whose training says where it stands, on which device, and how motion is estimated.
-        kinds: of scenes.
-        shares: of every kind among the batches.
-        size: clips that are made at once.
-        reuse: how often each is used.
-        batch_size: clips in a batch, those of films included.
-        length: batches in an epoch.
-        workers: processes that draw the numbers of scenes.
+        data: data module; its trainer and model determine the step, the device and the motion estimator.
+        kinds: kinds of scenes, as :class:`StillClips`.
+        shares: fraction of the batches for every kind.
+        size: clips that are rendered at once.
+        reuse: number of uses of a clip.
+        batch_size: clips of a batch; every key frame of a film counts.
+        length: batches of an epoch.
+        workers: processes that draw the random numbers of scenes.
     """
 
     def __init__(
@@ -69,7 +68,7 @@ class ScenePool:
         self.reuse, self.length, self.workers = reuse, length, workers
         self.batches = [max(1, batch_size // kind.key_frames) for kind in kinds]
         self.parts = [max(size // kind.key_frames, batch) for kind, batch in zip(kinds, self.batches, strict=True)]
-        #: batches of a kind until the oldest part makes way
+        #: batches of a kind until the oldest part is replaced
         self.rounds = [part * reuse // batch for part, batch in zip(self.parts, self.batches, strict=True)]
         self._next, self._stream = -1, iter(())
         self._gallery: Gallery | None = None
@@ -87,7 +86,7 @@ class ScenePool:
             self._next += 1
             yield batch
 
-    # Lightning takes a loader with these two for one that can be resumed. It can: training's step says where it stands.
+    # these two methods mark the loader as resumable for Lightning; its position follows from the training step
     def state_dict(self) -> dict[str, object]:  # noqa: D102
         return {}
 
@@ -95,7 +94,7 @@ class ScenePool:
         pass
 
     def _turns(self, first: int) -> Iterator[tuple[int, int]]:
-        """Kind of every batch from one on, and how many of that kind were before it: as even as shares allow."""
+        """Yield the kind of every batch from ``first`` on and the number of earlier batches of it, evenly mixed."""
         done = [0] * len(self.kinds)
         n = 0
         while True:
@@ -106,7 +105,7 @@ class ScenePool:
             n += 1
 
     def _events(self, first: int) -> Iterator[tuple[int, int, int | None]]:
-        """Parts to be made, (kind, number, None), and batches, (kind, round, which of it), in order."""
+        """Yield parts to render, (kind, number, None), and batches, (kind, round, batch of the round), in order."""
         made = [-1] * len(self.kinds)
         for kind, before in self._turns(first):
             turn, batch = divmod(before, self.rounds[kind])
@@ -155,7 +154,7 @@ class ScenePool:
 
     @torch.no_grad()
     def _made(self, kind: int, drawn: dict[str, np.ndarray]) -> dict[str, Tensor]:
-        """Clips of drawn numbers, with the motion that is estimated for them; pictures in half precision."""
+        """Render clips from drawn numbers and estimate their motion; pictures and flow in half precision."""
         clips, count = self.kinds[kind], self.parts[kind]
         parts: dict[str, list[Tensor]] = {}
         for start in range(0, count, _AT_ONCE):
@@ -192,7 +191,7 @@ def _as_it_is(item: Any) -> Any:
 
 
 def _estimator(data: LightningDataModule) -> Any:
-    """Return what estimates motion in training, where that does not learn; else None."""
+    """Return the motion estimator of the training if it is used and fixed, else ``None``."""
     model = None if data.trainer is None else data.trainer.lightning_module
     network = getattr(model, "network", None)
     if getattr(model, "flow", None) != "estimated" or not network.takes_flow or network.motion.static:

@@ -1,4 +1,4 @@
-"""Scenes of still pictures, rendered in batches on any device from numbers that were drawn before."""
+"""Render batches of scenes of still pictures on any device, from random numbers drawn before."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from spikekit import SensorNoise, bin_to_sensor, spike_integrate_fire
 from spikekit.color.cfa import GREY
 from spikekit.scenes.analytic import Layer, Motion, Scene
 
-_TEXTURES = 64  # that are drawn once and cut anew every time
-_TEXTURE = 320  # pixels on a side
-_TAPS = 4  # of a cubic
+_TEXTURES = 64  # drawn once and cropped differently every time
+_TEXTURE = 320  # side in pixels
+_TAPS = 4  # of the cubic kernel
 
 
 class Pictures:
-    """Pictures of 8 bits, (3, h, w), by number: files, then, if asked for, procedural textures."""
+    """Pictures, uint8 (3, h, w), by index: files, then optional procedural textures."""
 
     def __init__(self, paths: Sequence[Path], textures: bool) -> None:
         self.paths, self.textures = list(paths), _TEXTURES if textures else 0
@@ -37,11 +37,11 @@ class Pictures:
         return read_shades(self.paths[n]) if n < len(self.paths) else _texture(n - len(self.paths))
 
     def size(self, n: int) -> tuple[int, int]:
-        """Rows and columns of a picture."""
+        """Return rows and columns of a picture."""
         return self._sizes[n] if self._sizes else tuple(self[n].shape[1:])
 
     def gallery(self, device: torch.device | str) -> Gallery:
-        """Bring all of them to a device; from then on their sizes are known without reading them."""
+        """Load all pictures to a device; their sizes are then known without reading them."""
         pictures = [self[n] for n in range(len(self))]
         self._sizes = [tuple(picture.shape[1:]) for picture in pictures]
         return Gallery.of(pictures, device)
@@ -57,10 +57,10 @@ class Gallery:
     """Pictures of any sizes in one tensor.
 
     Args:
-        shades: all values, uint8.
-        start: where each picture begins, (P,).
+        shades: values of all pictures, uint8.
+        start: index of the first value of each picture, (P,).
         size: rows and columns, (P, 2).
-        grey: whether the three channels are the same, (P,).
+        grey: whether the three channels are equal, (P,).
     """
 
     shades: Tensor
@@ -70,7 +70,7 @@ class Gallery:
 
     @classmethod
     def of(cls, pictures: Sequence[Tensor], device: torch.device | str = "cpu") -> Gallery:
-        """Bring pictures (3, h, w) to a device."""
+        """Load pictures (3, h, w) to a device."""
         counts = np.cumsum([0] + [picture.numel() for picture in pictures])
         flat = [picture.flatten() for picture in pictures]
         return cls(
@@ -82,20 +82,20 @@ class Gallery:
 
 
 def _is_grey(picture: Tensor) -> bool:
-    # nearly every coloured picture shows it in a few pixels
+    # a few pixels suffice for nearly every coloured picture
     return all(bool((part[1:] == part[:1]).all()) for part in (picture[:, ::16, ::16], picture))
 
 
 def draw_cut(
     side: int, size: tuple[int, int], rng: np.random.Generator, mirror: float, least: float = 0.5
 ) -> np.ndarray:
-    """Draw a square of so many pixels at a random place and size of a picture; where that ends, it is mirrored.
+    """Draw a random square crop of a picture, with ``side`` pixels after random shrinking.
 
-    The square is at most ``mirror`` times as long as the picture, where that needs no enlarging, and the picture is
-    shrunk to ``least`` at most. Returned is, of rows and of columns, (2, 4): the first line of the picture, how many
-    are taken, to how many they are resampled, and where the square begins in those.
+    Beyond its edges the picture is mirrored; the crop is at most ``mirror`` times as long as the picture if that needs
+    no enlarging. The shrinking factor is at least ``least``. The result, (2, 4), has for rows and columns: first line
+    of the picture, number of lines, number of lines after resampling, and first line of the crop among these.
     """
-    # Shrinking makes grain small and edges sharp. Enlarging blurs: only a picture below half the square's side is.
+    # Shrinking reduces grain and sharpens edges. Enlarging blurs, so only pictures below half the side are enlarged.
     shortest = min(size)
     smallest = max(least, min(1.0, side / (mirror * shortest)), side / (2 * shortest))
     factor = math.exp(rng.uniform(math.log(smallest), math.log(max(smallest, 1.0))))
@@ -111,18 +111,18 @@ def draw_cut(
 def cut_pictures(
     gallery: Gallery, which: Tensor, cuts: Tensor, sides: Tensor, side: int, taken: tuple[int, int], turn: Tensor
 ) -> Tensor:
-    """Cut squares out of pictures, (B, 3, side, side) in [0, 1]: bicubic, antialiased, two matrix products for each.
+    """Crop squares from pictures, (B, 3, side, side) in [0, 1]: bicubic and antialiased, by two matrix products each.
 
     Args:
         gallery: the pictures.
-        which: (B,) numbers of pictures.
+        which: (B,) indices of pictures.
         cuts: (B, 2, 4), see :func:`draw_cut`.
-        sides: (B,), what every square was drawn as; it is turned about the middle of that.
-        side: of all squares, at least as long: they go on beyond what was drawn.
-        taken: most lines that any cut takes, of rows and of columns.
-        turn: (B, 3) bool: turn rows around, columns, swap rows and columns.
+        sides: (B,) sides of the drawn squares; flips are about their middles.
+        side: side of all returned squares, at least the largest of ``sides``; they continue beyond the drawn ones.
+        taken: largest number of rows and of columns that a crop takes.
+        turn: (B, 3) bool: reverse rows, reverse columns, transpose.
     """
-    # what is taken beyond a cut has no weight, but it must lie inside the gallery
+    # lines beyond a crop have no weight, but must lie inside the gallery
     rows, columns = (
         torch.minimum(cut[:, :1] + torch.arange(most, device=cuts.device), cut[:, :1] + cut[:, 1:2] - 1)
         for cut, most in zip(cuts.unbind(dim=1), taken, strict=True)
@@ -138,7 +138,7 @@ def cut_pictures(
 
 
 def _resampling(cut: Tensor, around: Tensor, sides: Tensor, side: int, taken: int) -> Tensor:
-    """Weights (B, side, taken) of the lines of a cut in those of a square."""
+    """Return weights (B, side, taken) that resample the lines of a crop to those of a square."""
     _, count, resampled, begin = (part[:, None] for part in cut.long().unbind(dim=1))
     line = torch.arange(side, device=cut.device)
     line = torch.where(around[:, None], sides[:, None] - 1 - line, line) + begin
@@ -146,7 +146,7 @@ def _resampling(cut: Tensor, around: Tensor, sides: Tensor, side: int, taken: in
     line = torch.minimum(line, 2 * resampled - 1 - line)
     ratio = count / resampled
     at, wide = (line + 0.5) * ratio - 0.5, ratio.clamp(min=1)
-    taps = _TAPS * 2 + 1  # a picture is shrunk to a half at most; more taps would weigh nothing
+    taps = _TAPS * 2 + 1  # pictures are shrunk to a half at most; more taps would have no weight
     tap = (at - 2 * wide).floor()[..., None] + 1 + torch.arange(taps, device=cut.device)
     weight = _cubic((tap - at[..., None]) / wide[..., None]) * ((tap >= 0) & (tap < count[..., None]))
     weight = weight / weight.sum(dim=-1, keepdim=True)
@@ -155,19 +155,19 @@ def _resampling(cut: Tensor, around: Tensor, sides: Tensor, side: int, taken: in
 
 
 def _cubic(x: Tensor) -> Tensor:
-    """Keys' kernel with a = -1/2."""
+    """Evaluate Keys' cubic kernel with a = -1/2."""
     x = x.abs()
     near, far = (1.5 * x - 2.5) * x * x + 1, ((-0.5 * x + 2.5) * x - 4) * x + 2
     return torch.where(x < 1, near, torch.where(x < 2, far, 0.0))
 
 
 def outline_masks(radius: Tensor, sides: Tensor, side: int) -> Tensor:
-    """Masks (B, side, side) of outlines, 1 inside, 0 outside; the edge is as wide as a pixel.
+    """Return masks (B, side, side) of outlines, 1 inside, 0 outside, with an edge one pixel wide.
 
     Args:
-        radius: (B, A), at A angles from -pi on, at most 1; all of them 0 for no object.
-        sides: (B,), of the squares that the outlines fill.
-        side: of the masks.
+        radius: (B, A) radii at A angles from -pi on, at most 1; all 0 for no object.
+        sides: (B,) sides of the squares that the outlines fill.
+        side: side of the masks.
     """
     middle = ((sides - 1) / 2)[:, None]
     place = torch.arange(side, device=radius.device) - middle
@@ -184,7 +184,7 @@ def outline_masks(radius: Tensor, sides: Tensor, side: int) -> Tensor:
 def render_scene(
     drawn: dict[str, np.ndarray], gallery: Gallery, pattern: str, side: int, margin: int, clocks: int
 ) -> Scene:
-    """Build a batch of scenes of what :meth:`StillClips.draw` drew; in the margin is what comes into view."""
+    """Build a batch of scenes from the numbers of :meth:`StillClips.draw`; the margin comes into view by motion."""
     device = gallery.shades.device
 
     def there(name: str, n: int) -> Tensor:
@@ -193,7 +193,7 @@ def render_scene(
     layers = []
     for n in range(drawn["side"].shape[1]):
         sides = drawn["side"][:, n]
-        if not sides.any():  # no scene has so many objects
+        if not sides.any():  # no scene has this many objects
             continue
         longest = side + 2 * margin if n == 0 else int(sides.max()) + 1
         taken = tuple(drawn["cut"][:, n, :, 1].max(axis=0).tolist())
@@ -213,9 +213,9 @@ def render_scene(
 
 
 def see(light: Tensor, drawn: dict[str, np.ndarray], noise: SensorNoise | None) -> Tensor:
-    """Return the spikes of light (B, T, H, W), uint8, that sensors see, each with its share of the noise.
+    """Return the spikes, uint8, of light (B, T, H, W), each clip with its share of the sensor noise.
 
-    Photons come out of the device's own random numbers, all else is drawn; so is the same on every device.
+    All random numbers but those of photons are drawn before, so they are the same on every device.
     """
     device = light.device
 
@@ -242,13 +242,13 @@ def see(light: Tensor, drawn: dict[str, np.ndarray], noise: SensorNoise | None) 
 
 
 def _around_one(normal: Tensor, spread: Tensor | float) -> Tensor:
-    """Log-normal numbers of mean 1 and a standard deviation."""
+    """Return log-normal numbers with mean 1 and the standard deviation ``spread``, from normal ones."""
     variance = torch.as_tensor(spread, device=normal.device).square().log1p()
     return (variance.sqrt() * normal - variance / 2).exp()
 
 
 def _arrive(light: Tensor, drawn: dict[str, np.ndarray], photons: float, purpose: str) -> Tensor:
-    """Let charge (B, T, H, W) arrive in whole electrons, every clip by its own seed."""
+    """Draw the charge (B, T, H, W) in whole electrons, with a seed for every clip."""
     generator = torch.Generator(light.device)
     arrived = []
     for clip, seed, share in zip(light, drawn[purpose].tolist(), drawn["noise"].tolist(), strict=True):

@@ -33,24 +33,24 @@ from spikekit.sensor.noise import SensorNoise
 
 @dataclass(frozen=True)
 class ClipRecipe:
-    """How a clip is made from a sequence of frames; the same frames give the same clip, in whatever process and order.
+    """Settings that simulate clips from frame sequences; the same frames always give the same clip.
 
     Args:
         scale: super-resolution factor.
-        frames: spike frames of a clip. The truth is the source frame at frame ``frames // 2``.
-        pattern: Bayer phase of the sensor: RGGB, BGGR, GRBG or GBRG; or grey, whose truth has one channel.
-        alpha: light of a white pixel per clock; a threshold of charge is 1.
+        frames: spike frames of a clip. The ground truth is the source frame at spike frame ``frames // 2``.
+        pattern: Bayer phase of the sensor, RGGB, BGGR, GRBG or GBRG; or grey, with a ground truth of one channel.
+        alpha: light of a white pixel per clock; the threshold of charge is 1.
         clocks: spike frames from one source frame to the next.
-        key_frames: clips that follow each other, around so many source frames, an odd number; their truth is all of
-            these frames, and there is no flow.
-        flow_times: spike frames to which the flow from the middle is given; empty for no flow.
-        interpolation: what makes frames between two source frames, by its class path; motion-compensated, without
-            weights, when null. Delete the cache where the code of one of your own changes.
-        noise: what the sensor adds, such as ``{photons: 1000}``; nothing when null.
+        key_frames: number of consecutive source frames with a clip around each, odd. With more than one, all of them
+            are ground truth, and there is no flow.
+        flow_times: spike frames to which the flow from the middle frame is given; empty for no flow.
+        interpolation: class path of the interpolation between source frames; null for motion-compensated
+            interpolation without weights. Delete the cache after changes to code of your own.
+        noise: noise of the sensor, such as ``{photons: 1000}``; null for none.
         seed: random seed.
 
     Raises:
-        ValueError: an argument that makes no sense; the message names it.
+        ValueError: an argument is out of range; the message names it.
     """
 
     scale: int = 4
@@ -81,18 +81,18 @@ class ClipRecipe:
 
     @property
     def reach(self) -> tuple[int, int]:
-        """Source frames that a clip needs before and after the one in its middle."""
+        """Source frames that a clip needs before and after its middle frame."""
         more = self.key_frames // 2
         return -(-(self.frames // 2) // self.clocks) + more, -(-((self.frames - 1) // 2) // self.clocks) + more
 
     def files(self, sequence: SequenceFiles, middle: int) -> list[Path]:
-        """Return the files that a clip is made of, the truth last where it is a file of its own."""
+        """Return the files that a clip is made of; a separate file of ground truth is the last."""
         before, after = self.reach
         paths = [sequence.folder / name for name in sequence.frames[middle - before : middle + after + 1]]
         return paths if sequence.truth is None else [*paths, sequence.truth / sequence.frames[middle]]
 
     def key(self, sequence: SequenceFiles, middle: int) -> str:
-        """Return the name of a clip in a cache."""
+        """Return the key of a clip in a cache."""
         return clip_key(
             simulator=SIMULATOR_VERSION,
             files=[file_digest(path) for path in self.files(sequence, middle)],
@@ -108,13 +108,13 @@ class ClipRecipe:
         """Simulate a clip around a source frame.
 
         Returns:
-            ``spikes`` uint8 (N, H, W), ``rgb`` (3, s H, s W), the truth, and ``flow`` (times, 2, H, W), in sensor
-            pixels, all of the whole view. Where the sequence is cut, nothing can be followed, and flow is 0. Of several
-            key frames K all their clocks as ``spikes``, and ``rgb`` (K, 3, s H, s W).
+            ``spikes`` uint8 (N, H, W), the ground truth ``rgb`` (3, s H, s W), and ``flow`` (times, 2, H, W) in sensor
+            pixels, all of the whole view. The flow is 0 across a cut of the film. With K key frames, ``spikes`` holds
+            all their spike frames and ``rgb`` is (K, 3, s H, s W).
 
         Raises:
-            spikekit.io.video.VideoError: a file that cannot be read; the message names it.
-            ValueError: frames too small for the sensor, or a truth of another size than theirs.
+            spikekit.io.video.VideoError: a file cannot be read; the message names it.
+            ValueError: the frames are too small for the sensor, or the ground truth has the wrong size.
         """
         clip, paths = self.view(sequence, middle), self.files(sequence, middle)
         spikes = torch.cat(
@@ -131,11 +131,11 @@ class ClipRecipe:
         return made
 
     def _seen(self, rgb: Tensor) -> Tensor:
-        """Colours as they are, or their luminance, (*, 1, s H, s W), where the sensor sees no more."""
+        """Return the colours, or for a grey sensor their luminance, (*, 1, s H, s W)."""
         return bin_to_sensor(rgb, GREY, scale=1).unsqueeze(-3) if self.pattern == GREY else rgb
 
     def view(self, sequence: SequenceFiles, middle: int) -> SequenceClip:
-        """Return what the camera sees around a source frame; errors are those of :meth:`clip`."""
+        """Return the view of the camera around a source frame; raises the errors of :meth:`clip`."""
         paths = self.files(sequence, middle)[: sum(self.reach) + 1]
         seen = FrameSequence(
             [_shrunk(read_video(path)[0], sequence.shrink) for path in paths],
@@ -153,15 +153,15 @@ class ClipRecipe:
         except ValueError:
             if not isinstance(self.interpolation, FlowInterpolation):
                 raise
-            return torch.zeros(2, clip.height // clip.sequence.scale, clip.width // clip.sequence.scale)  # beyond a cut
+            return torch.zeros(2, clip.height // clip.sequence.scale, clip.width // clip.sequence.scale)  # across a cut
 
     def _chance(self, paths: list[Path]) -> int:
-        """A seed for the sensor that depends on what the frames show, not on where they lie."""
+        """Return a seed for the sensor that depends on the content of the frames, not on their paths."""
         return int(clip_key(seed=self.seed, files=[file_digest(path) for path in paths])[:15], 16)
 
 
 def _shrunk(rgb: Tensor, factor: int) -> Tensor:
-    """Reduce a picture as the field does, bicubic and to 8 bits."""
+    """Reduce a picture as usual for super-resolution: bicubic, rounded to 8 bits."""
     if factor == 1:
         return rgb
     height, width = (length // factor for length in rgb.shape[1:])
@@ -172,7 +172,7 @@ def _shrunk(rgb: Tensor, factor: int) -> Tensor:
 
 def _truth(path: Path, scale: int, spikes: Tensor) -> Tensor:
     rgb, wanted = read_video(path)[0], [scale * length for length in spikes.shape[1:]]
-    # the view is cut to whole Bayer cells
+    # the view is cropped to whole Bayer cells
     if not all(0 <= length - side < 2 * scale for length, side in zip(rgb.shape[1:], wanted, strict=True)):
         expected, got = (f"{height} x {width}" for height, width in (wanted, rgb.shape[1:]))
         raise ValueError(f"{path}: expected {expected}, {scale} times the frames that the sensor sees, got {got}")
@@ -180,24 +180,24 @@ def _truth(path: Path, scale: int, spikes: Tensor) -> Tensor:
 
 
 class SequenceClips(Dataset):
-    """Clips of sequences, around some frames of each.
+    """Clips around frames of sequences.
 
-    The frames that a clip can have in its middle are cut into as many parts of one length as there are clips. Whole
-    clips stand in the middle of a part. Patches stand at a frame of it that the seed chooses once, so that a
-    cache comes to hold them all; they are shuffled in every round, and the place of a patch is another each time, at
-    even offsets, which keep the Bayer phase. Which clip, the seed and the index say, in whatever process and order.
+    The possible middle frames of a sequence are divided into equal parts, one per clip. A whole clip is around the
+    middle of its part. Patches are around a frame of the part that the seed fixes, so that a cache can hold all clips.
+    They are shuffled in every round, each time at another place with even offsets, which keep the Bayer phase. Seed and
+    index determine a clip, in any process and order.
 
     Args:
-        sequences: what was found by :func:`lightning_modules.data.layouts.find_sequences`.
-        recipe: how clips are made.
-        clips: clips of a sequence; fewer where it has too few frames, and one of a sequence with a middle of its own.
-        patch: side of a patch in sensor pixels; None for whole clips.
-        cache: where clips are kept; None to simulate each whenever it is asked for.
-        flow_patch: smallest side of the spikes of a patch, which reach beyond it as far as that takes and the view
-            goes, for an estimate of motion; truth and flow are those of the patch.
+        sequences: sequences of :func:`lightning_modules.data.layouts.find_sequences`.
+        recipe: settings of the simulation.
+        clips: clips per sequence; fewer for short sequences, and one for sequences with a fixed middle frame.
+        patch: side of a patch in sensor pixels; ``None`` for whole clips.
+        cache: cache of the clips; ``None`` to simulate them every time.
+        flow_patch: smallest side of the spikes, in sensor pixels, for the estimate of motion. Spikes reach beyond the
+            patch accordingly, within the view; ground truth and flow cover the patch.
 
     Raises:
-        ValueError: no sequences, one too short for a clip, a number of clips or a patch below 1.
+        ValueError: there are no sequences, one is too short for a clip, or ``clips`` or ``patch`` is below 1.
     """
 
     def __init__(
@@ -234,12 +234,12 @@ class SequenceClips(Dataset):
 
     @property
     def names(self) -> list[str]:
-        """Sequence and middle frame of every clip."""
+        """Names of sequence and middle frame of every clip."""
         places = (self.place(index) for index in range(len(self)))
         return [f"{sequence.name}/{Path(sequence.frames[middle]).stem}" for sequence, middle in places]
 
     def place(self, index: int) -> tuple[SequenceFiles, int]:
-        """Return the sequence and the middle frame of a clip, without regard to the shuffling of patches."""
+        """Return the sequence and the middle frame of a clip, before patches are shuffled."""
         sequence, first, end = self.places[index]
         if self.patch is None:
             return sequence, (first + end) // 2
@@ -247,7 +247,7 @@ class SequenceClips(Dataset):
         return sequence, int(rng.integers(first, end))
 
     def __getitem__(self, index: int) -> dict[str, Tensor]:
-        """Return a clip, see :meth:`ClipRecipe.clip`; of patches, any index from 0 on can be had."""
+        """Return a clip, see :meth:`ClipRecipe.clip`; patches have no last index."""
         if self.patch is None:
             return self._clip(*self.place(index), None)
         turn, index_in_turn = divmod(index, len(self))
@@ -283,30 +283,30 @@ class SequenceClips(Dataset):
 class FilmScenes(ClipScenes):
     """Clips of frame sequences, seen by a simulated camera: REDS, Vid4, Vimeo-90K, or any folder of frame folders.
 
-    The contents of ``root`` determine which data set it is. Of the 120-fps REDS, 240 scenes train and 30 validate and
-    test, 5 clips each. Vid4 is for tests. Vimeo-90K is for a scale of 4: the camera sees its low-resolution sequences,
-    which are the official ones of its test set, or those of a folder ``BIx4`` beside ``sequences``, or made here; the
-    truth is the full-size frame in the middle. Of other sequences one in twenty validates, and all are tested.
+    The data set is recognised by the files in ``root``. REDS (120 fps) has 240 scenes for training and 30 for
+    validation and test, with 5 clips each. Vid4 is for tests. Vimeo-90K requires scale 4: the camera sees its
+    low-resolution sequences, which are the official ones of its test set, those of a folder ``BIx4`` beside
+    ``sequences``, or computed; the ground truth is the full-size middle frame. Of other films, one in twenty is for
+    validation, and all are for tests.
 
-    Training takes patches, everything else whole views, cut at the bottom and at the right to multiples of twice the
-    scale. The whole view is simulated also for a patch, which takes seconds where frames are large: give a ``cache``.
+    Training uses patches, validation and test whole views, cropped at the bottom and right to multiples of twice the
+    scale. Patches need a simulation of the whole view, which takes seconds for large frames: use a ``cache``.
 
-    Besides its own arguments it has those of :class:`~lightning_modules.data.sequences.ClipRecipe`.
+    All arguments of :class:`~lightning_modules.data.sequences.ClipRecipe` are accepted as well.
 
     Args:
-        root: folder of the data set, with what its archives hold.
+        root: folder of the unpacked data set.
         patch: side of a training clip in sensor pixels.
-        clips: clips of a sequence, spread over it. Null for 5 of REDS and of others, 1 of Vid4 and Vimeo-90K.
-        flow: give the interpolation's flow from the middle to ``flow_times``. False for an interpolation that has
-            none; training then uses the network's own estimator.
-        flow_times: frames to which the flow is given.
-        flow_patch: smallest side, in sensor pixels, of what motion is estimated on in training, see
-            :class:`StillScenes`.
-        cache: folder where simulated clips are kept, found again by the content of their frames, by all settings and
-            by the code of the simulator. It is never emptied: delete it, or files in it, at any time. Null for none.
-        batch_size: training clips in a batch; everything else goes one by one.
-        workers: processes that make clips. Null takes one less than there are cores, sixteen at most.
-        seed: random seed. The same seed gives the same clips, whatever the number of workers.
+        clips: clips per sequence, spread over it. Null for 5 (REDS and other films) or 1 (Vid4, Vimeo-90K).
+        flow: include the flow of the interpolation from the middle to ``flow_times``. False for an interpolation
+            without flow; training then uses the network's own estimator.
+        flow_times: spike frames to which the flow is given.
+        flow_patch: smallest side, in sensor pixels, for the estimate of motion in training, see :class:`StillScenes`.
+        cache: folder of simulated clips, which are identified by the content of their frames, all settings and the
+            version of the simulator. It is never emptied; files can be deleted at any time. Null for none.
+        batch_size: training clips in a batch; validation and test use 1.
+        workers: processes that make clips. Null for all cores but one, at most sixteen.
+        seed: random seed; the clips do not depend on the number of workers.
     """
 
     @inherit_signature(ClipRecipe)
@@ -335,13 +335,13 @@ class FilmScenes(ClipScenes):
         """Find the sequences.
 
         Args:
-            stage: ``fit``, ``validate``, ``test``; all that is there when not given.
+            stage: ``fit``, ``validate`` or ``test``, whose sequences must exist; default: no check.
 
         Raises:
-            FileNotFoundError: the folder is missing, or has not what the stage needs; the message shows what was
-                expected.
-            OSError: the cache cannot be made.
-            ValueError: an argument that makes no sense, or a sequence too short for a clip.
+            FileNotFoundError: the folder, or the sequences for the stage, do not exist; the message shows the expected
+                layouts.
+            OSError: the cache folder cannot be made.
+            ValueError: an argument is out of range, or a sequence is too short for a clip.
         """
         recipe = ClipRecipe(**self.options)
         check_whole("batch_size", self.batch_size)
@@ -379,5 +379,5 @@ class FilmScenes(ClipScenes):
 
     @property
     def test_names(self) -> list[str]:
-        """Sequence and frame of every test clip."""
+        """Names of sequence and frame of every test clip."""
         return self.test_set.names

@@ -29,53 +29,52 @@ from spikekit.scenes.analytic import Scene
 from spikekit.scenes.frame_sequence import SIMULATOR_VERSION
 from spikekit.sensor.noise import SensorNoise
 
-#: what says how a clip looks, besides the sensor
+#: files whose code determines how a clip looks, besides the sensor
 _CODE = [Path(__file__).with_name(f"{name}.py") for name in ("stills", "rendering", "textures", "pictures")] + [
     Path(analytic.__file__)
 ]
-_TEXTURES = 0.3  # share of procedural pictures among embedded ones
-_ANGLES = 256  # at which an outline is known
+_TEXTURES = 0.3  # fraction of procedural textures among the pictures
+_ANGLES = 256  # samples of an outline
 _MOVES = "motion", "bend", "rotation", "zoom"
 
 
 @dataclass(eq=False, repr=False)
 class StillClips(Dataset):
-    """Clips of random scenes; which one, only the seed and the index say, in whatever process and order.
+    """Clips of random scenes; seed and index determine a clip, in any process and order.
 
     Args:
-        pictures: files to make scenes of.
-        scale: super-resolution factor: how many view pixels a sensor pixel is wide.
+        pictures: picture files for the scenes.
+        scale: super-resolution factor: width of a sensor pixel in pixels of the view.
         patch: side of the clip in sensor pixels.
-        frames: spike frames of a clip. The truth is the view at frame ``frames // 2``.
-        pattern: Bayer phase of the sensor: RGGB, BGGR, GRBG or GBRG; or grey, whose truth has one channel.
-        alpha: light of a white pixel per clock; a threshold of charge is 1.
-        motion: largest displacement of the background, at its centre, from the middle frame to the first or last one,
-            in sensor pixels. An object moves by up to as much again relative to the background.
-        bend: what acceleration adds to that displacement at most, in sensor pixels, for the background and for each
-            object: paths are parabolas instead of straight lines.
-        rotation: largest turn of the background and of each object in that time, in degrees.
-        zoom: largest growth or shrinkage of the background and of each object in that time; 0.01 is one per cent.
-        objects: most objects that move in front of the background.
-        brightness: darkest and brightest exposure. Truth and light of a clip are both multiplied by one number between.
-        noise: what a sensor adds, such as ``{photons: 3000, gain_spread: 0.06}``; a clip with ``augment``, as training
-            clips are, has a random share of it: a network learns sensors from the ideal to this one. The share is the
-            clip's ``noise``.
-        gains: lowest and highest alpha of clips with ``augment``, all orders of magnitude between alike; it is the
-            clip's ``alpha``. Null for one alpha.
-        flow_times: frames to which the flow from the middle frame is given; with 41 frames and a window of 11, 5 and 35
-            are the centres of the first and of the last window.
-        key_frames: clips that follow each other, of one scene, for a network that makes films.
-        every: frames from the middle of one to the middle of the next.
+        frames: spike frames of a clip. The ground truth is the view at spike frame ``frames // 2``.
+        pattern: Bayer phase of the sensor, RGGB, BGGR, GRBG or GBRG; or grey, with a ground truth of one channel.
+        alpha: light of a white pixel per clock; the threshold of charge is 1.
+        motion: largest displacement of the centre of the background from the middle frame to the first or last one, in
+            sensor pixels. Objects move by up to as much relative to the background.
+        bend: largest additional displacement by acceleration, in sensor pixels, for the background and each object;
+            paths are then parabolas.
+        rotation: largest rotation of the background and each object in that time, in degrees.
+        zoom: largest magnification or reduction of the background and each object in that time; 0.01 is one per cent.
+        objects: largest number of objects in front of the background.
+        brightness: lowest and highest exposure; a random number in between multiplies ground truth and light of a clip.
+        noise: noise of the sensor, such as ``{photons: 3000, gain_spread: 0.06}``. With ``augment``, as in training,
+            every clip has a random share of it, given as its ``noise``, so that a network learns all levels up to it.
+        gains: lowest and highest alpha with ``augment``, drawn log-uniformly and given as the clip's ``alpha``. Null
+            for a constant alpha.
+        flow_times: spike frames to which the flow from the middle frame is given; for 41 frames and a window of 11, 5
+            and 35 are the centres of the first and last window.
+        key_frames: consecutive clips of a scene, for networks for films.
+        every: spike frames between the middles of consecutive clips.
         seed: random seed.
-        augment: mirror, turn and recolour the pictures. Without it the pictures take their turns, one an index.
-        textures: take some of the pictures from :func:`lightning_modules.data.textures.texture`.
-        length: what ``len`` says; any index from 0 on can be had.
-        flow_patch: smallest side of the spikes, which reach beyond the patch as far as that takes, for an estimate of
-            motion; the truth and the flow are those of the patch.
-        cache: where clips are kept; None to make each whenever it is asked for.
+        augment: mirror, rotate and recolour the pictures. Otherwise, the index selects the picture of the background.
+        textures: also use procedural pictures, see :func:`lightning_modules.data.textures.texture`.
+        length: value of ``len``; every index from 0 on is valid.
+        flow_patch: smallest side of the spikes, in sensor pixels, for the estimate of motion. Spikes reach beyond the
+            patch accordingly; ground truth and flow cover the patch.
+        cache: cache of the clips; ``None`` to make them every time.
 
     Raises:
-        ValueError: an argument that makes no sense; the message names it.
+        ValueError: an argument is out of range; the message names it.
     """
 
     pictures: Sequence[Path]
@@ -117,9 +116,9 @@ class StillClips(Dataset):
     def __getitem__(self, index: int) -> dict[str, Tensor]:
         """Return a clip: ``spikes`` uint8 (N, H, W), ``rgb`` (3, s h, s w) and ``flow`` (times, 2, h, w) float32.
 
-        H and W are h and w, those of the patch, unless motion is to be estimated on more. Several key frames K have
-        ``spikes`` (K, N, H, W), ``rgb`` (K, 3, s h, s w) and ``every``, and no flow. The gain is ``alpha``, where there
-        are ``gains``, and the level of the noise ``noise``, where there is any.
+        (h, w) is the size of the patch; (H, W) is larger only with ``flow_patch``. With K key frames, ``spikes`` is
+        (K, N, H, W), ``rgb`` (K, 3, s h, s w), and ``every`` replaces the flow. With ``gains``, the clip has its
+        ``alpha``; with ``noise``, its level of ``noise``.
         """
         if self.cache is None:
             return self.cut(self.whole(index))
@@ -130,7 +129,7 @@ class StillClips(Dataset):
 
     @cached_property
     def _source(self) -> str:
-        """Digest of all that a clip is made of, besides its index."""
+        """Digest of everything that determines a clip, except its index."""
         aside = {"pictures", "sources", "length", "cache"}
         options = {name: value for name, value in vars(self).items() if name not in aside}
         options["noise"] = self.noise and asdict(self.noise)
@@ -138,22 +137,22 @@ class StillClips(Dataset):
         return clip_key(simulator=SIMULATOR_VERSION, files=files, **options)
 
     def whole(self, index: int) -> dict[str, Tensor]:
-        """Return a clip whose ``spikes`` are those of all key frames, (T, H, W), not cut into a clip of each."""
+        """Return a clip with the ``spikes`` of all key frames, (T, H, W), before they are cut into clips."""
         drawn, gallery = self._alone(index)
         return {name: part[0] for name, part in self.render(drawn, gallery).items()}
 
     def _alone(self, index: int) -> tuple[dict[str, np.ndarray], Gallery]:
-        """Numbers of a scene, a batch of one, and the pictures that it is made of."""
+        """Return the random numbers of a scene, as a batch of one, and its pictures."""
         drawn = {name: part[None] for name, part in self.draw(index).items()}
         used, drawn["picture"] = np.unique(drawn["picture"], return_inverse=True)
         drawn["picture"] = drawn["picture"].reshape(1, -1)
         return drawn, Gallery.of([self.sources[n] for n in used])
 
     def render(self, drawn: dict[str, np.ndarray], gallery: Gallery) -> dict[str, Tensor]:
-        """Return clips of drawn numbers, as they are before key frames are cut.
+        """Render clips from random numbers, before they are cut into key frames.
 
         Args:
-            drawn: of :meth:`draw`, each with a leading dimension B.
+            drawn: random numbers of :meth:`draw`, with a leading dimension B.
             gallery: the pictures, on the device that renders.
         """
         scene = self._scene(drawn, gallery)
@@ -168,15 +167,15 @@ class StillClips(Dataset):
 
     @property
     def _told(self) -> list[str]:
-        """What a clip says of its camera."""
+        """Names of the camera parameters that a clip includes."""
         return [name for name, varies in (("alpha", self.gains), ("noise", self.noise)) if varies]
 
     def cut(self, clip: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Cut what :meth:`whole` or :meth:`render` returned into a clip of each key frame."""
+        """Cut a result of :meth:`whole` or :meth:`render` into one clip per key frame."""
         return cut_key_frames(clip, self.key_frames, self.frames, self.every)
 
     def scene(self, index: int) -> Scene:
-        """Return the scene of a clip, to look at other clocks or sizes than the clip has."""
+        """Return the scene of a clip, to render it at other times or sizes."""
         scene = self._scene(*self._alone(index))
         alone = [
             replace(layer, picture=layer.picture[0], mask=None if layer.mask is None else layer.mask[0])
@@ -189,23 +188,23 @@ class StillClips(Dataset):
 
     @cached_property
     def _side(self) -> int:
-        """Of the view, in its pixels."""
+        """Side of the view in its pixels."""
         return self.scale * (self.patch + 2 * self.margin)
 
     @cached_property
     def _longer(self) -> float:
-        """How many times longer a film is away from its middle than a clip."""
+        """Half length of a film relative to that of a clip."""
         return (self.clocks // 2) / max(self.frames // 2, 1) if self.key_frames > 1 else 1
 
     @cached_property
     def _around(self) -> int:
-        """What comes into view beside it: the corners by motion, rotation and zoom."""
+        """Margin around the view that motion, rotation and zoom can bring into view."""
         turns = (self._side - 1) / 2 * math.sqrt(2) * (math.radians(self.rotation) + self.zoom)
         reach = turns * self._longer + (self.motion * self._longer + self.bend * self._longer**2) * self.scale
         return math.ceil(reach) + 2
 
     def draw(self, index: int) -> dict[str, np.ndarray]:
-        """Draw the numbers of a scene, of its background and of its objects, which :meth:`render` makes a clip of."""
+        """Draw the random numbers of a scene, for its background and objects; :meth:`render` makes a clip of them."""
         rng, side, half = self._rng(index, "scene"), self._side, max(self.frames // 2, 1)
         middle = (side - 1) / 2
         brightness = rng.uniform(*self.brightness)
@@ -219,7 +218,7 @@ class StillClips(Dataset):
             layers.append(self._layer(size, corner, moves, corner + (size - 1) / 2, rng))
             radius = outline(np.linspace(-np.pi, np.pi, _ANGLES, endpoint=False), rng)
             layers[n + 1]["outline"] = (radius / radius.max()).astype("float32")
-        # there are always as many, so that scenes fit into a batch; those of no size are none
+        # padded with empty layers, so that all scenes of a batch have the same number
         layers += [_NONE] * (1 + self.objects - len(layers))
         drawn = {name: np.stack([layer[name] for layer in layers]) for name in layers[0]}
         drawn["outline"] = np.stack([layer["outline"] for layer in layers[1:]]) if self.objects else np.zeros((0, 0))
@@ -228,14 +227,14 @@ class StillClips(Dataset):
     def _layer(
         self, side: int, corner: Any, velocity: Any, center: Any, rng: np.random.Generator, turn: int | None = None
     ) -> dict[str, Any]:
-        """A random square out of a picture in motion: ``turn`` says whose turn it is, where pictures take turns."""
+        """Draw a random square of a moving picture; ``turn`` selects the picture of backgrounds without ``augment``."""
         half, count = max(self.frames // 2, 1), len(self.pictures)
         if self.textures and rng.uniform() < _TEXTURES:
             which = count + int(rng.integers(self.sources.textures))
         else:
             which = int(rng.integers(count)) if self.augment or turn is None else turn % count
         push = _in_disc(rng) * 2 * self.bend * self.scale / half**2
-        # at the sensor's own resolution nothing is averaged later, which would make edges sharp
+        # at scale 1 no later averaging sharpens edges
         least = 0.25 if self.scale == 1 else 0.5
         return {
             "picture": which,
@@ -251,7 +250,7 @@ class StillClips(Dataset):
         }
 
     def _sensor(self, index: int) -> dict[str, np.ndarray]:
-        """What is random about the sensor that sees a scene."""
+        """Draw the random numbers of the sensor."""
         rng, side = self._rng(index, "spikes"), self.patch + 2 * self.margin
         drawn = {"charge": rng.random((side, side), "float32"), "alpha": np.float32(self.alpha)}
         if self.gains and self.augment:
@@ -271,7 +270,7 @@ class StillClips(Dataset):
         return np.random.default_rng([self.seed, self.augment, index, purpose == "spikes"])
 
 
-#: of a picture that is not changed
+#: parameters of an unchanged picture
 _AS_IT_IS = {
     "turn": np.zeros(3, bool),
     "colours": np.arange(3),
@@ -302,20 +301,20 @@ def _check(clips: StillClips) -> None:
         ("brightness", 0 <= low <= high < math.inf, "two numbers 0 <= low <= high"),
         ("flow_times", all(0 <= t < clips.frames for t in clips.flow_times), f"clocks in [0, {clips.frames})"),
         ("gains", gains is None or 0 < gains[0] <= gains[1] < math.inf, "two numbers 0 < low <= high, or null"),
-        ("noise", getattr(clips.noise, "calibration", None) is None, "no calibration, which is of one size of sensor"),
+        ("noise", getattr(clips.noise, "calibration", None) is None, "no calibration, as it has a fixed size"),
     ):
         if not good:
             raise ValueError(f"{name}: expected {expected}, got {getattr(clips, name)}")
 
 
 def _in_disc(rng: np.random.Generator) -> np.ndarray:
-    """(x, y) in the unit disc: any direction, any length, all equally likely."""
+    """Draw (x, y) in the unit disc, with uniform direction and uniform length."""
     angle, length = rng.uniform(0, 2 * math.pi), rng.uniform()
     return length * np.array([math.cos(angle), math.sin(angle)])
 
 
 def _recolour(rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Mirror and turn at random; rarely, swap colours; how to tint what is grey."""
+    """Draw mirroring, transposition, rare swaps of colours, and a tint for grey pictures."""
     dark, bright = np.sort(rng.uniform(0, 1, (2, 3)) ** [[2.0], [0.5]], axis=0)
     changed = {"turn": rng.uniform(size=3) < 0.5}
     changed["colours"] = rng.permutation(3) if rng.uniform() < 0.1 else _AS_IT_IS["colours"]
@@ -324,33 +323,32 @@ def _recolour(rng: np.random.Generator) -> dict[str, np.ndarray]:
 
 
 class StillScenes(ClipScenes):
-    """Clips of still pictures in motion, made while training runs.
+    """Clips of still pictures in motion, made during training.
 
-    Besides its own arguments it has those of :class:`StillClips` that say how a clip is made.
+    Arguments of :class:`StillClips` that describe a clip are accepted as well.
 
     Args:
-        root: folder of training pictures, read with all folders in it. Without it, the photographs inside
-            scikit-image's wheel and procedural textures: no files are needed.
-        val_root: folder of validation pictures. Without it, one picture in twenty of ``root`` is kept for validation
-            (at least four, if there are as many again); without both, four held-out photographs of scikit-image.
+        root: folder of training pictures, with subfolders. Default: photographs of scikit-image and procedural
+            textures, without any files.
+        val_root: folder of validation pictures. Default: one picture in twenty of ``root``, but at least four, or half
+            if there are fewer than eight; without ``root``, four held-out photographs of scikit-image.
         patch: side of a training clip in sensor pixels.
         val_patch: side of a validation or test clip in sensor pixels.
-        flow_patch: smallest side, in sensor pixels, of the part of a scene that motion is estimated on in training: on
-            less the estimate is poor. Spikes of training clips reach so far beyond their patch. ``lightning`` says 48
-            where ``model.flow`` is estimated, else 0.
-        cache: folder where training clips are kept, for trials of a sweep that train on the same ones. It is never
-            emptied: delete it, or files in it, at any time. Null for none.
-        train_clips: training clips in an epoch. They are new in every epoch.
-        val_clips: validation clips, the same every time; also those of ``test``.
+        flow_patch: smallest side, in sensor pixels, for the estimate of motion in training, as small patches give poor
+            estimates. Spikes of training clips reach beyond their patch accordingly. ``lightning`` sets 48 if
+            ``model.flow`` is estimated, else 0.
+        cache: folder of training clips, for trials of a sweep that train on the same clips. It is never emptied; files
+            can be deleted at any time. Null for none.
+        train_clips: training clips in an epoch; they are new in every epoch.
+        val_clips: validation clips, always the same; also used by ``test``.
         batch_size: clips in a batch.
-        pool: make so many training clips at once, on the device that trains, where workers only draw their numbers; 0
-            has workers make them. With a GPU some 1000 are worth it.
-        reuse: how often a clip of a pool is trained on, turned in between.
-        kinds: kinds of scenes in a pool, such as ``[{share: 0.4}, {share: 0.6, key_frames: 5, every: 8}]``: their share
-            of the batches, and what they have other than the rest says. Null for one kind.
-        workers: processes that make clips. Null takes one less than there are cores, sixteen at most: one core is left
-            to training.
-        seed: random seed. The same seed gives the same clips, whatever the number of workers.
+        pool: training clips that are rendered at once on the training device, from random numbers of the workers; about
+            1000 pay off on a GPU. 0 to render in the workers.
+        reuse: number of times that a clip of a pool is used, each time transformed.
+        kinds: kinds of scenes in a pool, such as ``[{share: 0.4}, {share: 0.6, key_frames: 5, every: 8}]``: the share
+            of the batches, and arguments that override the others. Null for one kind.
+        workers: processes that make clips. Null for all cores but one, at most sixteen.
+        seed: random seed; the clips do not depend on the number of workers.
     """
 
     @inherit_signature(StillClips, "pictures", "augment", "textures", "length")
@@ -384,9 +382,9 @@ class StillScenes(ClipScenes):
         """Find the pictures.
 
         Raises:
-            FileNotFoundError: a folder is missing or holds no picture.
-            OSError: the cache cannot be made.
-            ValueError: an argument that makes no sense.
+            FileNotFoundError: a folder does not exist or has no pictures.
+            OSError: the cache folder cannot be made.
+            ValueError: an argument is out of range.
         """
         if self.batch_size < 1 or self.train_clips < self.batch_size:
             raise ValueError(f"train_clips: expected at least batch_size = {self.batch_size}, got {self.train_clips}")
@@ -422,7 +420,7 @@ class StillScenes(ClipScenes):
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:  # noqa: D102
         if self.pool and self.trainer.training:
-            return batch  # made there
+            return batch  # already there
         return super().transfer_batch_to_device(batch, device, dataloader_idx)
 
     def _pictures(self) -> tuple[list[Path], list[Path]]:

@@ -1,4 +1,4 @@
-"""Procedural textures, colourful and rich in fine detail, for where photographs are few."""
+"""Procedural textures, colourful and rich in fine detail, to complement a few photographs."""
 
 from __future__ import annotations
 
@@ -8,10 +8,7 @@ from torch import Tensor
 
 
 def outline_mask(size: int, rng: np.random.Generator) -> Tensor:
-    """Draw an ellipse, a polygon or a blob that fills a square of so many pixels.
-
-    (size, size), 1 inside, 0 outside; the edge is as wide as a pixel.
-    """
+    """Draw a mask (size, size) of an ellipse, polygon or blob: 1 inside, 0 outside, with an edge one pixel wide."""
     middle = (size - 1) / 2
     y, x = np.mgrid[:size, :size] - middle
     angle, distance = np.arctan2(y, x), np.hypot(y, x)
@@ -21,7 +18,7 @@ def outline_mask(size: int, rng: np.random.Generator) -> Tensor:
 
 
 def outline(angle: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Draw an ellipse, a polygon or a blob: its radius at angles in [-pi, pi]."""
+    """Draw an ellipse, polygon or blob, as its radius at angles in [-pi, pi]."""
     return [_ellipse, _polygon, _blob][rng.integers(3)](angle, rng)
 
 
@@ -51,24 +48,24 @@ def _blob(angle: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def texture(height: int, width: int, rng: np.random.Generator) -> Tensor:
-    """Draw ``rgb`` (3, height, width): coloured noise, gratings, checkers, or patches that lie over each other."""
+    """Draw ``rgb`` (3, height, width): coloured noise, gratings, checkers, or overlapping patches."""
     draw = [_noise, _gratings, _checkers, _patches, _patches][rng.integers(5)]
     return torch.from_numpy(draw(height, width, rng).clip(0, 1).astype("float32"))
 
 
 def _colour(rng: np.random.Generator) -> np.ndarray:
-    """A random colour, (3, 1, 1): most are muted, as in photographs, some glare."""
+    """Draw a colour, (3, 1, 1), mostly muted as in photographs, sometimes glaring."""
     return (rng.uniform(0, 1) + rng.exponential(0.15) * rng.standard_normal((3, 1, 1))).clip(0, 1)
 
 
 def _ramp(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Colour values in [0, 1] from one random colour to another."""
+    """Map values in [0, 1] to a ramp between two random colours."""
     first, second = _colour(rng), _colour(rng)
     return first + (second - first) * values
 
 
 def _noise(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
-    """Coloured noise of a random band, the colours related as in a random photograph."""
+    """Draw coloured noise of a random frequency band, with correlated colours as in photographs."""
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width))
     finest = rng.uniform(0.05, 0.5)
     gain = np.exp(-((frequency / finest) ** 4)) / np.maximum(frequency, 0.01) ** rng.uniform(0.3, 1.6)
@@ -81,7 +78,7 @@ def _noise(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _gratings(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
-    """Stripes of random pitch and direction, straight or bent, smooth or square."""
+    """Draw stripes of random pitch and direction, straight or bent, smooth or square."""
     y, x = np.mgrid[:height, :width].astype("float32")
     picture = np.zeros((3, height, width), "float32")
     count = rng.integers(1, 4)
@@ -96,7 +93,7 @@ def _gratings(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _checkers(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
-    """A turned board of two colours, each square shaded a little differently."""
+    """Draw a rotated checkerboard of two colours, with slightly different shades."""
     y, x = np.mgrid[:height, :width].astype("float32")
     turn, pitch = rng.uniform(0, np.pi / 2), np.exp(rng.uniform(np.log(4), np.log(40)))
     across = (x * np.cos(turn) + y * np.sin(turn)) / pitch + 1000
@@ -108,7 +105,7 @@ def _checkers(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _patches(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
-    """Outlines and lines of small bars, like print, painted over each other, plain or textured."""
+    """Draw overlapping shapes, plain or textured, and lines of small bars like print."""
     picture = _ramp(np.linspace(0, 1, height * width).reshape(height, width), rng)
     side = (height + width) / 2
     for _ in range(rng.integers(20, 80)):
@@ -132,7 +129,7 @@ def _patches(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _print(picture: np.ndarray, rng: np.random.Generator) -> None:
-    """Paint a line of letter-like strokes."""
+    """Draw a line of letter-like strokes."""
     height, width = picture.shape[1:]
     letter, ink = int(rng.integers(5, 25)), _colour(rng)
     top, left = rng.integers(0, height), rng.integers(-width // 4, width)
