@@ -119,7 +119,7 @@ def end_with_parent() -> None:
 
 
 def exit_reason(log: Path, status: int) -> str | None:
-    """Return why a process ended with a status, or None where nothing went wrong."""
+    """Return why a process failed, or ``None`` if it succeeded."""
     if status == 0:
         return None
     if status < 0:

@@ -65,10 +65,10 @@ def film_length(frames: int, every: int) -> int:
 
 
 def film_scenes(data: LightningDataModule, frames: int, every: int) -> Iterator[dict[str, Tensor]]:
-    """Yield the test scenes of data as films, moving as fast as the clips do.
+    """Yield the test scenes of data as films, with the motion of the clips.
 
-    A film is ``spikes`` (1, T, H, W), ``rgb``, the pictures that count, (3, 3, s H, s W), and ``flow`` from the one in
-    the middle to the one before it and to the one behind it, (2, 2, s H, s W), in their pixels.
+    A film has ``spikes`` (1, T, H, W), the three scored pictures ``rgb`` (3, 3, s H, s W), and the ``flow`` from the
+    middle picture to the previous and the next one, (2, 2, s H, s W), in pixels of the pictures.
     """
     length = film_length(frames, every)
     if isinstance(data, StillScenes):

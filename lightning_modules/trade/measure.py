@@ -72,11 +72,11 @@ def measure(
     rounds: int,
     score: Callable[[Measurement, dict[str, Tensor]], None] | None = None,
 ) -> Timed:
-    """Score and time the settings that can run; if one fails, its row gets the reason, and the others continue.
+    """Score and time the settings that can run; a setting that fails gets a reason, and the others continue.
 
-    All settings see a clip before the next one is made. That also warms them up. Then they are timed on the clips that
-    are of one size with the first, of which the first is also weighed. Times do not include moving the spikes to the
-    device.
+    All settings are scored on a clip before the next one is loaded, which also warms them up. Then they are timed on
+    the clips that have the size of the first. Memory and work are measured on the first. Times do not include moving
+    the spikes to the device.
     """
     kept: list[Tensor] = []
     for clip in progress(clips, "clips scored"):
@@ -84,7 +84,7 @@ def measure(
             kept.append(clip["spikes"])
         for row in running(rows):
             attempt(row, lambda row=row, clip=clip: (score or _score)(row, clip))
-    for row in progress(running(rows), "settings weighed"):
+    for row in progress(running(rows), "settings measured"):
         attempt(row, lambda row=row: _weigh(row, kept[0]))
     rows = running(rows)
     time_in_turns(rows, kept, rounds)
@@ -119,7 +119,7 @@ def _timer(row: Measurement) -> tuple[Timer, str]:
 
 
 def single_clips(scenes: DataLoader) -> Iterator[dict[str, Tensor]]:
-    """Yield clips one by one, as a recording has them: what a batch takes depends on its size."""
+    """Yield single clips, as in a recording; the cost of a batch depends on its size."""
     for batch in scenes:
         for n in range(len(batch["spikes"])):
             yield {name: value[n : n + 1] for name, value in batch.items()}
