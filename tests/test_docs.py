@@ -1,4 +1,4 @@
-"""The docs: every operator has a page and a docstring that says all it should, figures draw, the build is clean."""
+"""The docs: complete pages and docstrings of operators, working figures, and a build without warnings."""
 
 import builtins
 import doctest
@@ -64,7 +64,7 @@ def documented(kind):
     return dict(found)
 
 
-def test_every_public_name_is_on_a_page_and_nothing_else():
+def test_pages_list_exactly_the_public_names():
     assert sorted(documented(r"auto\w+")) == sorted(sk.__all__)
 
 
@@ -73,7 +73,7 @@ def figures(text):
 
 
 @pytest.mark.parametrize("name", OPERATORS)
-def test_operator_has_a_page_with_its_module_and_a_picture(name):
+def test_operators_have_a_page_with_module_and_picture(name):
     page = documented("autofunction")[name]
     assert page.parent.name == "operators"
     if name not in WITHOUT_MODULE:
@@ -83,7 +83,7 @@ def test_operator_has_a_page_with_its_module_and_a_picture(name):
     assert ":alt: " in PAGES[page]
 
 
-def test_every_page_under_operators_is_an_operators_and_every_page_is_in_the_contents_once():
+def test_contents_list_every_page_once():
     pages = {path for path in PAGES if path.parent.name == "operators"}
     assert pages == {documented("autofunction")[name] for name in OPERATORS}
     assert sorted(figure for text in PAGES.values() for figure in figures(text)) == [path.name for path in FIGURES]
@@ -97,7 +97,7 @@ def test_every_page_under_operators_is_an_operators_and_every_page_is_in_the_con
     assert sorted(contents) == sorted(named - {"index", "examples/README"} | {"gallery/index"})
 
 
-def test_every_public_name_is_in_the_list_of_its_room():
+def test_public_names_are_listed_with_their_package():
     listed = {}
     for path, text in PAGES.items():
         if path.parent.name == "api" and ".. autosummary::\n\n" in text:
@@ -149,8 +149,8 @@ def test_quickstart_runs():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("page", "name"), [("training", "mynet.py"), ("motion", "myflow.py")])
-def test_networks_and_estimators_of_ones_own_go_through_the_verbs_as_shown(page, name, tmp_path):
-    """The file that a page shows, and the commands under it."""
+def test_own_networks_and_estimators_work_as_shown(page, name, tmp_path):
+    """The file on the page and the commands below it."""
     text = PAGES[DOCS / "howto" / f"{page}.rst"]
     code, commands = re.search(rf"   # {name}\n((?:   .*\n|\n)+?)\.\. code-block:: sh\n\n((?:   .*\n)+)", text).groups()
     (tmp_path / name).write_text(textwrap.dedent(code))
@@ -170,8 +170,8 @@ def test_networks_and_estimators_of_ones_own_go_through_the_verbs_as_shown(page,
 
 
 @pytest.mark.slow
-def test_docs_build_without_a_warning_and_need_no_network(tmp_path):
-    """From a copy, since the gallery is written beside its source."""
+def test_docs_build_offline_without_warnings(tmp_path):
+    """From a copy, as the gallery is written beside its source."""
     for needed in ("sphinx", "furo", "matplotlib", "sphinx_gallery"):
         pytest.importorskip(needed, reason="the docs extra is not installed")
     shutil.copytree(DOCS, tmp_path / "docs", ignore=shutil.ignore_patterns(*MADE))

@@ -1,4 +1,4 @@
-"""What is declared is what is imported; without the extra, operators work and commands say what they lack."""
+"""Declared dependencies match imports; without the extra, operators work and commands name it."""
 
 import ast
 import re
@@ -35,7 +35,7 @@ def imported():
     return found - set(sys.stdlib_module_names) - {"spikekit", "lightning_modules"}
 
 
-def test_every_package_that_is_imported_is_declared_and_the_other_way_round():
+def test_imported_packages_are_exactly_the_declared_ones():
     extras = PROJECT["optional-dependencies"]
     of_users = declared([*PROJECT["dependencies"], *(text for name in extras for text in extras[name])])
     brought_by = {"lightning_fabric"}  # by pytorch_lightning
@@ -46,7 +46,7 @@ def test_every_package_that_is_imported_is_declared_and_the_other_way_round():
     assert declared(extras["learn"]) - {"kornia_rs"} | brought_by == LEARN  # kornia itself needs kornia_rs
 
 
-def test_the_lowest_versions_that_ci_tests_are_those_that_are_allowed():
+def test_ci_tests_the_lowest_allowed_versions():
     lowest = dict(line.split("==") for line in (ROOT / ".ci" / "lowest.txt").read_text().split("\n")[1:] if line)
     lowest = {name.replace("_", "-"): version.split(".") for name, version in lowest.items()}
     of_users = [*PROJECT["dependencies"]]
@@ -89,7 +89,7 @@ def test_operators_need_no_extra():
     ],
     ids=["spikekit", "lightning"],
 )
-def test_a_command_without_the_extra_names_it_in_one_line(code):
+def test_missing_extra_is_named_in_one_line(code):
     done = without_the_extra(code)
     assert done.returncode == 1
     assert "spikekit[learn]" in done.stderr

@@ -1,4 +1,4 @@
-"""What README and quickstart say is what happens: every command and every line of Python, on small inputs."""
+"""Commands and Python examples of README and quickstart, on small inputs."""
 
 import multiprocessing
 import os
@@ -77,7 +77,7 @@ def run(program, words, folder):
 
 
 @pytest.mark.parametrize("text", [README, QUICKSTART], ids=["readme", "quickstart"])
-def test_every_command_runs_as_written_and_makes_what_it_says(text, folder):
+def test_commands_run_as_written(text, folder):
     import pytorch_lightning  # noqa: F401
 
     outputs = 0
@@ -90,7 +90,7 @@ def test_every_command_runs_as_written_and_makes_what_it_says(text, folder):
     assert outputs >= 4
 
 
-def test_the_readmes_call_in_python_gives_the_pictures_of_a_recording(folder, monkeypatch):
+def test_python_example_reconstructs_a_recording(folder, monkeypatch):
     (code,) = re.findall(r"```python\n(import lightning_modules\n.*?)```", README, flags=re.DOTALL)
     monkeypatch.chdir(folder)
     names: dict = {}
@@ -100,7 +100,7 @@ def test_the_readmes_call_in_python_gives_the_pictures_of_a_recording(folder, mo
     assert 0 <= names["rgb"].min() < names["rgb"].max() <= 1
 
 
-def test_the_readmes_operators_run_and_gradients_reach_scene_and_motion():
+def test_operator_example_runs_with_gradients():
     (code,) = re.findall(r"```python\n(import torch\n.*?)```", README, flags=re.DOTALL)
     names: dict = {}
     exec(code, names)
@@ -112,7 +112,7 @@ def test_the_readmes_operators_run_and_gradients_reach_scene_and_motion():
     assert not torch.equal(names["moved"][0, 0], names["raw"])
 
 
-def test_what_the_readme_names_is_there():
+def test_named_files_and_options_exist():
     address = r"https://(?:raw\.githubusercontent\.com/spikekit/spikekit/main|github\.com/spikekit/spikekit/(?:blob|tree)/main)/"
     named = re.findall(address + r"([\w./]+)", README) + re.findall(r"(?:configs|docs)/[\w/]+\.(?:yaml|py)", README)
     assert len(named) > 7
@@ -121,7 +121,7 @@ def test_what_the_readme_names_is_there():
     assert not re.findall(r"\]\((?!http)", README), "links that PyPI cannot follow"
 
 
-def test_the_readmes_figures_are_those_of_the_table():
+def test_figures_match_the_tables():
     rows = [row.split(",") for row in (ROOT / "results" / "vid4.csv").read_text().splitlines()[1:]]
     for row in re.findall(r"^\| x(\d)(, fast)?.*? \| (.*) \|$", README, flags=re.MULTILINE):
         (found,) = [r for r in rows if r[0] == row[0] and (r[1] == "8") == bool(row[1])]
@@ -129,11 +129,11 @@ def test_the_readmes_figures_are_those_of_the_table():
         assert cells == [found[4], *(cell for cell in found[5:] if cell)], row
 
 
-def test_it_is_read_in_a_few_minutes():
+def test_length():
     assert len(README.splitlines()) <= 140
 
 
-def test_its_first_two_commands_are_those_that_ci_runs():
+def test_first_commands_are_those_of_ci():
     train, test = re.findall(r"```sh\n(.*?)\n```", README, flags=re.DOTALL)[:2]
     assert "-c quick" in train
     assert train.endswith("--ckpt_path best")

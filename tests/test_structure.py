@@ -1,4 +1,4 @@
-"""The house as its imports draw it: no circle of modules or rooms, small rooms, and the order in which light goes."""
+"""Structure of the packages: no circular imports, small folders, and imports in the order of packages."""
 
 import ast
 from graphlib import CycleError, TopologicalSorter
@@ -66,20 +66,20 @@ def _house():
     return graph({name: path.read_text(encoding="utf-8") for name, path in MODULES.items()})
 
 
-def test_no_circle_of_modules(house):
+def test_no_circular_imports_of_modules(house):
     assert circle(house) is None
 
 
-def test_no_circle_of_rooms(house):
+def test_no_circular_imports_of_packages(house):
     assert circle(rooms(house)) is None
 
 
 @pytest.mark.parametrize("folder", sorted({path.parent for path in MODULES.values()}), ids=str)
-def test_a_folder_has_no_more_modules_than_one_takes_in(folder):
+def test_folders_have_few_modules(folder):
     assert len([path for path in folder.glob("*.py") if path.name != "__init__.py"]) <= 13
 
 
-def test_nothing_imports_against_the_way_of_the_light(house):
+def test_imports_follow_the_order_of_packages(house):
     order = {f"spikekit.{name}": place for place, name in enumerate(WAY)}
     edges = rooms(house)
     assert set(order) <= set(edges)
@@ -87,7 +87,7 @@ def test_nothing_imports_against_the_way_of_the_light(house):
     assert not against
 
 
-def test_the_camera_does_not_know_the_networks(house):
+def test_spikekit_does_not_import_lightning_modules(house):
     known = {name for name, others in house.items() if any(room(other).startswith(PACKAGES[1]) for other in others)}
     assert not [name for name in known if name.startswith("spikekit")]
 
@@ -121,6 +121,6 @@ UNWHOLE = {
 }
 
 
-def test_files_are_written_whole():
+def test_files_are_written_atomically():
     found = {name: list(writers(path.read_text(encoding="utf-8"))) for name, path in MODULES.items()}
     assert {name: len(lines) for name, lines in found.items() if lines} == UNWHOLE, found

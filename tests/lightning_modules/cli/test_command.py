@@ -1,4 +1,4 @@
-"""The ``lightning`` command, as its users type it."""
+"""The ``lightning`` command."""
 
 import csv
 import re
@@ -61,7 +61,7 @@ def weights(output, name="last"):
 
 
 @pytest.mark.slow
-def test_fit_leaves_checkpoints_and_pictures(trained):
+def test_fit_writes_checkpoints_and_pictures(trained):
     assert weights(trained)["global_step"] == 6
     assert weights(trained, "best")["network"]["scale"] == 4
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -83,8 +83,8 @@ def _files(folder, pattern):
 
 
 @pytest.mark.slow
-def test_a_training_that_is_killed_goes_on(trained, overlay, configs, tmp_path, forked):
-    """What lies there under its name is whole, and the weights are those of an unbroken training."""
+def test_killed_training_resumes(trained, overlay, configs, tmp_path, forked):
+    """Its files are complete, and the weights equal those of an uninterrupted training."""
     folder = tmp_path / "checkpoints"
     args = ["fit", "-c", configs / "x4.yaml", "-c", overlay, "-o", tmp_path]
     for moment, pattern in ((0.01, "*.ckpt"), (0.0, ".*.part")):
@@ -107,7 +107,7 @@ def test_a_training_that_is_killed_goes_on(trained, overlay, configs, tmp_path, 
 
 
 @pytest.mark.slow
-def test_test_prints_a_table_and_writes_it(trained, overlay, configs, capsys):
+def test_test_prints_and_writes_a_table(trained, overlay, configs, capsys):
     args = ["test", "-c", configs / "x4.yaml", "-c", overlay, "-o", trained, "--ckpt_path", "best"]
     main([*map(str, args)])
     printed = capsys.readouterr().out
@@ -123,7 +123,7 @@ def test_test_prints_a_table_and_writes_it(trained, overlay, configs, capsys):
     assert read_picture(trained / "test.png").shape == (3, 3 * 48 + 2 * 4, 5 * 48 + 4 * 4)
 
 
-def test_the_short_help_names_options_that_there_are(capsys):
+def test_short_help_names_existing_options(capsys):
     main(["fit", "--help"])
     short, known = capsys.readouterr().out, ""
     assert len(short.splitlines()) < 30
@@ -136,7 +136,7 @@ def test_the_short_help_names_options_that_there_are(capsys):
     assert [option for option in named if option not in known] == []
 
 
-def test_a_number_of_batches_is_no_share(configs, overlay, tmp_path):
+def test_integer_limits_are_numbers_of_batches(configs, overlay, tmp_path):
     words = ["fit", "-c", str(configs / "x4.yaml"), "-c", str(overlay), "-o", str(tmp_path)]
     words += ["--trainer.limit_val_batches", "1", "--trainer.limit_train_batches", "1.0", "--trainer.logger", "false"]
     trainer = run_command(words, Fit).trainer
@@ -173,7 +173,7 @@ def test_models_lists_the_weights_of_the_package(capsys):
 
 
 @pytest.mark.slow
-def test_config_yaml_stays_the_record_of_the_training(trained, overlay, configs):
+def test_only_fit_writes_config_yaml(trained, overlay, configs):
     before = (trained / "config.yaml").read_text()
     args = ["-c", configs / "x4.yaml", "-c", overlay, "-o", trained, "--ckpt_path", "best", "--data.val_clips", 1]
     for verb in ("validate", "test"):
@@ -214,7 +214,7 @@ def _checkpoint(begun, overlay, configs, tmp_path):
         ("--model.network.width=6", "last.ckpt was trained with width=4; this run asks for width=6"),
     ],
 )
-def test_a_run_does_not_go_on_with_what_the_checkpoint_would_override(checkpoint, change, said):
+def test_resume_rejects_settings_that_the_checkpoint_overrides(checkpoint, change, said):
     words, path = checkpoint
     with pytest.raises(InputError, match=said):
         run_command([*words, change], Fit)
@@ -222,7 +222,7 @@ def test_a_run_does_not_go_on_with_what_the_checkpoint_would_override(checkpoint
 
 
 @pytest.mark.parametrize("lacking", ["optimizer_states", "loops", "weight_decay"])
-def test_a_run_does_not_go_on_from_half_a_checkpoint(checkpoint, lacking):
+def test_resume_rejects_incomplete_checkpoints(checkpoint, lacking):
     words, path = checkpoint
     content = torch.load(path, weights_only=True)
     del (content if lacking in content else content["optimizer_states"][0]["param_groups"][0])[lacking]
@@ -231,7 +231,7 @@ def test_a_run_does_not_go_on_from_half_a_checkpoint(checkpoint, lacking):
         run_command(words, Fit)
 
 
-def test_a_run_goes_on_for_longer_with_other_data_and_from_older_checkpoints(checkpoint):
+def test_resume_allows_more_steps_other_data_and_older_checkpoints(checkpoint):
     words, path = checkpoint
     run_command([*words, "--trainer.max_steps=9", "--data.motion=1"], Fit)
     content = torch.load(path, weights_only=True)
@@ -241,7 +241,7 @@ def test_a_run_goes_on_for_longer_with_other_data_and_from_older_checkpoints(che
 
 
 @pytest.mark.parametrize("scale", [2, 3, 4])
-def test_the_paper_is_the_default(scale, configs, capsys):
+def test_defaults_are_those_of_the_paper(scale, configs, capsys):
     with pytest.raises(SystemExit):
         main(["fit", "-c", str(configs / f"x{scale}.yaml"), "--print_config"])
     config = yaml.safe_load(capsys.readouterr().out)

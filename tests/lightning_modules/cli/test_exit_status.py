@@ -1,4 +1,4 @@
-"""What every verb ends with: one line on stderr, 2 for wrong use and 1 for a file that is to blame; nothing written."""
+"""Errors of every verb: one line on stderr, status 2 for wrong use and 1 for bad files, and nothing written."""
 
 import io
 import os
@@ -85,7 +85,7 @@ ROWS = [(words, 2, said) for words, said in WRONG.items()] + [(words, 1, said) f
 
 
 @pytest.mark.parametrize(("words", "status", "named"), ROWS)
-def test_one_line(words, status, named, tmp_path, monkeypatch, capfd):
+def test_errors_are_one_line(words, status, named, tmp_path, monkeypatch, capfd):
     for name, content in FILES.items():
         (tmp_path / name).write_bytes(content)
     monkeypatch.chdir(tmp_path)
@@ -117,8 +117,8 @@ SOON = "predict a.npz --speed fastest --calibration none -o"
         (f"{SOON} film.mp4", "film.mp4.frames", ".predict.lock"),
     ],
 )
-def test_two_runs_of_a_verb_in_one_folder(words, folder, name, tmp_path, monkeypatch):
-    """One of them would go on with what the other writes; said before anything is computed."""
+def test_second_run_in_a_folder_is_rejected(words, folder, name, tmp_path, monkeypatch):
+    """Before anything is computed, as one run would continue with files of the other."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "tiny.yaml").write_bytes(FILES["tiny.yaml"])
     write_spikes("a.npz", torch.zeros(41, 4, 4))
@@ -127,7 +127,7 @@ def test_two_runs_of_a_verb_in_one_folder(words, folder, name, tmp_path, monkeyp
     assert {path.name for path in (tmp_path / folder).iterdir()} == {name}
 
 
-def test_a_folder_that_cannot_be_locked(tmp_path, monkeypatch):
+def test_folder_that_cannot_be_locked(tmp_path, monkeypatch):
     (tmp_path / "lock").mkdir()
     with (
         pytest.raises(InputError, match=rf"^-o: {tmp_path}/lock: expected a lock file"),
@@ -144,7 +144,7 @@ def test_a_folder_that_cannot_be_locked(tmp_path, monkeypatch):
         pass
 
 
-def test_a_disk_that_refuses_is_failed_work():
+def test_full_disk_ends_with_status_1():
     with pytest.raises(SystemExit) as ended, as_one_line():
         raise OSError(28, "No space left on device", "a.png")
     assert ended.value.code == "lightning: a.png: No space left on device"  # Python prints it and ends with 1
@@ -154,7 +154,7 @@ def test_a_disk_that_refuses_is_failed_work():
         raise OSError("no errno")
 
 
-def test_what_is_printed_is_not_read_or_finds_no_room():
+def test_closed_or_full_standard_output():
     """As with ``| head -1``, but without a race; then on a full disk."""
     reader, writer = os.pipe()
     os.close(reader)

@@ -1,4 +1,4 @@
-"""``lightning predict``, as its users type it: pictures and films, stopped, resumed, and in folders of others."""
+"""``lightning predict``: pictures and films, stopped and resumed runs, and folders with other files."""
 
 import os
 import signal
@@ -55,7 +55,7 @@ def refused(words, status=1):
     return str(ended.value.code)
 
 
-def test_a_film_shows_the_pictures_of_the_folder(words, tmp_path, capsys):
+def test_film_shows_the_pictures_of_the_folder(words, tmp_path, capsys):
     main([*words, str(tmp_path / "out")])
     main([*words, str(tmp_path / "a" / "film.mkv"), "--fps", "12"])
     film = read_video(tmp_path / "a" / "film.mkv")
@@ -67,22 +67,22 @@ def test_a_film_shows_the_pictures_of_the_folder(words, tmp_path, capsys):
     assert "film.mkv: 6 pictures, in " in capsys.readouterr().out
 
 
-def test_one_frame_is_one_picture(words, tmp_path):
+def test_one_frame_gives_one_picture(words, tmp_path):
     main([*words, str(tmp_path / "out"), "--frame", "40"])
     main([*words, str(tmp_path / "a" / "one.PNG"), "--frame", "40"])
     assert (tmp_path / "a" / "one.PNG").read_bytes() == (tmp_path / "out" / "frame_000040.png").read_bytes()
     assert [path.name for path in (tmp_path / "a").iterdir()] == ["one.PNG"]
 
 
-def test_a_picture_of_nan_is_no_picture(words, tmp_path, monkeypatch):
-    """Weights may be finite and too large; a black picture would say nothing of it."""
+def test_nan_is_not_written(words, tmp_path, monkeypatch):
+    """Finite weights that are too large give NaN, which would be saved as black."""
     nan = torch.full((1, 3, 24, 32), float("nan"))
     monkeypatch.setattr(ClassicalDecoder, "forward", lambda *_, static=False: nan)
     assert "frame_000020.png: expected finite values, got NaN" in refused([*words, str(tmp_path / "out")])
     assert not pictures(tmp_path / "out")
 
 
-def test_the_truth_of_a_simulated_recording_is_not_written_over(words, tmp_path, capsys):
+def test_ground_truth_of_a_recording_is_not_overwritten(words, tmp_path, capsys):
     Image.effect_noise((40, 32), 60).convert("RGB").save(tmp_path / "scene.png")
     spikekit(["simulate", str(tmp_path / "scene.png"), "-o", str(tmp_path / "a.dat"), "--scale", "2"])
     truth = (tmp_path / "a.png").read_bytes()
@@ -92,7 +92,7 @@ def test_the_truth_of_a_simulated_recording_is_not_written_over(words, tmp_path,
     assert (tmp_path / "a.png").read_bytes() == truth
 
 
-def test_a_decoder_stands_beside_the_picture(words, tmp_path):
+def test_decoder_is_shown_beside_the_picture(words, tmp_path):
     one, other = tmp_path / "tfi", tmp_path / "both"
     main([*words, str(one), "--frame", "40"])
     main([*words, str(other), "--frame", "40", "--beside", "tfi"])
@@ -101,7 +101,7 @@ def test_a_decoder_stands_beside_the_picture(words, tmp_path):
     torch.testing.assert_close(both[:, :, :32], read_picture(one / "frame_000040.png"), rtol=0, atol=1.1 / 255)
 
 
-def test_a_stopped_run_is_one_line_and_resumes_behind_its_last_picture(words, tmp_path, monkeypatch, capsys):
+def test_stopped_run_resumes_after_its_last_picture(words, tmp_path, monkeypatch, capsys):
     main([*words, str(tmp_path / "unbroken")])
     for name, folder in (("out", tmp_path / "out"), ("film.mp4", tmp_path / "film.mp4.frames")):
         with monkeypatch.context() as patch:
@@ -120,7 +120,7 @@ def test_a_stopped_run_is_one_line_and_resumes_behind_its_last_picture(words, tm
     assert not folder.exists()
 
 
-def test_sigterm_ends_with_143_and_leaves_whole_pictures(words, tmp_path, forked):
+def test_sigterm_ends_with_143_and_complete_pictures(words, tmp_path, forked):
     process, begin = forked([*words, str(tmp_path / "out"), "--frame", "20:79:1"]), time.monotonic()
     while not any((tmp_path / "out").glob("*.png")) and time.monotonic() < begin + 120:
         time.sleep(0.01)
@@ -134,7 +134,7 @@ def test_sigterm_ends_with_143_and_leaves_whole_pictures(words, tmp_path, forked
     assert not list((tmp_path / "out").glob("*.part"))
 
 
-def test_what_was_made_otherwise_or_is_damaged_is_made_again(words, tmp_path):
+def test_outdated_and_damaged_pictures_are_made_again(words, tmp_path):
     folder = tmp_path / "out"
     main([*words, str(folder)])
     before = pictures(folder)
@@ -152,7 +152,7 @@ def test_what_was_made_otherwise_or_is_damaged_is_made_again(words, tmp_path):
     assert all(before[name] != data for name, data in pictures(folder).items())
 
 
-def test_what_others_put_beside_the_pictures_of_a_film_stays(words, tmp_path):
+def test_other_files_beside_the_pictures_of_a_film_stay(words, tmp_path):
     folder = tmp_path / "film.mp4.frames"
     (folder / "mine").mkdir(parents=True)
     (folder / "mine" / "thesis.tex").write_text("all of it")
@@ -163,7 +163,7 @@ def test_what_others_put_beside_the_pictures_of_a_film_stays(words, tmp_path):
     assert (folder / "mine" / "thesis.tex").read_text() == "all of it"
 
 
-def test_nothing_is_written_through_links_over_files_of_others_or_into_pipes(words, tmp_path):
+def test_links_foreign_files_and_pipes_are_not_written_to(words, tmp_path):
     (tmp_path / "other").mkdir()
     secret, out = tmp_path / "other" / "secret.txt", tmp_path / "out"
     secret.write_text("secret")
@@ -188,7 +188,7 @@ def test_nothing_is_written_through_links_over_files_of_others_or_into_pipes(wor
     assert [path.name for path in (tmp_path / "other").iterdir()] == ["secret.txt"]
 
 
-def test_every_picture_is_a_line_without_a_terminal_and_bars_with_one(words, tmp_path, monkeypatch, capsys):
+def test_progress_on_a_terminal_and_elsewhere(words, tmp_path, monkeypatch, capsys):
     main([*words, str(tmp_path / "out")])
     said = capsys.readouterr()
     assert [line for line in said.out.splitlines() if "frame_0000" in line] == [
@@ -206,7 +206,7 @@ def test_every_picture_is_a_line_without_a_terminal_and_bars_with_one(words, tmp
 TINY = {"scale": 2, "width": 8, "representation_width": 8, "features": 1, "stages": 1, "end_blocks": 1}
 
 
-def test_checkpoints_of_a_run_are_found_and_which_there_are_is_said(words, tmp_path):
+def test_checkpoints_of_a_run_are_found_or_listed(words, tmp_path):
     network, last = CSCSR(**TINY), tmp_path / "run" / "checkpoints" / "last.ckpt"
     last.parent.mkdir(parents=True)
     state = {f"network.{name}": value for name, value in network.state_dict().items()}
@@ -250,7 +250,7 @@ class Slowly(MotionEstimator):
 """
 
 
-def test_a_network_and_an_estimator_of_the_present_folder_make_pictures(words, tmp_path, monkeypatch):
+def test_own_network_and_estimator_make_pictures(words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path not in ("", str(tmp_path))])
     (tmp_path / "my_network.py").write_text(OWN)
@@ -272,7 +272,7 @@ def test_a_network_and_an_estimator_of_the_present_folder_make_pictures(words, t
 
 
 @pytest.mark.slow
-def test_ray_makes_what_one_process_makes(words, tmp_path, monkeypatch):
+def test_ray_makes_the_same_pictures(words, tmp_path, monkeypatch):
     pytest.importorskip("ray", reason="Ray is an extra")
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     main([*words, str(tmp_path / "one.mp4")])

@@ -1,4 +1,4 @@
-"""The cache of clips: what is not whole is never believed, and packing loses nothing."""
+"""The cache of clips: damaged clips are not used, and packing is lossless."""
 
 import warnings
 
@@ -19,7 +19,7 @@ def same(one, other):
     return one.keys() == other.keys() and all(np.array_equal(one[n], other[n]) for n in other)
 
 
-def test_a_clip_comes_back(tmp_path):
+def test_cached_clip_is_returned(tmp_path):
     made = ClipCache(tmp_path / "new" / "folder").packed(KEY, lambda: clip(200))
     assert same(made, pack_clip(clip(200)))
     assert same(ClipCache(tmp_path / "new" / "folder").packed(KEY, made_again), made)
@@ -28,7 +28,7 @@ def test_a_clip_comes_back(tmp_path):
 
 
 @pytest.mark.parametrize("damage", [slice(0, 0), slice(0, 500), slice(0, -1), "a bit"])
-def test_a_damaged_clip_is_made_again_and_said_so_once(tmp_path, damage):
+def test_damaged_clip_is_made_again_with_one_warning(tmp_path, damage):
     made = ClipCache(tmp_path).packed(KEY, lambda: clip(200))
     (path,) = tmp_path.glob("*/*.npz")
     stored = bytearray(path.read_bytes())
@@ -58,7 +58,7 @@ def clip(levels, height=6, width=22, scale=2, flow=True):
 
 @pytest.mark.parametrize(("levels", "dtype"), [(256, "uint8"), (257, "uint16"), (99999, "float32")])
 @pytest.mark.parametrize("flow", [True, False])
-def test_packing_loses_nothing(levels, dtype, flow):
+def test_packing_is_lossless(levels, dtype, flow):
     original = clip(levels, 160, 170, flow=flow)
     packed = pack_clip(original)
     assert packed["rgb"].dtype == dtype
@@ -71,7 +71,7 @@ def test_packing_loses_nothing(levels, dtype, flow):
 
 
 @pytest.mark.parametrize("part", [(2, 8, 4, 8), (1, 7, 3, 2), (0, 6, 6, 13), (5, 21, 1, 1)])
-def test_a_part_is_cut_out(part):
+def test_parts_are_unpacked(part):
     original, (top, left, height, width) = clip(200), part
     cut = unpack_clip(pack_clip(original), part, 2)
     rows, columns = slice(top, top + height), slice(left, left + width)

@@ -1,4 +1,4 @@
-"""The layouts of data sets: found by their files, and shown where they are not there."""
+"""Layouts of data sets: recognised by their files, and shown in error messages."""
 
 import re
 
@@ -78,7 +78,7 @@ def test_vimeo_septuplets(tmp_path, small, septuplets):
 
 
 @pytest.mark.parametrize("made_small", [False, True])
-def test_the_camera_sees_the_small_frames_of_vimeo(tmp_path, made_small, septuplets):
+def test_camera_sees_low_resolution_frames_of_vimeo(tmp_path, made_small, septuplets):
     large = tmp_path / ("sequences" if made_small else "target") / "00001/0266/im4.png"
     septuplets(tmp_path, ["00001/0266"], large.parts[-4], frames=range(1, 8) if made_small else [4])
     if not made_small:
@@ -113,7 +113,7 @@ def test_other_films(tmp_path, write_film):
     assert names(found(tmp_path / "b").test) == ["b"]  # one film alone
 
 
-def test_what_is_missing_is_shown(tmp_path, reds):
+def test_missing_folders_are_reported(tmp_path, reds):
     empty = tmp_path / "empty"
     (empty / "train").mkdir(parents=True)
     for root in (empty, tmp_path / "nowhere"):
@@ -137,7 +137,7 @@ def test_what_is_missing_is_shown(tmp_path, reds):
         ({"frames": 201}, "000: expected at least 11 frames for a clip, got 9"),
     ],
 )
-def test_arguments_that_make_no_sense(tmp_path, options, message, reds):
+def test_invalid_arguments_are_rejected(tmp_path, options, message, reds):
     reds(tmp_path)
     with pytest.raises(ValueError, match=message):
         scenes(tmp_path, "fit", **options)

@@ -49,7 +49,7 @@ def test_workers_end_with_a_killed_run():
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signals")
-def test_a_process_of_several_ends_with_the_first():
+def test_processes_end_with_the_first():
     started = """
 from lightning_modules.cli import command
 command.run(None, lambda *_, **__: print("begun", flush=True) or input())

@@ -1,4 +1,4 @@
-"""Pools of scenes: the n-th batch is the same in every run, a clip is used as often as asked, and turned soundly."""
+"""Pools of scenes: reproducible batches, reuse of clips, and transforms."""
 
 import types
 from collections import Counter
@@ -30,7 +30,7 @@ def pool(step=0, model=None, **options):
     return data.train_dataloader()
 
 
-def test_the_nth_batch_is_the_same_wherever_training_begins():
+def test_batches_do_not_depend_on_the_first_step():
     whole = list(islice(pool(), 12))
     for workers in (0, 1):
         later = list(islice(pool(step=5, workers=workers), 7))
@@ -39,7 +39,7 @@ def test_the_nth_batch_is_the_same_wherever_training_begins():
             assert all(torch.equal(expected[name], batch[name]) for name in batch)
 
 
-def test_an_epoch_goes_on_where_the_last_one_ended():
+def test_epochs_continue_each_other():
     scenes = pool(train_clips=20)
     assert len(scenes) == 5
     first = list(scenes)
@@ -49,13 +49,13 @@ def test_an_epoch_goes_on_where_the_last_one_ended():
         assert torch.equal(batch["spikes"], expected["spikes"])
 
 
-def test_every_clip_is_used_as_often_as_asked():
+def test_clips_are_reused_as_set():
     scenes = pool(kinds=None, reuse=3, train_clips=240)
     means = [round(float(rgb.double().mean()), 6) for batch in islice(scenes, 60) for rgb in batch["rgb"]]
     assert Counter(Counter(means).values()).most_common(1)[0][0] == 3  # the first ones and the last ones less
 
 
-def test_kinds_take_turns_by_their_shares():
+def test_kinds_are_mixed_by_their_shares():
     kinds = [{"share": 3}, {"share": 1, "key_frames": 2, "every": 8, "objects": 0}]
     films = ["every" in batch for batch in islice(pool(kinds=kinds), 16)]
     assert sum(films) == 4
@@ -64,8 +64,8 @@ def test_kinds_take_turns_by_their_shares():
     assert film["every"].tolist() == [8, 8]
 
 
-def test_a_turned_batch_is_a_scene_turned():
-    """Its spikes show its truth, and its flow is that which its spikes show: a wrong turn of any part would be seen."""
+def test_transformed_batches_are_consistent():
+    """Spikes agree with ground truth and flow, so a wrong transform of one would be seen."""
     scenes = pool(kinds=None, patch=40, motion=4.0, brightness=(1.0, 1.0))
     wrong, error, other = [], 0.0, 0.0
     for batch in islice(scenes, 4):
@@ -78,7 +78,7 @@ def test_a_turned_batch_is_a_scene_turned():
     assert error < other / 1.5
 
 
-def test_motion_is_estimated_for_the_pool_and_noise_is_told():
+def test_pool_estimates_motion_and_includes_noise():
     network = CSCSR(scale=2, width=8, representation_width=8, features=1, stages=1, end_blocks=1)
     model = types.SimpleNamespace(network=network, flow="estimated")
     scenes = pool(model=model, flow_patch=12, noise=SensorNoise(photons=1000), gains=(0.1, 1.0), kinds=None)
@@ -90,7 +90,7 @@ def test_motion_is_estimated_for_the_pool_and_noise_is_told():
     assert len(set(batch["alpha"].tolist())) > 1
 
 
-def test_what_makes_no_sense_is_refused():
+def test_invalid_arguments_are_rejected():
     for options, message in (
         ({"kinds": KINDS, "pool": 0}, "kinds: expected a pool"),
         ({"kinds": [{"shared": 1}], "pool": 8}, "kinds: expected arguments of StillClips"),

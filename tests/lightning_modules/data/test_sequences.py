@@ -1,4 +1,4 @@
-"""Films: a clip is the same by content and seed, in whatever process, from the cache or fresh."""
+"""Clips of films: content and seed determine them, in any process, with and without a cache."""
 
 import functools
 import shutil
@@ -39,7 +39,7 @@ def write_pan(folder, speed, size=(128, 192)):
 original_clip = ClipRecipe.clip
 
 
-def test_a_clip_is_what_the_network_reads(tmp_path, write_film):
+def test_shapes_and_types_of_a_clip(tmp_path, write_film):
     write_film(tmp_path / "film", 5, (37, 51))
     clip = scenes(tmp_path, clips=1).test_set[0]
     assert {name: (tuple(value.shape), value.dtype) for name, value in clip.items()} == {
@@ -93,7 +93,7 @@ def test_clips_are_spread_over_a_film(tmp_path, write_film):
     assert frames != others
 
 
-def test_patches_keep_the_phase_and_are_others_every_time(tmp_path, monkeypatch, reds):
+def test_patches_vary_and_keep_the_phase(tmp_path, monkeypatch, reds):
     reds(tmp_path)
     clips = scenes(tmp_path, clips=2).train_set
     whole = {}
@@ -113,7 +113,7 @@ def test_patches_keep_the_phase_and_are_others_every_time(tmp_path, monkeypatch,
     assert len(whole) == 4  # every film has two clips, and every round has all of them
 
 
-def test_spikes_of_a_patch_reach_as_far_as_motion_is_estimated_on(tmp_path, reds):
+def test_spikes_of_a_patch_include_the_margin(tmp_path, reds):
     """8 x 8 sensor pixels of a view of 16 x 24 have at most 4 around them."""
     reds(tmp_path)
     for flow_patch, side in ((8, 8), (11, 12), (48, 16)):
@@ -126,14 +126,14 @@ def test_spikes_of_a_patch_reach_as_far_as_motion_is_estimated_on(tmp_path, reds
         assert torch.corrcoef(torch.stack([inner.flatten(), light.flatten()]))[0, 1] > 0.8
 
 
-def test_flow_is_that_of_the_film(tmp_path):
+def test_flow_matches_the_film(tmp_path):
     write_pan(tmp_path / "film", 2)
     flow = scenes(tmp_path).test_set[0]["flow"]
     inside = flow[:, :, 16:-16, 16:-16].mean((2, 3))
     assert torch.allclose(inside, torch.tensor([[-0.75, 0.0], [0.75, 0.0]]), atol=0.15)  # x: 15 clocks, 2 / 2 / 20 each
 
 
-def test_there_is_no_flow_beyond_a_cut(tmp_path):
+def test_flow_is_zero_across_a_cut(tmp_path):
     write_pan(tmp_path / "film", 2, (64, 64))
     other = np.random.default_rng(1).integers(0, 256, (64, 64, 3), "uint8")
     io.imsave(tmp_path / "film" / "2.png", other, check_contrast=False)
@@ -202,7 +202,7 @@ def test_cached_clips_equal_fresh_ones(film, tmp_path, simulated):
     assert not simulated
 
 
-def test_another_setting_is_another_clip(film):
+def test_settings_change_the_cache_key(film):
     (one,) = find_sequences(film, lambda found: (found, found)).test
     changes = [
         {},
@@ -223,7 +223,7 @@ def test_another_setting_is_another_clip(film):
     assert ClipRecipe().key(one, 2) in keys
 
 
-def test_other_frames_are_another_clip(film, tmp_path, simulated, write_film):
+def test_frames_change_the_cache_key(film, tmp_path, simulated, write_film):
     cache = str(tmp_path / "cache")
     scenes(film, cache=cache, clips=1).test_set[0]
     for first, count in ((4, 1), (3, 2)):  # not a frame of the clip, and one

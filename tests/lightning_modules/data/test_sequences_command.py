@@ -43,7 +43,7 @@ def test_fit_and_test_on_reds(tmp_path, command, capsys, reds):
     assert "mean of 5 clips" in capsys.readouterr().out
 
 
-def test_the_data_follow_the_network(command, monkeypatch):
+def test_data_options_follow_the_network(command, monkeypatch):
     def stop(self, stage):
         raise ValueError(f"{stage}: {self.options}")
 
@@ -56,7 +56,7 @@ def test_the_data_follow_the_network(command, monkeypatch):
 
 
 @pytest.mark.slow
-def test_test_on_vid4_names_every_clip(tmp_path, command, capsys, write_film):
+def test_test_on_vid4_names_all_clips(tmp_path, command, capsys, write_film):
     write_film(tmp_path / "vid4/GT/walk", 3)
     write_film(tmp_path / "vid4/GT/city", 3, (40, 32))
     command("test", "--data.root", tmp_path / "vid4", "-o", tmp_path / "run")
@@ -91,7 +91,7 @@ def test_fit_on_vimeo_and_on_films_without_flow(tmp_path, command, capsys, write
         ("vid4", "Vid4 without sequences for fit"),
     ],
 )
-def test_errors_come_before_anything_is_written(tmp_path, command, root, message, write_film):
+def test_errors_are_raised_before_anything_is_written(tmp_path, command, root, message, write_film):
     if root == "vid4":
         write_film(tmp_path / "vid4" / "walk", 3)
     with pytest.raises(SystemExit, match=f"^lightning: .*{re.escape(message)}"):

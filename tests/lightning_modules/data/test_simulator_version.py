@@ -1,4 +1,4 @@
-"""What the simulator makes of a fixed film is known for every version of it: other output needs another version."""
+"""Known output of the simulator for a fixed film; other output requires another ``SIMULATOR_VERSION``."""
 
 import hashlib
 
@@ -40,8 +40,8 @@ def film(tmp_path):
     return SequenceFiles("film", tmp_path, tuple(names))
 
 
-def test_spikes_and_truth(film):
-    """Sums of halves and quarters, which no machine rounds differently."""
+def test_spikes_and_ground_truth(film):
+    """Sums of halves and quarters, which are exact on every machine."""
     recipe = ClipRecipe(scale=2, alpha=0.5, clocks=16, flow_times=(), interpolation=Blend(), seed=3)
     clip = recipe.clip(film, 2)
     found = hashlib.sha256(clip["spikes"].numpy().tobytes() + (clip["rgb"] * 255).round().byte().numpy().tobytes())
@@ -49,7 +49,7 @@ def test_spikes_and_truth(film):
 
 
 def test_noise(film):
-    """How many bits it changes; single ones depend on the machine's logarithm."""
+    """Number of changed bits; single bits depend on the logarithm of the machine."""
     noise = SensorNoise(photons=100, dark_current=0.01)
     plain, noisy = (
         ClipRecipe(scale=2, clocks=16, flow_times=(), interpolation=Blend(), **with_noise).clip(film, 2)["spikes"]
@@ -59,7 +59,7 @@ def test_noise(film):
 
 
 def test_latent_frames_and_flow():
-    """At some pixels, nearly: optical flow stops as soon as rounding lets it."""
+    """At some pixels and approximately, as rounding decides when optical flow stops."""
     y, x = np.mgrid[:48, :64]
     waves = [np.sin((x - 3 * n) / 5 + k) * np.cos(y / 4 - k) for n in range(3) for k in range(3)]
     frames = torch.from_numpy(np.stack(waves).reshape(3, 3, 48, 64)).float() * 0.4 + 0.5

@@ -1,4 +1,4 @@
-"""The still-picture clips: the same by seed and index everywhere, fresh every epoch, from any folder."""
+"""Clips of still pictures: seed and index determine them; new ones in every epoch; pictures of any folder."""
 
 import hashlib
 from pathlib import Path
@@ -55,7 +55,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_a_clip_is_its_scene():
+def test_clip_matches_its_scene():
     data = scenes(patch=12, flow_times=(5, 35, 20), alpha=0.7, pattern="GBRG")
     scene, clip = data.train_set.scene(3), data.train_set[3]
     assert {name: (value.shape, value.dtype) for name, value in clip.items()} == {
@@ -72,7 +72,7 @@ def test_a_clip_is_its_scene():
 
 
 @pytest.mark.parametrize("key_frames", [1, 3])
-def test_spikes_reach_as_far_as_motion_is_estimated_on_with_a_cache_or_without(tmp_path, monkeypatch, key_frames):
+def test_spikes_include_the_margin_with_and_without_cache(tmp_path, monkeypatch, key_frames):
     options = {"scale": 2, "key_frames": key_frames, "every": 20}
     data, cached = (scenes(patch=6, flow_patch=12, cache=cache, **options) for cache in (None, str(tmp_path)))
     assert data.val_set[0]["spikes"].shape[-2:] == (8, 8)
@@ -93,7 +93,7 @@ def test_spikes_reach_as_far_as_motion_is_estimated_on_with_a_cache_or_without(t
 
 
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")
-def test_same_clips_whatever_the_workers_and_the_default_device():
+def test_clips_do_not_depend_on_workers_or_default_device():
     alone, data = scenes(), scenes(workers=2)
     expected = clips_of(alone.train_dataloader())
     assert expected[::-1] == [digest(alone.train_set[i]) for i in range(7, -1, -1)]
@@ -106,7 +106,7 @@ def test_same_clips_whatever_the_workers_and_the_default_device():
             assert clips_of(data.val_dataloader()) == clips_of(alone.val_dataloader())
 
 
-def test_chance_of_others_does_not_matter():
+def test_clips_do_not_depend_on_global_random_state():
     torch.manual_seed(1)
     np.random.seed(1)  # noqa: NPY002
     first = digest(scenes().train_set[0])
@@ -118,7 +118,7 @@ def test_chance_of_others_does_not_matter():
 
 
 @pytest.mark.parametrize("kind", ["motion", "bend"])
-def test_motion_keeps_to_its_bounds(kind):
+def test_motion_stays_within_its_bounds(kind):
     clips = scenes(**{"motion": 0.0, kind: 2.0}, rotation=0.0, zoom=0.0, objects=0).train_set
     first, last = (torch.stack([clips.scene(i).flow(t, scale=4)[:, 0, 0] for i in range(30)]) for t in (0, 40))
     torch.testing.assert_close(first, last if kind == "bend" else -last)  # acceleration adds the same at both ends
@@ -128,7 +128,7 @@ def test_motion_keeps_to_its_bounds(kind):
     assert not scenes(motion=0.0, rotation=0.0, zoom=0.0).train_set[1]["flow"].any()
 
 
-def test_options_do_what_they_say():
+def test_options_change_the_scene():
     assert {len(scenes(objects=3).train_set.scene(i).layers) for i in range(40)} == {1, 2, 3, 4}
     dark, bright = (scenes(brightness=(b, b)).train_set[4] for b in (0.5, 1.0))
     torch.testing.assert_close(dark["rgb"] * 2, bright["rgb"])
@@ -141,8 +141,8 @@ def test_options_do_what_they_say():
     assert scenes(frames=11, flow_times=(0, 10)).train_set[0]["spikes"].shape[0] == 11
 
 
-def test_training_sees_sensors_from_the_ideal_to_the_noisiest():
-    """White light on the sensor, of which dead pixels see nothing: 4 % at most, 2 % of them on average."""
+def test_training_covers_all_noise_levels():
+    """White light on a sensor with dead pixels: at most 4 %, on average 2 %."""
     options = {"brightness": (1.0, 1.0), "motion": 0.0, "objects": 0, "alpha": 1.0, "patch": 32, "val_patch": 32}
     noisy, clean = (scenes(noise=noise, **options).train_set for noise in (SensorNoise(dead=0.04), None))
     dead = [[(clips[n]["spikes"].amax(dim=0) == 0).double().mean() for n in range(12)] for clips in (noisy, clean)]
@@ -153,7 +153,7 @@ def test_training_sees_sensors_from_the_ideal_to_the_noisiest():
     assert (shown[0]["spikes"].amax(dim=0) == 0).double().mean() > 0.035
 
 
-def test_key_frames_are_one_scene_that_moves_on():
+def test_key_frames_show_one_moving_scene():
     clips = StillClips(embedded_pictures(), scale=2, patch=16, key_frames=3, every=10, motion=2.0, bend=0.5, objects=1)
     clip, scene = clips[3], clips.scene(3)
     assert scene.frames == 61
@@ -168,7 +168,7 @@ def test_key_frames_are_one_scene_that_moves_on():
 
 @pytest.mark.parametrize("options", [{}, {"pattern": "grey", "key_frames": 2}, {"gains": (0.05, 1.0), "scale": 3}])
 @pytest.mark.parametrize("on", ["cpu", pytest.param("cuda", marks=NEEDS_GPU)])
-def test_a_batch_has_the_clips_that_are_made_one_by_one(on, options):
+def test_batches_equal_single_clips(on, options):
     noise = SensorNoise(gain_spread=0.05, dark_current=0.002, dark_spread=0.3, hot=0.001, dead=0.01)
     clips = StillClips(embedded_pictures(), **{"scale": 2, "patch": 16, "noise": noise, "textures": True} | options)
     drawn = [clips.draw(index) for index in range(3)]
@@ -192,7 +192,7 @@ def test_embedded_pictures_are_disjoint():
     assert (data.train_set.pictures, data.val_set.pictures) == (train, held_out)
 
 
-def test_any_folder(folder):
+def test_pictures_of_any_folder(folder):
     names = ["colour.png", "grey.JPG", "tiny.tif", "deep.png", "far.png", "rgba.png"]
     assert [path.name for path in folder_pictures(folder)] == names
     data = scenes(root=str(folder), val_root=str(folder), patch=12, val_patch=12)
@@ -219,7 +219,7 @@ def test_folder_without_validation_is_split(folder):
     assert split_pictures(many[:1], 0) == (many[:1], many[:1])
 
 
-def test_errors_say_what_is_wrong(folder, tmp_path):
+def test_errors_name_the_argument(folder, tmp_path):
     (tmp_path / "empty").mkdir()
     for name, value, message in (
         ("root", "nowhere", "nowhere: no such folder"),
@@ -246,7 +246,7 @@ def test_corrupt_picture_is_named(tmp_path):
         next(iter(data.train_dataloader()))
 
 
-def test_outlines_and_textures_are_sound():
+def test_outlines_and_textures_are_valid():
     for seed in range(20):
         rng = np.random.default_rng(seed)
         mask = outline_mask(31, rng)
@@ -270,7 +270,7 @@ def test_grey_clips_are_the_luminance_of_the_same_scenes():
     torch.testing.assert_close(clip["rgb"][0], luminance, rtol=1e-4, atol=1e-5)
 
 
-def test_training_clips_say_the_gain_and_the_noise_of_their_camera():
+def test_training_clips_include_gain_and_noise():
     options = {"patch": 12, "scale": 1, "noise": SensorNoise(photons=1000), "gains": (0.03, 1.0)}
     clips = StillClips(embedded_pictures()[:2], **options, length=200)
     gains = torch.stack([torch.tensor(clips.draw(n)["alpha"]) for n in range(40)])

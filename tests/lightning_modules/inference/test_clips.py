@@ -35,7 +35,7 @@ def _opened(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["clip.dat", "clip.npz"])
-def test_clips_are_those_of_the_file(opened, spikes, name):
+def test_clips_equal_the_frames_of_the_file(opened, spikes, name):
     clips = RecordingClips(opened(spikes, name))
     assert clips.chosen == [20, 40]
     for frame, clip in clips.in_order():
@@ -44,7 +44,7 @@ def test_clips_are_those_of_the_file(opened, spikes, name):
 
 @pytest.mark.parametrize("pattern", PATTERNS)
 @pytest.mark.parametrize("crop_to", PATTERNS)
-def test_every_phase_becomes_that_of_the_network(opened, pattern, crop_to):
+def test_clips_are_cropped_to_the_phase_of_the_network(opened, pattern, crop_to):
     red = bayer_mask(6, 10, pattern, dtype=torch.uint8)[0]
     clips = RecordingClips(opened(red.expand(41, 6, 10), pattern=pattern), crop_to=crop_to)
     ((_, clip),) = clips.in_order()
@@ -52,14 +52,14 @@ def test_every_phase_becomes_that_of_the_network(opened, pattern, crop_to):
     assert clip.equal(bayer_mask(*clips.size, crop_to, dtype=torch.uint8)[0].expand(41, -1, -1))
 
 
-def test_a_grey_recording_is_not_cropped_to_a_phase(opened, spikes, tmp_path):
+def test_grey_recordings_are_not_cropped(opened, spikes, tmp_path):
     grey = opened(spikes, pattern="grey")
     assert next(RecordingClips(grey, crop_to="BGGR").in_order())[1].equal(spikes[:41])
     write_spikes(tmp_path / "a.dat", torch.zeros(41, 250, 400, dtype=torch.uint8))
     assert RecordingClips(open_recording(tmp_path / "a.dat", camera="vidar"), crop_to="BGGR").size == (250, 400)
 
 
-def test_a_recording_of_which_too_little_is_left_is_refused(opened, spikes):
+def test_too_small_recordings_are_rejected(opened, spikes):
     tiny = torch.zeros(41, 3, 5, dtype=torch.uint8)
     RecordingClips(opened(tiny))
     with pytest.raises(ValueError, match=r"clip.npz: expected at least 3 x 3 pixels .* got \(2, 4\)"):
@@ -71,18 +71,18 @@ def test_a_recording_of_which_too_little_is_left_is_refused(opened, spikes):
 @pytest.mark.parametrize(
     ("frame", "expected"), [("30", [30]), ("22:40:6", [22, 28, 34]), ("25:", [25, 45]), (":41", [20, 40])]
 )
-def test_frames_are_chosen(opened, spikes, frame, expected):
+def test_key_frames_are_parsed(opened, spikes, frame, expected):
     clips = RecordingClips(opened(spikes), frame=frame)
     assert [middle for middle, _ in clips.in_order()] == expected
 
 
 @pytest.mark.parametrize("frame", ["19", "50", "19:30", "20:51", "40:30", "x"])
-def test_frames_that_no_clip_is_around_are_refused(opened, spikes, frame):
+def test_key_frames_without_a_whole_clip_are_rejected(opened, spikes, frame):
     with pytest.raises(ValueError, match=f"frame: expected .* got {frame}; a clip has 41 frames of the 70 of"):
         RecordingClips(opened(spikes), frame=frame)
 
 
-def test_white_is_the_same_whichever_frames_are_chosen(opened):
+def test_white_level_does_not_depend_on_key_frames(opened):
     spikes = torch.zeros(2041, 8, 10, dtype=torch.uint8)
     spikes[1000:, 2, 3] = 1  # half of the time
     spikes[::4, 4:] = 1
@@ -91,7 +91,7 @@ def test_white_is_the_same_whichever_frames_are_chosen(opened):
     assert RecordingClips(recording).white == pytest.approx(0.5, abs=0.02)
 
 
-def test_a_sidecar_knows_size_phase_and_white(tmp_path, monkeypatch):
+def test_sidecar_gives_size_phase_and_white_level(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_picture("photo.png", torch.ones(3, 30, 40))
     simulate = ["simulate", "photo.png", "-o", "a.dat", "--scale", "1", "--pattern", "GBRG", "--alpha", "0.3"]
@@ -102,7 +102,7 @@ def test_a_sidecar_knows_size_phase_and_white(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", ["clip.dat", "clip.npz"])
 @pytest.mark.parametrize("frame", ["20:50:1", "21:50:28"])
-def test_every_frame_is_read_once_and_what_nobody_wants_is_not_read(opened, spikes, name, frame, monkeypatch):
+def test_frames_are_read_once_and_only_if_needed(opened, spikes, name, frame, monkeypatch):
     clips = RecordingClips(opened(spikes, name, pattern="BGGR"), 5, frame)
     read, frames_from = [], type(clips.recording).frames_from
 
@@ -119,7 +119,7 @@ def test_every_frame_is_read_once_and_what_nobody_wants_is_not_read(opened, spik
         assert read == [*range(19, 24), *range(47, 52)]
 
 
-def test_a_calibration_makes_ideal_spikes(opened, tmp_path):
+def test_calibration_corrects_spikes(opened, tmp_path):
     defects = torch.zeros(6, 10, dtype=torch.uint8)
     defects[3, 4] = 2
     gain = torch.linspace(0.5, 1.5, 10).repeat(6, 1)

@@ -1,4 +1,4 @@
-"""Networks as programs of other programs."""
+"""Export of networks for other programs."""
 
 import subprocess
 import sys
@@ -38,7 +38,7 @@ assert "torch" not in sys.modules
 
 
 @pytest.mark.parametrize("wrong", [2e-4, float("nan")])
-def test_a_program_that_differs_from_the_network_is_not_written(tmp_path, monkeypatch, wrong):
+def test_programs_that_differ_from_the_network_are_rejected(tmp_path, monkeypatch, wrong):
     network = ClassicalDecoder("tfp", 2)
     monkeypatch.setattr(torch.export, "export", lambda *_, **__: None)
     monkeypatch.setattr(export, "_torch", lambda *_: b"a program")
@@ -80,7 +80,7 @@ def sizes_differ(run, network):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "settings"), MADE)
-def test_networks_as_onnx(kind, settings, tmp_path, program):
+def test_onnx_export(kind, settings, tmp_path, program):
     pytest.importorskip("onnxruntime", reason="the extra export is not installed")
     pytest.importorskip("onnxscript", reason="the extra export is not installed")
     network = unlike_at_first(kind(scale=2, **settings))
@@ -88,7 +88,7 @@ def test_networks_as_onnx(kind, settings, tmp_path, program):
     assert sizes_differ(program(tmp_path / "a.onnx"), network) < 1e-4
 
 
-def test_what_an_export_takes(tmp_path):
+def test_inputs_of_an_export(tmp_path):
     film = RecurrentCSCSR(scale=2, **FILM)
     cases = {
         "spikes": CSCSR(scale=2, **TINY, search=False, refinement=False),  # searches nothing, so no motion
@@ -102,7 +102,7 @@ def test_what_an_export_takes(tmp_path):
     assert example_inputs(independent, (16, 20))["flow"].shape == (1, 3, 2, 2, 16, 20)
 
 
-def test_a_film_by_its_states_is_that_of_the_network():
+def test_exported_states_give_the_film_of_the_network():
     network = unlike_at_first(RecurrentCSCSR(scale=2, **FILM))
     generator = torch.Generator().manual_seed(1)
     clips = (torch.rand(1, 3, 41, 16, 20, generator=generator) < 0.3).float()
@@ -117,7 +117,7 @@ def test_a_film_by_its_states_is_that_of_the_network():
 
 
 @pytest.mark.slow
-def test_a_program_of_torch_takes_any_even_size(tmp_path, program):
+def test_torch_program_takes_any_even_size(tmp_path, program):
     network = CSCSR(scale=2, resolution="sensor", motion=ClassicalFlow(), **TINY).eval()
     said = export_network(network, tmp_path / "a.pt2", "torch")
     assert said.startswith("takes spikes (1, 41, H, W) and flow (1, 2, 2, H, W), H and W even, within")
@@ -127,14 +127,14 @@ def test_a_program_of_torch_takes_any_even_size(tmp_path, program):
         torch.testing.assert_close(run(spikes, flow), network(spikes, flow), rtol=0, atol=1e-4)
 
 
-def test_what_cannot_be_exported_is_said_in_one_line(tmp_path):
+def test_export_errors_are_one_line(tmp_path):
     with pytest.raises(ValueError, match=r"CSCSR: cannot be exported \(neighbors: expected 4 at most"):
         export_network(CSCSR(scale=2, neighbors=5, motion=ZeroFlow(), **TINY), tmp_path / "a.pt2", "torch")
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
-def test_the_picture_of_a_recording_by_onnxruntime_alone(tmp_path, capfd):
+def test_onnxruntime_alone_reconstructs_a_recording(tmp_path, capfd):
     pytest.importorskip("onnxruntime", reason="the extra export is not installed")
     pytest.importorskip("onnxscript", reason="the extra export is not installed")
     network = CSCSR(scale=2, resolution="sensor", motion=ClassicalFlow(), **TINY).eval()

@@ -24,7 +24,7 @@ def _spikes():
 
 @pytest.mark.parametrize("chunk", [1, 7, 50, 113])
 @pytest.mark.parametrize("every", [3, 20, 45])
-def test_pictures_are_those_of_single_clips_however_the_stream_is_cut(spikes, chunk, every):
+def test_pictures_do_not_depend_on_chunks(spikes, chunk, every):
     network = ClassicalDecoder("tfp", scale=2)
     found = dict(film(network, spikes.split(chunk), every, white=0.3))
     assert list(found) == list(range(20, 93, every))
@@ -33,7 +33,7 @@ def test_pictures_are_those_of_single_clips_however_the_stream_is_cut(spikes, ch
         assert rgb.equal(predict(network, clip, exposure=0.4 / 0.3)[0])
 
 
-def test_a_picture_is_twenty_clocks_late(spikes):
+def test_picture_comes_after_twenty_clocks(spikes):
     come = 0
 
     def camera():
@@ -46,7 +46,7 @@ def test_a_picture_is_twenty_clocks_late(spikes):
         assert come == clock + 20 + 1  # clock 0 is the first that comes
 
 
-def test_white_is_that_of_the_first_clip_in_all_pictures(spikes):
+def test_white_level_of_the_first_clip_is_used_for_all_pictures(spikes):
     bright = torch.cat([spikes, torch.ones(50, 8, 10, dtype=torch.uint8)])
     given, found = (
         [rgb for _, rgb in film(ClassicalDecoder("tfp", scale=1), bright.split(9), white=white)]
@@ -55,7 +55,7 @@ def test_white_is_that_of_the_first_clip_in_all_pictures(spikes):
     assert all(map(torch.allclose, given, found))
 
 
-def test_errors(spikes):
+def test_invalid_arguments_are_rejected(spikes):
     network = ClassicalDecoder()
     with pytest.raises(ValueError, match="every: expected a whole number >= 1, got 0"):
         film(network, [spikes], 0)
@@ -134,7 +134,7 @@ def clips(clocks, side=SIDE):
 
 @pytest.mark.parametrize("tile", [0, 8])
 @pytest.mark.parametrize("interpolated", [1, 3])
-def test_pictures_between_are_those_of_the_scene_up_to_the_edges(interpolated, tile):
+def test_interpolated_pictures_match_the_scene_up_to_the_edges(interpolated, tile):
     network = Truth()
     maker = FilmMaker(network, 0, interpolated, tile=tile)
     network.frames = 40  # only says how far a picture may be away
@@ -150,7 +150,7 @@ def test_pictures_between_are_those_of_the_scene_up_to_the_edges(interpolated, t
         assert network.asked == [clocks[n] for n in (0, group - 1, 2 * group - 1)]
 
 
-def test_tiles_change_nothing():
+def test_tiles_do_not_change_interpolation():
     torch.manual_seed(0)
     network = CSCSR(**TINY).eval()
     spikes = (torch.rand(4, 41, 40, 36) < 0.3).to(torch.uint8)
@@ -159,7 +159,7 @@ def test_tiles_change_nothing():
     torch.testing.assert_close(tiled, whole, rtol=0, atol=2e-4)
 
 
-def test_where_nothing_moves_pictures_are_blended():
+def test_static_pictures_are_blended():
     network = CSCSR(**TINY).eval()
     spikes = (torch.rand(4, 41, 12, 10) < 0.3).to(torch.uint8)
     found = FilmMaker(network, 0, 2)(spikes, [20, 40, 50, 60], static=True)
@@ -168,7 +168,7 @@ def test_where_nothing_moves_pictures_are_blended():
     torch.testing.assert_close(found[1], first / 3 + last * 2 / 3)
 
 
-def test_the_network_sees_what_it_must_and_no_more():
+def test_network_runs_only_on_its_own_pictures():
     network = Truth()
     maker = FilmMaker(network, 0, 1)
     maker(clips([0, 3]), [0, 3])
@@ -178,14 +178,14 @@ def test_the_network_sees_what_it_must_and_no_more():
     assert network.asked[4:] == [40, 43]
 
 
-def test_brightness_of_every_clip():
+def test_exposure_of_every_clip():
     exposure = torch.tensor([0.5, 0.25, 1.0]).reshape(3, 1, 1, 1)
     found = FilmMaker(Truth(), 0, 2)(clips([0, 1, 2]), [0, 1, 2], exposure=exposure)
     torch.testing.assert_close(found[0], 0.5 * waves(0))
     torch.testing.assert_close(found[2], waves(2))
 
 
-def test_light_and_motion_go_from_those_of_one_picture_to_those_of_the_other(monkeypatch):
+def test_interpolation_blends_light_and_motion(monkeypatch):
     network, x = Truth(), torch.arange(2.0 * SIDE).expand(1, 3, 2 * SIDE, -1) / 1000
     monkeypatch.setattr(network, "forward", lambda spikes, *_: x * (1 + clock(spikes) / 4))
     ends = torch.tensor([-2.0, 2.0]).reshape(1, 2, 1, 1, 1).expand(1, 2, 2, SIDE, SIDE)
@@ -198,7 +198,7 @@ def test_light_and_motion_go_from_those_of_one_picture_to_those_of_the_other(mon
     torch.testing.assert_close(found[:1, :, 8:-8, 8:-8], expected[:, :, 8:-8, 8:-8])
 
 
-def test_a_network_for_films_advances_from_one_of_its_pictures_to_the_next():
+def test_state_advances_between_pictures_of_the_network():
     torch.manual_seed(1)
     network = RecurrentCSCSR(**TINY).eval()
     torch.nn.init.normal_(network.fusion.share.weight, std=0.1)
@@ -215,7 +215,7 @@ def test_a_network_for_films_advances_from_one_of_its_pictures_to_the_next():
     torch.testing.assert_close(both[0], found[0])
 
 
-def test_the_film_of_a_stream_waits_for_the_next_picture_of_the_network():
+def test_interpolated_pictures_wait_for_the_next_picture_of_the_network():
     network, come = Truth(), []
 
     def camera():
@@ -230,14 +230,14 @@ def test_the_film_of_a_stream_waits_for_the_next_picture_of_the_network():
     assert shown[:4] == [(2, 4), (4, 8), (6, 8), (8, 12)]
 
 
-def test_with_a_self_ensemble_every_clip_of_a_film_stands_alone():
+def test_self_ensemble_carries_no_state():
     network = RecurrentCSCSR(**TINY).eval()
     spikes = (torch.rand(2, 41, 12, 10) < 0.3).to(torch.uint8)
     alone = [predict(network, clip, self_ensemble=2) for clip in spikes.split(1)]
     torch.testing.assert_close(FilmMaker(network, self_ensemble=2)(spikes, [20, 40]), torch.cat(alone))
 
 
-def test_what_a_network_cannot_do_in_a_film_is_said():
+def test_unsupported_film_options_are_rejected():
     network = CSCSR(**TINY)
     for wrong in (-1, 0.5, True):
         with pytest.raises((ValueError, TypeError), match="interpolated"):

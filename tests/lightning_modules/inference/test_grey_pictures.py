@@ -1,4 +1,4 @@
-"""Pictures of grey recordings, by networks for grey sensors and by those for colours."""
+"""Pictures of grey recordings, with networks for grey and for colour sensors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _spikes(*size):
 
 @pytest.mark.parametrize("scale", [1, 2])
 @torch.inference_mode()
-def test_tiles_and_views_of_a_grey_clip(scale):
+def test_tiles_and_self_ensemble_of_a_grey_clip(scale):
     network, spikes = _network(scale=scale), _spikes(1, 41, 61, 70)
     whole = predict(network, spikes, static=True, tile=0)
     assert whole.shape == (1, 1, 61 * scale, 70 * scale)
@@ -54,7 +54,7 @@ def test_pictures_of_a_grey_recording(recording, kind, pattern):
     assert len(made.notes) == (pattern != "grey")
 
 
-def test_weights_for_another_sensor_are_told(recording):
+def test_weights_for_another_sensor_give_a_note(recording):
     (note,) = reconstruct(**recording, network=_network(pattern="RGGB"), pattern="grey").notes
     assert "grey" in note
     assert "RGGB" in note
@@ -63,7 +63,7 @@ def test_weights_for_another_sensor_are_told(recording):
     assert not reconstruct(**recording, network=_network()).notes  # nobody says what the camera is
 
 
-def test_speeds_stand_for_sizes_of_grey_weights():
+def test_speed_chooses_the_size_of_grey_weights():
     def model(name, macs):
         known = {"scale": 1, "pattern": "grey", "size": None, "frames": 41, "margin": 16, "film": False, "noise": True}
         return Model(name, macs=macs, kodak=None, vid4=None, **known)
@@ -77,7 +77,7 @@ def test_speeds_stand_for_sizes_of_grey_weights():
 
 
 @pytest.mark.parametrize(("pattern", "weights"), [("grey", "cscsr_small_grey_x1"), ("RGGB", "cscsr_small_x1")])
-def test_the_resolution_of_the_sensor_has_weights_for_grey_and_colour(recording, pattern, weights):
+def test_scale_1_has_weights_for_grey_and_colour(recording, pattern, weights):
     made = reconstruct(**recording, speed="best", scale=1, pattern=pattern)
     assert made.array().shape == (3, 16, 24, 3)
     assert [note.split(",")[0] for note in made.notes] == [weights]

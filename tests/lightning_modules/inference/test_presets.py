@@ -1,4 +1,4 @@
-"""Settings by what they may cost, from Python and as they are typed."""
+"""Choice of presets by speed and budget."""
 
 import csv
 from itertools import pairwise
@@ -65,11 +65,11 @@ def _table(tmp_path, monkeypatch):
         ({"budget": "2.6 fps", "size": (40, 50)}, "no motion"),
     ],
 )
-def test_speeds_and_budgets_which_grow_with_the_frame(table, wish, expected):
+def test_speeds_and_budgets_scale_with_the_frame(table, wish, expected):
     assert choose(3, **wish).name == expected
 
 
-def test_films_have_a_table_of_their_own(table):
+def test_films_have_their_own_table(table):
     assert choose(3, "fastest", film=True) == choose(3, "fastest")  # as long as there is none
     lines = (table / "x3.csv").read_text().splitlines()
     (table / "x3_film.csv").write_text("\n".join(line for line in lines if not line.startswith("tfi")))
@@ -87,14 +87,14 @@ def test_films_have_a_table_of_their_own(table):
         (4, "cscsr_huge_x4"),
     ],
 )
-def test_one_network_makes_films_and_pictures(scale, expected):
+def test_same_network_for_films_and_single_clips(scale, expected):
     film, picture = (choose(scale, "balanced", film=film).preset for film in (True, False))
     assert film.weights == picture.weights == expected
     assert isinstance(film.build(), RecurrentCSCSR) == find_model(film.weights).film
 
 
-def test_little_light_has_tables_of_its_own(table, monkeypatch):
-    """Those of films before those of pictures; without any, those of more light."""
+def test_dim_light_has_its_own_tables(table, monkeypatch):
+    """The table of films comes first; without any for dim light, the one for bright light."""
     assert choose(3, "best", white=0.1).name == choose(3, "best").name == "all"
     lines = (table / "x3.csv").read_text().splitlines()
     reference = next(line for line in lines if line.startswith("all,")).replace(",30.0,", ",20.0,")
@@ -110,8 +110,8 @@ def test_little_light_has_tables_of_its_own(table, monkeypatch):
     assert choose(3, "best", film=True, white=0.1).name == "tfp"
 
 
-def test_in_little_light_the_longer_clips_are_chosen():
-    """At x4, where there are weights for them and room."""
+def test_longer_clips_are_chosen_in_dim_light():
+    """At x4, which has weights for long clips, if the recording is long enough."""
     weights = "cscsr_huge_long_x4"
     for film in (False, True):
         assert choose(4, "best", film=film, frames=101, white=0.07).preset.weights == weights
@@ -121,7 +121,7 @@ def test_in_little_light_the_longer_clips_are_chosen():
         assert choose(4, "fastest", film=film, frames=101, white=0.07).name == "TFP 33, order 3"
 
 
-def test_a_budget_of_time_is_one_of_this_machine(table, monkeypatch):
+def test_time_budget_is_for_this_machine(table, monkeypatch):
     monkeypatch.setattr(speed, "pace", lambda *_: 2.0)
     choice = choose(3, budget="400ms", size=(40, 50))
     assert (choice.name, choice.ms) == ("no motion", 2 * 200)
@@ -130,7 +130,7 @@ def test_a_budget_of_time_is_one_of_this_machine(table, monkeypatch):
 
 @pytest.mark.usefixtures("table")
 def test_pace_is_measured_on_the_reference(monkeypatch):
-    """A frame takes four times what the quarter of a clip takes, over the 400 ms of the table."""
+    """A frame takes four times as long as a quarter of a clip; the table has 400 ms."""
 
     def timer(work, number):
         work()
@@ -151,12 +151,12 @@ def test_pace_is_measured_on_the_reference(monkeypatch):
         ({"scale": 7, "speed": "fast"}, r"scale: expected one that was measured \(x3\), got 7"),
     ],
 )
-def test_wishes_that_cannot_be(table, arguments, message):
+def test_invalid_speeds_and_budgets_are_rejected(table, arguments, message):
     with pytest.raises(ValueError, match=message):
         choose(**{"scale": 3, **arguments})
 
 
-def test_presets_are_read_as_they_are_written():
+def test_presets_survive_writing_and_reading():
     for given in ({}, WEIGHTS | {"motion": "Spike2Flow", "motion_iterations": 1, "self_ensemble": 2, "tile": 0}):
         preset = Preset(**given)
         assert Preset.read(preset.write()) == preset
@@ -165,7 +165,7 @@ def test_presets_are_read_as_they_are_written():
         Preset.read({"tile": "wide"})
 
 
-def test_presets_that_cannot_be_built():
+def test_invalid_presets_are_rejected():
     for nothing in (Preset(tile=32), Preset(network="CSCSR")):
         with pytest.raises(ValueError, match="preset: expected weights, or ClassicalDecoder as network"):
             nothing.build()
@@ -173,7 +173,7 @@ def test_presets_that_cannot_be_built():
         Preset("cscsr_small_x4", motion="os").build()
 
 
-def test_tables_of_the_package():
+def test_tables_of_the_package_are_valid():
     for scale in (2, 3, 4):
         picked = [choose(scale, name, frames=101) for name in SPEEDS]
         assert all(faster.ms < 0.8 * slower.ms for faster, slower in pairwise(picked))  # every speed is worth its name
@@ -184,7 +184,7 @@ def test_tables_of_the_package():
             assert (find_model(choice.preset.weights).scale if choice.preset.weights else choice.preset.scale) == scale
 
 
-def test_a_sensor_that_may_be_noisy_gets_weights_for_noise_at_the_same_cost():
+def test_noisy_sensors_get_weights_for_noise_at_the_same_cost():
     for film in (False, True):
         for white in (0.4, 0.1):
             noisy = choices(4, (250, 400), film, 101, white, noisy=True)

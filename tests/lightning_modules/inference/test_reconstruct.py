@@ -1,4 +1,4 @@
-"""From a recording to pictures, in Python: what is chosen, and what the pictures show."""
+"""Reconstruction of recordings from Python: the chosen weights and the pictures."""
 
 import pytest
 import torch
@@ -33,7 +33,7 @@ def _flat(tmp_path):
     return write
 
 
-def test_pictures_are_an_iterator_and_an_array(recording):
+def test_pictures_as_iterator_and_array(recording):
     pictures = reconstruct(recording, network=ClassicalDecoder("tfi", scale=2), white=0.4)
     clocks, rgb = zip(*pictures, strict=True)
     assert clocks == (20, 40, 60)
@@ -46,7 +46,7 @@ def test_pictures_are_an_iterator_and_an_array(recording):
 
 
 @pytest.mark.parametrize("trained", ["RGGB", "GBRG"])
-def test_pictures_have_the_colours_of_the_scene_whatever_phase_the_network_takes(tmp_path, trained):
+def test_colours_are_correct_for_every_bayer_phase(tmp_path, trained):
     colour = torch.tensor([0.9, 0.3, 0.1])
     light = 0.4 * mosaic(colour[:, None, None].expand(41, 3, 16, 20), "BGGR")
     write_spikes(tmp_path / "flat.npz", simulate_spikes(light, generator=torch.Generator().manual_seed(0)))
@@ -55,7 +55,7 @@ def test_pictures_have_the_colours_of_the_scene_whatever_phase_the_network_takes
     torch.testing.assert_close(rgb.mean(dim=(1, 2)), colour, rtol=0, atol=0.04)
 
 
-def test_a_dim_recording_is_shown_bright(tmp_path):
+def test_dim_recordings_give_bright_pictures(tmp_path):
     light = torch.linspace(0, 0.02, 400).reshape(20, 20).expand(121, 20, 20)
     write_spikes(tmp_path / "dim.npz", simulate_spikes(light, generator=torch.Generator().manual_seed(0)))
     network = ClassicalDecoder("tfp")
@@ -71,7 +71,7 @@ def test_weights_for_noise_are_chosen_where_nobody_has_measured_the_sensor(flat)
     assert "this sensor is not calibrated" in pictures.notes[-1]
 
 
-def test_ideal_sensors_get_the_weights_for_them(flat, tmp_path, monkeypatch):
+def test_ideal_sensors_get_weights_for_ideal_sensors(flat, tmp_path, monkeypatch):
     asked = reconstruct(flat(0.4), "balanced", calibration="none")
     assert not find_model(asked.notes[0].split(",")[0].split(":")[0]).noise
     monkeypatch.chdir(tmp_path)
@@ -85,13 +85,13 @@ def test_ideal_sensors_get_the_weights_for_them(flat, tmp_path, monkeypatch):
     ("white", "frame", "frames", "hint"),
     [(0.05, None, 41, True), (0.05, "50:150", 101, False), (0.05, "50:151", 41, True), (0.4, None, 41, False)],
 )
-def test_longer_clips_are_chosen_or_hinted_at_in_little_light(flat, white, frame, frames, hint):
+def test_longer_clips_are_chosen_or_hinted_at_in_dim_light(flat, white, frame, frames, hint):
     pictures = reconstruct(flat(white), "best", frame=frame)
     assert pictures.network.frames == frames
     assert any("--frame 50:150 leaves room for them" in line for line in pictures.notes) == hint
 
 
-def test_a_white_that_is_given_decides_what_is_little_light(flat):
+def test_given_white_level_determines_dim_light(flat):
     path = flat(0.4)
     assert reconstruct(path, "best", frame="100").network.frames == 41
     assert reconstruct(path, "best", frame="100", white=0.05).network.frames == 101
@@ -101,14 +101,14 @@ def test_a_white_that_is_given_decides_what_is_little_light(flat):
     ("every", "speed", "interpolated"),
     [(1, "balanced", 11), (3, "best", 1), (4, "best", 0), (20, "balanced", 0), (3, "fastest", 0)],
 )
-def test_pictures_close_to_each_other_are_interpolated(flat, every, speed, interpolated):
+def test_close_pictures_are_interpolated(flat, every, speed, interpolated):
     pictures = reconstruct(flat(0.3), speed, frame=f"60:120:{every}", calibration="none")
     assert pictures.how.get("interpolated", 0) == interpolated
     without = reconstruct(flat(0.3), speed, frame=f"60:120:{every}", calibration="none", interpolated=0)
     assert without.how["interpolated"] == 0
 
 
-def test_a_film_is_that_of_the_stream_and_parts_of_it_are_the_same(recording):
+def test_recording_equals_stream_and_its_parts(recording):
     torch.manual_seed(0)
     network = RecurrentCSCSR(**TINY).eval()
     for weight in (network.fusion.share.weight, network.fusion.rest.weight):
@@ -127,7 +127,7 @@ def test_a_film_is_that_of_the_stream_and_parts_of_it_are_the_same(recording):
     assert [*parts[0], *parts[1]] == [*unbroken]
 
 
-def test_views_reach_the_network(recording):
+def test_self_ensemble_reaches_the_network(recording):
     torch.manual_seed(0)
     network = CSCSR(**TINY).eval()
     ((_, plain),) = reconstruct(recording, network=network, frame="40", white=0.3)

@@ -26,7 +26,7 @@ def transposed(flow):
 
 @torch.no_grad()
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR"])
-def test_two_views_are_the_clip_and_its_transposed(pattern):
+def test_two_views_average_clip_and_transpose(pattern):
     network = CSCSR(2, **TINY, pattern=pattern)
     spikes, flow = clip()
     one, both = partial(predict, network), partial(predict, network, self_ensemble=2)
@@ -39,8 +39,8 @@ def test_two_views_are_the_clip_and_its_transposed(pattern):
 
 @pytest.mark.parametrize("pattern", PATTERNS)
 @pytest.mark.parametrize("size", SIZES)
-def test_every_view_has_its_colours_where_the_network_has_them(pattern, size):
-    """What runs sees a mosaic of the picture's own colours, mirrored or not, and ends with the same colours."""
+def test_every_view_keeps_the_bayer_phase(pattern, size):
+    """Every view is a mosaic with the colours of the picture, at its beginning and its end."""
     mask = bayer_mask(*size, pattern)
     sites = (mask * torch.tensor([1.0, 2, 3])[:, None, None]).sum(dim=0)[None, None]
     seen = []
@@ -60,8 +60,8 @@ def test_every_view_has_its_colours_where_the_network_has_them(pattern, size):
 
 @pytest.mark.parametrize("views", [2, 4, 8])
 @pytest.mark.parametrize(("pattern", "size"), zip(PATTERNS, SIZES, strict=True))
-def test_what_follows_the_flow_comes_back_the_same_from_every_view(pattern, size, views):
-    """A run that samples along the flow: were a vector mirrored wrongly, its view would sample elsewhere."""
+def test_flow_is_transformed_with_every_view(pattern, size, views):
+    """The run samples along the flow; a wrongly mirrored vector would sample elsewhere."""
     generator = torch.Generator().manual_seed(0)
     planes = torch.rand(1, 3, *size, generator=generator, dtype=torch.float64)
     vectors = torch.tensor([2.0, -1.0], dtype=torch.float64)[:, None, None].expand(1, 2, 2, *size)
@@ -78,7 +78,7 @@ def test_what_follows_the_flow_comes_back_the_same_from_every_view(pattern, size
     assert len(differing) == views
 
 
-def test_other_numbers_of_views_and_clips_that_have_none_are_refused():
+def test_invalid_view_counts_and_small_clips_are_rejected():
     with pytest.raises(ValueError, match=r"^self_ensemble: expected one of \(1, 2, 4, 8\), got 3$"):
         predict(CSCSR(2, **TINY), torch.zeros(1, 41, 8, 8), self_ensemble=3)
     with pytest.raises(ValueError, match=r"^self_ensemble: expected at least 5 x 5 sensor pixels, got 4 x 9$"):

@@ -54,7 +54,7 @@ def mixed():
     return clip([Layer(coarse(64, 192)), thing], 64, 192)
 
 
-def test_tiles_are_those_of_the_picture_cut_by_hand():
+def test_tiles_equal_manual_crops():
     network = CSCSR(1, **TINY, motion=Counting())
     spikes = mixed()
     flow, expected = network.estimate_flow(spikes), torch.empty(1, 3, 64, 192)
@@ -71,7 +71,7 @@ def test_tiles_are_those_of_the_picture_cut_by_hand():
 
 @pytest.mark.parametrize("settings", [{}, {"neighbors": 3}, {"resolution": "sensor"}, {"pattern": "grey"}])
 @pytest.mark.parametrize("size", [(9, 12), (32, 20)])
-def test_static_is_a_flow_of_zeros(settings, size):
+def test_static_equals_zero_flow(settings, size):
     network = CSCSR(3, **TINY, **settings)
     spikes = (torch.rand(2, 41, *size, generator=torch.Generator().manual_seed(0)) < 0.3).to(torch.uint8)
     with torch.no_grad():
@@ -80,7 +80,7 @@ def test_static_is_a_flow_of_zeros(settings, size):
 
 
 @pytest.mark.parametrize("flow", [0, "still"])
-def test_a_number_is_no_flow(flow):
+def test_flow_must_be_a_tensor(flow):
     message = f"^flow: expected .*, got {flow!r}; for no motion, pass static=True$"
     spikes = torch.zeros(1, 41, 8, 8)
     for run in (CSCSR(2, **TINY), lambda spikes, flow: forward_in_tiles(CSCSR(2, **TINY), spikes, 4, flow=flow)):
@@ -91,7 +91,7 @@ def test_a_number_is_no_flow(flow):
 
 
 @pytest.mark.parametrize(("size", "tile"), [((3, 5), 128), ((17, 33), 16), ((50, 70), 50), ((40, 24), 0)])
-def test_any_size_and_several_clips(size, tile):
+def test_any_size_and_batch(size, tile):
     network, _ = counted(pattern="GBRG")
     spikes = (torch.rand(2, 41, *size, generator=torch.Generator().manual_seed(0)) < 0.3).to(torch.uint8)
     rgb = forward_in_tiles(network, spikes, tile)
@@ -103,7 +103,7 @@ def test_any_size_and_several_clips(size, tile):
 
 @torch.no_grad()
 @pytest.mark.parametrize("scale", [2, 3])
-def test_a_decoder_sees_no_further_than_its_halo(scale):
+def test_decoder_depends_only_on_its_halo(scale):
     spikes = (torch.rand(1, 41, 40, 56, generator=torch.Generator().manual_seed(0)) < 0.4).to(torch.uint8)
     decoder = ClassicalDecoder("tfi", scale, "GBRG")
     torch.testing.assert_close(forward_in_tiles(decoder, spikes, 16), decoder(spikes), rtol=0, atol=1e-5)
@@ -112,7 +112,7 @@ def test_a_decoder_sees_no_further_than_its_halo(scale):
 
 
 @torch.no_grad()
-def test_a_network_that_sees_everything_is_not_run_in_tiles():
+def test_network_without_halo_is_not_tiled():
     network, calls = counted()
     network.halo = None
     spikes = mixed()
@@ -122,7 +122,7 @@ def test_a_network_that_sees_everything_is_not_run_in_tiles():
     assert calls == [(64, 192)]
 
 
-def test_how_far_a_picture_is_is_told_tile_by_tile_and_view_by_view():
+def test_progress_is_reported_per_tile_and_view():
     shares = []
     how = {"done": shares.append, "tile": 32}
     predict(ClassicalDecoder(scale=2), clip([Layer(coarse(32, 64))], 32, 64), self_ensemble=2, **how)
@@ -133,7 +133,7 @@ def test_how_far_a_picture_is_is_told_tile_by_tile_and_view_by_view():
 
 
 @pytest.mark.parametrize("tile", [0, 64])
-def test_a_motion_that_is_given_takes_the_place_of_the_estimate(tile):
+def test_given_flow_replaces_the_estimate(tile):
     network, _ = counted()
     spikes = mixed()
     flow = network.estimate_flow(spikes)
@@ -144,7 +144,7 @@ def test_a_motion_that_is_given_takes_the_place_of_the_estimate(tile):
     assert network.motion.sizes == []
 
 
-def test_static_may_be_asked_for():
+def test_static_needs_no_estimate():
     network, _ = counted()
     spikes = mixed()
     still = forward_in_tiles(network, spikes, 64, static=True)
@@ -154,7 +154,7 @@ def test_static_may_be_asked_for():
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_a_gpu_gives_the_same_picture():
+def test_gpu_gives_the_same_picture():
     network, _ = counted()
     spikes = mixed()
     expected = forward_in_tiles(network, spikes, 64)

@@ -1,4 +1,4 @@
-"""``lightning sweep``, as its users type it; trials run in this process where processes are not what is tested."""
+"""``lightning sweep``; most trials run in this process."""
 
 import csv
 import re
@@ -95,7 +95,7 @@ def weights(folder):
     return torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
 
 
-def test_every_combination_has_a_name_and_a_configuration(overlays, tmp_path):
+def test_combinations_have_names_and_configurations(overlays, tmp_path):
     configs = [CONFIGS / "x4.yaml", overlays / "tiny.yaml"]
     variants = [[CONFIGS / "ablation/b.yaml", CONFIGS / "ablation/j.yaml"]]
     sets = ["model.network.features=1,2", "data.brightness=[0.5,0.8]"]
@@ -116,7 +116,7 @@ def test_every_combination_has_a_name_and_a_configuration(overlays, tmp_path):
 
 
 @pytest.mark.slow
-def test_table_is_that_of_the_tests(swept):
+def test_table_matches_the_tests(swept):
     output, _ = swept
     rows = table(output)
     order = [(variant, seed) for variant in "cj" for seed in ("0", "1", "mean", "spread")]
@@ -145,7 +145,7 @@ def test_table_is_that_of_the_tests(swept):
 
 
 @pytest.mark.slow
-def test_finished_trials_are_not_run_again_and_those_of_other_settings_refused(swept, capsys, monkeypatch):
+def test_finished_trials_are_kept_and_other_settings_rejected(swept, capsys, monkeypatch):
     output, command = swept
     files = [path for path in output.rglob("*") if path.is_file() and path.parent != output]
     before = {path: path.stat().st_mtime_ns for path in files}
@@ -163,7 +163,7 @@ def test_finished_trials_are_not_run_again_and_those_of_other_settings_refused(s
 
 
 @pytest.mark.slow
-def test_a_killed_sweep_goes_on_and_ends_as_an_unbroken_one(typed, overlays, tmp_path, monkeypatch, forked):
+def test_killed_sweep_resumes_exactly(typed, overlays, tmp_path, monkeypatch, forked):
     settings = ["data.train_clips=12", "data.val_clips=1", "model.network.features=1,2"]  # epochs of 6 steps
     sets = [word for setting in settings for word in ("--set", setting)]
     command = [*typed, "-c", str(overlays / "cosine.yaml"), *sets, "--steps", "10", "-o", str(tmp_path / "broken")]
@@ -202,7 +202,7 @@ def test_a_killed_sweep_goes_on_and_ends_as_an_unbroken_one(typed, overlays, tmp
 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["local", "ray"])
-def test_a_trial_that_fails_is_reported_and_the_others_go_on(engine, typed, overlays, tmp_path, capsys):
+def test_other_trials_continue_after_a_failure(engine, typed, overlays, tmp_path, capsys):
     if engine == "ray":
         pytest.importorskip("ray", reason="Ray is an extra")
     over = [str(overlays / "diverges.yaml"), str(overlays / "wide.yaml")]
@@ -223,7 +223,7 @@ def test_a_trial_that_fails_is_reported_and_the_others_go_on(engine, typed, over
 
 
 @pytest.mark.slow
-def test_flops_pay_for_steps_of_all_batches_that_gradients_are_accumulated_over(overlays, tmp_path, convolutions):
+def test_flops_count_all_accumulated_batches(overlays, tmp_path, convolutions):
     configs = [CONFIGS / "x4.yaml", overlays / "tiny.yaml", overlays / "cosine.yaml"]
     accumulated = ["trainer.accumulate_grad_batches=1,2"]
     one, two = make_trials(configs, [], accumulated, [], {"flops": 1e9}, tmp_path)
@@ -248,7 +248,7 @@ def test_flops_pay_for_steps_of_all_batches_that_gradients_are_accumulated_over(
     assert worker.plan(one.folder).read_text() == "# a resumed trial keeps its plan"
 
 
-def test_time_ends_training_and_a_schedule_that_has_an_end(overlays, tmp_path):
+def test_time_budget_ends_training_and_schedule(overlays, tmp_path):
     configs = [CONFIGS / "x4.yaml", overlays / "tiny.yaml", overlays / "cosine.yaml"]
     for files, schedule, callbacks in ((configs[:2], "StepLR", []), (configs, "ConstantLR", ["Pace"])):
         [trial] = make_trials(files, [], [], [], {"seconds": 3600}, tmp_path)
@@ -285,7 +285,7 @@ def _written(trial):
         ),
     ],
 )
-def test_mistakes_are_one_line_before_anything_is_written(args, message, tmp_path):
+def test_errors_are_one_line_before_anything_is_written(args, message, tmp_path):
     files = {"X": "x4.yaml", "A": "ablation/a.yaml", "J": "ablation/j.yaml"}
     words = [str(CONFIGS / files[word]) if word in files else word for word in args]
     with pytest.raises(SystemExit) as exit:
@@ -296,14 +296,14 @@ def test_mistakes_are_one_line_before_anything_is_written(args, message, tmp_pat
     assert not (tmp_path / "sweep").exists()
 
 
-def test_a_folder_that_holds_no_trial_is_refused(typed, tmp_path):
+def test_foreign_folders_are_rejected(typed, tmp_path):
     (tmp_path / "tiny").mkdir()
     (tmp_path / "tiny" / "notes.txt").touch()
     with pytest.raises(SystemExit, match="tiny: is not empty, and holds no trial"):
         main([*typed, "-o", str(tmp_path)])
 
 
-def test_a_result_is_of_the_checkpoint_and_of_the_table_of_its_test(tmp_path):
+def test_result_combines_checkpoint_and_test(tmp_path):
     network = {"class": "RecurrentCSCSR", "scale": 4}
     state = {"state_dict": {}, "network": network, "global_step": 6, "pytorch-lightning_version": "2.6.0"}
     torch.save(state, tmp_path / "last.ckpt")
@@ -322,7 +322,7 @@ def test_a_result_is_of_the_checkpoint_and_of_the_table_of_its_test(tmp_path):
         worker._result(tmp_path, tmp_path / "last.ckpt", report)
 
 
-def test_variants_are_compared_with_j_of_the_same_kind_or_with_the_first(tmp_path):
+def test_variants_are_compared_with_j_or_the_first(tmp_path):
     names = [("c", "size=tiny"), ("j", "size=tiny"), ("c", "size=small"), ("j", "size=small"), ("c", "size=large")]
     rows = collect([Trial(name, None, tmp_path / "-".join(name), {}, {}) for name in names], {})
     assert [reference(row, rows).labels for row in rows] == [names[1], names[1], names[3], names[3], names[0]]
@@ -343,7 +343,7 @@ def started(monkeypatch):
     return processes
 
 
-def test_trials_end_as_their_processes_do(started, tmp_path, monkeypatch):
+def test_trials_report_how_their_process_ended(started, tmp_path, monkeypatch):
     ends = {
         "fine": ("pass", None),
         "fails": ("import sys; print('before'); sys.exit('lightning: no such thing')", "no such thing"),
@@ -361,7 +361,7 @@ def test_trials_end_as_their_processes_do(started, tmp_path, monkeypatch):
     assert found == {name: reason for name, (_, reason) in ends.items()}
 
 
-def test_a_sweep_that_stops_ends_its_trials(started, tmp_path):
+def test_trials_end_with_the_sweep(started, tmp_path):
     (tmp_path / "code").write_text("import sys; sys.stdin.read()")
     running = engines.run_locally([tmp_path], None, 60)
     next(running)
@@ -371,7 +371,7 @@ def test_a_sweep_that_stops_ends_its_trials(started, tmp_path):
     assert process.poll() == 0
 
 
-def test_what_is_shown(typed, tmp_path, capsys, monkeypatch):
+def test_output_of_a_failed_trial(typed, tmp_path, capsys, monkeypatch):
     def engine(folders, *_):
         say_progress(folders[0], "step 30\x1b[31m")
         yield {}
@@ -385,7 +385,7 @@ def test_what_is_shown(typed, tmp_path, capsys, monkeypatch):
     assert "failed: ended without a result" in (tmp_path / "sweep.md").read_text()
 
 
-def test_ray_that_is_missing_is_said(typed, tmp_path, monkeypatch):
+def test_missing_ray_is_reported(typed, tmp_path, monkeypatch):
     monkeypatch.setattr(cli, "find_spec", lambda _: None)
     with pytest.raises(SystemExit, match=r"pip install '.\[ray\]' in a clone"):
         main([*typed, "--engine", "ray", "-o", str(tmp_path / "sweep")])

@@ -1,4 +1,4 @@
-"""What training shows of its validation."""
+"""Pictures of the validation during training."""
 
 from types import SimpleNamespace
 
@@ -14,7 +14,7 @@ class Numbered(ValidationPictures):
         return [[output.new_full((3, 4, 6), output.item())] for output in outputs]
 
 
-def test_the_first_four_clips_of_a_validation_are_shown(monkeypatch, tmp_path):
+def test_first_four_validation_clips_are_shown(monkeypatch, tmp_path):
     shown = []
     logger = TensorBoardLogger(tmp_path)
     monkeypatch.setattr(logger.experiment, "add_image", lambda *seen: shown.append(seen))

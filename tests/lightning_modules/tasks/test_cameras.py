@@ -1,4 +1,4 @@
-"""Training for cameras of many gains and noises, grey ones among them."""
+"""Training for cameras with different gains and noise levels, also grey ones."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DATA = {"patch": 12, "val_patch": 16, "train_clips": 8, "val_clips": 2, "batch_s
 @pytest.mark.parametrize(
     ("kind", "key_frames", "pattern"), [(CSCSR, 1, "grey"), (CSCSR, 2, "RGGB"), (RecurrentCSCSR, 2, "grey")]
 )
-def test_a_network_learns_gains_and_noise_at_scale_1(kind, key_frames, pattern, tmp_path):
+def test_gains_and_noise_are_learned_at_scale_1(kind, key_frames, pattern, tmp_path):
     torch.manual_seed(0)
     cameras = {"gains": (0.1, 1.0), "noise": SensorNoise(photons=500), "pattern": pattern, "key_frames": key_frames}
     data = StillScenes(scale=1, **DATA, **cameras)
@@ -34,8 +34,8 @@ def test_a_network_learns_gains_and_noise_at_scale_1(kind, key_frames, pattern, 
     assert all(parameter.abs().max() > 0 for parameter in level.parameters())
 
 
-def test_clips_of_little_light_do_not_outweigh_the_others(tmp_path):
-    """Of two clips, one with a hundredth of the light, both errors fall by one share, and not the larger one alone."""
+def test_dim_clips_do_not_dominate_the_loss(tmp_path):
+    """The errors of two clips, one with a hundredth of the light, fall by similar fractions."""
     torch.manual_seed(0)
     module = SuperResolution(CSCSR(scale=1, pattern="grey", **TINY))
     module.log = lambda *_, **__: None
@@ -56,7 +56,7 @@ def test_clips_of_little_light_do_not_outweigh_the_others(tmp_path):
 
 
 @pytest.mark.parametrize("scale", [1, 4])
-def test_configurations_of_grey_sensors_and_of_all_cameras(configs, scale, capsys):
+def test_configurations_for_grey_sensors_and_all_cameras(configs, scale, capsys):
     files = [part for name in (f"x{scale}", "grey", "cameras") for part in ("-c", str(configs / f"{name}.yaml"))]
     with pytest.raises(SystemExit):
         main(["fit", *files, "--print_config"])

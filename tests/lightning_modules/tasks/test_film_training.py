@@ -1,4 +1,4 @@
-"""Training and testing on several key frames of a scene, as users type it."""
+"""Training and test on several key frames of a scene."""
 
 import csv
 
@@ -30,7 +30,7 @@ def _trained(tmp_path_factory):
     return words, folder
 
 
-def test_what_is_frozen_stays_and_the_rest_learns(trained):
+def test_only_unfrozen_parts_are_trained(trained):
     _, folder = trained
     before = read_weights(folder / "start.safetensors").tensors
     after = read_weights(folder / "run" / "checkpoints" / "last.ckpt").tensors
@@ -38,7 +38,7 @@ def test_what_is_frozen_stays_and_the_rest_learns(trained):
     assert changed == {name for name in before if name.startswith("fusion.")}
 
 
-def test_a_film_is_judged_beside_its_clips(trained):
+def test_films_are_compared_with_single_clips(trained):
     words, folder = trained
     last = str(folder / "run" / "checkpoints" / "last.ckpt")
     main(["test", *words, "--model.weights", last, "--model.future=4", "-o", str(folder / "test")])
@@ -53,7 +53,7 @@ def batch(count=5):
     return {"spikes": spikes, "rgb": torch.rand(2, count, 3, 24, 24), "every": torch.full((2,), 20)}
 
 
-def test_the_loss_is_that_of_a_film_read_twice():
+def test_loss_covers_both_passes_over_a_film():
     torch.manual_seed(0)
     module = SuperResolution(RecurrentCSCSR(**TINY), flow="estimated", future=4)
     for weight in module.network.fusion.parameters():
@@ -66,7 +66,7 @@ def test_the_loss_is_that_of_a_film_read_twice():
     assert not torch.allclose(read[0], read[1])
 
 
-def test_a_network_without_a_state_takes_every_key_frame_by_itself():
+def test_network_without_state_takes_single_key_frames():
     torch.manual_seed(0)
     module = SuperResolution(CSCSR(**TINY), flow="estimated").eval()
     module.log = lambda *_, **__: None
@@ -79,7 +79,7 @@ def test_a_network_without_a_state_takes_every_key_frame_by_itself():
     torch.testing.assert_close(tested["scores"]["CSCSR, single clips"]["psnr"], shown.mean(dim=1))
 
 
-def test_errors():
+def test_invalid_arguments_are_rejected():
     with pytest.raises(ValueError, match="future: expected 0, as ClassicalDecoder takes every clip by itself, got 2"):
         SuperResolution(ClassicalDecoder(), future=2)
     with pytest.raises(ValueError, match=r"frozen: expected parts of the network, such as motion, .* got nothing"):

@@ -1,4 +1,4 @@
-"""Training with estimated motion, which is seen on more than the patch."""
+"""Training with motion that is estimated on more than the patch."""
 
 import pytest
 import torch
@@ -19,7 +19,7 @@ from lightning_modules.tasks.super_resolution import SuperResolution
         ("scene", ClassicalFlow, 1),  # several key frames come without a flow
     ],
 )
-def test_a_network_learns_from_the_patch_and_the_motion_of_what_is_around_it(flow, motion, key_frames):
+def test_margin_serves_only_motion_estimation(flow, motion, key_frames):
     torch.manual_seed(0)
     sizes = {"width": 4, "representation_width": 4, "features": 1, "stages": 1, "end_blocks": 1}
     network = CSCSR(scale=2, **sizes, motion=motion())

@@ -15,7 +15,7 @@ def _steps(optimizer, parameter, gradients):
 
 
 @pytest.mark.parametrize(("shape", "size"), [((6, 6), 1.0), ((12, 5), 1e-6), ((5, 12), 1e6)])
-def test_singular_values_become_about_one_and_directions_stay(shape, size):
+def test_orthogonalisation_keeps_singular_vectors(shape, size):
     torch.manual_seed(0)
     left, _ = torch.linalg.qr(torch.randn(shape[0], 5, dtype=torch.float64))
     right, _ = torch.linalg.qr(torch.randn(shape[1], 5, dtype=torch.float64))
@@ -28,7 +28,7 @@ def test_singular_values_become_about_one_and_directions_stay(shape, size):
     assert 0.6 < inside.diag().min() <= inside.diag().max() < 1.3
 
 
-def test_on_matrices_it_is_the_muon_of_torch():
+def test_matches_torch_on_matrices():
     torch.manual_seed(0)
     start, gradients = torch.randn(8, 20), torch.randn(4, 8, 20)
     ours, theirs = nn.Parameter(start.clone()), nn.Parameter(start.clone())
@@ -38,7 +38,7 @@ def test_on_matrices_it_is_the_muon_of_torch():
     assert (moved - expected).norm() < 0.02 * expected.norm()  # torch rounds to bfloat16 on the way
 
 
-def test_a_convolution_is_the_matrix_of_its_output_channels():
+def test_convolution_is_a_matrix_with_one_row_per_output_channel():
     torch.manual_seed(0)
     start, gradients = torch.randn(8, 4, 3, 3), torch.randn(3, 8, 4, 3, 3)
     whole, flat = nn.Parameter(start.clone()), nn.Parameter(start.flatten(1).clone())
@@ -48,7 +48,7 @@ def test_a_convolution_is_the_matrix_of_its_output_channels():
     assert torch.allclose(_steps(MuonWithAdam([last]), last, gradients).flatten(1), expected, atol=1e-6)
 
 
-def test_layers_of_one_shape_do_not_see_each_other():
+def test_layers_of_equal_shape_are_independent():
     torch.manual_seed(0)
     shapes = [(8, 4, 3, 3), (8, 4, 3, 3), (6, 8), (8, 4, 3, 3), (8, 6), (5,)]
     start = [torch.randn(shape) for shape in shapes]
@@ -68,7 +68,7 @@ def test_layers_of_one_shape_do_not_see_each_other():
 
 
 @pytest.mark.parametrize("shape", [(7,), (16, 3), (3, 16, 3, 3), ()])
-def test_biases_and_layers_of_three_channels_are_left_to_adam(shape):
+def test_biases_and_layers_with_three_channels_use_adam(shape):
     torch.manual_seed(0)
     start, gradients = torch.randn(shape), torch.randn(5, *shape)
     ours, theirs = nn.Parameter(start.clone()), nn.Parameter(start.clone())
@@ -77,7 +77,7 @@ def test_biases_and_layers_of_three_channels_are_left_to_adam(shape):
     assert torch.allclose(_steps(MuonWithAdam([ours], lr=1e-2), ours, gradients), expected, atol=1e-6)
 
 
-def test_it_goes_on_where_it_stopped():
+def test_state_is_restored():
     torch.manual_seed(0)
     start, gradients = [torch.randn(6, 5), torch.randn(6)], [(torch.randn(6, 5), torch.randn(6)) for _ in range(4)]
 

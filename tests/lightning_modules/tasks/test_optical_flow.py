@@ -1,4 +1,4 @@
-"""``lightning fit -c configs/flow.yaml``: learning motion, and what CSCSR does with it."""
+"""Training of optical flow (``configs/flow.yaml``), and its use in CSCSR."""
 
 import csv
 
@@ -32,7 +32,7 @@ CSCSR_TINY = {"width": 4, "representation_width": 4, "features": 1, "stages": 1,
 FLOW_TINY = yaml.safe_load(TINY)["model"]["init_args"]["network"]["init_args"]
 
 
-def test_errors_of_flow_against_brute_force():
+def test_flow_metrics_against_brute_force():
     flow, truth = torch.tensor([[3.0, 0], [100, 103.5], [0, 0.4]]), torch.tensor([[0.0, 4], [100, 100], [0, 0]])
     flow, truth = (pairs.T.reshape(2, 1, 3) for pairs in (flow, truth))
     error = end_point_error(flow, truth)
@@ -50,7 +50,7 @@ def batch():
     }
 
 
-def test_loss_is_the_discounted_error_of_every_iteration(batch, monkeypatch):
+def test_loss_discounts_earlier_iterations(batch, monkeypatch):
     module = FlowTraining(Spike2Flow(**FLOW_TINY), pattern="GRBG")
     monkeypatch.setattr(module, "log", lambda *_, **__: None)
     cells = split_bayer(batch["flow"], "GRBG") / 2
@@ -76,13 +76,13 @@ def test_validation_measures_the_joint_flow_and_zero_flow(batch, monkeypatch):
     assert 0 < logged["val/outliers"] < logged["val/outliers_zero"]
 
 
-def test_a_network_that_cannot_learn_is_refused():
+def test_frozen_networks_are_rejected():
     with pytest.raises(ValueError, match="got a frozen one"):
         FlowTraining(Spike2Flow(**FLOW_TINY, frozen=True))
 
 
 @pytest.mark.parametrize(("flow", "asked"), [("scene", 0), ("estimated", 1)])
-def test_super_resolution_trains_with_the_flow_that_is_asked_for(flow, asked, batch, monkeypatch):
+def test_super_resolution_trains_with_the_chosen_flow(flow, asked, batch, monkeypatch):
     module = SuperResolution(CSCSR(2, **CSCSR_TINY, motion=Spike2Flow(**FLOW_TINY)), flow=flow)
     seen = []
     module.network.motion.register_forward_hook(lambda *of: seen.append(of))
@@ -91,7 +91,7 @@ def test_super_resolution_trains_with_the_flow_that_is_asked_for(flow, asked, ba
     assert len(seen) == asked
 
 
-def test_estimators_of_a_checkpoint_are_exchanged():
+def test_estimator_of_a_checkpoint_can_be_replaced():
     def module(motion):
         return SuperResolution(CSCSR(2, **CSCSR_TINY, motion=motion))
 

@@ -1,4 +1,4 @@
-"""The schedule by steps or time, the lines, and the weights that training leaves behind."""
+"""Schedule by steps or time, progress lines, and written weights."""
 
 import pytest
 import pytorch_lightning as pl
@@ -39,7 +39,7 @@ def train(folder, *callbacks, **how):
     return module
 
 
-def test_the_rate_rises_then_falls_to_the_last_step(tmp_path):
+def test_learning_rate_rises_then_falls_to_the_last_step(tmp_path):
     rates = train(tmp_path, Pace(warm_up=5), max_steps=40).rates
     assert rates[:5] == sorted(rates[:5])
     assert rates[5:] == sorted(rates[5:], reverse=True)
@@ -47,13 +47,13 @@ def test_the_rate_rises_then_falls_to_the_last_step(tmp_path):
     assert rates[-1] < 0.002
 
 
-def test_time_ends_the_schedule_too(tmp_path):
+def test_schedule_ends_with_time(tmp_path):
     rates = train(tmp_path, Pace(warm_up=1), max_time="00:00:00:02", max_epochs=-1).rates
     assert rates[0] > 0.09
     assert rates[-1] < 0.02
 
 
-def test_lines_tell_steps_and_clips(tmp_path, capfd):
+def test_progress_lines_show_steps_and_clips(tmp_path, capfd):
     train(tmp_path, Pace(line_every=0), max_steps=4)
     lines = capfd.readouterr().out.splitlines()
     assert len(lines) == 4
@@ -61,7 +61,7 @@ def test_lines_tell_steps_and_clips(tmp_path, capfd):
     assert "clips/s" in lines[-1]
 
 
-def test_weights_are_the_average_and_what_the_network_had(tmp_path):
+def test_averaged_weights_with_settings_are_written(tmp_path):
     module = train(tmp_path / "plain", Pace(), max_steps=5)
     read = CSCSR.from_pretrained(tmp_path / "plain" / "weights.safetensors")
     for name, value in module.network.state_dict().items():

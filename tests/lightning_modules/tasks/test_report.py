@@ -1,4 +1,4 @@
-"""What ``lightning test`` writes about clips: their names, their scores, their pictures."""
+"""The report of ``lightning test``: names, scores and pictures of clips."""
 
 import csv
 from types import SimpleNamespace
@@ -30,7 +30,7 @@ def report_of(folder, clips, names, count=8):
         return {(row["method"], row["clip"]): float(list(row.values())[2]) for row in csv.DictReader(file)}
 
 
-def test_clips_have_their_names_and_the_mean_is_that_of_them(tmp_path, capsys):
+def test_table_has_named_clips_and_their_mean(tmp_path, capsys):
     names = ["walk", "city"]  # with --trainer.limit_test_batches the first ones
     scores = report_of(tmp_path, 2, [*names, "foliage"])
     for method, more in (("CSCSR", 0.5), ("TFI", 0.0)):
@@ -39,7 +39,7 @@ def test_clips_have_their_names_and_the_mean_is_that_of_them(tmp_path, capsys):
     assert "mean of 2 clips" in capsys.readouterr().out
 
 
-def test_as_many_pictures_as_asked_for(tmp_path):
+def test_number_of_pictures(tmp_path):
     report_of(tmp_path, 3, None, count=2)
     shown = read_picture(tmp_path / "test.png")
     assert shown[0].unique().mul(10).round().tolist() in ([0, 1, 10], [0, 1])

@@ -1,4 +1,4 @@
-"""Trainings that are stopped and resumed."""
+"""Training that is stopped and resumed."""
 
 import os
 import re
@@ -74,7 +74,7 @@ def same(weights, others):
 
 
 @pytest.mark.parametrize(("step", "where"), [(6, "step"), (8, "validation")])
-def test_a_training_that_sigterm_stops_resumes_as_if_nothing_had_happened(fit, unbroken, tmp_path, step, where, capfd):
+def test_training_resumes_exactly_after_sigterm(fit, unbroken, tmp_path, step, where, capfd):
     with pytest.raises(SystemExit) as ended:
         fit("broken", *stop(step, where))
     assert ended.value.code == 143
@@ -87,14 +87,14 @@ def test_a_training_that_sigterm_stops_resumes_as_if_nothing_had_happened(fit, u
     assert best("broken") == unbroken["best"]
 
 
-def test_ctrl_c_is_a_line_and_status_130(fit, capfd):
+def test_ctrl_c_gives_one_line_and_status_130(fit, capfd):
     with pytest.raises(SystemExit) as ended:
         fit("broken", *stop(2, number=2))
     assert ended.value.code == 130
     assert len(re.findall("lightning: .*", capfd.readouterr().err)) == 1
 
 
-def test_a_slurm_job_that_is_requeued_resumes_without_being_told(fit, unbroken, monkeypatch, tmp_path):
+def test_requeued_slurm_job_resumes(fit, unbroken, monkeypatch, tmp_path):
     with pytest.raises(SystemExit):
         fit("job", *stop(6))
     with pytest.raises(SystemExit, match="holds a run already"):
@@ -105,7 +105,7 @@ def test_a_slurm_job_that_is_requeued_resumes_without_being_told(fit, unbroken, 
     assert same(unbroken["weights"], resumed["state_dict"])
 
 
-def test_a_plateau_is_looked_for_in_what_chooses_the_best(fit):
+def test_plateau_schedule_monitors_the_best_metric(fit):
     words = ["--model.lr_scheduler=torch.optim.lr_scheduler.ReduceLROnPlateau", "--model.lr_scheduler.mode=max"]
     words += ["--model.lr_scheduler.patience=0", "--model.lr_scheduler.threshold=1000"]
     checkpoint = fit("run", "--trainer.check_val_every_n_epoch=1", "--trainer.max_steps=12", *words)
@@ -115,7 +115,7 @@ def test_a_plateau_is_looked_for_in_what_chooses_the_best(fit):
 
 
 @pytest.mark.slow
-def test_processes_that_lightning_spawns_itself(tmp_path, configs):
+def test_spawned_processes(tmp_path, configs):
     (tmp_path / "tiny.yaml").write_text(TINY)
     words = ["fit", "-c", str(configs / "x4.yaml"), "-c", "tiny.yaml", "--trainer.max_steps=2", "--trainer.devices=1"]
     words = [sys.executable, "-m", "lightning_modules", *words, "--trainer.strategy=ddp_spawn", "-o", "run"]
@@ -124,7 +124,7 @@ def test_processes_that_lightning_spawns_itself(tmp_path, configs):
     assert torch.load(tmp_path / "run/checkpoints/last.ckpt", weights_only=True)["global_step"] == 2
 
 
-def test_a_home_in_an_output_is_found(fit, monkeypatch, tmp_path):
+def test_home_in_the_output_path_is_expanded(fit, monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "there.yaml").write_text("output: ~/run")
     with pytest.raises(FileNotFoundError):  # by this test, which does not know of ~

@@ -1,4 +1,4 @@
-"""``lightning fit`` by several processes."""
+"""``lightning fit`` with several processes."""
 
 import subprocess
 import sys
@@ -25,7 +25,7 @@ def trained(output):
 
 
 @pytest.mark.slow
-def test_two_processes_train_as_one_with_twice_the_batch(tmp_path, monkeypatch):
+def test_two_processes_equal_one_with_twice_the_batch(tmp_path, monkeypatch):
     (tmp_path / "tiny.yaml").write_text(TINY)
     words = ["fit", "-c", CONFIGS / "x2.yaml", "-c", CONFIGS / "quick.yaml", "-c", tmp_path / "tiny.yaml"]
     monkeypatch.setenv("OMP_NUM_THREADS", "1")

@@ -1,4 +1,4 @@
-"""``lightning trade``, as its users type it, and the parts of it that have laws of their own."""
+"""``lightning trade`` and its parts."""
 
 import csv
 import random
@@ -120,8 +120,8 @@ def test_scores_are_those_of_lightning_test(traded, shared, checkpoint, tmp_path
 
 
 @pytest.mark.slow
-def test_films(shared, base, tmp_path):
-    """Pictures, errors and work are those of single clips, which these networks see in a film as well."""
+def test_films_of_single_clip_networks(shared, base, tmp_path):
+    """Pictures, errors and work equal those of single clips."""
     settings = ["--setting", "as it is:", "--setting", f"TFI: {TFI}"]
     more = ["--data.val_clips", "1", "--rounds", "1", "--film", "10"]
     main(["trade", *shared, *settings, *more, "-o", str(tmp_path)])
@@ -139,7 +139,7 @@ def test_films(shared, base, tmp_path):
     assert f"| {float(rows['TFI']['flicker']):.3f} " in text
 
 
-def test_the_truth_of_a_film_follows_its_motion(base):
+def test_true_flow_warps_the_ground_truth_of_a_film(base):
     middle, moved, still = (..., slice(16, 32), slice(16, 32)), 0.0, 0.0
     for scene in film_scenes(base.data, 41, 20):
         assert scene["spikes"].shape == (1, 121, 12, 12)
@@ -150,7 +150,7 @@ def test_the_truth_of_a_film_follows_its_motion(base):
     assert moved < 0.7 * still, (moved, still)
 
 
-def test_what_flickers():
+def test_flicker():
     truth, flow = torch.rand(3, 3, 16, 16, generator=torch.Generator().manual_seed(0)), torch.zeros(3, 2, 16, 16)
     flow[:, 0] = 2.0
     then = truth.roll(2, dims=-1)
@@ -164,7 +164,7 @@ def test_what_flickers():
     assert (film_flicker(truth + outside, then, truth, then, flow) < 1e-3).all()
 
 
-def test_films_need_scenes_that_go_on(base, tmp_path, write_film):
+def test_films_need_continuous_scenes(base, tmp_path, write_film):
     write_film(tmp_path / "film", 9)
     data = FilmScenes(str(tmp_path), scale=2)
     data.setup("test")
@@ -193,7 +193,7 @@ def test_work_and_weights_are_counted(traded, convolutions):
 
 
 @pytest.mark.slow
-def test_usual_settings_run_on_weights_of_ones_own(shared, checkpoint, tmp_path, monkeypatch):
+def test_default_settings_run_on_own_weights(shared, checkpoint, tmp_path, monkeypatch):
     tried = ["", ", no motion", ", Spike2Flow, once", ", self-ensemble of 8", ", bf16-true"]
     names = [*(f"own weights{name}" for name in tried), "TFI", "TFP 41", "TFP 13, order 3"]
     monkeypatch.setattr(cli, "usual_settings", lambda *of: [one for one in usual_settings(*of) if one.name in names])
@@ -209,7 +209,7 @@ def networks_of(settings):
     return [setting.name for setting in settings if setting.name.startswith("cscsr_") and "," not in setting.name]
 
 
-def test_usual_settings_are_the_networks_of_the_package_and_the_decoders():
+def test_default_settings_are_the_networks_of_the_package_and_the_decoders():
     settings = {setting.name: setting for setting in usual_settings(4)}
     networks = networks_of(settings.values())
     assert networks == ["cscsr_small_x4", "cscsr_tiny_x4", "cscsr_large_x4", "cscsr_huge_x4"]  # the reference first
@@ -240,17 +240,17 @@ def test_usual_settings_are_the_networks_of_the_package_and_the_decoders():
         ("--model.weights cscsr_small_x4 --model.network CSCSR", None),
     ],
 )
-def test_what_is_typed_is_a_preset_where_columns_can_say_it(typed, preset):
+def test_arguments_become_a_preset_if_possible(typed, preset):
     assert read_setting(typed).preset == preset
 
 
-def test_a_setting_without_a_name_is_called_by_its_arguments():
+def test_unnamed_setting_is_named_after_its_arguments():
     assert read_setting("-c 'a: b.yaml'  ") == ("-c 'a: b.yaml'", ["-c", "a: b.yaml"])
     assert read_setting("a, b|c: --tile 8") == ("a, b|c", ["--tile", "8"])
 
 
-def test_a_table_is_read_as_it_is_written(tmp_path, monkeypatch):
-    """The reader of the package's tables takes that of a trade, and skips what is no preset."""
+def test_presets_read_the_written_table(tmp_path, monkeypatch):
+    """Presets read the table of a trade and skip rows that are no presets."""
     rows, _ = some_rows(3, [(9.0, 9.0), (2.0, 2.0), (1.0, 1.0)])
     typed = ["lost: --model.weights cscsr_large_x4", f"tfi: {TFI}", "-c my.yaml --model.weights cscsr_small_x4"]
     for row, text in zip(rows, typed, strict=True):
@@ -274,7 +274,7 @@ MISTAKES = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("words", "said"), MISTAKES)
-def test_mistakes_are_one_line_before_anything_runs(words, said, shared, tmp_path, monkeypatch):
+def test_errors_are_one_line_before_anything_runs(words, said, shared, tmp_path, monkeypatch):
     monkeypatch.setattr(cli, "measure", lambda *_: pytest.fail("something was run"))
     with pytest.raises(SystemExit, match=rf"^[^\n]*{re.escape(said)}[^\n]*$"):
         main(["trade", *shared, "-o", str(tmp_path / "out"), *words])
@@ -282,7 +282,7 @@ def test_mistakes_are_one_line_before_anything_runs(words, said, shared, tmp_pat
 
 
 @pytest.mark.slow
-def test_what_fails_while_it_runs_does_not_take_the_others_along(shared, tmp_path, monkeypatch):
+def test_other_settings_continue_after_a_failure(shared, tmp_path, monkeypatch):
     def fail(*_):
         raise NotImplementedError("not for this\ndtype")
 
@@ -300,12 +300,12 @@ def test_what_fails_while_it_runs_does_not_take_the_others_along(shared, tmp_pat
 @pytest.mark.slow
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is here")
 @pytest.mark.parametrize("args", [["--trainer.accelerator", "gpu"], ["--trainer.precision", "16-mixed"]])
-def test_what_the_machine_lacks_is_a_row(args, shared, base):
+def test_missing_hardware_is_reported(args, shared, base):
     with pytest.raises(CannotRunError, match=r"gpu|16-mixed: not on this device"):
         make_runner(shared, args, base)
 
 
-def test_a_network_of_fewer_frames_sees_the_middle_of_the_clip(shared, base):
+def test_shorter_network_takes_the_middle_of_the_clip(shared, base):
     fewer = ["--model.network.frames", "21", "--model.network.stride", "5"]
     runner = make_runner(shared, fewer, base)
     spikes = (torch.rand(1, 41, 12, 12, generator=torch.Generator().manual_seed(0)) < 0.3).to(torch.uint8)
@@ -336,14 +336,14 @@ def some_rows(count, seconds=()):
     return rows, calls
 
 
-def test_order_rotates_and_everyone_is_timed_equally_often_on_the_same_clip():
+def test_settings_are_timed_in_rotating_order_on_the_same_clip():
     rows, calls = some_rows(3)
     time_in_turns(rows, [torch.full((1, 1, 1, 1), n) for n in range(2)], 6)
     assert calls == [(name, n % 2) for n, turn in enumerate(["abc", "bca", "cab"] * 2) for name in turn]
     assert [len(row.seconds) for row in rows] == [6, 6, 6]
 
 
-def test_ratios_are_of_the_same_round():
+def test_ratios_are_taken_within_a_round():
     rows, _ = some_rows(2, [(1.0, 10.0, 2.0), (2.0, 20.0, 4.0)])
     lost = Measurement(Setting("lost", []), reason="no such thing")
     first, second, third = figures([rows[0], rows[1], lost])
@@ -354,7 +354,7 @@ def test_ratios_are_of_the_same_round():
     assert third == {}
 
 
-def test_the_front_is_that_of_brute_force():
+def test_front_against_brute_force():
     chance = random.Random(0)
     for _ in range(100):
         points = [(chance.randint(0, 6), chance.randint(0, 6)) for _ in range(chance.randint(1, 9))]
