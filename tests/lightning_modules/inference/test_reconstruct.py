@@ -65,7 +65,7 @@ def test_dim_recordings_give_bright_pictures(tmp_path):
     assert rgb.max() < 0.2
 
 
-def test_weights_for_noise_are_chosen_where_nobody_has_measured_the_sensor(flat):
+def test_uncalibrated_sensors_get_weights_for_noise(flat):
     pictures = reconstruct(flat(0.4), "fast")
     assert find_model(pictures.notes[0].split(",")[0].split(":")[0]).noise
     assert "this sensor is not calibrated" in pictures.notes[-1]
