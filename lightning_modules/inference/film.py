@@ -1,4 +1,4 @@
-"""Films: pictures from a stream of spikes, one after the other as it arrives."""
+"""Films: pictures from a stream of spikes, as it arrives."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class FilmFrame(NamedTuple):
     """A picture of a film.
 
     Args:
-        clock: number of the spike frame that it shows, counted from the beginning of the stream.
+        clock: index of the spike frame that it shows, from the beginning of the stream.
         rgb: (3, s H, s W), [0, 1].
     """
 
@@ -47,32 +47,33 @@ def film(
     r"""Yield the pictures of a stream as it arrives, from a recording or a live camera.
 
     Convention:
-        The picture of clock n needs the clocks n - N // 2 to n + (N - 1) // 2, N being the network's frames, and is
-        made as soon as the last of them has come. So a picture is (N - 1) // 2 clocks late, 20 of 41, which is a
-        millisecond at 20 kHz; with chunks of c clocks up to c - 1 more, and by the time that the network takes. The
-        first shows clock N // 2. N frames and the present chunk are held, however long the stream.
+        The picture of clock n needs the clocks n - N // 2 to n + (N - 1) // 2, for a network with clips of N frames. It
+        is made as soon as the last of them has arrived, (N - 1) // 2 clocks later: 20 clocks for N = 41, a millisecond
+        at 20 kHz. Chunks of c clocks add up to c - 1 clocks, and the network its computing time. The first picture
+        shows clock N // 2. Only N frames and the current chunk are kept in memory.
 
-        With a ``future`` or ``interpolated`` pictures they come in groups, see :class:`FilmMaker`: a picture is then
-        up to ``(future + 1) * (interpolated + 1) - 1`` pictures later, and the group is held meanwhile.
+        With ``future`` or ``interpolated``, pictures come in groups, see :class:`FilmMaker`. A picture is then delayed
+        by up to ``(future + 1) * (interpolated + 1) - 1`` pictures, and the group is kept in memory.
 
-        White is the same in all pictures: ``white``, or else what 99.9 % of the pixels of the first clip do not exceed.
+        The white level is the same in all pictures: ``white``, else the level that 99.9 % of the pixels of the first
+        clip do not exceed.
 
     Args:
-        network: any of :mod:`lightning_modules.networks`, on the device of the chunks.
-        chunks: spikes (T, H, W) of any lengths, such as :func:`spikekit.iter_spikes` reads with a ``chunk``; they begin
+        network: network of :mod:`lightning_modules.networks`, on the device of the chunks.
+        chunks: spikes (T, H, W) of any length, as :func:`spikekit.iter_spikes` returns with a ``chunk``; they begin
             with the network's Bayer phase.
         every: clocks between two pictures.
-        future: see :class:`FilmMaker`.
-        interpolated: likewise.
-        white: spikes a clock of a pixel that is shown white.
-        how: ``static``, and more arguments of :class:`FilmMaker`.
+        future: later key frames that a picture may wait for, see :class:`FilmMaker`.
+        interpolated: pictures interpolated between two pictures of the network, see :class:`FilmMaker`.
+        white: white level in spikes per clock.
+        how: ``static``, and further arguments of :class:`FilmMaker`.
 
     Returns:
         An iterator over pictures.
 
     Raises:
-        TypeError: ``white`` is not a number; when iterated, a chunk that is not a tensor of real numbers.
-        ValueError: an argument is out of range; when iterated, a chunk of another shape.
+        TypeError: ``white`` is not a number; when iterated, a chunk is not a tensor of real numbers.
+        ValueError: an argument is out of range; when iterated, a chunk has another shape.
 
     Example:
         >>> import torch
@@ -99,7 +100,7 @@ def _pictures(
             white = white_rate(clips[0].float().mean(0).cpu())
         pictures = maker(clips, clocks, static, maker.network.settings["alpha"] / white)
         for clock, rgb in zip(clocks, pictures, strict=True):
-            yield FilmFrame(clock, rgb.clone() if len(group) > 1 else rgb)  # who keeps one does not keep the group
+            yield FilmFrame(clock, rgb.clone() if len(group) > 1 else rgb)  # a kept picture does not keep the group
 
 
 def _frames(chunks: Iterable[Tensor]) -> Iterator[Tensor]:
@@ -111,7 +112,7 @@ def _frames(chunks: Iterable[Tensor]) -> Iterator[Tensor]:
 
 
 class _Made(NamedTuple):
-    """A picture that the network made, and the motion of its clip."""
+    """A picture of the network and the motion of its clip."""
 
     clock: int
     rgb: Tensor
@@ -126,30 +127,32 @@ class _Known(NamedTuple):
 
 
 class FilmMaker:
-    r"""Makes the pictures of a film, group by group, and keeps what the next group needs.
+    r"""Make the pictures of a film, group by group.
 
-    A :class:`lightning_modules.networks.RecurrentCSCSR` carries the state of a key frame on to the next. With a
-    ``future``, groups have ``future + 1`` key frames, which are read from their end first: all but the last then know
-    the one behind them as well. A neighbour helps if it is at most a clip's length away; further away nothing is known
-    of the motion. So a group may come from any other place of the film.
+    A :class:`lightning_modules.networks.RecurrentCSCSR` passes the state of a key frame to the next. With ``future``,
+    groups have ``future + 1`` key frames, which take a backward pass before the forward pass, so that all but the last
+    also use the next key frame. Neighbours further away than the length of a clip are not used, as their motion is
+    unknown; groups from any other place of a film are therefore allowed.
+
+    An interpolated picture between those of the clocks l and r is
 
     .. math:: I_n(x) = (1 - a) \, I_l(x + o_l(x)) + a \, I_r(x + o_r(x)), \quad a = \frac{n - l}{r - l}
 
-    is an interpolated picture between those of the clocks l and r, where the offsets o follow the motion of both clips,
-    taken together with the same shares. What comes from outside of one of the two is taken from the other alone.
+    with offsets o along the motion of both clips, blended with the same weights. Where one of the two points lies
+    outside the picture, only the other is used.
 
     Convention:
-        Of every ``interpolated + 1`` clips of a group the network sees the last, and the last of the group. Where the
-        picture before the group is more than a clip's length away, it sees the first as well.
+        The network makes the last picture of every ``interpolated + 1`` and the last of a group. If the previous
+        picture is further away than the length of a clip, it also makes the first.
 
-        Where frames are larger than a tile, the state of a key frame waits in half precision: 0.27 GiB at x4 and
+        For frames larger than a tile, states of key frames are stored in half precision: 0.27 GiB at x4 and
         1000 x 1000 sensor pixels. Pictures change by 0.03 of an 8-bit step (rms).
 
     Args:
-        network: any of :mod:`lightning_modules.networks`.
-        future: key frames that a picture may wait for, of a network that carries a state on.
-        interpolated: pictures between two that the network makes.
-        tile: side of the tiles in sensor pixels, 0 for none; when not given, what suits the network's device.
+        network: network of :mod:`lightning_modules.networks`.
+        future: later key frames that a picture may wait for; only for networks with a state.
+        interpolated: pictures interpolated between two pictures of the network.
+        tile: side of a tile in sensor pixels, 0 for no tiles; default: 200, or 512 on a GPU.
         psnr_tolerance: by how many dB the PSNR of a picture may fall where this saves work. With any but 0 the network
             is asked only where the spikes say that something moves (:class:`lightning_modules.inference.rest.Rest`).
             The first picture knows of nothing that rests, so a film of one is as it is without.
@@ -157,9 +160,9 @@ class FilmMaker:
             self-ensemble every clip is reconstructed alone: no state is carried on.
 
     Raises:
-        ValueError: a ``future`` for a network that takes every clip by itself; ``interpolated`` pictures by one that
-            estimates no motion; a negative number of either; what such a network does not take; a tolerance below 0,
-            with a ``future`` or ``interpolated`` pictures, or for a network that sees the whole picture.
+        ValueError: ``future`` for a network without a state; ``interpolated`` for a network without a motion estimate;
+            a negative number; an option that the network does not support; or a tolerance that is negative, is combined
+            with ``future`` or ``interpolated``, or is for a network without a ``halo``.
 
     Example:
         >>> from lightning_modules.networks import CSCSR
@@ -215,19 +218,19 @@ class FilmMaker:
     def __call__(
         self, spikes: Tensor, clocks: Sequence[int], static: bool = False, exposure: float | Tensor = 1.0
     ) -> Tensor:
-        """Return the pictures of clips that follow each other.
+        """Return the pictures of consecutive clips.
 
         Args:
             spikes: (G, N, H, W).
-            clocks: number of the frame in the middle of each, increasing.
+            clocks: clock of the middle frame of each clip, increasing.
             static: nothing moves.
-            exposure: what pictures are multiplied by before they are clamped, a number or (G, 1, 1, 1).
+            exposure: factor of the pictures before they are clamped, a number or (G, 1, 1, 1).
 
         Returns:
             rgb (G, 3, s H, s W), in [0, 1].
 
         Raises:
-            ValueError: as many clocks as clips, increasing ones, were expected.
+            ValueError: the number of clocks differs from that of clips, or they do not increase.
         """
         if len(clocks) != len(spikes) or any(after <= before for before, after in pairwise(clocks)):
             raise ValueError(f"clocks: expected {len(spikes)} increasing ones, got {list(clocks)}")
@@ -251,7 +254,7 @@ class FilmMaker:
         return torch.cat([pictures[clock] for clock in clocks])
 
     def _where_it_moves(self, spikes: Tensor, clock: int, exposure: float) -> Tensor:
-        """A picture, of which only what moves is made anew; the rest of a state that is carried on stays as it is."""
+        """Return a picture of which only moving parts are computed; the state of the other parts is kept."""
         whole, before, state = Box(0, 0, *spikes.shape[-2:]), self._known, None
         if before is not None and clock - before.clock <= self.network.frames:
             state = before.state.clone()
@@ -275,7 +278,7 @@ class FilmMaker:
     def _made(
         self, spikes: Tensor, clocks: list[int], flow: Tensor | None, static: bool, exposure: float | Tensor
     ) -> Tensor:
-        """The network's pictures of clips."""
+        """Return the network's pictures of clips."""
         if self.carries_on:
             return self._carried_on(spikes, clocks, flow, static).mul_(exposure).clamp_(0, 1)
         return predict(self.network, spikes, flow, static, exposure=exposure, tile=self.tile, **self._how)
@@ -283,7 +286,7 @@ class FilmMaker:
     def _see(
         self, spikes: Tensor, clocks: Sequence[int], static: bool, exposure: float | Tensor, keys: list[int]
     ) -> list[_Made]:
-        """The network's pictures of some clips of a group, and their motion."""
+        """Return the network's pictures of some clips of a group, and their motion."""
         if not keys:
             return []
         flows = [self.network.resolve_flow(spikes[n : n + 1], None, static) for n in keys]
@@ -291,7 +294,7 @@ class FilmMaker:
         light = exposure[keys] if isinstance(exposure, Tensor) and exposure.ndim else exposure
         at = [clocks[n] for n in keys]
         rgb = self._made(spikes[keys], at, flow, flow is None, light)
-        # a single motion for all colours
+        # one motion for all colours
         joint = [one.mean(dim=1) if one is not None and one.ndim == 6 else one for one in flows]
         return list(map(_Made, at, rgb.split(1), joint))
 
@@ -319,7 +322,7 @@ class FilmMaker:
         return tiled(run, whole, self.tile, lambda _: 0, scale)
 
     def _carried_on(self, spikes: Tensor, clocks: list[int], flow: Tensor | None, static: bool) -> Tensor:
-        """Pictures of key frames that know their neighbours, (G, 3, s H, s W), not clamped."""
+        """Return the pictures of key frames that use their neighbours, (G, 3, s H, s W), not clamped."""
         network, whole = self.network, Box(0, 0, *spikes.shape[-2:])
         clips = spikes.split(1)
         given = [None] * len(clips) if flow is None else flow.split(1)
@@ -339,7 +342,7 @@ class FilmMaker:
         rgb = None
         for n, known in enumerate(read_forward(group, meet, self._known, behind)):
             self._known = known
-            del features[n]  # of a large film what a group remembers fills the memory
+            del features[n]  # frees unused features, which are large
             picture = network.picture(known.state)
             if rgb is None:
                 rgb = picture.new_empty(len(clips), *picture.shape[1:])
@@ -374,13 +377,13 @@ class FilmMaker:
         return tiled(run, whole, self.tile, lambda _: self.network.halo)
 
     def _halved(self, planes: Tensor, whole: Box) -> Tensor:
-        """What waits for its neighbours; where frames are larger than a tile, in half precision: half the memory."""
+        """Return planes in half precision for frames larger than a tile, to save memory."""
         large = 0 < self.tile < max(whole.bottom, whole.right)
         return planes.half() if large and planes.dtype == torch.float32 else planes
 
 
 def _ends_inside(flow: Tensor, near: Box, whole: Box, scale: int) -> Tensor:
-    """Where a flow (1, 2, h, w) of a box ends inside the picture, (1, 1, h, w)."""
+    """Return a mask (1, 1, h, w) of the vectors of a box's flow (1, 2, h, w) that end inside the picture."""
     rows, columns = (torch.arange(side, device=flow.device) for side in flow.shape[-2:])
     x, y = flow[:, 0] + columns + scale * near.left, flow[:, 1] + rows[:, None] + scale * near.top
     return ((x >= 0) & (x <= scale * whole.right - 1) & (y >= 0) & (y <= scale * whole.bottom - 1)).unsqueeze(1)
