@@ -1,4 +1,4 @@
-"""What rests in a film: told from its spikes, and kept as long as it does."""
+"""Parts of a film at rest: found by their spikes, and not computed again."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ _NOISY = 0.01  # variance of a noisy sensor, for a spike, beside that of countin
 
 
 class Changes(NamedTuple):
-    """What became of a scene.
+    """Changes of a scene.
 
     Args:
-        moved: cells (h, w) whose spikes are no longer those of the same scene.
-        gain: by how much all light has changed.
+        moved: cells (h, w) where the scene has changed.
+        gain: factor by which all light has changed.
     """
 
     moved: Tensor
@@ -39,31 +39,31 @@ class Changes(NamedTuple):
 
 
 def find_changes(recent: Tensor, reference: Tensor, share: Tensor, noise: float = 0.0) -> Changes:
-    r"""Tell where a scene has changed between two counts of spikes, and by how much a lamp has.
+    r"""Find where a scene has changed between two counts of spikes, and by how much its light has.
 
-    A pixel that integrates light l counts :math:`n l` spikes in n clocks, rounded up or down: the part f of it behind
-    the point decides how often, and the variance is :math:`f (1 - f)`, a quarter at most, however many spikes there
-    are. A reference of m clocks, with :math:`q = n / m`, predicts the count of an ideal sensor with
+    A pixel that integrates light l counts :math:`n l` spikes in n clocks, rounded up or down. With the fractional part
+    f of :math:`n l`, the variance is :math:`f (1 - f)`, at most a quarter for any number of spikes. A reference of m
+    clocks, with :math:`q = n / m`, predicts the count of an ideal sensor with
 
     .. math:: d = c - g q r, \quad |d| \le 1 + g q, \quad
         \operatorname{var} d \approx \max_{|\epsilon| \le q} f_\epsilon (1 - f_\epsilon) + \frac{q^2 + q}{4}
 
-    where the first part is the largest that light as the reference may have rounded it gives, and the rest is the
-    reference's own rounding, and what it shares with the next count. g, the gain of lamps that flicker, is the median
-    of the ratio over all cells, weighted by their light; it is 1 unless it differs by five standard deviations.
+    where the first term is the largest variance for any light that agrees with the rounded reference, and the second is
+    the rounding of the reference, which is correlated with that of the next count. The gain g of flickering lamps is
+    the median ratio over all cells, weighted by their light; it is 1 unless it differs by five standard deviations.
 
-    A cell has moved if a pixel exceeds the bound, if the sum of :math:`d^2 / \operatorname{var}` over its blocks of 1,
-    2 or 4 pixels, or the cell as one, exceeds what K normal numbers do in one of 1 / risk cases,
-    :math:`K + 2 \sqrt{K x} + 2 x` with :math:`x = \ln(\text{tests} / \text{risk})`, or if a single block does. Larger
-    blocks see faint motion, whose changes have the same sign side by side; single ones see what is smaller than a cell.
-    The risk is 0.00001 a cell.
+    A cell has moved if a pixel exceeds the bound, or if the sum of :math:`d^2 / \operatorname{var}` over its K blocks
+    of 1, 2, 4 or 8 pixels exceeds :math:`K + 2 \sqrt{K x} + 2 x` with :math:`x = \ln(\text{tests} / \text{risk})`,
+    which K normal numbers exceed with the probability of the risk, or if a single block does. Large blocks detect faint
+    motion, whose changes have the same sign at neighbouring pixels; single blocks detect objects smaller than a cell.
+    The risk is 0.00001 per cell.
 
     Args:
         recent: counts (H, W).
         reference: earlier counts (H, W).
-        share: (h, w), for how much of the reference's clocks the recent ones stand, in every cell; infinity where there
-            is no reference, which counts as moved.
-        noise: variance of the sensor beside that of rounding, for a spike; 0 for an ideal one.
+        share: (h, w) ratio of the clocks of the recent counts to those of the reference, for every cell; infinity for
+            cells without a reference, which count as moved.
+        noise: variance of the sensor per spike, besides rounding; 0 for an ideal sensor.
 
     Example:
         >>> at_rest, lamp = torch.full((16, 16), 8.0), torch.full((16, 16), 12.0)
@@ -94,7 +94,7 @@ def find_changes(recent: Tensor, reference: Tensor, share: Tensor, noise: float 
 
 
 def _gain(recent: Tensor, expected: Tensor) -> float:
-    """Weighted median of ratios; 1 where it may be 1."""
+    """Return the weighted median of ratios, or 1 if it does not differ significantly."""
     recent, expected = recent[expected > 0], expected[expected > 0]
     if not len(expected):
         return 1.0
@@ -106,7 +106,7 @@ def _gain(recent: Tensor, expected: Tensor) -> float:
 
 
 def _sum(plane: Tensor, side: int) -> Tensor:
-    """Sums over blocks, those at the right and at the bottom cut off."""
+    """Return sums over blocks; those at the right and bottom edges may be smaller."""
     return F.avg_pool2d(plane[None], side, ceil_mode=True, divisor_override=1)[0]
 
 
@@ -117,31 +117,31 @@ def _pixels(cells: Tensor, size: tuple[int, ...], scale: int = 1) -> Tensor:
 
 
 class Rest:
-    r"""Makes the pictures of key frames one after the other, and asks the network only where something moves.
+    r"""Make the pictures of consecutive key frames, with the network running only where something moves.
 
     Convention:
-        The spikes that came since the last key frame are compared with those before, twice: they alone, which sees what
-        begins to move; and they with those before them, up to as many as there are in the reference, which sees what
-        drifts. So the reference grows as long as nothing moves, and begins anew where something does.
+        The spikes since the last key frame are compared with earlier ones twice: alone, which detects sudden motion,
+        and together with their predecessors, up to the length of the reference, which detects drift. The reference
+        grows while nothing moves, and starts anew where something does.
 
         A cell rests when all its clip does. It then shows the mean of the network's next eight pictures, for which
         nothing is said to move; after that no network is asked. Cells beside one that moves are computed, and blended.
         A lamp's gain is taken out of what is kept, and put into what is shown.
 
-        An ideal or calibrated sensor's mean over all clocks is exact in the end. The picture is drawn towards it, at
-        the sensor's resolution, by the share of their difference that is not the mean's own noise.
+        The mean over all clocks of an ideal or calibrated sensor converges to the exact light. At the resolution of the
+        sensor, the picture is corrected towards it, by the share of their difference that is not noise of the mean.
 
     Args:
-        scale: pixels of the picture for one of the sensor's.
-        pattern: colours of the sensor.
-        white: light of what the network shows white, in spikes a clock.
-        noisy: the sensor is not known to be ideal: its mean is not trusted.
+        scale: pixels of the picture per sensor pixel.
+        pattern: Bayer phase of the sensor, or grey.
+        white: white level of the network in spikes per clock.
+        noisy: the sensor may be noisy; its mean is then not used.
 
     Attributes:
         computed: cells (h, w) that the network made of the last picture.
     """
 
-    #: pictures that are seen again where a film goes on, so that what rests rests again
+    #: pictures to repeat when a film is resumed, so that parts at rest are found again
     warm_up = _PICTURES + 3
 
     def __init__(self, scale: int, pattern: str, white: float, noisy: bool = False) -> None:
@@ -160,10 +160,11 @@ class Rest:
         """Return a picture.
 
         Args:
-            spikes: its clip (N, H, W).
-            clock: its number, larger than the last.
-            make: asks the network for the picture (3, s h, s w) of a box; nothing moves there, if so said.
-            exposure: what the network's pictures are multiplied by.
+            spikes: clip (N, H, W).
+            clock: clock of the picture, larger than that of the previous one.
+            make: function that returns the network's picture (3, s h, s w) of a box; its second argument tells that
+                nothing moves there.
+            exposure: factor of the network's pictures.
         """
         frames, whole, scale = len(spikes), Box(0, 0, *spikes.shape[-2:]), self.scale
         came = int(min(clock - self._clock, frames + 1))
@@ -202,7 +203,7 @@ class Rest:
         return shown.clamp(0, 1)
 
     def _compare(self, spikes: Tensor) -> None:
-        """Take new spikes into the counts; where the scene has changed they begin anew."""
+        """Add new spikes to the counts, which start anew where the scene has changed."""
         recent, noise = spikes.sum(0, dtype=torch.float32), _NOISY * self.noisy
         came = len(spikes) * self._light
         alone = find_changes(recent, self._earlier, came / self._before, noise)
@@ -224,7 +225,7 @@ class Rest:
             self._light = 1.0
 
     def _drawn(self, exposure: float) -> Tensor:
-        """The mean of pictures, drawn towards that of all spikes."""
+        """Return the mean of pictures, corrected towards that of all spikes."""
         clocks = self._before + self._since
         share = (exposure / self.white / clocks).nan_to_num(posinf=0)
         picture = self._mean
