@@ -217,7 +217,7 @@ class Command(LightningCLI):
         kwargs["callbacks"] = [*_listed(config.get("callbacks")), *self._callbacks(output)]
         if self.subcommand != "fit":
             self.save_config_callback = None  # config.yaml is the record of the training
-            kwargs["devices"] = 1  # several would score some clips twice if their number does not divide
+            kwargs["devices"] = 1  # several devices would score some clips twice
         try:
             return super().instantiate_trainer(**kwargs)
         except TypeError as error:  # such as -1 devices on a CPU

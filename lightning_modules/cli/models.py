@@ -19,13 +19,13 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the verb."""
     return VerbParser(
         prog="lightning models",
-        description="List the weights that come with the package, for lightning predict --model.weights NAME and "
+        description="List the weights of the package, for lightning predict --model.weights NAME and "
         "CSCSR.from_pretrained(NAME).",
     )
 
 
 def models(args: Sequence[str]) -> None:
-    """Print the weights that come with the package."""
+    """Run ``lightning models``: print the weights of the package."""
     parser().parse_args(args)
     rows = []
     for one in list_models():

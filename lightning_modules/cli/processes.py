@@ -69,7 +69,7 @@ def _share(nodes: Sequence[dict[str, float]], jobs: int | None) -> dict[str, Any
 
 
 def run_to_end(log: Path, words: Sequence[str], there: str) -> str | None:
-    """Run Python in a separate process and in a folder, see :func:`start`; return the :func:`reason` of a failure."""
+    """Run Python in a separate process and in a folder, see :func:`start`; return its :func:`exit_reason`."""
     os.chdir(there)
     process = start(log, words, {})
     try:

@@ -24,7 +24,7 @@ EXPECTED = """\
 
 _VID4 = ("calendar", "city", "foliage", "walk")
 
-# places of the REDS scenes, with the archives unpacked together, into separate folders, or one folder up
+# places of the REDS scenes: archives unpacked together or into separate folders, or root one folder further down
 _REDS = ("{0}/{0}_orig", "{0}_orig", "{0}_orig_part*/{0}/{0}_orig", "{0}_orig_part*/{0}_orig", "{0}")
 
 

@@ -116,7 +116,7 @@ class _ClipLoader(DataLoader):
 
 
 def made_on_cpu(batches: Callable[[], Iterator[T]]) -> Iterator[T]:
-    """Go through what a loader iterates, whose tensors are the CPU's, whatever the default device."""
+    """Iterate over a loader with the CPU as the default device."""
     with torch.device("cpu"):
         iterator = batches()
     while True:

@@ -20,7 +20,7 @@ from spikekit.scenes.analytic import Layer, Motion, Scene
 
 _TEXTURES = 64  # drawn once and cropped differently every time
 _TEXTURE = 320  # side in pixels
-_TAPS = 4  # of the cubic kernel
+_TAPS = 4  # support of the cubic kernel
 
 
 class Pictures:
