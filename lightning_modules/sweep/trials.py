@@ -113,8 +113,8 @@ def make_trials(
 
 
 def _folder_name(name: str) -> str:
-    """Return a valid name of a folder; file systems allow 255 bytes."""
-    return re.sub(r"[^\w.=+-]+", "_", name, flags=re.ASCII)[:_LONGEST]
+    """Return a valid name of a folder; file systems allow 255 bytes. The end of a long name, with its seed, is kept."""
+    return re.sub(r"[^\w.=+-]+", "_", name, flags=re.ASCII)[-_LONGEST:]
 
 
 def _check_differences(trials: Sequence[Trial]) -> None:
