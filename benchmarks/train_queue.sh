@@ -1,7 +1,7 @@
 #!/bin/sh
-# What a GPU should train next, in order: sh benchmarks/train_queue.sh PICTURES OUTPUT [MINUTES [ARGUMENT ...]]
-# MINUTES for each of the large ones, half as long for the small. A run that was cut short goes on where it stopped when
-# the same is typed again (its time, too); what is ready is OUTPUT/NAME/weights.safetensors.
+# Train networks on a GPU one after another: sh benchmarks/train_queue.sh PICTURES OUTPUT [MINUTES [ARGUMENT ...]]
+# Large networks train for MINUTES, small ones for half as long. Repeat the command to resume interrupted runs; the time so
+# far counts. The results are OUTPUT/NAME/weights.safetensors.
 set -e
 pictures=$1 output=$2 minutes=${3:-4}
 [ -d "$pictures" ] && [ -n "$output" ] || { sed -n 2,4p "$0"; exit 2; }

@@ -31,13 +31,13 @@ extensions = [
     "sphinx_gallery.gen_gallery",
 ]
 exclude_patterns = ["_build", "_templates", "examples", "sg_execution_times.rst", "gallery/sg_execution_times.rst"]
-html_math_renderer = "mathml"  # browsers draw it themselves: the pages need no network
+html_math_renderer = "mathml"  # drawn by browsers without network access
 html_theme = "furo"
 html_static_path = ["_static"]
 html_css_files = ["style.css"]
 html_title = f"spikekit {version}"
 
-# A name in a docstring that leads nowhere is an error, except where it belongs to another project.
+# An unresolved name in a docstring is an error, unless it belongs to another project.
 nitpicky = True
 nitpick_ignore_regex = [
     ("py:.*", r"(torch|kornia|collections|pathlib|optional|numpy|pytorch_lightning)\b.*"),
@@ -45,7 +45,7 @@ nitpick_ignore_regex = [
     ("py:class", r".*\._\w+"),  # private
 ]
 
-templates_path = ["_templates"]  # of the pages that autosummary makes
+templates_path = ["_templates"]  # for the pages of autosummary
 autosummary_ignore_module_all = False
 autodoc_inherit_docstrings = False
 autodoc_member_order = "bysource"
@@ -79,7 +79,7 @@ class Run(SphinxDirective):
 
     def run(self):
         """Return the nodes."""
-        self.env.note_reread()  # what it prints can change without a change of the page
+        self.env.note_reread()  # the output can change without a change of the page
         printed = _spikekit(self.arguments[0])
         if "--markdown" not in self.arguments[0]:
             return [nodes.literal_block(printed, f"$ spikekit {self.arguments[0]}\n{printed}", language="console")]
@@ -99,7 +99,7 @@ def _spikekit(arguments):
 
 
 def _restructured(markdown):
-    """Markdown's headings, tables and code as lines of reStructuredText."""
+    """Convert headings, tables and code of Markdown to lines of reStructuredText."""
     header = True
     for line in markdown.splitlines():
         if not line.startswith("|"):
@@ -115,13 +115,13 @@ def _restructured(markdown):
 
 
 def _inline(text):
-    """Keep what is between backticks as code, and let nothing else mean anything."""
+    """Keep text between backticks as code, and escape the rest."""
     parts = text.split("`")
     return "".join(f"``{part}``" if i % 2 else re.sub(r"([*_|\\])", r"\\\1", part) for i, part in enumerate(parts))
 
 
 class ShippedTrade(SphinxDirective):
-    """``.. shipped-trade:: 4`` is the table of a scale that comes with the weights, ``4_dim`` that for little light."""
+    """``.. shipped-trade:: 4`` shows the table of a scale in the package, ``4_dim`` that for low light."""
 
     required_arguments = 1
 
@@ -136,10 +136,10 @@ class ShippedTrade(SphinxDirective):
 
 
 def _trade(path):
-    """Rows of Markdown."""
+    """Return the table in Markdown, line by line."""
     with path.open(newline="") as file:
         rows = sorted((row for row in csv.DictReader(file) if not row["failed"]), key=lambda row: float(row["ms"]))
-    yield "| setting | PSNR (dB) | SSIM | time, ratio | ms a frame | MiB | on the front |"
+    yield "| setting | PSNR (dB) | SSIM | time, ratio | ms per frame | MiB | on the front |"
     yield "|---|---|---|---|---|---|---|"
     for row in rows:
         psnr, ssim, ratio, ms, mib = (float(row[name]) for name in ("psnr", "ssim", "ratio", "ms", "mib"))
@@ -158,12 +158,12 @@ def _block_math(self, node):
 
 
 def _plain_inside(app, env, node, contnode):
-    """Show as text what docstrings of lightning_modules say of its inner parts, which have no page."""
+    """Show references to parts of lightning_modules without a page as text."""
     return contnode if node["refdoc"].startswith(("generated/", "api/lightning_modules")) else None
 
 
 def setup(app):
-    """Register the directives, and MathML as the form of formulas."""
+    """Register the directives and the MathML renderer."""
     app.connect("missing-reference", _plain_inside)
     app.add_directive("run", Run)
     app.add_directive("shipped-trade", ShippedTrade)

@@ -1,7 +1,6 @@
 """The picture and the film of the README: ``python docs/front_page.py`` writes docs/scenes.png and docs/film.gif.
 
-Photographs that no weights were trained on move before a simulated camera at x4, 20 clocks between two pictures, alpha
-0.4, seed 0.
+Photographs outside the training set move in front of a simulated camera: x4, a picture every 20 clocks, alpha 0.4.
 """
 
 from pathlib import Path
@@ -17,7 +16,7 @@ HERE, SCALE, ALPHA, WEIGHTS = Path(__file__).parent, 4, 0.4, "cscsr_huge_x4"
 
 
 def recorded(photograph, height, width, frames, position, **motion):
-    """Return a scene that moves, and its spikes."""
+    """Return a scene of a moving photograph, and its spikes."""
     rgb = torch.tensor(photograph).movedim(-1, 0) / 255
     moved = sk.Motion(center=(width / 2, height / 2), **motion)
     scene = sk.Scene([sk.Layer(rgb, moved, position=position)], height, width, frames=frames)
@@ -26,13 +25,13 @@ def recorded(photograph, height, width, frames, position, **motion):
 
 
 def pictures(network, spikes):
-    """Return the film that a network makes of spikes."""
+    """Return the pictures of a film, reconstructed from spikes."""
     with torch.inference_mode():
         return list(film(network, [spikes], every=20, white=ALPHA))
 
 
 def main():
-    """Write both."""
+    """Write the picture and the film."""
     ours = CSCSR.from_pretrained(WEIGHTS)
     tfi, tfp = (ClassicalDecoder(method, SCALE, "RGGB", ALPHA) for method in ("tfi", "tfp"))
 

@@ -16,16 +16,16 @@ picture = torch.tensor(data.astronaut()).movedim(-1, 0)[:, :256, 96:352] / 255
 
 
 def clip(velocity):
-    """Return spikes and truth of a picture that moves at so many sensor pixels a clock."""
+    """Return spikes and ground truth of a picture that moves at ``velocity``, in sensor pixels per clock."""
     scene = sk.Scene([sk.Layer(picture, sk.Motion(velocity=velocity), position=(-60, -20))], 144, half)
     light = scene.light("RGGB", scale=1, alpha=alpha)
     return sk.simulate_spikes(light, generator=torch.Generator().manual_seed(0)), scene.rgb(scene.middle)
 
 
 # %%
-# TFI takes the inverse of the interval between two spikes: it follows motion, but has only 1, 1/2, 1/3, ... TFP
-# counts spikes in a window: smooth at rest, blurred in motion. A mean of means of means (``order=3``) over 13
-# frames each loses much less to rounding than one mean, and weighs the middle most.
+# TFI takes the inverse of the interval between two spikes: it follows motion, but its only values are 1, 1/2, 1/3, ...
+# TFP counts spikes in a window: smooth at rest, blurred in motion. A mean of means of means (``order=3``) over 13
+# frames each has much less rounding error than one mean, and the largest weight in the middle.
 
 decoders = {
     "TFI": sk.tfi,
@@ -46,8 +46,7 @@ for ax in axes:
     ax.set_axis_off()
 
 # %%
-# The same as curves over the speed: TFP of third order is ahead until the motion within its window is several
-# pixels.
+# The same as curves over the speed: TFP of third order is best up to a motion of several pixels within its window.
 
 figure, ax = plt.subplots(figsize=(5.5, 3.2), layout="constrained")
 speeds = [0.0, 0.05, 0.1, 0.2, 0.3, 0.4]
@@ -55,6 +54,6 @@ clips = [clip((speed, 0.0)) for speed in speeds]
 for name, decode in decoders.items():
     pictures = [sk.demosaic(decode(spikes)[20] / alpha, "RGGB").clamp(0, 1) for spikes, _ in clips]
     ax.plot(speeds, [sk.psnr(rgb, clip[1]) for rgb, clip in zip(pictures, clips, strict=True)], "o-", label=name)
-ax.set(xlabel="speed (sensor pixels a clock)", ylabel="PSNR (dB)")
+ax.set(xlabel="speed (sensor pixels per clock)", ylabel="PSNR (dB)")
 ax.grid(alpha=0.3)
 ax.legend()

@@ -2,9 +2,9 @@
 A recording, decoded
 ====================
 
-A ``.dat`` file as a camera writes it: no header, eight pixels a byte, upside down. It is read in part, decoded at
-single frames, and looked at over time. A simulated camera with noise writes the file first; with one of your own,
-begin below.
+Read parts of a ``.dat`` file, decode single frames, and look at a column over time. The file is as cameras write it:
+no header, eight pixels per byte, upside down. A simulated camera with noise writes it first; skip this if you have your
+own.
 """
 
 import tempfile
@@ -30,8 +30,8 @@ sk.write_spikes(path, spikes, flip=True)
 print(f"{path.name}: {path.stat().st_size:,} bytes for {frames} frames of {height} x {width}")
 
 # %%
-# Read what is needed: 61 frames around the one of interest. :func:`~spikekit.tfi_at` and :func:`~spikekit.tfp_at`
-# decode a single frame for the work of a few.
+# Read 61 frames around the one of interest. :func:`~spikekit.tfi_at` and :func:`~spikekit.tfp_at` decode only that
+# frame.
 
 size = {"height": height, "width": width, "flip": True}
 print(sk.spikes_shape(path, height, width))
@@ -45,8 +45,8 @@ for column, frame in zip(axes.T, (60, 200, 340), strict=True):
         ax.set_axis_off()
 
 # %%
-# A recording that does not fit in memory comes in chunks. Here the green pixels of a column over time, decoded piece by
-# piece: the slopes are the motion.
+# Read a recording that does not fit in memory in chunks. This shows the green pixels of a column over time, decoded
+# piece by piece; the slopes are the motion.
 
 chunks = sk.iter_spikes(path, **size, chunk=100)
 pieces = sk.decode_in_chunks(lambda part: sk.tfp(part, 13, order=3), chunks, overlap=18)

@@ -1,8 +1,8 @@
 """
-Super-resolution with shipped weights
+Super-resolution with trained weights
 =====================================
 
-A clip of 41 frames becomes one picture of four times the resolution. The weights come with the package.
+A clip of 41 frames becomes one picture at four times the resolution. The weights come with the package.
 """
 
 import matplotlib.pyplot as plt
@@ -22,8 +22,8 @@ truth = scene.rgb(scene.middle)
 print("spikes", tuple(spikes.shape))
 
 # %%
-# The two decoders show what is possible without learning: decoded, demosaiced, enlarged by bicubic interpolation.
-# CSCSR estimates the motion from the spikes and looks for the pixels of every colour along it.
+# The two decoders show what is possible without learning: spikes are decoded, demosaiced and upsampled bicubically.
+# CSCSR estimates the motion from the spikes and searches along it for the pixels of every colour.
 
 networks = {
     "TFI, bicubic": ClassicalDecoder("tfi", scale, "RGGB", alpha),

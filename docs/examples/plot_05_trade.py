@@ -2,8 +2,8 @@
 Speed for accuracy: the trade curve
 ===================================
 
-``lightning trade`` measures quality, time and memory of every setting side by side. Its table for every scale comes
-with the weights; ``--speed`` and ``--budget`` read it. Here it is drawn, and asked.
+``lightning trade`` measures quality, time and memory of every setting. Its tables come with the weights; ``--speed``
+and ``--budget`` read them. This script draws the table of x4 and chooses from it.
 """
 
 import csv
@@ -20,8 +20,8 @@ for row in rows:
     row["ratio"], row["psnr"] = float(row["ratio"]), float(row["psnr"])
 
 # %%
-# Only the settings on the Pareto front are worth taking: no other one beats them in both time and PSNR. Time is a
-# ratio to that of the first setting, which holds on other machines better than milliseconds do.
+# No other setting beats those on the Pareto front in both time and PSNR. Time is given as a ratio to that of the first
+# setting, as ratios carry over to other machines better than milliseconds do.
 
 front = sorted((row for row in rows if row["front"] == "1"), key=lambda row: row["ratio"])
 figure, ax = plt.subplots(figsize=(8, 4.6), layout="constrained")
@@ -35,12 +35,12 @@ ax.grid(alpha=0.3)
 ax.legend()
 
 # %%
-# What every speed stands for at 250 x 400 sensor pixels:
+# The choice of every speed at 250 x 400 sensor pixels:
 
 for speed in ("fastest", "fast", "balanced", "best"):
     print(f"{speed:9}{choose(4, speed, size=(250, 400))}")
 
 # %%
-# And what fits into 600 MB:
+# The best setting within 600 MB:
 
 print(choose(4, budget="600MB", size=(250, 400)))

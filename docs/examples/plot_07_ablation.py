@@ -1,10 +1,9 @@
 """
-An ablation: what motion is worth
-=================================
+An ablation: the gain of motion
+===============================
 
-One set of weights, four sources of motion: none, TV-L1 on decoded pictures, Spike2Flow on spike intervals, and the
-truth. ``lightning sweep`` does the same with training, for all ten variants of the paper; see
-:doc:`/howto/ablations`.
+The same weights with four sources of motion: none, TV-L1 on decoded pictures, Spike2Flow on spike intervals, and the
+true motion. ``lightning sweep`` trains and compares all ten variants of the paper; see :doc:`/howto/ablations`.
 """
 
 import matplotlib.pyplot as plt
@@ -26,7 +25,7 @@ photographs = {"cat": data.chelsea()[20:300, 80:360], "astronaut": data.astronau
 first, last = network.times[0], network.times[-1]
 
 # %%
-# Scenes whose flow is known: two photographs, at four speeds.
+# Scenes with known flow: two photographs, at four speeds.
 
 speeds = [0.0, 1.0, 2.0, 4.0]  # sensor pixels from the middle to the last time point
 scores = {name: [] for name in [*estimators, "true motion"]}
@@ -56,8 +55,8 @@ ax.grid(alpha=0.3)
 ax.legend()
 
 # %%
-# Without motion, every moved pixel is looked for in the wrong place. At rest, all four agree. A little motion even
-# helps: the sensor sees the scene between its pixels, and the search puts these samples together.
+# Without an estimate, moved pixels are searched for at the wrong place. At rest, all four agree. A little motion even
+# helps: the sensor samples the scene between its pixels, and the search combines these samples.
 
 for name, values in scores.items():
     print(f"{name:12}", "  ".join(f"{value:6.2f}" for value in values))

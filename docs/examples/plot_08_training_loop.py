@@ -2,8 +2,8 @@
 Operators in your own training loop
 ===================================
 
-No Trainer, no command: the sensor is a layer like any other. Here the exposure of a scene and a small network
-behind the sensor learn together. The gradient of the exposure runs through the spikes.
+Without Trainer or command line, the sensor is a layer like any other. The exposure of a scene and a small network
+behind the sensor are trained together; the gradient of the exposure passes through the spikes.
 """
 
 import matplotlib.pyplot as plt
@@ -32,7 +32,7 @@ class Camera(nn.Module):
     def forward(self, rgb):
         """Map pictures (B, 3, H, W) to restored ones, by way of spikes."""
         light = sk.mosaic(rgb * self.log_gain.exp(), "RGGB")[:, None].expand(-1, self.clocks, -1, -1)
-        start = torch.rand(light[:, 0].shape)  # the charge when the clip begins
+        start = torch.rand(light[:, 0].shape)  # initial charge
         spikes, _ = sk.spike_integrate_fire(light, charge=start)
         raw = sk.tfp(spikes, self.clocks)[:, self.clocks // 2]
         decoded = sk.demosaic(raw, "RGGB") / self.log_gain.exp()
@@ -40,7 +40,7 @@ class Camera(nn.Module):
 
 
 # %%
-# The scene is lit so brightly, and so red, that the sensor saturates: more than one threshold arrives in a clock.
+# The light is so bright and red that the sensor saturates: pixels collect more than one threshold per clock.
 
 torch.manual_seed(0)
 photograph = torch.tensor(data.astronaut()).movedim(-1, 0) / 255
@@ -61,8 +61,8 @@ for _ in range(200):
     gains.append(model.log_gain.detach().exp().flatten())
 
 # %%
-# A spike count has the gradient of the light that it counts, and none where the light is above the threshold. So the
-# loss pulls the gains of red and green down until the sensor no longer saturates, and raises that of the dark blue.
+# The gradient of a spike count is that of the light, or 0 if the light is above the threshold. The loss therefore
+# lowers the gains of red and green until the sensor no longer saturates, and raises that of the dark blue.
 
 figure, axes = plt.subplots(1, 2, figsize=(9, 3), layout="constrained")
 axes[0].semilogy(losses)

@@ -2,8 +2,8 @@
 Super-resolution by gradient descent
 ====================================
 
-No weights at all: look for the picture whose spikes, seen through a model of the camera, come out as those that
-were recorded. Everything between the picture and the decoded spikes has a gradient, so Adam does the rest.
+Without any weights, search for the picture that a model of the camera maps to the recorded data. All steps from the
+picture to the sensor are differentiable, so Adam can optimise it.
 """
 
 import matplotlib.pyplot as plt
@@ -21,8 +21,8 @@ spikes = sk.simulate_spikes(scene.light("RGGB", scale=scale, alpha=alpha), gener
 truth = scene.rgb(scene.middle)
 
 # %%
-# The camera model: the picture, moved to every fifth clock as the flow says, averaged by the sensor's pixels. Its
-# result has to match what the decoder says of those clocks. (The flow is the true one here; an estimate would do.)
+# The camera model moves the picture to every fifth clock along the flow and averages over the sensor's pixels. Its
+# result should match the decoded spikes at those clocks. (This uses the true flow; an estimate works as well.)
 
 clocks = list(range(5, 36, 5))
 back = torch.stack([-scene.flow(clock, scale=1) for clock in clocks])  # from the clock to the middle
@@ -30,7 +30,7 @@ recorded = sk.tfp(spikes, 9, order=3)[clocks] / alpha
 
 
 def camera(rgb):
-    """Map a picture (3, H, W) to what the sensor sees at those clocks."""
+    """Map a picture (3, H, W) to the mosaics at those clocks."""
     moved = sk.flow_warp(rgb.expand(len(clocks), -1, -1, -1), back)
     return sk.bin_to_sensor(moved, "RGGB", scale=scale)
 
@@ -42,7 +42,7 @@ def roughness(rgb):
 
 
 # %%
-# Start from the classical decoder, and descend. Without the second term the picture would explain the noise as well.
+# Start from the classical decoder, and descend. Without the second term, the picture would fit the noise as well.
 
 start = ClassicalDecoder("tfp", scale, "RGGB", alpha)(spikes[None])[0].clamp(0, 1)
 rgb = start.clone().requires_grad_()

@@ -1,4 +1,4 @@
-"""A picture seen by a sensor of four times coarser pixels: every pixel averages its block, in its own colour."""
+"""A picture on a sensor with four times coarser pixels: each averages its block, in its own colour."""
 
 import matplotlib.pyplot as plt
 import torch

@@ -1,4 +1,4 @@
-"""A stream that comes in chunks: what is held for each piece of the result, and that the pieces are the whole."""
+"""A stream in chunks: the spikes held for each piece of the result, and the agreement with the whole."""
 
 import matplotlib.pyplot as plt
 import torch
@@ -13,7 +13,7 @@ held = []
 
 
 def decode(part):
-    """Decode what is at hand, and remember how much that was."""
+    """Decode ``part``, and record its length."""
     held.append(len(part))
     return sk.tfp(part, window)
 

@@ -1,4 +1,4 @@
-"""A picture, its mosaic, and the picture that demosaicing makes of it."""
+"""A picture, its mosaic, and the demosaiced picture."""
 
 import matplotlib.pyplot as plt
 import torch

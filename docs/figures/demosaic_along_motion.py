@@ -1,4 +1,4 @@
-"""A moving photograph, decoded by TFI: demosaiced by itself, and along its motion."""
+"""A moving photograph, decoded by TFI: demosaiced from one frame, and along its motion."""
 
 import matplotlib.pyplot as plt
 import torch

@@ -1,4 +1,4 @@
-"""Residual interpolation of a mosaic, beside linear filters."""
+"""Residual interpolation of a mosaic, compared with linear filters."""
 
 import matplotlib.pyplot as plt
 import torch

@@ -1,4 +1,4 @@
-"""The wheel of directions: the colour of a flow is that of the point it leads to."""
+"""The colour wheel of flow: a flow has the colour of the point to which it leads from the centre."""
 
 import matplotlib.pyplot as plt
 import torch

@@ -1,4 +1,4 @@
-"""An image and a flow; every pixel of the result is fetched from where its arrow points to."""
+"""An image and a flow; every pixel of the result is sampled where its arrow points."""
 
 import matplotlib.pyplot as plt
 import torch

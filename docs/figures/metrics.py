@@ -1,4 +1,4 @@
-"""Three damages of one size, by PSNR, that SSIM tells apart."""
+"""Three degradations of equal PSNR and different SSIM."""
 
 import matplotlib.pyplot as plt
 import torch

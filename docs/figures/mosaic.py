@@ -1,4 +1,4 @@
-"""A picture, and the one colour of it that a Bayer sensor keeps at every pixel."""
+"""A picture, and its mosaic: one colour per pixel."""
 
 import matplotlib.pyplot as plt
 import torch

@@ -8,7 +8,7 @@ import spikekit as sk
 light = torch.tensor([0.15] * 12 + [0.43] * 12 + [1.27] * 6 + [-0.12] * 8 + [0.31] * 14)
 clocks = range(len(light))
 spikes, charges, charge = [], [0.0], None
-for light_t in light.reshape(-1, 1, 1, 1):  # clock by clock, the charge handed on
+for light_t in light.reshape(-1, 1, 1, 1):  # clock by clock, passing the charge on
     fired, charge = sk.spike_integrate_fire(light_t, charge=charge)
     spikes.append(fired.item())
     charges.append(charge.item())

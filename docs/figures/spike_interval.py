@@ -1,4 +1,4 @@
-"""The interval that encloses every frame, for one pixel, and what stands in at the ends of the clip."""
+"""The interval that encloses every frame, for one pixel, and its substitute at the ends of the clip."""
 
 import matplotlib.pyplot as plt
 import torch
@@ -23,7 +23,7 @@ bottom.bar_label(bars, interval, fontsize=8)
 bottom.set(xlabel="frame n", ylabel=r"interval $\Psi_n$", xlim=(-1.4, 26.4), ylim=(0, 13), xticks=range(0, 26, 2))
 bottom.legend(
     handles=[bars[5], bars[0]],
-    labels=["enclosed by two spikes", "one is missing: nearest interval, or what was waited if that is longer"],
+    labels=["enclosed by two spikes", "one is missing: nearest interval, or time since the end if longer"],
     fontsize=8,
     loc="upper center",
 )

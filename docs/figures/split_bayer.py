@@ -1,4 +1,4 @@
-"""A mosaic of numbers and its four sub-streams: which pixel of the sensor each of them holds."""
+"""A mosaic of numbers and its four sub-streams."""
 
 import matplotlib.pyplot as plt
 import torch
@@ -10,7 +10,7 @@ raw = torch.arange(16).reshape(4, 4)
 
 
 def show(ax, numbers, names):
-    """Write the numbers into cells of the colour that their names say."""
+    """Draw the numbers in cells of their colours."""
     table = ax.table(
         [[str(int(number)) for number in row] for row in numbers],
         cellColours=[[COLOURS[name] for name in row] for row in names],

@@ -1,4 +1,4 @@
-"""TFI: of one pixel under changing light, and of a picture at one frame."""
+"""TFI of one pixel under changing light, and of a picture at one frame."""
 
 import math
 
@@ -33,6 +33,6 @@ shown = {"truth": picture, "spikes": still[20], "tfi": sk.tfi(still)[20] / 0.4}
 for name, values in shown.items():
     axes[name].imshow(values, cmap="gray", vmin=0, vmax=1)
     axes[name].set(xticks=[], yticks=[])
-axes["truth"].set_title("what the camera looks at")
+axes["truth"].set_title("scene")
 axes["spikes"].set_title("spikes, frame 20 of 41")
 axes["tfi"].set_title("tfi(spikes)[20] / 0.4")

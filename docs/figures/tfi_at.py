@@ -1,4 +1,4 @@
-"""The spikes of a few pixels, and those that decide their interval at one frame."""
+"""The spikes of a few pixels, and those that enclose one frame."""
 
 import matplotlib.pyplot as plt
 import torch

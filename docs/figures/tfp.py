@@ -1,4 +1,4 @@
-"""TFP beside TFI where the light moves: a short window is coarse, a long one is blurred, means of means are neither."""
+"""TFP and TFI in motion: a short window is coarse, a long one is blurred, means of means are neither."""
 
 import matplotlib.pyplot as plt
 import torch
