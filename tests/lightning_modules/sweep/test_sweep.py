@@ -281,7 +281,7 @@ def _written(trial):
         (["X", "--set", "trainer.max_steps=5,6", "--steps", "4"], "same settings for max_steps=5 and max_steps=6"),
         (
             ["X", "--set", "model.weights=cscsr_small_x4", "--over", "A", "J", "--seeds", "0", "1"],
-            "same settings for a-seed0 and j-seed0; model.weights=cscsr_small_x4 says what the network is",
+            "same settings for a-seed0 and j-seed0; the network of model.weights=cscsr_small_x4 overrides",
         ),
     ],
 )
