@@ -1,7 +1,8 @@
 """Measure time and quality of films of partly still scenes: ``python benchmarks/film_activity.py``.
 
 The scenes have known truth. The film is compared with one that recomputes everything, timed in turn. ``--overlay
-FOLDER`` writes pictures of both side by side, with recomputed parts in green.
+FOLDER`` writes pictures of both side by side, with recomputed parts in green. ``--false-rests`` measures
+instead how often cells count as resting while the scene moves by half a sensor pixel from picture to picture.
 """
 
 from __future__ import annotations
@@ -14,11 +15,12 @@ from pathlib import Path
 from statistics import mean
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from lightning_modules.data.pictures import embedded_pictures
 from lightning_modules.inference.film import FilmMaker
-from lightning_modules.inference.rest import CELL
+from lightning_modules.inference.rest import CELL, Rest
 from lightning_modules.networks import Network
 from spikekit import SensorNoise, bin_to_sensor, psnr, read_picture, simulate_spikes, write_picture
 from spikekit.arguments import whole
@@ -37,7 +39,7 @@ def scenes(size: tuple[int, int], clocks: int, scale: int) -> Iterator[tuple[str
     y, x = (torch.linspace(-1, 1, side) for _ in range(2))
     thing = thing[:, :side, :side]
     disc = (y[:, None].square() + x.square() <= 1).to(thing)
-    speed = 0.5 * view[1] / clocks
+    speed = min(0.1 * scale, 0.5 * view[1] / clocks)
     moving = Layer(thing, Motion(velocity=(speed, 0.0)), (view[1] // 2 - side // 2, view[0] // 2 - side // 2), disc)
     still = Scene([Layer(ground)], *view, clocks)
     yield "still", still, lambda _: 1.0
@@ -68,18 +70,23 @@ def main() -> None:
     parser.add_argument("--pictures", type=whole(12), default=60)
     parser.add_argument("--scene", action="append", help="only scenes whose names start with this")
     parser.add_argument("--overlay", type=Path)
+    parser.add_argument("--false-rests", action="store_true")
     args = parser.parse_args()
     torch.set_num_threads(1)
+    if args.false_rests:
+        false_rests(tuple(args.size), args.pictures)
+        return
     network = Network.from_pretrained(args.weights)
     clocks = EVERY * (args.pictures - 1) + network.frames
-    print("weights,sensor pixels,scene,time after 10,cells after 10,plain PSNR,PSNR after 1,after 10,at the end")
+    figures = "time after 10,cells after 10,plain PSNR,PSNR after 1,after 10,at the end,of what moves"
+    print(f"weights,sensor pixels,scene,{figures}")
     for name, scene, bright in scenes(tuple(args.size), clocks, network.scale):
         if args.scene and not name.startswith(tuple(args.scene)):
             continue
         network.noise_level = float(name == "noisy sensor")
         spikes = film_of(name, scene, bright, network)
         plain, resting = FilmMaker(network), FilmMaker(network, psnr_tolerance=0.1)
-        times, cells, found = [], [], []
+        times, cells, found, moving = [], [], [], []
         for clock in range(network.frames // 2, clocks - network.frames // 2, EVERY):
             clip = spikes[None, clock - network.frames // 2 :][:, : network.frames]
             truth = (bright(clock) * scene.rgb(clock)).clamp(0, 1)
@@ -90,13 +97,45 @@ def main() -> None:
                 times.append(time.process_time() - start)
             cells.append(resting.rest.computed.float().mean().item())
             found.append([psnr(picture, truth).item() for picture in made])
+            part = (scene.rgb(clock - EVERY) != scene.rgb(clock + EVERY)).any(0)
+            if part.any():
+                moving.append(-10 * math.log10(apart(made[1], truth, part) / apart(made[0], truth, part)))
             if args.overlay:
                 write_overlay(args.overlay, f"{name.split()[0]}_{clock:05}.png", made, truth, resting.rest.computed)
         late = times[20::2], times[21::2]
         ratio, share = sum(late[1]) / sum(late[0]), mean(cells[10:])
         figures = [mean(one for one, _ in found), *(found[n][1] - found[n][0] for n in (1, 10, -1))]
+        written = [f"{figure:.2f}" for figure in figures] + [f"{mean(moving[10:]):.2f}" if moving else ""]
         size = " x ".join(map(str, args.size))
-        print(f"{args.weights},{size},{name},{ratio:.3f},{share:.3f},{','.join(f'{figure:.2f}' for figure in figures)}")
+        print(f"{args.weights},{size},{name},{ratio:.3f},{share:.3f},{','.join(written)}", flush=True)
+
+
+def apart(picture: Tensor, truth: Tensor, part: Tensor) -> float:
+    """Mean squared error of a part (H, W) of a picture."""
+    return (picture - truth)[:, part].square().mean().item()
+
+
+def false_rests(size: tuple[int, int], pictures: int) -> None:
+    """Print how many cells that move are said to rest, by how much their light changes."""
+    clocks, scale = EVERY * pictures + 21, 2
+    layer = Layer(read_picture(embedded_pictures()[0]), Motion(velocity=(0.5 * scale / EVERY, 0.0)))
+    scene = Scene([layer], scale * size[0], scale * size[1], clocks)
+    light = scene.light("RGGB", scale=scale, alpha=ALPHA)
+    nothing = torch.zeros(3, *size)
+    print("sensor,change of light (rms / white),cells and pictures,false rests in 10 000")
+    for sensor, noise in (("ideal", None), ("noisy", NOISE)):
+        spikes = simulate_spikes(light, generator=torch.Generator().manual_seed(0), noise=noise)
+        rest = Rest(1, "RGGB", ALPHA, noise is not None)
+        changes, resting = [], []
+        for clock in range(20, clocks - 20, EVERY):
+            rest(spikes[clock - 20 : clock + 21], clock, lambda box, static: box.of(nothing), 1.0)
+            change = (light[clock + 20] - light[clock]) / ALPHA
+            changes.append(F.avg_pool2d(change.square()[None], CELL, ceil_mode=True)[0].sqrt())
+            resting.append(~rest.moving)
+        change, false = torch.stack(changes[3:]), torch.stack(resting[3:])
+        for least in (0.0, 0.01, 0.02, 0.05):
+            seen = change >= least
+            print(f"{sensor},>= {least:g},{seen.sum()},{1e4 * false[seen].float().mean():.2f}")
 
 
 def write_overlay(folder: Path, name: str, made: list[Tensor], truth: Tensor, computed: Tensor) -> None:

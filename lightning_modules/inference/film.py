@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lightning_modules.inference.clips import clips_around, film_groups
 from lightning_modules.inference.predict import check_views, predict
-from lightning_modules.inference.rest import AROUND, Rest
+from lightning_modules.inference.rest import AROUND, SEEN, Rest
 from lightning_modules.inference.tiles import TILE, TILE_ON_GPU, Box, reach, tiled
 from lightning_modules.networks import Network, RecurrentCSCSR
 from lightning_modules.networks.recurrent_cscsr import read_forward, read_from_end
@@ -261,10 +261,12 @@ class FilmMaker:
 
         def make(box: Box, static: bool) -> Tensor:
             nonlocal state
-            outer = box.grown(self.network.halo + (0 if static else AROUND), whole)
+            outer, near = box.grown(SEEN, whole), box.grown(AROUND, whole)
+            flow = self.network.resolve_flow(near.of(spikes), None, static)
+            flow = None if flow is None else outer.of(flow, near[:2])
             if self.carries_on:
                 self._known = None if state is None else _Known(before.clock, outer.of(before.state))
-            rgb = self._made(outer.of(spikes), [clock], None, static, exposure)[0]
+            rgb = self._made(outer.of(spikes), [clock], flow, flow is None, exposure)[0]
             if self.carries_on:
                 part = self._known.state
                 state = part.new_zeros(*part.shape[:2], *spikes.shape[-2:]) if state is None else state

@@ -16,12 +16,13 @@ from spikekit.color.cfa import GREY
 
 #: sensor pixels along the side of a cell, the smallest part that rests by itself
 CELL = 8
-#: sensor pixels around what moves in which motion is estimated
-AROUND = 24
+#: sensor pixels around a box that the network sees, and in which motion is estimated
+SEEN, AROUND = 8, 16
 
 _RISK = 1e-5  # of calling a cell at rest moved
 _TESTS = 5  # of a cell: blocks of 1, 2 and 4 pixels, all of them, and the cell
 _PICTURES = 8  # of which a cell at rest shows the mean, before the network is no longer asked
+_SURE = 80  # clocks without a change, behind those of a clip, after which its cell is said to rest
 _LEAST = 1 / 12  # variance that is always allowed for, in spikes: light is not known exactly
 _NOISY = 0.01  # variance of a noisy sensor, for a spike, beside that of counting: photons of 100 electrons a threshold
 
@@ -72,7 +73,7 @@ def find_changes(recent: Tensor, reference: Tensor, share: Tensor, noise: float 
         (False, 1.5)
     """
     known = share.isfinite()
-    each = _pixels(share.where(known, 0.0), recent.shape)
+    each = _pixels(share.where(known, 0.0), Box(0, 0, *recent.shape))
     expected = each * reference
     gain = _gain(_sum(recent, CELL)[known], _sum(expected, CELL)[known])
     expected, each = gain * expected, gain * each
@@ -110,10 +111,16 @@ def _sum(plane: Tensor, side: int) -> Tensor:
     return F.avg_pool2d(plane[None], side, ceil_mode=True, divisor_override=1)[0]
 
 
-def _pixels(cells: Tensor, size: tuple[int, ...], scale: int = 1) -> Tensor:
-    """The value of its cell for every pixel."""
-    side = CELL * scale
-    return cells.repeat_interleave(side, -2).repeat_interleave(side, -1)[..., : size[-2], : size[-1]]
+def _grown(cells: Tensor) -> Tensor:
+    """Cells, and those beside them."""
+    return F.max_pool2d(cells[None].float(), 3, 1, 1)[0] > 0
+
+
+def _pixels(cells: Tensor, box: Box, scale: int = 1) -> Tensor:
+    """The value of its cell for every pixel of a box."""
+    around = Box(box.top // CELL, box.left // CELL, -(-box.bottom // CELL), -(-box.right // CELL))
+    pixels = around.of(cells).repeat_interleave(CELL * scale, -2).repeat_interleave(CELL * scale, -1)
+    return box.of(pixels, (CELL * around.top, CELL * around.left), scale)
 
 
 class Rest:
@@ -124,9 +131,10 @@ class Rest:
         and together with their predecessors, up to the length of the reference, which detects drift. The reference
         grows while nothing moves, and starts anew where something does.
 
-        A cell rests when all its clip does. It then shows the mean of the network's next eight pictures, for which
-        nothing is said to move; after that no network is asked. Cells beside one that moves are computed, and blended.
-        A lamp's gain is taken out of what is kept, and put into what is shown.
+        A cell is still when its clip sees no change, and rests when the 80 clocks before it saw none either: a single
+        test may miss what moves slowly. It then shows the mean of the network's pictures since it was still, eight of
+        them, for the last of which nothing is said to move; after that no network is asked. Cells beside one that does
+        not rest are computed, and blended. A lamp's gain is taken out of what is kept, and put into what is shown.
 
         The mean over all clocks of an ideal or calibrated sensor converges to the exact light. At the resolution of the
         sensor, the picture is corrected towards it, by the share of their difference that is not noise of the mean.
@@ -138,7 +146,8 @@ class Rest:
         noisy: the sensor may be noisy; its mean is then not used.
 
     Attributes:
-        computed: cells (h, w) that the network made of the last picture.
+        moving: cells (h, w) of the last picture that did not rest, and those beside them.
+        computed: those that the network made, the moving ones among them.
     """
 
     #: pictures to repeat when a film is resumed, so that parts at rest are found again
@@ -173,34 +182,34 @@ class Rest:
         else:
             self._compare(spikes[frames - came :])
         self._clock = clock
-        moved = self._calm < frames
-        near = F.max_pool2d(moved[None].float(), 3, 1, 1)[0] > 0
-        self._count[moved] = 0
-        self.computed = near | (self._count < _PICTURES)
-        gain, fresh = 1.0, None
-        if not moved.all():
-            middle = spikes[frames // 2 - came // 2 :][:came]
-            clocks = self._before + self._since
-            expected = _sum(self._earlier + self._later, CELL) * (came / clocks)
-            gain = _gain(_sum(middle.sum(0, dtype=torch.float32), CELL)[clocks > 0], expected[clocks > 0])
-        for box, static in _boxes(self.computed, near, whole):
-            part = make(box, static).float()
-            if fresh is None:
-                size = scale * whole.bottom, scale * whole.right
-                fresh = part.new_zeros(len(part), *size) if self._mean is None else self._mean * gain
-            box.of(fresh, scale=scale).copy_(part)
-        if fresh is not None:
-            new = self.computed & ~near
-            self._count += new
-            weight = torch.where(new, 1 / self._count, (self._count == 0).float())
+        still = self._calm >= frames - 1
+        self.moving = near = _grown(self._calm < frames - 1 + _SURE)
+        new = still & (self._count < _PICTURES)
+        self.computed = near | new
+        self._count = (self._count + new) * still
+        boxes = [(whole, False)] if near.all() else _boxes(self.computed, near, whole)
+        parts = [(box, make(box, static).float()) for box, static in boxes]
+        if not still.any():
+            self._mean = None
+            return parts[0][1].clamp(0, 1)
+        middle = spikes[frames // 2 - came // 2 :][:came]
+        clocks = self._before + self._since
+        expected = _sum(self._earlier + self._later, CELL) * (came / clocks)
+        gain = _gain(_sum(middle.sum(0, dtype=torch.float32), CELL)[clocks > 0], expected[clocks > 0])
+        weight = torch.where(new, 1 / self._count, (self._count == 0).float())
+        for box, part in parts:
             if self._mean is None:
-                self._mean = fresh / gain
-            self._mean += _pixels(weight, self._mean.shape, scale) * (fresh / gain - self._mean)
-        shown = gain * (self._mean if self.noisy else self._drawn(exposure))
+                self._mean = part.new_zeros(len(part), scale * whole.bottom, scale * whole.right)
+            mean = box.of(self._mean, scale=scale)
+            mean += _pixels(weight, box, scale) * (part / gain - mean)
+        if near.all():
+            return parts[0][1].clamp(0, 1)
+        shown = (self._mean.clone() if self.noisy else self._drawn(exposure)).mul_(gain)
         if near.any():
             share = F.interpolate(near[None, None].float(), scale_factor=CELL * scale, mode="bilinear")[0, 0]
-            shown = shown.lerp(fresh, share[: shown.shape[-2], : shown.shape[-1]])
-        return shown.clamp(0, 1)
+            for box, part in parts:
+                box.of(shown, scale=scale).lerp_(part, box.of(share, scale=scale))
+        return shown.clamp_(0, 1)
 
     def _compare(self, spikes: Tensor) -> None:
         """Add new spikes to the counts, which start anew where the scene has changed."""
@@ -216,7 +225,8 @@ class Rest:
         changed = (alone.moved | joint.moved) & (self._before > 0)
         self._calm[changed] = self._before[changed] = self._since[changed] = 0
         full = self._since >= self._before
-        kept, grown = (_pixels(cells.float(), recent.shape) for cells in (~changed, full & ~changed))
+        whole = Box(0, 0, *recent.shape)
+        kept, grown = (_pixels(cells.float(), whole) for cells in (~changed, full & ~changed))
         self._earlier = self._earlier * kept + self._later * grown
         self._later *= kept * (1 - grown)
         self._before += self._since * full
@@ -233,27 +243,28 @@ class Rest:
             seen = F.avg_pool2d(picture, self.scale)[0]
         else:
             seen = bin_to_sensor(picture, self.pattern, scale=self.scale)
-        off = (self._earlier + self._later) * _pixels(share, seen.shape) - seen
+        whole = Box(0, 0, *seen.shape)
+        off = (self._earlier + self._later) * _pixels(share, whole) - seen
         power = _sum(off.square(), CELL) / _sum(torch.ones_like(off), CELL)
         trust = (1 - share.square() / 6 / power).nan_to_num(0).clamp(min=0) * (share > 0)
-        off = off * _pixels(trust, off.shape)
+        off = off * _pixels(trust, whole)
         colors = off[None] if self.pattern == GREY else demosaic(off, self.pattern)
         if self.scale > 1:
             colors = F.interpolate(colors[None], scale_factor=self.scale, mode="bilinear")[0]
-        return picture + colors
+        return colors.add_(picture)
 
 
 def _boxes(computed: Tensor, near: Tensor, whole: Box) -> list[tuple[Box, bool]]:
     """Boxes around the cells that are computed, and whether nothing moves there; of two that meet, the last counts."""
     from scipy.ndimage import find_objects, label
 
-    found = []
-    for cells, static in ((computed & ~near, True), (near, False)):
-        for rows, columns in find_objects(label(cells.cpu().numpy())[0]):
-            box = Box(*(CELL * end for end in (rows.start, columns.start, rows.stop, columns.stop)))
-            found.append((box.grown(CELL // 2, whole), static))
-    seen = [box.grown(AROUND, whole) for box, _ in found]
-    area = sum((box.bottom - box.top) * (box.right - box.left) for box in seen)
+    found, area = [], 0
+    groups = label(_grown(computed).cpu().numpy())[0] * computed.cpu().numpy()
+    for rows, columns in find_objects(groups):
+        box = Box(*(CELL * end for end in (rows.start, columns.start, rows.stop, columns.stop)))
+        found.append((box.grown(CELL // 2, whole), not near[rows, columns].any().item()))
+        top, left, bottom, right = box.grown(AROUND, whole)
+        area += (bottom - top) * (right - left)
     if found and area >= 1.2 * whole.bottom * whole.right:
         return [(whole, not near.any().item())]
-    return found
+    return sorted(found, key=lambda one: not one[1])
