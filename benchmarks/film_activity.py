@@ -129,10 +129,10 @@ def false_rests(size: tuple[int, int], pictures: int) -> None:
         changes, resting = [], []
         for clock in range(20, clocks - 20, EVERY):
             rest(spikes[clock - 20 : clock + 21], clock, lambda box, static: box.of(nothing), 1.0)
-            change = (light[clock + 20] - light[clock]) / ALPHA
+            change = (light[clock] - light[clock - EVERY]) / ALPHA
             changes.append(F.avg_pool2d(change.square()[None], CELL, ceil_mode=True)[0].sqrt())
             resting.append(~rest.moving)
-        change, false = torch.stack(changes[3:]), torch.stack(resting[3:])
+        change, false = torch.stack(changes[7:]), torch.stack(resting[7:])
         for least in (0.0, 0.01, 0.02, 0.05):
             seen = change >= least
             print(f"{sensor},>= {least:g},{seen.sum()},{1e4 * false[seen].float().mean():.2f}")

@@ -127,6 +127,22 @@ def test_recording_equals_stream_and_its_parts(recording):
     assert [*parts[0], *parts[1]] == [*unbroken]
 
 
+def test_resumed_film_is_equal_where_it_moves_and_close_where_it_rests(tmp_path):
+    random = torch.Generator().manual_seed(0)
+    light = torch.rand(32, 40, generator=random).mul(0.4).repeat(681, 1, 1)
+    light[:, :8] = torch.stack([light[0, :8].roll(clock // 10, 1) for clock in range(681)])
+    write_spikes(tmp_path / "film.npz", simulate_spikes(light, generator=random))
+    decoder = ClassicalDecoder("tfp", scale=1, pattern="grey")
+    how = {"network": decoder, "pattern": "grey", "calibration": "none", "white": 0.4, **EXACT}
+    pictures = reconstruct(tmp_path / "film.npz", psnr_tolerance=0.1, **how)
+    unbroken = {clock: rgb[0] for clock, rgb in pictures}
+    again = {clock: rgb[0] for clock, rgb in pictures.pictures(made=list(unbroken)[:20])}
+    assert [*again] == [*unbroken][20:]
+    for clock, rgb in again.items():
+        assert rgb[:8].equal(unbroken[clock][:8])
+        torch.testing.assert_close(rgb[16:], unbroken[clock][16:], rtol=0, atol=0.02)
+
+
 def test_self_ensemble_reaches_the_network(recording):
     torch.manual_seed(0)
     network = CSCSR(**TINY).eval()
