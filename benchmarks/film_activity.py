@@ -67,7 +67,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--weights", default="cscsr_tiny_x4")
     parser.add_argument("--size", type=whole(16), nargs=2, default=[96, 128])
-    parser.add_argument("--pictures", type=whole(12), default=30)
+    parser.add_argument("--pictures", type=whole(12), default=60)
     parser.add_argument("--scene", action="append", help="only scenes whose names start with this")
     parser.add_argument("--overlay", type=Path)
     parser.add_argument("--false-rests", action="store_true")

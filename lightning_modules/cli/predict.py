@@ -77,7 +77,8 @@ def parser() -> argparse.ArgumentParser:
         dest="psnr_tolerance",
         metavar="DB",
         help="films: PSNR in dB that a picture may lose to save work; above 0, the network runs only where the spikes "
-        "show motion, and no picture is interpolated; default: 0",
+        "show motion, and no picture is interpolated; default: 0.1 for --speed fast and balanced without interpolated "
+        "pictures, or else 0",
     )
     add("--self_ensemble", type=int, metavar="N", help="average 2, 4 or 8 views of a clip")
     add("--interpolated", type=whole(0), metavar="N", help="pictures interpolated between two of the network")

@@ -33,6 +33,8 @@ _WORTH_ROOM = 0.3
 # largest distance, in clocks, of two pictures of the network between which pictures are interpolated: without
 # loss in fast scenes, and in slower ones
 _APART, _FARTHER_APART = 6, 12
+# speeds whose films run the network only where something moves
+_ONLY_WHAT_MOVES = "fast", "balanced"
 # width of the white gap between two pictures side by side, in pixels
 _GAP = 4
 
@@ -62,6 +64,9 @@ def reconstruct(
         Without a ``network``, ``speed`` or ``budget`` chooses weights of the package whose clips fit the recording. If
         the sensor has no calibration and the recording no simulator's side-car, the weights are those trained for
         noisy sensors; ``calibration="none"`` declares the pixels ideal.
+
+        Films of ``"fast"`` and ``"balanced"`` run the network only where something moves, unless pictures are
+        interpolated; ``psnr_tolerance=0`` runs it everywhere.
 
     Args:
         path: a ``.dat`` or ``.npz`` file, see :func:`spikekit.read_spikes`.
@@ -119,6 +124,8 @@ def reconstruct(
         resting = bool(how.get("psnr_tolerance"))
         preset, notes = _chosen(recording, speed, budget, scale, frame, white, noisy, resting)
         how = {**preset.given("tile", "self_ensemble", "interpolated"), **how}
+        if speed in _ONLY_WHAT_MOVES and not (how.get("future") or how.get("interpolated")):
+            how = {"psnr_tolerance": 0.1, **how}
         network = preset.build()
     elif not isinstance(network, Network):
         network = Network.from_pretrained(network)

@@ -106,6 +106,17 @@ def test_close_pictures_are_interpolated(flat, every, speed, interpolated):
     assert pictures.how.get("interpolated", 0) == interpolated
     without = reconstruct(flat(0.3), speed, frame=f"60:120:{every}", calibration="none", interpolated=0)
     assert without.how["interpolated"] == 0
+    resting = reconstruct(flat(0.3), speed, frame=f"60:120:{every}", calibration="none", psnr_tolerance=0.2)
+    assert not resting.how.get("interpolated")
+
+
+@pytest.mark.parametrize(
+    ("speed", "how", "tolerance"),
+    [("fast", {}, 0.1), ("balanced", {"psnr_tolerance": 0}, 0), ("balanced", {"future": 1}, 0), ("best", {}, 0)],
+)
+def test_films_of_fast_and_balanced_compute_only_what_moves(flat, speed, how, tolerance):
+    pictures = reconstruct(flat(0.3), speed, calibration="none", **how)
+    assert pictures.how.get("psnr_tolerance", 0) == tolerance
 
 
 def test_recording_equals_stream_and_its_parts(recording):
