@@ -22,7 +22,7 @@ SEEN, AROUND = 8, 16
 _RISK = 1e-5  # of calling a cell at rest moved
 _TESTS = 5  # of a cell: blocks of 1, 2 and 4 pixels, all of them, and the cell
 _PICTURES = 8  # of which a cell at rest shows the mean, before the network is no longer asked
-_SURE = 80  # clocks without a change, behind those of a clip, after which its cell is said to rest
+_SURE = 80  # clocks without a change before the clip of a resting cell
 _LEAST = 1 / 12  # variance that is always allowed for, in spikes: light is not known exactly
 _NOISY = 0.01  # variance of a noisy sensor, for a spike, beside that of counting: photons of 100 electrons a threshold
 
@@ -112,12 +112,12 @@ def _sum(plane: Tensor, side: int) -> Tensor:
 
 
 def _grown(cells: Tensor) -> Tensor:
-    """Cells, and those beside them."""
+    """Return cells and their neighbours."""
     return F.max_pool2d(cells[None].float(), 3, 1, 1)[0] > 0
 
 
 def _pixels(cells: Tensor, box: Box, scale: int = 1) -> Tensor:
-    """The value of its cell for every pixel of a box."""
+    """Return the value of its cell for every pixel of a box."""
     around = Box(box.top // CELL, box.left // CELL, -(-box.bottom // CELL), -(-box.right // CELL))
     pixels = around.of(cells).repeat_interleave(CELL * scale, -2).repeat_interleave(CELL * scale, -1)
     return box.of(pixels, (CELL * around.top, CELL * around.left), scale)
@@ -131,10 +131,10 @@ class Rest:
         and together with their predecessors, up to the length of the reference, which detects drift. The reference
         grows while nothing moves, and starts anew where something does.
 
-        A cell is still when its clip sees no change, and rests when the 80 clocks before it saw none either: a single
-        test may miss what moves slowly. It then shows the mean of the network's pictures since it was still, eight of
-        them, for the last of which nothing is said to move; after that no network is asked. Cells beside one that does
-        not rest are computed, and blended. A lamp's gain is taken out of what is kept, and put into what is shown.
+        A cell is still if nothing changed during its clip, and rests if nothing changed in the 80 clocks before it
+        either, as a single test may miss slow motion. A resting cell shows the mean of the network's first eight
+        pictures of the still cell; after these the network does not run. Neighbours of cells that do not rest are
+        computed and blended. The gain of a lamp is removed from the mean, and applied to the picture.
 
         The mean over all clocks of an ideal or calibrated sensor converges to the exact light. At the resolution of the
         sensor, the picture is corrected towards it, by the share of their difference that is not noise of the mean.
@@ -146,8 +146,8 @@ class Rest:
         noisy: the sensor may be noisy; its mean is then not used.
 
     Attributes:
-        moving: cells (h, w) of the last picture that did not rest, and those beside them.
-        computed: those that the network made, the moving ones among them.
+        moving: cells (h, w) of the last picture that do not rest, and their neighbours.
+        computed: cells (h, w) of the last picture that the network computed.
     """
 
     #: pictures to repeat when a film is resumed, so that parts at rest are found again
