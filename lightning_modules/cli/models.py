@@ -19,7 +19,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the verb."""
     return VerbParser(
         prog="lightning models",
-        description="List the weights of the package, for lightning predict --model.weights NAME and "
+        description="List the weights of the package, for lightning predict --weights NAME and "
         "CSCSR.from_pretrained(NAME).",
     )
 
