@@ -108,7 +108,7 @@ class Camera:
 
         Args:
             spikes: stored frames :math:`(*, H, W)`, with or without the columns that are not pixels.
-            flip: flip the rows; default: :attr:`flip` of the camera. Use ``False`` for frames that are upright already.
+            flip: flip the rows; default: the camera's ``flip``. Use ``False`` for frames that are upright already.
 
         Returns:
             Frames :math:`(*, H', W')` of :attr:`prepared_size`, in the dtype of ``spikes``.
