@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lightning_modules.networks.layers import ConvBlock, conv
+from lightning_modules.networks.layers import ConvBlock, conv, fused_conv
 
 
 class FeatureRefinement(nn.Module):
@@ -26,7 +26,7 @@ class FeatureRefinement(nn.Module):
         # subtracting the mean from the few weights is cheaper than from the pixels
         weight = residual.weight.unflatten(1, (self.times, -1))
         weight = torch.cat([base.weight, (weight - weight.mean(dim=1, keepdim=True)).flatten(1, 2)])
-        seen = F.conv2d(pixels, weight, torch.cat([base.bias, residual.bias]), padding=1).relu_()
+        seen = fused_conv(pixels, weight, torch.cat([base.bias, residual.bias]))
         weight = torch.cat([base_end.weight, residual_end.weight], dim=1)
         return F.conv2d(seen, weight, base_end.bias + residual_end.bias, padding=1)
 

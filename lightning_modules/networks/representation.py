@@ -59,6 +59,8 @@ class SpikeRepresentation(nn.Module):
         last.weight[1:] *= 0.1
 
     def forward(self, spikes: Tensor, noise: Tensor | None = None) -> Tensor:  # noqa: D102
+        if torch.is_autocast_enabled(spikes.device.type):  # before they are copied into windows
+            spikes = spikes.to(torch.get_autocast_dtype(spikes.device.type))
         windows = spikes.unfold(1, self.window, self.stride).movedim(-1, 2)
         everywhere = None
         if self.whole is not None:

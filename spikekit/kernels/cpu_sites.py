@@ -47,14 +47,13 @@ _class = compiled(_find)
 
 
 def _search(
-    features: Any, flow: Any, shares: Any, start: Any, offset: Any, weight: Any, low: Any, high: Any, steps: Any,
+    features: Any, flow: Any, shares: Any, start: Any, jump: Any, weight: Any, low: Any, high: Any, steps: Any,
     rows: Any, out: Any, half: Any,
 ) -> None:  # fmt: skip
     """Compute the temporal pixels of some rows: features (T, H, W, F), flow (2, 2, H, W), out (H, W, T, F, s^2)."""
     times, height, width, channels = features.shape
     pixels = weight.shape[1]
     flat = features.reshape(times, height * width * channels)
-    jump = (offset[:, 0] * np.int32(width) + offset[:, 1]) * np.int32(channels)
     total = np.empty((channels, pixels), np.float32)
     bits = total.view(np.uint32)
     for y in range(rows[0], rows[1]):
@@ -96,14 +95,13 @@ _search_rows = compiled(_search)
 
 
 def _spread(
-    grad: Any, flow: Any, shares: Any, start: Any, offset: Any, weight: Any, low: Any, high: Any, steps: Any,
+    grad: Any, flow: Any, shares: Any, start: Any, jump: Any, weight: Any, low: Any, high: Any, steps: Any,
     t: Any, out: Any,
 ) -> None:  # fmt: skip
     """Add the gradient of the features of a time point to zeros ``out`` (T, H, W, F), from grad (H, W, T, F, s^2)."""
     _, height, width, channels = out.shape
     pixels = weight.shape[1]
     flat = out.reshape(len(out), height * width * channels)
-    jump = (offset[:, 0] * np.int32(width) + offset[:, 1]) * np.int32(channels)
     for y in range(height):
         for x in range(width):
             row, column, which = _class(flow, shares, t, y, x, low, high, steps)
@@ -128,7 +126,8 @@ def search_sites(
     half = features.dtype is torch.bfloat16
     out = new_tensor((batch, height, width, times, channels, scale**2), features.dtype)
     rows = features.permute(0, 1, 3, 4, 2).float().contiguous()
-    table = [part.numpy() for part in (shares.float(), start, offset, weight)]
+    jump = (offset[:, 0] * width + offset[:, 1]) * channels
+    table = [part.numpy() for part in (shares.float(), start, jump, weight)]
     for features_b, flow_b, out_b in zip(rows.numpy(), flow.contiguous().numpy(), out, strict=True):
         result = (out_b.view(torch.uint16) if half else out_b).numpy()
         jobs = ((y, min(y + _ROWS, height)) for y in range(0, height, _ROWS))
@@ -146,7 +145,8 @@ def spread_sites(
     rows = grad.movedim(1, -1).float().contiguous().unflatten(-1, (times, -1, scale**2))
     batch, height, width, _, channels, _ = rows.shape
     out = new_tensor((batch, times, height, width, channels), torch.float32, np.zeros)
-    table = [part.numpy() for part in (shares.float(), start, offset, weight)]
+    jump = (offset[:, 0] * width + offset[:, 1]) * channels
+    table = [part.numpy() for part in (shares.float(), start, jump, weight)]
     for rows_b, flow_b, out_b in zip(rows.numpy(), flow.contiguous().numpy(), out.numpy(), strict=True):
         arguments = rows_b, flow_b, *table, low, high, steps
         in_threads(_spread_time, ((*arguments, t, out_b) for t in range(times)))

@@ -5,6 +5,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from lightning_modules.inference.tiles import forward_in_tiles
 from lightning_modules.motion import ZeroFlow
 from lightning_modules.networks import CSCSR, ClassicalDecoder
+from lightning_modules.networks.layers import ConvBlock, res_blocks
 from lightning_modules.networks.refinement import FeatureRefinement
 from lightning_modules.networks.representation import SpikeRepresentation
 from spikekit import demosaic, mosaic, psnr, spike_integrate_fire, tfi, tfp
@@ -181,3 +182,13 @@ def test_training_works_after_inference_mode():
     learned = network(spikes, flow)
     learned.square().mean().backward()
     assert torch.equal(learned, seen)
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_inference_gives_the_features_of_training(half):
+    torch.manual_seed(0)
+    blocks, x = torch.nn.Sequential(ConvBlock(3, 8), *res_blocks(8, 2)), torch.randn(2, 3, 9, 7)
+    with torch.autocast("cpu", torch.bfloat16, enabled=half):
+        trained = blocks(x).detach()
+        with torch.no_grad():
+            torch.testing.assert_close(blocks(x), trained, rtol=0, atol=2e-2 if half else 1e-6)
