@@ -186,10 +186,13 @@ def warps(given: Inputs) -> Iterator[Case]:
     yield "flow_warp", size, lambda: sk.flow_warp(image, flow), {"grid_sample": lambda: grid_sample(image, flow)}
     red, green, _ = sk.bayer_mask(given.side // 2, given.side // 2, scale=2, device=given.device)
     for colour, mask in (("R", red), ("G", green)):
-        for steps in (None, 16):
-            name = f"{colour}, {size}, " + ("exact" if steps is None else f"steps {steps}")
-            run = partial(sk.flow_warp_idw, image, flow, mask, steps=steps)
-            yield "flow_warp_idw", name, run, {"grid_sample, from all pixels": lambda: grid_sample(image, flow)}
+        run = partial(sk.flow_warp_idw, image, flow, mask)
+        yield (
+            "flow_warp_idw",
+            f"{colour}, {size}",
+            run,
+            {"grid_sample, from all pixels": lambda: grid_sample(image, flow)},
+        )
 
         def backward(warp: Callable[..., Tensor], *masks: Tensor) -> list[Tensor]:
             leaves = [image.detach().requires_grad_(), flow.detach().requires_grad_()]
@@ -203,15 +206,6 @@ def warps(given: Inputs) -> Iterator[Case]:
     run = partial(sk.linear_motion, flow, -flow, times, scale=2)
     yield "linear_motion", "11 times, scale 2", run, {"interpolate": partial(motion, flow, -flow, times, 2)}
     yield "upsample_flow", "scale 4", lambda: sk.upsample_flow(flow, 4), {"interpolate": lambda: larger(flow, 4)}
-    three = given.rand(3, given.side, given.side)
-    ways = flow * torch.tensor([-1.0, 0.0, 1.0], device=given.device).reshape(3, 1, 1, 1)
-    run = partial(sk.demosaic_along_motion, three, ways)
-    yield (
-        "demosaic_along_motion",
-        "3 mosaics",
-        run,
-        {"demosaic_residual of one": lambda: sk.demosaic_residual(three[1])},
-    )
 
 
 def colour(given: Inputs) -> Iterator[Case]:
@@ -223,12 +217,6 @@ def colour(given: Inputs) -> Iterator[Case]:
     yield "split_colors", "uint8, 41 frames", lambda: sk.split_colors(clip), {"plain torch": lambda: colours(clip)}
     others = {"kornia, bilinear": lambda: raw_to_rgb(raw[:, None], CFA.BG)}
     yield "demosaic", "8 pictures", lambda: sk.demosaic(raw), others
-    yield (
-        "demosaic_residual",
-        "2 pictures",
-        lambda: sk.demosaic_residual(raw[:2]),
-        {"demosaic": lambda: sk.demosaic(raw[:2])},
-    )
     yield "ssim", "1 picture", lambda: sk.ssim(rgb[0], rgb[1]), made(scikit_image, rgb[0], rgb[1])
 
 
