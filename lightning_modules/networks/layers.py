@@ -46,12 +46,12 @@ def fused_conv(x: Tensor, weight: Tensor, bias: Tensor, add: Tensor | None = Non
 
 
 def _one_pass(dtype: torch.dtype) -> bool:
-    """Whether oneDNN takes the dtype, and nobody differentiates, traces or counts operations."""
+    """Return whether oneDNN takes the dtype, and nobody differentiates, traces or counts operations."""
     if torch.is_grad_enabled() or torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack():
         return False
-    has = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_convolution_pointwise")
-    bfloat16 = dtype is torch.bfloat16 and torch.ops.mkldnn._is_mkldnn_bf16_supported()
-    return has and not torch.jit.is_tracing() and (dtype is torch.float32 or bfloat16)
+    if torch.jit.is_tracing() or not torch.backends.mkldnn.is_available():
+        return False
+    return dtype is torch.float32 or (dtype is torch.bfloat16 and torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
 
 class ConvBlock(nn.Sequential):

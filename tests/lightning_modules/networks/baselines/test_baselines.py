@@ -72,7 +72,8 @@ def test_takes_flow_states_whether_the_flow_matters(name, tiny):
         assert network(spikes, 0 * flow).equal(still)
     assert network.halo is None
     if network.takes_flow:
-        assert build(name, **tiny, motion=ZeroFlow()).eval()(spikes).equal(still)
+        with torch.no_grad():
+            assert build(name, **tiny, motion=ZeroFlow()).eval()(spikes).equal(still)
 
 
 @EVERY
