@@ -153,11 +153,10 @@ class FilmMaker:
         future: later key frames that a picture may wait for; only for networks with a state.
         interpolated: pictures interpolated between two pictures of the network.
         tile: side of a tile in sensor pixels, 0 for no tiles; default: 200, or 512 on a GPU.
-        psnr_tolerance: by how many dB the PSNR of a picture may fall where this saves work. With any but 0 the network
-            is asked only where the spikes say that something moves (:class:`lightning_modules.inference.rest.Rest`).
-            The first picture knows of nothing that rests, so a film of one is as it is without.
+        psnr_tolerance: PSNR in dB that a picture may lose to save work. Above 0, the network runs only where the spikes
+            show motion, see :class:`lightning_modules.inference.rest.Rest`; the first picture is always complete.
         how: ``self_ensemble`` and ``done`` of :func:`lightning_modules.inference.predict.predict`. With a
-            self-ensemble every clip is reconstructed alone: no state is carried on.
+            self-ensemble, every clip is reconstructed alone, without a state.
 
     Raises:
         ValueError: ``future`` for a network without a state; ``interpolated`` for a network without a motion estimate;
@@ -187,7 +186,7 @@ class FilmMaker:
             if isinstance(number, bool) or not isinstance(number, int) or number < 0:
                 raise ValueError(f"{name}: expected a whole number >= 0, got {number!r}")
         if future and not self.carries_on:
-            raise ValueError(f"future: expected 0, as {kind} takes every clip by itself, got {future}")
+            raise ValueError(f"future: expected 0, as {kind} takes single clips, got {future}")
         if interpolated and not network.takes_flow:
             raise ValueError(f"interpolated: expected 0, as {kind} estimates no motion of a clip, got {interpolated}")
         check_views(how.get("self_ensemble", 1))
@@ -209,7 +208,7 @@ class FilmMaker:
 
     @property
     def warm_up(self) -> int:
-        """On how many pictures before a group its pictures depend, as far as one can see."""
+        """Number of pictures before a group that visibly affect it."""
         known = self.network.warm_up if self.carries_on else 0
         pictures = max(known, min(self.interpolated, 1), Rest.warm_up if self.rest else 0)
         return pictures * (self.interpolated + 1)

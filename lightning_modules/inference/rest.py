@@ -14,17 +14,17 @@ from lightning_modules.inference.tiles import Box
 from spikekit import bin_to_sensor, demosaic
 from spikekit.color.cfa import GREY
 
-#: sensor pixels along the side of a cell, the smallest part that rests by itself
+#: side of a cell, the smallest part that can rest, in sensor pixels
 CELL = 8
-#: sensor pixels around a box that the network sees, and in which motion is estimated
+#: margins around a box, in sensor pixels, for the network and for the estimate of motion
 SEEN, AROUND = 8, 16
 
-_RISK = 1e-5  # of calling a cell at rest moved
-_TESTS = 5  # of a cell: blocks of 1, 2 and 4 pixels, all of them, and the cell
-_PICTURES = 8  # of which a cell at rest shows the mean, before the network is no longer asked
+_RISK = 1e-5  # probability that a cell at rest counts as moved
+_TESTS = 5  # tests per cell: blocks of 1, 2 and 4 pixels, all of them, and the cell
+_PICTURES = 8  # pictures of the network that a cell at rest shows the mean of
 _SURE = 80  # clocks without a change before the clip of a resting cell
-_LEAST = 1 / 12  # variance that is always allowed for, in spikes: light is not known exactly
-_NOISY = 0.01  # variance of a noisy sensor, for a spike, beside that of counting: photons of 100 electrons a threshold
+_LEAST = 1 / 12  # smallest variance of a count, as light is not known exactly
+_NOISY = 0.01  # additional variance per spike of a noisy sensor: photon noise for 100 electrons per threshold
 
 
 class Changes(NamedTuple):
@@ -160,7 +160,7 @@ class Rest:
     def _start(self, spikes: Tensor) -> None:
         planes = spikes.new_zeros(2, *spikes.shape[-2:], dtype=torch.float32)
         self._earlier, self._later = planes
-        # the clocks of both, each as bright as the first; clocks without a change; pictures in the mean
+        # clocks of both counts, scaled to the first light; clocks without a change; pictures in the mean
         self._before, self._since, self._calm, self._count = _sum(torch.zeros_like(planes[:1]), CELL).repeat(4, 1, 1)
         self._mean: Tensor | None = None
         self._light = 1.0
@@ -202,7 +202,7 @@ class Rest:
                 self._mean = part.new_zeros(len(part), scale * whole.bottom, scale * whole.right)
             mean = box.of(self._mean, scale=scale)
             mean.lerp_(part if gain == 1 else part / gain, _pixels(weight, box, scale))
-        if boxes[:1] == [(whole, False)]:  # the mean of what rests is not worth its time
+        if boxes[:1] == [(whole, False)]:  # blending the few cells at rest would cost more than it gains
             return parts[0][1].clamp(0, 1)
         shown = (self._mean.clone() if self.noisy else self._drawn(exposure)).mul_(gain)
         if near.any():
@@ -250,13 +250,13 @@ class Rest:
         off = off * _pixels(trust, whole)
         colors = off[None] if self.pattern == GREY else demosaic(off, self.pattern)
         if self.scale > 1:
-            # as without, and three times faster
+            # antialias does not change the result of enlarging, but is three times faster
             colors = F.interpolate(colors[None], scale_factor=self.scale, mode="bilinear", antialias=True)[0]
         return picture + colors
 
 
 def _boxes(computed: Tensor, near: Tensor, whole: Box) -> list[tuple[Box, bool]]:
-    """Boxes around the cells that are computed, and whether nothing moves there; of two that meet, the last counts."""
+    """Return boxes around computed cells, and whether nothing moves there; where boxes overlap, the last counts."""
     from scipy.ndimage import find_objects, label
 
     found, area = [], 0

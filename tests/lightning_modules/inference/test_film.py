@@ -244,7 +244,7 @@ def test_unsupported_film_options_are_rejected():
             FilmMaker(network, 0, wrong)
     with pytest.raises(ValueError, match="interpolated: expected 0, as ClassicalDecoder estimates no motion"):
         FilmMaker(ClassicalDecoder(), 0, 1)
-    with pytest.raises(ValueError, match="future: expected 0, as CSCSR takes every clip by itself, got 1"):
+    with pytest.raises(ValueError, match="future: expected 0, as CSCSR takes single clips, got 1"):
         FilmMaker(network, 1)
     with pytest.raises(ValueError, match=r"clocks: expected 2 increasing ones, got \[3, 3\]"):
         FilmMaker(network)(torch.zeros(2, 41, 12, 10), [3, 3])

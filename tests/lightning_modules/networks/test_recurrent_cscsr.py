@@ -152,5 +152,5 @@ def test_invalid_settings_are_rejected(network, clips):
     spikes, _ = clips
     with pytest.raises(ValueError, match=r"clocks: expected 2 increasing ones, got \[40, 20\]"):
         FilmMaker(network)(spikes[:2], [40, 20])
-    with pytest.raises(ValueError, match="future: expected 0, as ClassicalDecoder takes every clip by itself, got 1"):
+    with pytest.raises(ValueError, match="future: expected 0, as ClassicalDecoder takes single clips, got 1"):
         film(ClassicalDecoder(), [], future=1)

@@ -80,7 +80,7 @@ def test_network_without_state_takes_single_key_frames():
 
 
 def test_invalid_arguments_are_rejected():
-    with pytest.raises(ValueError, match="future: expected 0, as ClassicalDecoder takes every clip by itself, got 2"):
+    with pytest.raises(ValueError, match="future: expected 0, as ClassicalDecoder takes single clips, got 2"):
         SuperResolution(ClassicalDecoder(), future=2)
     with pytest.raises(ValueError, match=r"frozen: expected parts of the network, such as motion, .* got nothing"):
         SuperResolution(RecurrentCSCSR(**TINY), frozen=["nothing"])
