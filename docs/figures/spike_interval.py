@@ -23,7 +23,7 @@ bottom.bar_label(bars, interval, fontsize=8)
 bottom.set(xlabel="frame n", ylabel=r"interval $\Psi_n$", xlim=(-1.4, 26.4), ylim=(0, 13), xticks=range(0, 26, 2))
 bottom.legend(
     handles=[bars[5], bars[0]],
-    labels=["enclosed by two spikes", "one is missing: nearest interval, or time since the end if longer"],
+    labels=["enclosed by two spikes", "one is missing: nearest interval, or that to the virtual spike if longer"],
     fontsize=8,
     loc="upper center",
 )
