@@ -374,6 +374,6 @@ def _unmeasured(preset: Preset, recording: Recording, scale: int) -> str:
     model = find_model(preset.weights or "")
     dark = ", with a recording in the dark," if recording.calibration is not None else ""
     measure = f"spikekit calibrate{dark} measures it, --calibration none takes it for ideal"
-    noisy = "using weights trained for noisy sensors, with the dB of ideal ones"
+    noisy = "using weights trained for noisy sensors"
     said = noisy if model and model.noise else f"there are no weights for noisy sensors at scale {scale}"
     return f"this sensor is not calibrated: {said}; {measure}"
