@@ -15,6 +15,11 @@ from lightning_modules.storage.settings import check_plain
 from spikekit.arguments import one_line
 
 _NUMBERS = {torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.int64, torch.int32, torch.bool}
+_KINDS = {
+    **dict.fromkeys(("network", "motion", "recipe", "callbacks", "loops"), dict),
+    **dict.fromkeys(("optimizer_states", "lr_schedulers"), list),
+    **dict.fromkeys(("epoch", "global_step"), int),
+}
 #: keys from which Lightning would build objects
 _NOT_TAKEN = ("hyper_parameters", "datamodule_hyper_parameters", "hparams_name", "datamodule_hparams_name")
 
@@ -47,10 +52,11 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(checkpoint, dict) or not isinstance(checkpoint.get("state_dict"), dict):
             raise TypeError("expected a dictionary with a state_dict")
+        for key, kind in _KINDS.items():
+            if not isinstance(checkpoint.get(key, kind()), kind):
+                raise TypeError(f"{key}: expected a {kind.__name__}, got a {type(checkpoint[key]).__name__}")
         for key in ("network", "motion", "recipe"):  # older checkpoints have no recipe
-            if not isinstance(checkpoint.setdefault(key, {}), dict):
-                raise TypeError(f"{key}: expected a dictionary, got a {type(checkpoint[key]).__name__}")
-            check_plain(key, checkpoint[key])
+            check_plain(key, checkpoint.setdefault(key, {}))
         check_tensors(checkpoint["state_dict"])
     except Exception as error:  # the type depends on the damage
         reason = one_line(error)[:300]

@@ -107,9 +107,10 @@ def _read_checkpoint(path: Path) -> Weights:
     tensors = {
         name.removeprefix("network.").removeprefix(_COMPILED): value for name, value in checkpoint["state_dict"].items()
     }
+    network = checkpoint["network"]
     try:
-        return Weights(path, _named(checkpoint["network"]), _named(checkpoint["motion"]), tensors)
-    except ValueError as error:
+        return Weights(path, {"class": network["class"], **_named(network)}, _named(checkpoint["motion"]), tensors)
+    except (KeyError, ValueError) as error:
         raise ValueError(f"{path}: not a checkpoint of lightning fit ({error})") from error
 
 

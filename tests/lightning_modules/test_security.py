@@ -117,6 +117,7 @@ ESTIMATOR = {"class": "Spike2Flow", "window": 5}
         (SETTINGS, {**ESTIMATOR, "widths": [4] * 1000}),
         (SETTINGS, {**ESTIMATOR, "radius": 10**6}),
         (SETTINGS, ["evilmod.X"]),
+        ({}, {}),
     ],
 )
 def test_settings_can_only_name_known_classes_and_arguments(settings, motion, trap, tmp_path):
@@ -198,6 +199,13 @@ def test_tensors_beyond_the_data_of_the_file_are_rejected(odd, tmp_path):
     torch.save({"network": SETTINGS, "state_dict": {"network.reconstruction.rgb.bias": odd}}, path)
     with pytest.raises(ValueError, match=r"odd.ckpt: not a checkpoint of lightning fit \(TypeError"):
         read_checkpoint(path)
+
+
+@pytest.mark.parametrize("odd", [{"loops": "x"}, {"callbacks": 0.5}, {"optimizer_states": {}}, {"epoch": "1"}])
+def test_parts_of_another_kind_are_rejected(odd, content, tmp_path):
+    torch.save({**content(), **odd}, tmp_path / "odd.ckpt")
+    with pytest.raises(ValueError, match=rf"odd.ckpt: .*{next(iter(odd))}: expected a "):
+        read_checkpoint(tmp_path / "odd.ckpt")
 
 
 def test_compressed_checkpoint_is_rejected(content, tmp_path):
