@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -37,21 +39,35 @@ def fused_conv(x: Tensor, weight: Tensor, bias: Tensor, add: Tensor | None = Non
     """Return the sum of a 3 x 3 convolution and ``add``, or its ReLU; in inference on a CPU in one pass, by oneDNN."""
     dtype = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else x.dtype
     if x.is_cpu and (add is None or add.dtype == dtype) and _one_pass(dtype):
-        how = weight.to(dtype), bias.to(dtype), (1, 1), (1, 1), (1, 1), 1
-        if add is None:
-            return torch.ops.mkldnn._convolution_pointwise(x.to(dtype), *how, "relu", [], None)
-        return torch.ops.mkldnn._convolution_pointwise.binary(x.to(dtype), add, *how, "add", None, None, [], None)
+        return _by_onednn(x.to(dtype), weight.to(dtype), bias.to(dtype), add)
     seen = F.conv2d(x, weight, bias, padding=1)
     return seen.relu_() if add is None else add + seen
 
 
+def _by_onednn(x: Tensor, weight: Tensor, bias: Tensor, add: Tensor | None) -> Tensor:
+    how = weight, bias, (1, 1), (1, 1), (1, 1), 1
+    if add is None:
+        return torch.ops.mkldnn._convolution_pointwise(x, *how, "relu", [], None)
+    return torch.ops.mkldnn._convolution_pointwise.binary(x, add, *how, "add", None, None, [], None)
+
+
 def _one_pass(dtype: torch.dtype) -> bool:
     """Return whether oneDNN takes the dtype, and nobody differentiates, traces or counts operations."""
-    if torch.is_grad_enabled() or torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack():
+    if torch.is_grad_enabled() or torch.compiler.is_compiling() or torch.jit.is_tracing():
         return False
-    if torch.jit.is_tracing() or not torch.backends.mkldnn.is_available():
+    return _has_onednn(dtype) and not torch._C._len_torch_dispatch_stack()
+
+
+@lru_cache
+def _has_onednn(dtype: torch.dtype) -> bool:
+    """Try it once: the operation is PyTorch's own, which another version or processor may lack."""
+    try:
+        torch._C._len_torch_dispatch_stack()
+        x = torch.ones(1, 1, 3, 3, dtype=dtype, device="cpu")
+        known = (_by_onednn(x, x, x[0, 0, 0, :1], add) for add in (None, x))
+        return [y[0, 0, 1, 1].item() for y in known] == [10, 11]
+    except (AttributeError, NotImplementedError, RuntimeError, TypeError):
         return False
-    return dtype is torch.float32 or (dtype is torch.bfloat16 and torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
 
 class ConvBlock(nn.Sequential):
