@@ -307,7 +307,7 @@ def by_size(models: Sequence[Model], speed: str) -> Model | None:
         raise ValueError(f"speed: expected one of {', '.join(SPEEDS)}, got {speed!r}")
     able = sorted(models, key=lambda model: model.macs)
     place = list(SPEEDS).index(speed) / (len(SPEEDS) - 1)
-    return able[round(place * (len(able) - 1))] if able else None
+    return able[int(place * (len(able) - 1))] if able else None
 
 
 def _chosen(

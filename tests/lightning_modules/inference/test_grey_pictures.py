@@ -70,13 +70,13 @@ def test_speed_chooses_the_size_of_grey_weights():
 
     models = [model("large", 2000), model("small", 700)]
     chosen = {speed: by_size(models, speed).name for speed in SPEEDS}
-    assert chosen == {"fastest": "small", "fast": "small", "balanced": "large", "best": "large"}
+    assert chosen == {"fastest": "small", "fast": "small", "balanced": "small", "best": "large"}
     assert by_size([], "best") is None
     with pytest.raises(ValueError, match="speed"):
         by_size(models, "soon")
 
 
-@pytest.mark.parametrize(("pattern", "weights"), [("grey", "cscsr_small_grey_x1"), ("RGGB", "cscsr_small_x1")])
+@pytest.mark.parametrize(("pattern", "weights"), [("grey", "cscsr_large_grey_x1"), ("RGGB", "cscsr_small_x1")])
 def test_scale_1_has_weights_for_grey_and_colour(recording, pattern, weights):
     made = reconstruct(**recording, speed="best", scale=1, pattern=pattern)
     assert made.array().shape == (3, 16, 24, 3)
