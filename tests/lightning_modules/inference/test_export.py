@@ -128,7 +128,7 @@ def test_torch_program_takes_any_even_size(tmp_path, program):
 
 
 def test_export_errors_are_one_line(tmp_path):
-    with pytest.raises(ValueError, match=r"CSCSR: cannot be exported \(neighbors: expected 4 at most"):
+    with pytest.raises(ValueError, match=r"CSCSR: cannot be exported \(neighbors: expected at most 4"):
         export_network(CSCSR(scale=2, neighbors=5, motion=ZeroFlow(), **TINY), tmp_path / "a.pt2", "torch")
     assert not list(tmp_path.iterdir())
 
