@@ -2,7 +2,6 @@
 
 import csv
 import os
-import re
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -72,7 +71,7 @@ sphinx_gallery_conf = {
 
 
 class Run(SphinxDirective):
-    """``.. run:: info --help`` shows what the ``spikekit`` command prints, with ``--markdown`` as tables."""
+    """``.. run:: info --help`` shows what the ``spikekit`` command prints."""
 
     required_arguments = 1
     final_argument_whitespace = True
@@ -81,12 +80,7 @@ class Run(SphinxDirective):
         """Return the nodes."""
         self.env.note_reread()  # the output can change without a change of the page
         printed = _spikekit(self.arguments[0])
-        if "--markdown" not in self.arguments[0]:
-            return [nodes.literal_block(printed, f"$ spikekit {self.arguments[0]}\n{printed}", language="console")]
-        rst = StringList(list(_restructured(printed)), source=self.get_source_info()[0])
-        node = nodes.Element()
-        self.state.nested_parse(rst, self.content_offset, node)
-        return node.children
+        return [nodes.literal_block(printed, f"$ spikekit {self.arguments[0]}\n{printed}", language="console")]
 
 
 def _spikekit(arguments):
@@ -98,28 +92,6 @@ def _spikekit(arguments):
     return printed.getvalue()
 
 
-def _restructured(markdown):
-    """Convert headings, tables and code of Markdown to lines of reStructuredText."""
-    header = True
-    for line in markdown.splitlines():
-        if not line.startswith("|"):
-            header = True
-            yield f".. rubric:: {_inline(line.lstrip('# '))}" if line.startswith("#") else _inline(line)
-            continue
-        if header:
-            yield from ("", ".. list-table::", "   :header-rows: 1", "")
-        header = False
-        if not set(line) <= set("|-: "):
-            for i, cell in enumerate(line.strip("|").split("|")):
-                yield f"   {'  -' if i else '* -'} {_inline(cell.strip())}"
-
-
-def _inline(text):
-    """Keep text between backticks as code, and escape the rest."""
-    parts = text.split("`")
-    return "".join(f"``{part}``" if i % 2 else re.sub(r"([*_|\\])", r"\\\1", part) for i, part in enumerate(parts))
-
-
 class ShippedTrade(SphinxDirective):
     """``.. shipped-trade:: 4`` shows the table of a scale in the package, ``4_dim`` that for low light."""
 
@@ -129,22 +101,22 @@ class ShippedTrade(SphinxDirective):
         """Return the nodes."""
         path = Path(lightning_modules.__file__).parent / "weights" / f"x{self.arguments[0]}.csv"
         self.env.note_dependency(str(path))
-        rst = StringList(list(_restructured("\n".join(_trade(path)))), source=self.get_source_info()[0])
+        rst = StringList(list(_trade(path)), source=self.get_source_info()[0])
         node = nodes.Element()
         self.state.nested_parse(rst, self.content_offset, node)
         return node.children
 
 
 def _trade(path):
-    """Return the table in Markdown, line by line."""
+    """Yield the table in reStructuredText, line by line."""
     with path.open(newline="") as file:
         rows = sorted((row for row in csv.DictReader(file) if not row["failed"]), key=lambda row: float(row["ms"]))
-    yield "| setting | PSNR (dB) | SSIM | time, ratio | ms per frame | MiB | on the front |"
-    yield "|---|---|---|---|---|---|---|"
+    yield from (".. csv-table::", "   :header-rows: 1", "")
+    yield '   setting,PSNR (dB),SSIM,"time, ratio",ms per frame,MiB,on the front'
     for row in rows:
         psnr, ssim, ratio, ms, mib = (float(row[name]) for name in ("psnr", "ssim", "ratio", "ms", "mib"))
         on_front = "yes" if row["front"] == "1" else ""
-        yield f"| {row['setting']} | {psnr:.2f} | {ssim:.4f} | {ratio:.2g} | {ms:.0f} | {mib:.0f} | {on_front} |"
+        yield f'   "{row["setting"]}",{psnr:.2f},{ssim:.4f},{ratio:.2g},{ms:.0f},{mib:.0f},{on_front}'
 
 
 def _inline_math(self, node):
