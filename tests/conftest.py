@@ -18,10 +18,12 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     torch.set_num_threads(1)
 
 
-def pytest_configure():
+def pytest_configure(config):
     """Programs that tests start hear Ctrl-C, also where the shell runs tests in the background and ignores it."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    if config.getoption("--table") and config.getoption("numprocesses", None):
+        raise pytest.UsageError("--table: expected a single process, got -n")
 
 
 def pytest_addoption(parser):
