@@ -71,6 +71,19 @@ def list_models(scale: int | None = None, pattern: str | None = None) -> list[Mo
     return [one for one in _models() if scale in (None, one.scale) and pattern in (None, one.pattern)]
 
 
+def for_noise(scale: int) -> dict[str, str]:
+    """Map weights to those of the same network that were trained for noisy sensors, which may be the same.
+
+    Example:
+        >>> for_noise(4)["cscsr_huge_x4"]
+        'cscsr_huge_noisy_x4'
+    """
+    models = list_models(scale)
+    noisy = {(one.size, one.frames, one.pattern): one.name for one in models if one.noise}
+    keys = {one.name: (one.size, one.frames, one.pattern) for one in models}
+    return {name: noisy[key] for name, key in keys.items() if key in noisy}
+
+
 def find_model(name: str) -> Model | None:
     """Find weights in the package by name; return None if there are none.
 

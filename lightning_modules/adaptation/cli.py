@@ -15,7 +15,8 @@ from lightning_modules.cli.errors import InputError, UsageError, VerbParser, inp
 from lightning_modules.cli.folder_lock import check_folder, locked_folder
 from lightning_modules.inference.clips import RecordingClips
 from lightning_modules.inference.output import check_place
-from lightning_modules.inference.reconstruct import may_be_noisy, precision_of
+from lightning_modules.inference.predict import precision_of
+from lightning_modules.inference.reconstruct import may_be_noisy
 from lightning_modules.networks import Network
 from lightning_modules.registry import list_models
 from lightning_modules.storage.pretrained import Weights, motion_of, settings_of, write_weights

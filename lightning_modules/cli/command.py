@@ -28,7 +28,7 @@ from lightning_modules.cli.folder_lock import check_folder, locked_folder
 from lightning_modules.cli.reasons import reason
 from lightning_modules.configurations import with_found_configs
 from lightning_modules.data.loading import end_when_orphaned
-from lightning_modules.inference.reconstruct import precision_of
+from lightning_modules.inference.predict import precision_of
 from lightning_modules.storage.checkpoint import read_checkpoint
 from lightning_modules.storage.pretrained import check_settings
 from lightning_modules.tasks import optical_flow, super_resolution  # noqa: F401  (classes that --model names)
@@ -213,7 +213,7 @@ class Command(LightningCLI):
         kwargs["plugins"] = [Checkpoints(output), *_listed(config.get("plugins"))]
         if config.get("precision") is None:
             gpu = config.get("accelerator") in ("auto", "gpu", "cuda") and torch.cuda.is_available()
-            kwargs["precision"] = precision_of(torch.device("cuda")) if gpu else "32-true"
+            kwargs["precision"] = self.precision_on(torch.device("cuda" if gpu else "cpu"))
         kwargs["callbacks"] = [*_listed(config.get("callbacks")), *self._callbacks(output)]
         if self.subcommand != "fit":
             self.save_config_callback = None  # config.yaml is the record of the training
@@ -222,6 +222,11 @@ class Command(LightningCLI):
             return super().instantiate_trainer(**kwargs)
         except TypeError as error:  # such as -1 devices on a CPU
             raise UsageError(f"trainer: {one_line(error)}") from error
+
+    @staticmethod
+    def precision_on(device: torch.device) -> str:
+        """Return the default precision on a device."""
+        return precision_of(device) if device.type == "cuda" else "32-true"
 
     def _callbacks(self, output: Path) -> list[Callback]:
         if self.subcommand == "fit":

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from itertools import count
 
+import torch
 from torch import Tensor
 
 from lightning_modules.inference.self_ensemble import COUNTS
@@ -70,3 +72,17 @@ def check_views(self_ensemble: int) -> None:
     """Check a number of views: 1, 2, 4 or 8."""
     if isinstance(self_ensemble, bool) or self_ensemble not in COUNTS:
         raise ValueError(f"self_ensemble: expected one of {COUNTS}, got {self_ensemble!r}")
+
+
+def precision_of(device: torch.device) -> str:
+    """Return bfloat16 for a GPU or a processor that computes in it, float32 otherwise."""
+    able = device.type == "cuda" and torch.cuda.is_bf16_supported()
+    return "bf16-mixed" if able or (device.type == "cpu" and _cpu_computes_in_bfloat16()) else "32-true"
+
+
+def _cpu_computes_in_bfloat16() -> bool:
+    """Whether torch may use bfloat16 instructions of the processor; emulated, bfloat16 is slower than float32."""
+    asked = getattr(torch.cpu, "get_capabilities", dict)()  # from torch 2.10 on
+    allowed = os.environ.get("ONEDNN_MAX_CPU_ISA", "DEFAULT").upper()
+    allowed = allowed in ("DEFAULT", "ALL") or "BF16" in allowed or "AMX" in allowed
+    return bool(asked.get("avx512_bf16")) and torch.backends.cpu.get_cpu_capability() == "AVX512" and allowed

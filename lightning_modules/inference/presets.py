@@ -12,10 +12,10 @@ from typing import Any, get_args, get_type_hints
 import torch
 
 from lightning_modules import motion as estimators
-from lightning_modules.inference.predict import predict
+from lightning_modules.inference.predict import precision_of, predict
 from lightning_modules.inference.tiles import FAR, TILE
 from lightning_modules.networks import CSCSR, ClassicalDecoder, Network
-from lightning_modules.registry import find_model, list_models
+from lightning_modules.registry import find_model, for_noise
 from spikekit.arguments import one_line
 from spikekit.timing import timer_of
 
@@ -202,7 +202,7 @@ def choices(
         ValueError: the package has no table for this scale.
     """
     rows = _table(scale, film, white)
-    twins = _for_noise(scale) if noisy else {}
+    twins = for_noise(scale) if noisy else {}
     frame = min(float(row["mib"]) for row in rows)
     found = []
     for row in rows:
@@ -229,14 +229,6 @@ def choices(
     best = max(choice.psnr for choice in found)
     found = [replace(choice, below=best - choice.psnr) for choice in found]
     return sorted(found, key=lambda choice: choice.ms)
-
-
-def _for_noise(scale: int) -> dict[str, str]:
-    """Map names of weights to those of the same network trained for noisy sensors."""
-    models = list_models(scale)
-    noisy = {(one.size, one.frames, one.pattern): one.name for one in models if one.noise}
-    keys = {one.name: (one.size, one.frames, one.pattern) for one in models if not one.noise}
-    return {name: noisy[key] for name, key in keys.items() if key in noisy}
 
 
 def _table(scale: int, film: bool = False, white: float = 0.4) -> list[dict[str, str]]:
@@ -287,8 +279,9 @@ def pace(scale: int, film: bool = False, white: float = 0.4) -> float:
     height, width = int(row["height"]) // 2, int(row["width"]) // 2
     spikes = torch.rand(1, network.frames, height, width, device=device) < network.settings["alpha"] / 2
     timer, _ = timer_of(device, torch.get_num_threads())
-    predict(network, spikes, **options)
-    return 4e3 * timer(lambda: predict(network, spikes, **options), 3) / float(row["ms"])
+    with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, enabled=precision_of(device) != "32-true"):
+        predict(network, spikes, **options)
+        return 4e3 * timer(lambda: predict(network, spikes, **options), 3) / float(row["ms"])
 
 
 def choose(

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from itertools import islice, pairwise
 from pathlib import Path
@@ -18,6 +16,7 @@ from torch import Tensor
 from lightning_modules.inference.clips import FRAMES, RecordingClips, film_groups
 from lightning_modules.inference.film import FilmFrame, FilmMaker
 from lightning_modules.inference.output import file_identity
+from lightning_modules.inference.predict import precision_of
 from lightning_modules.inference.presets import SPEEDS, Choice, Preset, choose
 from lightning_modules.networks import ClassicalDecoder, Network
 from lightning_modules.registry import Model, find_model, list_models
@@ -202,7 +201,7 @@ class Reconstruction:
         exposure = self.network.settings["alpha"] / self.white
         groups = self._groups(maker, set(made), *part)
         clips = self.clips.in_order(frame for group, _ in groups for frame in group)
-        mixed = torch.autocast(self.device.type, torch.bfloat16) if self.precision == "bf16-mixed" else nullcontext()
+        mixed = torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bf16-mixed")
         for group, wanted in groups:
             spikes = torch.stack([clip for _, clip in islice(clips, len(group))]).to(self.device)
             with torch.inference_mode(), mixed:
@@ -272,20 +271,6 @@ def may_be_noisy(recording: Recording) -> bool:
     """Whether the sensor has no calibration in the dark and the recording no simulator's side-car."""
     measured = recording.calibration
     return recording.alpha is None and (measured is None or not measured.dark.any())
-
-
-def precision_of(device: torch.device) -> str:
-    """Return bfloat16 for a GPU or a processor that computes in it, float32 otherwise."""
-    able = device.type == "cuda" and torch.cuda.is_bf16_supported()
-    return "bf16-mixed" if able or (device.type == "cpu" and _cpu_computes_in_bfloat16()) else "32-true"
-
-
-def _cpu_computes_in_bfloat16() -> bool:
-    """Whether torch may use bfloat16 instructions of the processor; emulated, bfloat16 is slower than float32."""
-    asked = getattr(torch.cpu, "get_capabilities", dict)()  # from torch 2.10 on
-    allowed = os.environ.get("ONEDNN_MAX_CPU_ISA", "DEFAULT").upper()
-    allowed = allowed in ("DEFAULT", "ALL") or "BF16" in allowed or "AMX" in allowed
-    return bool(asked.get("avx512_bf16")) and torch.backends.cpu.get_cpu_capability() == "AVX512" and allowed
 
 
 def _digest(values: Any) -> str:

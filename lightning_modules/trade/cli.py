@@ -78,7 +78,7 @@ def trade(args: Sequence[str]) -> None:
         raise InputError(f"trade: {error}") from error
     own = _own_weights(base)
     network, film = base.network, asked.film is not None
-    usual = usual_settings(network.scale, own, network if own else None, film, network.frames)
+    usual = usual_settings(network.scale, own, network if own else None, film, network.frames, network.pattern)
     settings = given or usual
     names = [setting.name for setting in settings]
     twice = next((name for name in names if names.count(name) > 1), None)

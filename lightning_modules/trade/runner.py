@@ -16,6 +16,7 @@ from lightning_modules.cli.errors import InputError, UsageError, VerbParser
 from lightning_modules.cli.reasons import reason
 from lightning_modules.cli.rehearsal import Rehearsal, resolved
 from lightning_modules.inference.film import FilmFrame, FilmMaker, film
+from lightning_modules.inference.predict import precision_of
 from lightning_modules.storage.pretrained import load_weights, read_weights
 from lightning_modules.tasks.super_resolution import SuperResolution
 from spikekit.arguments import one_line, whole
@@ -29,6 +30,8 @@ class CannotRunError(RuntimeError):
 
 
 class _Test(Rehearsal):
+    precision_on = staticmethod(precision_of)  # as lightning predict
+
     def instantiate_trainer(self, **kwargs: Any) -> Any:
         trainer = super().instantiate_trainer(**kwargs)
         asked = self.config[self.verb].trainer.precision

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from lightning_modules.cli.errors import UsageError
 from lightning_modules.inference.presets import Preset
 from lightning_modules.networks import Network
-from lightning_modules.registry import Model, list_models
+from lightning_modules.registry import Model, for_noise, list_models
 
 #: columns of a table, by option
 _COLUMNS = {f"--model.network.{name}": name for name in ("method", "window", "order", "scale", "frames", "motion")}
@@ -87,21 +87,25 @@ _SPIKE2FLOW = "--model.network.motion Spike2Flow --model.network.motion.weights 
 _VARIANTS = [
     ("Spike2Flow", _SPIKE2FLOW),
     ("Spike2Flow, once", f"{_SPIKE2FLOW} --model.network.motion.iterations 1"),
-    ("bf16-true", "--trainer.precision bf16-true"),
-    ("bf16-mixed", "--trainer.precision bf16-mixed"),
+    ("32-true", "--trainer.precision 32-true"),
     ("no tiles", "--tile 0"),
     ("tiles of 64", "--tile 64"),
 ]
 
 
 def usual_settings(
-    scale: int, own: Sequence[str] = (), network: Network | None = None, film: bool = False, frames: int = 41
+    scale: int,
+    own: Sequence[str] = (),
+    network: Network | None = None,
+    film: bool = False,
+    frames: int = 41,
+    pattern: str = "RGGB",
 ) -> list[Setting]:
     """Return the default settings.
 
     First the networks of the package: the reference, then the others by their multiplications. Then variants: every
-    network without motion and as a self-ensemble, the reference also with other estimators, precisions and tiles, the
-    largest network also with larger self-ensembles. Last the classical decoders.
+    network without motion and as a self-ensemble, the reference also with other estimators, in float32 and with other
+    tiles, the largest network also with larger self-ensembles. Last the classical decoders.
 
     Args:
         scale: super-resolution factor.
@@ -110,9 +114,10 @@ def usual_settings(
         network: that network; variants that it has no options for are left out.
         film: settings for films: only the networks, with and without motion.
         frames: spike frames of the scenes; networks with longer clips are left out.
+        pattern: Bayer phase of the networks, or ``"grey"``.
     """
-    # weights for noisy sensors would need other scenes
-    models = [one for one in list_models(scale) if not one.noise and one.frames <= frames]
+    noisy = {name for ideal, name in for_noise(scale).items() if ideal != name}  # they would need other scenes
+    models = [one for one in list_models(scale, pattern) if one.name not in noisy and one.frames <= frames]
     models.sort(key=lambda model: model.macs)
     largest = models[-1].name if models else None
     reference = _reference(models) if models else None
