@@ -204,7 +204,8 @@ def load_weights(network: nn.Module, weights: Weights, keep_motion: bool = False
     """Load weights into a network of the same class and settings.
 
     The settings ``alpha`` and ``motion_fusion`` may differ. If alpha differs, the network's output is scaled by the
-    ratio of the gains. With ``keep_motion``, the network keeps the weights of its own motion estimator.
+    ratio of the gains. A network with ``noise`` may start from weights without: it ignores the noise level until it is
+    trained. With ``keep_motion``, the network keeps the weights of its own motion estimator.
 
     Raises:
         CheckpointMismatchError: the weights belong to another network.
@@ -213,6 +214,10 @@ def load_weights(network: nn.Module, weights: Weights, keep_motion: bool = False
     network = getattr(network, "_orig_mod", network)
     exchanged = {name: network.settings[name] for name in _ADAPTED if name in network.settings}
     ratio = weights.settings.get("alpha", exchanged["alpha"]) / exchanged["alpha"] if "alpha" in exchanged else 1
+    levels = {name: value for name, value in network.state_dict().items() if ".noise." in name}
+    if levels and not weights.settings.get("noise"):
+        exchanged["noise"] = True
+        weights = replace(weights, tensors={**levels, **weights.tensors})
     check_settings(network, weights.settings and {**weights.settings, **exchanged}, weights.source)
     motion = getattr(network, "motion", None)
     tensors = weights.tensors if motion is None else with_own_motion(weights.tensors, motion, keep=keep_motion)
