@@ -6,6 +6,7 @@ import csv
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from itertools import product
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -123,11 +124,12 @@ class Preset:
         """Return a row of a table, the inverse of :meth:`read`."""
         return {name: "" if value is None else str(value) for name, value in vars(self).items()}
 
-    def build(self) -> Network:
+    def build(self, pattern: str = "RGGB") -> Network:
         """Build the network in evaluation mode, on the CPU.
 
-        ``tile``, ``self_ensemble`` and ``precision`` have no effect here: pass them to
-        :func:`lightning_modules.inference.predict.predict` and to the Trainer.
+        ``pattern`` is the Bayer phase of a decoder, or ``"grey"``; weights have their own. ``tile``, ``self_ensemble``
+        and ``precision`` have no effect here: pass them to :func:`lightning_modules.inference.predict.predict` and to
+        the Trainer.
 
         Raises:
             FileNotFoundError: the weights do not exist.
@@ -135,7 +137,8 @@ class Preset:
                 the estimator is unknown.
         """
         if self.network == _DECODER:
-            return ClassicalDecoder(**self.given("method", "window", "order", "scale", "frames")).eval()
+            options = self.given("method", "window", "order", "scale", "frames")
+            return ClassicalDecoder(**options, pattern=pattern).eval()
         if self.weights is None or self.network is not None:
             raise ValueError(f"preset: expected weights, or {_DECODER} as network, got {self}")
         if self.motion not in (None, *estimators.__all__):
@@ -180,6 +183,7 @@ def choices(
     frames: int = _FRAMES,
     white: float = 0.4,
     noisy: bool = False,
+    grey: bool = False,
 ) -> list[Choice]:
     """Return the measured presets for a scale that keep the default precision, fastest first.
 
@@ -197,11 +201,12 @@ def choices(
             one for the scale. Longer clips gain more there.
         noisy: of the networks keep only those with weights trained for noisy sensors, and use these weights; no effect
             if the package has none for the scale.
+        grey: use the table of grey cameras, if the package has one for the scale.
 
     Raises:
         ValueError: the package has no table for this scale.
     """
-    rows = _table(scale, film, white)
+    rows = _table(scale, film, white, grey)
     twins = for_noise(scale) if noisy else {}
     frame = min(float(row["mib"]) for row in rows)
     found = []
@@ -231,11 +236,11 @@ def choices(
     return sorted(found, key=lambda choice: choice.ms)
 
 
-def _table(scale: int, film: bool = False, white: float = 0.4) -> list[dict[str, str]]:
-    lights, uses = ("_dim", "") if white < _LITTLE_LIGHT else ("",), ("_film", "") if film else ("",)
-    paths = [_FOLDER / f"x{scale}{light}{use}.csv" for light in lights for use in uses]
-    path = next((path for path in paths if path.is_file()), paths[-1])
-    if not path.is_file():
+def _table(scale: int, film: bool = False, white: float = 0.4, grey: bool = False) -> list[dict[str, str]]:
+    of, light, use = ("_grey" if grey else "", "_dim" if white < _LITTLE_LIGHT else "", "_film" if film else "")
+    names = (f"x{scale}{''.join(kind)}.csv" for kind in product({of: 0, "": 0}, {light: 0, "": 0}, {use: 0, "": 0}))
+    path = next((_FOLDER / name for name in names if (_FOLDER / name).is_file()), None)
+    if path is None:
         there = ", ".join(sorted(path.stem for path in _FOLDER.glob("x?.csv"))) or "none"
         raise ValueError(f"scale: expected one that was measured ({there}), got {scale}")
     try:
@@ -258,7 +263,7 @@ def _reference(rows: list[dict[str, str]]) -> dict[str, str]:
     return next(row for row in rows if row["setting"] == row["reference"])
 
 
-def pace(scale: int, film: bool = False, white: float = 0.4) -> float:
+def pace(scale: int, film: bool = False, white: float = 0.4, grey: bool = False) -> float:
     """Measure the time of a frame on this machine, relative to the table.
 
     Runs the reference preset on a quarter of the area of a clip.
@@ -267,11 +272,12 @@ def pace(scale: int, film: bool = False, white: float = 0.4) -> float:
         scale: super-resolution factor.
         film: use the table of films.
         white: white level in spikes per frame, see :func:`choices`.
+        grey: use the table of grey cameras.
 
     Returns:
         1 on the machine of the table, 2 on one that takes twice as long.
     """
-    row = _reference(_table(scale, film, white))
+    row = _reference(_table(scale, film, white, grey))
     preset = Preset.read(row)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network = preset.build().to(device)
@@ -293,6 +299,7 @@ def choose(
     frames: int = _FRAMES,
     white: float = 0.4,
     noisy: bool = False,
+    grey: bool = False,
 ) -> Choice:
     """Choose the best preset for a speed or a budget.
 
@@ -309,6 +316,7 @@ def choose(
         frames: spike frames available for a clip; from 101 on, presets with longer clips take part.
         white: white level in spikes per frame, see :func:`choices`.
         noisy: the sensor may be noisy, see :func:`choices`.
+        grey: the camera is grey, see :func:`choices`.
 
     Raises:
         ValueError: the speed is unknown, the budget cannot be read, no preset fits it, or the package has no table for
@@ -324,7 +332,7 @@ def choose(
     """
     if (speed is None) == (budget is None):
         raise ValueError(f"speed, budget: expected one of them, got {speed!r} and {budget!r}")
-    found = choices(scale, size, film, frames, white, noisy)
+    found = choices(scale, size, film, frames, white, noisy, grey)
     if speed is not None:
         if speed not in SPEEDS:
             raise ValueError(f"speed: expected one of {', '.join(SPEEDS)}, got {speed!r}")
@@ -336,7 +344,7 @@ def choose(
     what, unit = _UNITS.get(read[2], ("ms", 1e3))
     limit = unit / float(read[1]) if read[2] == "fps" else unit * float(read[1])
     if what == "ms":
-        here = pace(scale, film, white)
+        here = pace(scale, film, white, grey)
         where = f"on this machine, which takes {here:.2g} times as long as that of the table"
         found = [replace(choice, ms=here * choice.ms, where=where) for choice in found]
     fitting = [choice for choice in found if getattr(choice, what) <= limit]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from itertools import islice, pairwise
 from pathlib import Path
@@ -19,7 +19,7 @@ from lightning_modules.inference.output import file_identity
 from lightning_modules.inference.predict import precision_of
 from lightning_modules.inference.presets import SPEEDS, Choice, Preset, choose
 from lightning_modules.networks import ClassicalDecoder, Network
-from lightning_modules.registry import Model, find_model, list_models
+from lightning_modules.registry import find_model
 from spikekit import __version__
 from spikekit.color.cfa import GREY, PATTERNS
 from spikekit.io.image_bytes import to_bytes
@@ -125,7 +125,7 @@ def reconstruct(
         how = {**preset.given("tile", "self_ensemble", "interpolated"), **how}
         if speed in _ONLY_WHAT_MOVES and not (how.get("future") or how.get("interpolated")):
             how = {"psnr_tolerance": 0.1, **how}
-        network = preset.build()
+        network = preset.build(GREY if recording.pattern == GREY else "RGGB")
     elif not isinstance(network, Network):
         network = Network.from_pretrained(network)
     network.noise_level = float(noisy)
@@ -286,15 +286,6 @@ def _digest(values: Any) -> str:
     return total.hexdigest()
 
 
-def by_size(models: Sequence[Model], speed: str) -> Model | None:
-    """Return the weights for a speed if no table was measured: ``"fastest"`` the smallest, ``"best"`` the largest."""
-    if speed not in SPEEDS:
-        raise ValueError(f"speed: expected one of {', '.join(SPEEDS)}, got {speed!r}")
-    able = sorted(models, key=lambda model: model.macs)
-    place = list(SPEEDS).index(speed) / (len(SPEEDS) - 1)
-    return able[int(place * (len(able) - 1))] if able else None
-
-
 def _chosen(
     recording: Recording,
     speed: str | None,
@@ -309,15 +300,10 @@ def _chosen(
     clips = RecordingClips(recording, frame=frame)
     every = min((later - clock for clock, later in pairwise(clips.chosen)), default=clips.frames + 1)
     film = every <= clips.frames  # neighbouring clips overlap
-    if recording.pattern == GREY or scale == 1:
-        kind = GREY if recording.pattern == GREY else "RGGB"  # serves every phase
-        model = by_size(list_models(scale, kind), speed or "balanced")
-        if model is not None:
-            said = "grey cameras" if kind == GREY else "colour at the resolution of the sensor"
-            return Preset(model.name), [f"{model.name}, for {said}"]
     around = 2 * min(clips.chosen[0], recording.frames - 1 - clips.chosen[-1]) + 1
     room = max(FRAMES, recording.frames // _MANY if frame is None else around)
-    asked = {"scale": scale, "size": clips.size, "film": film, "white": white, "noisy": noisy}
+    grey = recording.pattern == GREY
+    asked = {"scale": scale, "size": clips.size, "film": film, "white": white, "noisy": noisy, "grey": grey}
     choice = choose(speed=speed, budget=budget, frames=room, **asked)
     interpolated = 0 if resting else _interpolated(choice.preset, every, speed)
     said = [str(choice)]

@@ -79,6 +79,14 @@ def test_films_have_their_own_table(table):
         choose(4, "fastest", film=True)
 
 
+def test_grey_cameras_have_their_own_table(table):
+    assert choose(3, "fastest", grey=True) == choose(3, "fastest")  # as long as there is none
+    lines = (table / "x3.csv").read_text().splitlines()
+    (table / "x3_grey.csv").write_text("\n".join(line for line in lines if not line.startswith("tfi")))
+    assert [choose(3, "fastest", grey=grey, film=True).name for grey in (True, False)] == ["tfp 5", "tfi"]
+    assert choose(3, "fastest", grey=True).preset.build("grey").pattern == "grey"
+
+
 @pytest.mark.parametrize(
     ("scale", "expected"),
     [
@@ -174,13 +182,14 @@ def test_invalid_presets_are_rejected():
 
 
 def test_tables_of_the_package_are_valid():
-    for scale in (2, 3, 4):
-        picked = [choose(scale, name, frames=101) for name in SPEEDS]
+    for scale, grey in ((1, True), (1, False), (2, False), (3, False), (4, False)):
+        picked = list(dict.fromkeys(choose(scale, name, frames=101, grey=grey) for name in SPEEDS))
+        assert len(picked) == (3 if (scale, grey) == (1, False) else 4)  # one network for colour at x1
         assert all(faster.ms < 0.8 * slower.ms for faster, slower in pairwise(picked))  # every speed is worth its name
         assert picked[-2].preset.self_ensemble is None  # several views are for the best alone
-        reference = speed._reference(speed._table(scale))
+        reference = speed._reference(speed._table(scale, grey=grey))
         assert (reference["ratio"], Preset.read(reference)) == ("1", Preset(reference["setting"]))
-        for choice in choices(scale, (250, 400)):
+        for choice in choices(scale, (250, 400), grey=grey):
             assert (find_model(choice.preset.weights).scale if choice.preset.weights else choice.preset.scale) == scale
 
 
