@@ -13,10 +13,9 @@ from lightning_modules.adaptation.distillation import ROOM, make_distillation_se
 from lightning_modules.adaptation.fine_tune import fine_tune
 from lightning_modules.cli.errors import InputError, UsageError, VerbParser, input_errors
 from lightning_modules.cli.folder_lock import check_folder, locked_folder
-from lightning_modules.inference.clips import RecordingClips
+from lightning_modules.inference.clips import NOISY, RecordingClips
 from lightning_modules.inference.output import check_place
 from lightning_modules.inference.predict import precision_of
-from lightning_modules.inference.reconstruct import may_be_noisy
 from lightning_modules.networks import Network
 from lightning_modules.registry import list_models
 from lightning_modules.storage.pretrained import Weights, motion_of, settings_of, write_weights
@@ -64,8 +63,9 @@ def adapt(args: Sequence[str]) -> None:
         check_place(written)
         student = _student(weights).to(device)
         recording = recordings.opened(asked)
-        noisy = asked.calibration != "none" and may_be_noisy(recording)
-        clips, name, teacher = clips_and_teacher(recording, student, asked.teacher, noisy)
+        level = 0.0 if asked.calibration == "none" else RecordingClips(recording).noise_level
+        clips, name, teacher = clips_and_teacher(recording, student, asked.teacher, level > NOISY)
+        student.noise_level = teacher.noise_level = level
         with locked_folder(asked.output, "adaptation"):
             examples = make_distillation_set(student, teacher.to(device).eval(), clips)
             precision = precision_of(torch.device(device)) if device == "cuda" else "32-true"

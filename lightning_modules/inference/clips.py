@@ -14,16 +14,23 @@ from torch import Tensor
 
 from spikekit import bayer_sites
 from spikekit.arguments import frames_of
+from spikekit.calibration.gain_spread import gain_spread
 from spikekit.color.cfa import GREY
 from spikekit.recording import Recording, white_rate
 
 Item = TypeVar("Item")
 
+#: noise level above which weights for noisy sensors are better
+NOISY = 0.3
+
 #: default spike frames of a clip, and default distance of two pictures in spike frames
 FRAMES, EVERY = 41, 20
 
-# clips, evenly spread over the recording, that the white level is measured on
-_LOOKS = 8
+# parts of a recording that white and noise are measured on, and least frames of a part of several
+_PARTS, _LEAST_PART = 4, 200
+
+# spread of the gains at noise level 1, see configs/cameras.yaml, and the largest level that networks extrapolate to
+_SPREAD, _MOST = 0.06, 1.5
 
 
 class RecordingClips:
@@ -84,13 +91,28 @@ class RecordingClips:
             yield middle, self.recording.correct_spikes(clip)[..., self.top :, self.left :]
 
     @cached_property
+    def _looks(self) -> tuple[Tensor, int, int]:
+        """Mean rates (H, W) of parts evenly spread over the recording, frames of a part, and number of parts."""
+        whole = self.recording.frames
+        parts = min(max(whole // _LEAST_PART, 1), _PARTS)
+        frames = min(whole // parts, 2 * _LEAST_PART)
+        middles = np.linspace(frames // 2, whole - 1 - (frames - 1) // 2, parts).round().astype(int).tolist()
+        clips = RecordingClips(self.recording, frames, crop_to=self.recording.pattern or "RGGB").in_order(middles)
+        return torch.stack([clip.sum(0, dtype=torch.float32) / frames for _, clip in clips]).mean(0), frames, parts
+
+    @cached_property
     def white(self) -> float:
         """White level in spikes per frame: the side-car's, else the level that 99.9 % of the pixels do not exceed."""
-        if self.recording.alpha is not None:
-            return self.recording.alpha
-        clips = range(self.frames // 2, self.recording.frames - (self.frames - 1) // 2, EVERY)
-        looks = sorted({clips[round(n)] for n in np.linspace(0, len(clips) - 1, _LOOKS)})
-        return white_rate(torch.stack([clip.float().mean(0) for _, clip in self.in_order(looks)]).mean(0))
+        return self.recording.alpha or white_rate(self._looks[0])
+
+    @cached_property
+    def noise_level(self) -> float:
+        """Noise level for networks: 0 for an ideal or calibrated sensor, and 1 for that of the training."""
+        measured = self.recording.calibration
+        if self.recording.alpha is not None or (measured is not None and measured.dark.any()):
+            return 0.0
+        spread = gain_spread(*self._looks, self.recording.pattern or "RGGB")
+        return 1.0 if spread is None else min(spread / _SPREAD, _MOST)
 
 
 def clips_around(

@@ -22,7 +22,7 @@ from spikekit.timing import timer_of
 
 _FOLDER = Path(__file__).parents[1] / "weights"
 
-_DECODER, _OF_MOTION = "ClassicalDecoder", ("motion_weights", "motion_iterations")
+_DECODER = "ClassicalDecoder"
 
 #: default spike frames of a clip
 _FRAMES = 41
@@ -62,8 +62,6 @@ class Preset:
         scale: super-resolution factor of the decoder; weights have their own.
         frames: spike frames of a clip of the decoder; weights have their own.
         motion: class name of a motion estimator, such as ``"ZeroFlow"``, that replaces the one used in training.
-        motion_weights: weights of that estimator.
-        motion_iterations: iterations of that estimator.
         tile: side of a tile in sensor pixels, see :func:`lightning_modules.inference.predict.predict`.
         self_ensemble: number of views, 1, 2, 4 or 8, see :func:`lightning_modules.inference.predict.predict`.
         interpolated: pictures interpolated between two pictures of the network, see
@@ -83,8 +81,6 @@ class Preset:
     scale: int | None = None
     frames: int | None = None
     motion: str | None = None
-    motion_weights: str | None = None
-    motion_iterations: int | None = None
     tile: int | None = None
     self_ensemble: int | None = None
     interpolated: int | None = None
@@ -143,8 +139,7 @@ class Preset:
             raise ValueError(f"preset: expected weights, or {_DECODER} as network, got {self}")
         if self.motion not in (None, *estimators.__all__):
             raise ValueError(f"motion: expected one of {', '.join(estimators.__all__)}, got {self.motion!r}")
-        how = {name.removeprefix("motion_"): value for name, value in self.given(*_OF_MOTION).items()}
-        return CSCSR.from_pretrained(self.weights, self.motion and getattr(estimators, self.motion)(**how))
+        return CSCSR.from_pretrained(self.weights, self.motion and getattr(estimators, self.motion)())
 
 
 @dataclass(frozen=True)

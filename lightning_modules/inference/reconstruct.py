@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lightning_modules.inference.clips import FRAMES, RecordingClips, film_groups
+from lightning_modules.inference.clips import FRAMES, NOISY, RecordingClips, film_groups
 from lightning_modules.inference.film import FilmFrame, FilmMaker
 from lightning_modules.inference.output import file_identity
 from lightning_modules.inference.predict import precision_of
@@ -115,20 +115,21 @@ def reconstruct(
         path, height=height, width=width, flip=flip, pattern=pattern, camera=camera, calibration=calibration
     )
     notes: list[str] = []
-    noisy = str(calibration) != "none" and may_be_noisy(recording)
+    if not (network is None or isinstance(network, Network)):
+        network = Network.from_pretrained(network)
+    looks = RecordingClips(recording, FRAMES if network is None else network.frames)
+    level = 0.0 if str(calibration) == "none" else looks.noise_level
+    white = looks.white if white is None else white
     if network is None:
         scale = scale or (1 if recording.pattern == GREY else 4)
-        white = RecordingClips(recording).white if white is None else white
         speed = "balanced" if budget is None and speed is None else speed
         resting = bool(how.get("psnr_tolerance"))
-        preset, notes = _chosen(recording, speed, budget, scale, frame, white, noisy, resting)
+        preset, notes = _chosen(recording, speed, budget, scale, frame, white, level, resting)
         how = {**preset.given("tile", "self_ensemble", "interpolated"), **how}
         if speed in _ONLY_WHAT_MOVES and not (how.get("future") or how.get("interpolated")):
             how = {"psnr_tolerance": 0.1, **how}
         network = preset.build(GREY if recording.pattern == GREY else "RGGB")
-    elif not isinstance(network, Network):
-        network = Network.from_pretrained(network)
-    network.noise_level = float(noisy)
+    network.noise_level = level
     clips = RecordingClips(recording, network.frames, frame, network.pattern)
     notes = [line for line in (recording.note, _other_sensor(recording, network.pattern), *notes) if line]
     return Reconstruction(network, clips, white, device, precision, notes, **how)
@@ -267,12 +268,6 @@ def _other_sensor(recording: Recording, pattern: str) -> str | None:
     return None
 
 
-def may_be_noisy(recording: Recording) -> bool:
-    """Whether the sensor has no calibration in the dark and the recording no simulator's side-car."""
-    measured = recording.calibration
-    return recording.alpha is None and (measured is None or not measured.dark.any())
-
-
 def _digest(values: Any) -> str:
     """Return a hash of named tensors or values."""
     total = hashlib.sha256()
@@ -293,7 +288,7 @@ def _chosen(
     scale: int,
     frame: str | None,
     white: float,
-    noisy: bool,
+    level: float,
     resting: bool,
 ) -> tuple[Preset, list[str]]:
     """Return the preset for a speed or a budget, and lines that tell its name and cost."""
@@ -302,7 +297,7 @@ def _chosen(
     film = every <= clips.frames  # neighbouring clips overlap
     around = 2 * min(clips.chosen[0], recording.frames - 1 - clips.chosen[-1]) + 1
     room = max(FRAMES, recording.frames // _MANY if frame is None else around)
-    grey = recording.pattern == GREY
+    noisy, grey = level > NOISY, recording.pattern == GREY
     asked = {"scale": scale, "size": clips.size, "film": film, "white": white, "noisy": noisy, "grey": grey}
     choice = choose(speed=speed, budget=budget, frames=room, **asked)
     interpolated = 0 if resting else _interpolated(choice.preset, every, speed)
@@ -319,7 +314,7 @@ def _chosen(
     if speed:
         said += _longer(choose(speed=speed, frames=recording.frames, **asked), choice, recording)
     if noisy and choice.preset.weights:
-        said.append(_unmeasured(choice.preset, recording, scale))
+        said.append(_unmeasured(choice.preset, recording, scale, level))
     return replace(choice.preset, interpolated=interpolated or None), said
 
 
@@ -340,11 +335,11 @@ def _longer(ideal: Choice, choice: Choice, recording: Recording) -> list[str]:
     return [f"clips of {ideal.preset.clip} frames would be about {gain:.1f} dB better: {leaves}"]
 
 
-def _unmeasured(preset: Preset, recording: Recording, scale: int) -> str:
-    """Return a line on the weights used for a sensor without calibration."""
+def _unmeasured(preset: Preset, recording: Recording, scale: int, level: float) -> str:
+    """Return a line on the weights used for a noisy sensor without calibration."""
     model = find_model(preset.weights or "")
     dark = ", with a recording in the dark," if recording.calibration is not None else ""
     measure = f"spikekit calibrate{dark} measures it, --calibration none takes it for ideal"
     noisy = "using weights trained for noisy sensors"
     said = noisy if model and model.noise else f"there are no weights for noisy sensors at scale {scale}"
-    return f"this sensor is not calibrated: {said}; {measure}"
+    return f"this sensor is not calibrated, noise level about {level:.1f}: {said}; {measure}"

@@ -15,7 +15,6 @@ from lightning_modules.registry import Model, for_noise, list_models
 
 #: columns of a table, by option
 _COLUMNS = {f"--model.network.{name}": name for name in ("method", "window", "order", "scale", "frames", "motion")}
-_COLUMNS |= {f"--model.network.motion.{name}": f"motion_{name}" for name in ("weights", "iterations")}
 _COLUMNS |= {f"--{name}": name for name in ("tile", "self_ensemble", "interpolated")}
 _COLUMNS |= {"--model.weights": "weights", "--model.network": "network", "--trainer.precision": "precision"}
 
@@ -83,10 +82,7 @@ _NO_MOTION, _TWO_VIEWS = ("no motion", "--model.network.motion ZeroFlow"), ("sel
 _MOST = [(f"self-ensemble of {views}", f"--self_ensemble {views}") for views in (4, 8)]
 
 #: further variants of the reference
-_SPIKE2FLOW = "--model.network.motion Spike2Flow --model.network.motion.weights spike2flow"
 _VARIANTS = [
-    ("Spike2Flow", _SPIKE2FLOW),
-    ("Spike2Flow, once", f"{_SPIKE2FLOW} --model.network.motion.iterations 1"),
     ("32-true", "--trainer.precision 32-true"),
     ("no tiles", "--tile 0"),
     ("tiles of 64", "--tile 64"),

@@ -165,7 +165,7 @@ def test_invalid_speeds_and_budgets_are_rejected(table, arguments, message):
 
 
 def test_presets_survive_writing_and_reading():
-    for given in ({}, WEIGHTS | {"motion": "Spike2Flow", "motion_iterations": 1, "self_ensemble": 2, "tile": 0}):
+    for given in ({}, WEIGHTS | {"motion": "Spike2Flow", "self_ensemble": 2, "tile": 0}):
         preset = Preset(**given)
         assert Preset.read(preset.write()) == preset
         assert preset.given(*Preset.columns()) == given

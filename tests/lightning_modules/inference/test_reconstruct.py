@@ -7,7 +7,7 @@ from lightning_modules import reconstruct
 from lightning_modules.inference.film import film
 from lightning_modules.networks import CSCSR, ClassicalDecoder, RecurrentCSCSR
 from lightning_modules.registry import find_model
-from spikekit import mosaic, read_spikes, simulate_spikes, write_picture, write_spikes
+from spikekit import SensorNoise, SpikeSensor, mosaic, read_spikes, simulate_spikes, write_picture, write_spikes
 from spikekit.cli.command import main as spikekit_main
 
 EXACT = {"precision": "32-true"}  # whatever the processor would do
@@ -69,6 +69,16 @@ def test_uncalibrated_sensors_get_weights_for_noise(flat):
     pictures = reconstruct(flat(0.4), "fast")
     assert find_model(pictures.notes[0].split(",")[0].split(":")[0]).noise
     assert "this sensor is not calibrated" in pictures.notes[-1]
+
+
+@pytest.mark.parametrize(("spread", "level"), [(0.0, 0.0), (0.06, 1.0)])
+def test_noise_is_measured_if_nothing_is_known(tmp_path, spread, level):
+    light = torch.linspace(0.1, 0.4, 64).expand(300, 48, 64)
+    write_spikes(tmp_path / "clip.npz", SpikeSensor(SensorNoise(gain_spread=spread), seed=0).expose(light))
+    made = reconstruct(tmp_path / "clip.npz", "fast", pattern="grey", frame="150")
+    assert made.network.noise_level == pytest.approx(level, abs=0.2)
+    assert any("not calibrated" in note for note in made.notes) == (level > 0)
+    assert reconstruct(tmp_path / "clip.npz", "fast", pattern="grey", calibration="none").network.noise_level == 0
 
 
 def test_ideal_sensors_get_weights_for_ideal_sensors(flat, tmp_path, monkeypatch):
