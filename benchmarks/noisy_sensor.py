@@ -1,7 +1,7 @@
 """Measure the benefit of a calibration on a noisy sensor, for decoders and a network.
 
 ``python benchmarks/noisy_sensor.py PICTURES`` prints the table. Moving still pictures are recorded by a BGGR sensor
-with another gain than that of the training data.
+with another gain than that of the training data. Networks with a noise level are told the measured one.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from lightning_modules.data.stills import StillClips
 from lightning_modules.networks import CSCSR
 from spikekit import SensorNoise, SpikeSensor, correct_spikes, demosaic, psnr, tfi_at, tfp_at
 from spikekit.calibration.calibration import Calibration
+from spikekit.calibration.gain_spread import gain_spread
 from spikekit.calibration.in_motion import calibrate_in_motion, count_segments, segment_length
 from spikekit.calibration.measure import calibrate, find_defects
 from spikekit.calibration.pixel_rates import PixelRates
@@ -76,14 +77,15 @@ def _halves(spikes: Tensor) -> tuple[PixelRates, PixelRates]:
 def _scores(spikes: Tensor, truth: dict[int, Tensor], network: CSCSR, known: Calibration | None) -> list[float]:
     decoders: list[Callable[[Tensor, int], Tensor]] = [tfi_at, lambda clip, middle: tfp_at(clip, middle, 13, order=3)]
     sums = [0.0] * 3
+    corrected = spikes if known is None else correct_spikes(spikes, known, PATTERN)
+    network.noise_level = (gain_spread(corrected.float().mean(0), len(spikes), 1, PATTERN) or 0) / NOISE.gain_spread
     for middle, rgb in truth.items():
         near = spikes[middle - 60 : middle + 61].float()
         small = F.avg_pool2d(rgb, network.scale)
         for n, decode in enumerate(decoders):
             raw = decode(near, 60) if known is None else known.correct(decode(near, 60), PATTERN)
             sums[n] += psnr(demosaic(raw[None] / ALPHA, PATTERN)[0].clamp(0, 1), small).item()
-        clip = spikes[middle - network.frames // 2 :][: network.frames]
-        clip = clip if known is None else correct_spikes(clip, known, PATTERN)
+        clip = corrected[middle - network.frames // 2 :][: network.frames]
         # from (1, 1) on, BGGR is RGGB
         with torch.no_grad():
             seen = network(clip[None, :, 1:, 1:])[0].clamp(0, 1)
