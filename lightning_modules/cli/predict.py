@@ -69,7 +69,7 @@ def parser() -> argparse.ArgumentParser:
         "--tile",
         type=whole(0),
         metavar="N",
-        help=f"side of the tiles in sensor pixels, 0 for none; default: {sides}",
+        help=f"largest side of a tile in sensor pixels, 0 for none; default: {sides}",
     )
     add(
         "--tolerance",

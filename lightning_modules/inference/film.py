@@ -152,7 +152,7 @@ class FilmMaker:
         network: network of :mod:`lightning_modules.networks`.
         future: later key frames that a picture may wait for; only for networks with a state.
         interpolated: pictures interpolated between two pictures of the network.
-        tile: side of a tile in sensor pixels, 0 for no tiles; default: 200, or 512 on a GPU.
+        tile: largest side of a tile in sensor pixels, 0 for no tiles; default: 256, or 512 on a GPU.
         psnr_tolerance: PSNR in dB that a picture may lose to save work. Above 0, the network runs only where the spikes
             show motion, see :class:`lightning_modules.inference.rest.Rest`; the first picture is always complete.
         how: ``self_ensemble`` and ``done`` of :func:`lightning_modules.inference.predict.predict`. With a

@@ -82,7 +82,7 @@ class Output:
     def write(self, frame: int, rgb: Tensor) -> Path:
         """Write the picture of a frame, (3, H, W), and return its path."""
         path = self._paths[frame]
-        if not rgb.isfinite().all():  # saved, it would be black without explanation
+        if not rgb.sum().isfinite():  # saved, it would be black without explanation
             raise PictureError(f"{path}: expected finite values, got NaN from the network; the picture is not written")
         _check_picture(path)
         pixels = to_bytes(rgb).movedim(-1, 0)
@@ -115,7 +115,7 @@ class Output:
 
 
 def _digest(pixels: Tensor) -> str:
-    return hashlib.sha256(pixels.contiguous().numpy()).hexdigest()
+    return hashlib.sha256(pixels.movedim(0, -1).contiguous().numpy()).hexdigest()
 
 
 def check_place(path: Path, follow: bool = False) -> None:

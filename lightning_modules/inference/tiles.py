@@ -12,8 +12,8 @@ from torch import Tensor
 
 from lightning_modules.networks import Network
 
-#: default side of a tile, in sensor pixels
-TILE = 200
+#: default largest side of a tile, in sensor pixels
+TILE = 256
 #: default on a GPU, which has more memory and needs larger tiles to be busy
 TILE_ON_GPU = 512
 #: largest motion followed beyond the edge of a tile, in sensor pixels; larger motion is searched within the tile
@@ -37,7 +37,7 @@ def forward_in_tiles(
     Args:
         network: network of :mod:`lightning_modules.networks`.
         spikes: :math:`(B, N, H, W)`.
-        tile: side of a tile in sensor pixels, even to keep the Bayer phase; 0 for no tiles.
+        tile: largest side of a tile in sensor pixels; 0 for no tiles.
         flow: flow in the network's shape; default: the network's own estimate.
         static: nothing moves; replaces a flow.
         done: called after every tile with the finished fraction.
@@ -78,12 +78,12 @@ def tiled(
     scale: int = 1,
     done: Callable[[float], object] | None = None,
 ) -> Tensor:
-    """Compute planes tile by tile.
+    """Compute planes in tiles of about the same size, even to keep the Bayer phase.
 
     Args:
         run: function that returns planes (..., s h, s w) for a box of h x w sensor pixels.
         whole: box of the whole planes.
-        tile: side of a tile in sensor pixels, 0 for a single tile.
+        tile: largest side of a tile in sensor pixels, 0 for a single tile.
         around: function that returns the margin needed around a box, in sensor pixels.
         scale: pixels of the planes per sensor pixel, s.
         done: called after every tile with the finished fraction.
@@ -95,9 +95,10 @@ def tiled(
     if not tile or max(height, width) <= tile:
         return run(whole)
     planes = None
-    corners = [(top, left) for top in range(0, height, tile) for left in range(0, width, tile)]
+    rows, columns = (2 * -(-length // -(-length // tile) // 2) for length in (height, width))
+    corners = [(top, left) for top in range(0, height, rows) for left in range(0, width, columns)]
     for top, left in _told(corners, done):
-        box = Box(top, left, top + tile, left + tile).grown(0, whole)
+        box = Box(top, left, top + rows, left + columns).grown(0, whole)
         outer = box.grown(around(box), whole)
         part = run(outer)
         if planes is None:
