@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 
 import torch
-from kornia.filters import filter2d_separable, get_gaussian_kernel1d
 from torch import Tensor
 
 from lightning_modules.motion.estimator import MotionEstimator, split_any_size
@@ -17,14 +17,20 @@ from spikekit.flow.tvl1 import tvl1_flow
 from spikekit.kernels import compiler_kept_out
 from spikekit.sensor.quantization_noise import flicker
 
+
+def _gaussian(length: int, sigma: float) -> list[float]:
+    weights = [math.exp(-((n - length // 2) ** 2) / (2 * sigma**2)) for n in range(length)]
+    return [weight / sum(weights) for weight in weights]
+
+
 _GREY = 0.25, 0.5, 0.25  # kernel that averages the Bayer cells around a pixel
-_BLUR = tuple(get_gaussian_kernel1d(5, 0.5, device="cpu")[0].tolist())  # of a sub-stream's pictures, in Bayer cells
+_BLUR = _gaussian(5, 0.5)  # of a sub-stream's pictures, in Bayer cells
 _ORDER = 3  # averaging passes of TFP
 _LONGEST = 17  # longest TFP window in spike frames, beyond which motion blur outweighs the noise reduction
 _LIGHT = 0.1  # mean firing rate of a clip below which the window grows, as noise dominates
 _NOISE = 0.002  # standard deviation, in firing rates, that halves the weight of a pixel
 _RATES = 1024
-_NEAR = tuple(get_gaussian_kernel1d(17, 2.0, device="cpu")[0].tolist())  # window of the test for linear motion
+_NEAR = _gaussian(17, 2.0)  # window of the test for linear motion
 _PART = 1.25, 1.75  # error ratios at which the flows begin to differ, and at which they are independent
 _UNSEEN = 1e-6  # negligible squared difference of two pictures, in firing rates
 
@@ -112,6 +118,8 @@ class ClassicalFlow(MotionEstimator):
 
 
 def _filtered(planes: Tensor, weights: Sequence[float], border: str) -> Tensor:
+    from kornia.filters import filter2d_separable
+
     kernel = torch.cat([planes.new_full((1, 1), weight) for weight in weights], dim=1)
     return filter2d_separable(planes, kernel, kernel, border)
 

@@ -8,9 +8,8 @@ from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
-from kornia.core.utils import is_exporting
-from kornia.filters import filter2d_separable
 from torch import Tensor, nn
+from torch.compiler import is_exporting
 
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks.cscsr_config import CSCSRConfig
@@ -315,6 +314,8 @@ class CSCSR(Network):
             smooth = tfp_at(spikes, self.frames // 2, (self.frames - 1) // 6 * 2 + 1, order=3).unsqueeze(1)
             smooth = smooth / self.config.alpha
         else:
+            from kornia.filters import filter2d_separable
+
             raw = tfp_at(spikes, self.frames // 2, self.frames) / self.config.alpha
             # zero at the Nyquist frequency, to remove the zipper artefacts of demosaicing
             binomial = torch.cat([raw.new_full((1, 1), weight) for weight in (0.25, 0.5, 0.25)], dim=1)

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Self
 
 import torch
-from kornia.core.utils import is_exporting
 from torch import Tensor, nn
+from torch.compiler import is_exporting
 
 from lightning_modules.motion import ESTIMATORS, ClassicalFlow, MotionEstimator
 from lightning_modules.storage.pretrained import check_weights, load_weights, read_weights

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
-from kornia.core.utils import is_exporting
 from torch import Tensor, nn
+from torch.compiler import is_exporting
 
 from lightning_modules.networks.layers import ConvBlock, NoiseLevel, ResBlock, channels_last, conv
 from spikekit import tfi, tfi_at

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from enum import Enum
+from typing import TYPE_CHECKING, TypeAlias
+
 import torch
-from kornia.color import CFA, rgb_to_grayscale
 from torch import Tensor
 
 from spikekit.check import check_planes, check_whole
 from spikekit.options_module import OptionsModule
+
+if TYPE_CHECKING:  # kornia's import takes a quarter of a second
+    from kornia.color import CFA
+
+#: Name of a Bayer phase, ``"grey"``, or kornia's name of a phase.
+Pattern: TypeAlias = "str | CFA"
 
 #: Bayer phases by name, read along the rows of the top-left 2 x 2 cell.
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
@@ -15,10 +23,10 @@ PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 #: The pattern of a sensor without colour filters.
 GREY = "grey"
 
-_PATTERN_OF_CFA = {CFA.BG: "RGGB", CFA.RG: "BGGR", CFA.GB: "GRBG", CFA.GR: "GBRG"}
+_PATTERN_OF_CFA = {"BG": "RGGB", "RG": "BGGR", "GB": "GRBG", "GR": "GBRG"}
 
 
-def bayer_pattern(pattern: str | CFA) -> str:
+def bayer_pattern(pattern: Pattern) -> str:
     """Return the name of a Bayer phase.
 
     Args:
@@ -36,14 +44,14 @@ def bayer_pattern(pattern: str | CFA) -> str:
         >>> bayer_pattern(CFA.BG), bayer_pattern("bggr")
         ('RGGB', 'BGGR')
     """
-    name = _PATTERN_OF_CFA.get(pattern, pattern) if isinstance(pattern, CFA) else pattern
+    name = _PATTERN_OF_CFA.get(pattern.name, pattern) if isinstance(pattern, Enum) else pattern
     name = name.upper() if isinstance(name, str) else name
     if name not in PATTERNS:
         raise ValueError(f"pattern: expected one of {', '.join(PATTERNS)} or a kornia.color.CFA, got {pattern!r}")
     return name
 
 
-def cfa_pattern(pattern: str | CFA) -> str:
+def cfa_pattern(pattern: Pattern) -> str:
     """Return the name of a Bayer phase, see :func:`bayer_pattern`, or :data:`GREY`."""
     if isinstance(pattern, str) and pattern.lower() == GREY:
         return GREY
@@ -54,17 +62,17 @@ def cfa_pattern(pattern: str | CFA) -> str:
         raise ValueError(f"pattern: expected one of {names} or a kornia.color.CFA, got {pattern!r}") from None
 
 
-def count_colors(pattern: str | CFA) -> int:
+def count_colors(pattern: Pattern) -> int:
     """Return the number of colours of a sensor: 3 with a Bayer filter, 1 if it is grey."""
     return 1 if cfa_pattern(pattern) == GREY else 3
 
 
-def cfa_sites(pattern: str | CFA) -> tuple[tuple[tuple[int, int, int], ...], int]:
+def cfa_sites(pattern: Pattern) -> tuple[tuple[tuple[int, int, int], ...], int]:
     """Return the sites of a cell, see :func:`bayer_sites`, and its side: 2, or 1 if the sensor is grey."""
     return (((0, 0, 0),), 1) if cfa_pattern(pattern) == GREY else (bayer_sites(pattern), 2)
 
 
-def bayer_sites(pattern: str | CFA) -> tuple[tuple[int, int, int], ...]:
+def bayer_sites(pattern: Pattern) -> tuple[tuple[int, int, int], ...]:
     """Return ``(colour, row, column)`` of R, G1, G2 and B in the 2 x 2 cell; colour is 0, 1, 2 for R, G, B.
 
     G1 is the green pixel of the upper row, G2 that of the lower row.
@@ -90,7 +98,7 @@ def bayer_sites(pattern: str | CFA) -> tuple[tuple[int, int, int], ...]:
 class PatternModule(OptionsModule):
     """Base class of modules with a pattern, see :func:`bayer_pattern`."""
 
-    def __init__(self, pattern: str | CFA = "RGGB") -> None:
+    def __init__(self, pattern: Pattern = "RGGB") -> None:
         super().__init__()
         self.pattern = cfa_pattern(pattern)
 
@@ -98,7 +106,7 @@ class PatternModule(OptionsModule):
 def bayer_mask(
     height: int,
     width: int,
-    pattern: str | CFA = "RGGB",
+    pattern: Pattern = "RGGB",
     *,
     scale: int = 1,
     device: torch.device | str | None = None,
@@ -166,7 +174,7 @@ class BayerMask(PatternModule):
         torch.Size([3, 8, 12])
     """
 
-    def __init__(self, pattern: str | CFA = "RGGB", *, scale: int = 1) -> None:
+    def __init__(self, pattern: Pattern = "RGGB", *, scale: int = 1) -> None:
         super().__init__(pattern)
         self.scale = check_whole("scale", scale)
 
@@ -176,7 +184,7 @@ class BayerMask(PatternModule):
         return bayer_mask(height, width, self.pattern, scale=self.scale, device=raw.device, dtype=raw.dtype)
 
 
-def mosaic(rgb: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
+def mosaic(rgb: Tensor, pattern: Pattern = "RGGB") -> Tensor:
     r"""Sample a picture by a colour filter array: one colour per pixel, or the luminance for a grey sensor.
 
     .. math:: R(x, y) = I_{C(x, y)}(x, y)
@@ -223,7 +231,7 @@ class Mosaic(PatternModule):
         return mosaic(rgb, self.pattern)
 
 
-def bin_to_sensor(rgb: Tensor, pattern: str | CFA = "RGGB", *, scale: int) -> Tensor:
+def bin_to_sensor(rgb: Tensor, pattern: Pattern = "RGGB", *, scale: int) -> Tensor:
     r"""Average a high-resolution picture to the mosaic of a sensor with ``scale`` times coarser pixels.
 
     .. math:: R(x, y) = \frac{1}{s^2} \sum_{0 \le a, b < s} I_{C(x, y)}(s x + a, s y + b)
@@ -271,7 +279,11 @@ def bin_to_sensor(rgb: Tensor, pattern: str | CFA = "RGGB", *, scale: int) -> Te
         multiples = f" with H and W multiples of {scale}" if scale > 1 else ""
         raise ValueError(f"rgb: expected {shape}{multiples}, got {tuple(rgb.shape)}")
     wide = torch.promote_types(rgb.dtype, torch.float32)
-    dtype, rgb = rgb.dtype, rgb_to_grayscale(rgb.to(wide)) if luminance else rgb
+    dtype = rgb.dtype
+    if luminance:
+        from kornia.color import rgb_to_grayscale
+
+        rgb = rgb_to_grayscale(rgb.to(wide))
     raw = rgb.new_empty(*rgb.shape[:-3], height // scale, width // scale, dtype=dtype)
     for colour, row, column in sites:
         plane, step = rgb[..., colour, :, :], side * scale
@@ -298,7 +310,7 @@ class BinToSensor(PatternModule):
         torch.Size([2, 4, 2])
     """
 
-    def __init__(self, pattern: str | CFA = "RGGB", *, scale: int) -> None:
+    def __init__(self, pattern: Pattern = "RGGB", *, scale: int) -> None:
         super().__init__(pattern)
         self.scale = check_whole("scale", scale)
 
@@ -306,7 +318,7 @@ class BinToSensor(PatternModule):
         return bin_to_sensor(rgb, self.pattern, scale=self.scale)
 
 
-def split_colors(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
+def split_colors(raw: Tensor, pattern: Pattern = "RGGB") -> Tensor:
     r"""Split a mosaic, or a stream of mosaics, into full-size planes with one colour each and 0 elsewhere.
 
     .. math:: S^C = M_C \, S, \quad C \in \{R, G, B\}
@@ -360,7 +372,7 @@ class SplitColors(PatternModule):
         return split_colors(raw, self.pattern)
 
 
-def split_bayer(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
+def split_bayer(raw: Tensor, pattern: Pattern = "RGGB") -> Tensor:
     r"""Split a mosaic, or a stream of mosaics, into its four half-size sub-streams R, G1, G2, B.
 
     .. math:: S^k(x, y) = S(2 x + \text{column}_k, 2 y + \text{row}_k)
@@ -411,7 +423,7 @@ class SplitBayer(PatternModule):
         return split_bayer(raw, self.pattern)
 
 
-def merge_bayer(planes: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
+def merge_bayer(planes: Tensor, pattern: Pattern = "RGGB") -> Tensor:
     r"""Merge the four sub-streams R, G1, G2, B into one mosaic; the inverse of :func:`split_bayer`.
 
     .. math:: S(2 x + \text{column}_k, 2 y + \text{row}_k) = S^k(x, y)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
-from kornia.color import CFA
 from torch import Tensor
 
 from spikekit.check import check_planes
-from spikekit.color.cfa import PatternModule, bayer_sites, count_colors
+from spikekit.color.cfa import Pattern, PatternModule, bayer_sites, count_colors
 
 
-def demosaic(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
+def demosaic(raw: Tensor, pattern: Pattern = "RGGB") -> Tensor:
     r"""Interpolate the two missing colours of every pixel with the 5 x 5 linear filters of Malvar, He and Cutler.
 
     For example, green at a red pixel is the mean of its green neighbours, plus half the difference between the red

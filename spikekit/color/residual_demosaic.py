@@ -7,10 +7,9 @@ from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
-from kornia.color import CFA
 from torch import Tensor
 
-from spikekit.color.cfa import PatternModule, bayer_mask, count_colors
+from spikekit.color.cfa import Pattern, PatternModule, bayer_mask, count_colors
 from spikekit.color.demosaic import wide_mosaics
 
 _RADIUS = 5  # radius of the guided filter
@@ -20,7 +19,7 @@ _FADE = [math.exp(-(k**2) / 8) for k in range(5)]  # half of a Gaussian of nine 
 _BORDER = 18  # receptive radius, 17, rounded up to keep the Bayer phase
 
 
-def demosaic_residual(raw: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
+def demosaic_residual(raw: Tensor, pattern: Pattern = "RGGB") -> Tensor:
     r"""Interpolate the two missing colours of every pixel by residual interpolation, guided by green.
 
     In every window a guide I predicts a colour p by a line, fitted to the pixels k where p is known. Only the residual

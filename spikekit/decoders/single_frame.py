@@ -7,8 +7,8 @@ from itertools import accumulate
 
 import numpy as np
 import torch
-from kornia.core.utils import is_exporting
 from torch import Tensor
+from torch.compiler import is_exporting
 
 from spikekit.check import check_dtype, check_index, check_planes, check_positive, check_whole, default_float
 from spikekit.decoders.dense import cast_light, check_window, interval_dtype, rate_of

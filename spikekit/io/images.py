@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from kornia.color import hsv_to_rgb
 from torch import Tensor
 
 from spikekit.arguments import home_path, one_line
@@ -290,6 +289,8 @@ def flow_to_rgb(flow: Tensor, max_flow: float | None = None) -> Tensor:
     length = torch.hypot(x, y)
     if max_flow is None:
         max_flow = length.amax().clamp(min=1e-6) if length.numel() else 1.0
+    from kornia.color import hsv_to_rgb
+
     hue = torch.atan2(y, x).remainder(2 * math.pi)
     hsv = torch.stack([hue, (length / max_flow).clamp(max=1), torch.ones_like(length)], dim=-3)
     return hsv_to_rgb(hsv).to(flow.dtype)

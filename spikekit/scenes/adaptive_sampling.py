@@ -9,11 +9,10 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from kornia.color import CFA
 from torch import Tensor
 
 from spikekit.check import check_positive, check_whole
-from spikekit.color.cfa import bin_to_sensor, mosaic
+from spikekit.color.cfa import Pattern, bin_to_sensor, mosaic
 from spikekit.flow.fields import upsample_flow
 from spikekit.flow.interpolate import FlowInterpolation
 from spikekit.warp.warp import flow_warp
@@ -141,7 +140,7 @@ def profile_interval(
     second: Tensor,
     *,
     scale: int,
-    pattern: str | CFA = "RGGB",
+    pattern: Pattern = "RGGB",
     alpha: float = 0.4,
     clocks: int = 20,
     spike_tolerance: float = 0.05,

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
-from kornia.color import CFA
 from numpy.typing import ArrayLike
 from torch import Tensor
 
 from spikekit.check import check_planes, check_positive, check_whole
-from spikekit.color.cfa import bin_to_sensor, cfa_sites
+from spikekit.color.cfa import Pattern, bin_to_sensor, cfa_sites
 
 _CHUNK = 1 << 16  # positions sampled at a time on a CPU, to fit in the cache
 _CHUNK_ELSEWHERE = 1 << 26  # on a GPU, to save launches
@@ -226,7 +225,7 @@ class Scene:
         view = self._render(self._picked([*range(self.channels)]), self._moves([clock]), rows, columns).squeeze(2)
         return view if self._batch else view[0]
 
-    def light(self, pattern: str | CFA = "RGGB", *, scale: int, alpha: float = 0.4) -> Tensor:
+    def light(self, pattern: Pattern = "RGGB", *, scale: int, alpha: float = 0.4) -> Tensor:
         """Return the light that arrives at the sensor at every clock.
 
         Equals ``alpha * bin_to_sensor(scene.rgb(clock), pattern, scale=scale)``, but evaluates only the colour that the

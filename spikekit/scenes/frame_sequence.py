@@ -9,11 +9,10 @@ from typing import Any, TypeVar
 
 import torch
 import torch.nn.functional as F
-from kornia.color import CFA
 from torch import Tensor
 
 from spikekit.check import check_picture, check_positive, check_whole
-from spikekit.color.cfa import bin_to_sensor, cfa_pattern
+from spikekit.color.cfa import Pattern, bin_to_sensor, cfa_pattern
 from spikekit.flow.interpolate import Blend, FlowInterpolation, Still
 from spikekit.scenes.adaptive_sampling import Plan, Region, SceneProfile, profile_interval
 from spikekit.sensor.noise import SensorNoise
@@ -85,7 +84,7 @@ class FrameSequence:
         frames: Sequence[Tensor],
         *,
         scale: int,
-        pattern: str | CFA = "RGGB",
+        pattern: Pattern = "RGGB",
         alpha: float = 0.4,
         clocks: int = 20,
         interpolation: Callable[[Tensor, Tensor], Any] | None = None,

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import torch
-from kornia.color import CFA
 from torch import Tensor
 
-from spikekit.color.cfa import cfa_sites
+from spikekit.color.cfa import Pattern, cfa_sites
 from spikekit.warp.neighbors import finite
 
 _FLAT = 1 << 31  # exceeds every flat index; combines a distance and an index in one integer
 
 
 def bayer_warp_idw(
-    features: Tensor, flow: Tensor, pattern: str | CFA, color: int, scale: int, steps: int, neighbors: int = 4
+    features: Tensor, flow: Tensor, pattern: Pattern, color: int, scale: int, steps: int, neighbors: int = 4
 ) -> Tensor:
     """Compute :func:`spikekit.flow_warp_idw` for the mask of one colour.
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import torch
-from kornia.color import CFA
 from torch import Tensor
 
 from spikekit.check import check_planes
-from spikekit.color.cfa import PatternModule, bayer_mask, bayer_pattern
+from spikekit.color.cfa import Pattern, PatternModule, bayer_mask, bayer_pattern
 from spikekit.color.residual_demosaic import guided_by_green, interpolate_green
 from spikekit.warp.neighbors import finite
 from spikekit.warp.warp import flow_warp
@@ -17,7 +16,7 @@ _SIGMA_RANGE = 0.5  # of white: weight by deviation from the estimate
 _TAU = 5.0  # mosaics after which the weight drops to 1 / e
 
 
-def demosaic_along_motion(raw: Tensor, flow: Tensor, pattern: str | CFA = "RGGB") -> Tensor:
+def demosaic_along_motion(raw: Tensor, flow: Tensor, pattern: Pattern = "RGGB") -> Tensor:
     r"""Demosaic the middle one of several mosaics, using samples of the others along the motion.
 
     The missing colours are first estimated in the middle mosaic, as by :func:`spikekit.demosaic_residual`. The estimate

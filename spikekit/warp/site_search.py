@@ -122,7 +122,7 @@ def site_table(
         device: device of the table.
         neighbors: number of known temporal pixels that are weighted, at most 4.
     """
-    with torch.inference_mode(False), torch.device("cpu"):  # tensors of inference mode cannot be used in training
+    with torch.inference_mode(False):  # tensors of inference mode cannot be used in training
         if device.type == "cpu":
             return _make_table(pattern, color, scale, odd, neighbors)
         return site_table(pattern, color, scale, odd, torch.device("cpu"), neighbors).to(device)
@@ -130,8 +130,8 @@ def site_table(
 
 def _make_table(pattern: str, color: int, scale: int, odd: tuple[bool, bool], neighbors: int) -> SiteTable:
     size = _SIDE + odd[0], _SIDE + odd[1]
-    mask = bayer_mask(*size, pattern, scale=scale, dtype=torch.bool)[color]
-    inside, step = [_SIDE // 2, _SIDE // 2 + 1], torch.arange(STEPS)
+    mask = bayer_mask(*size, pattern, scale=scale, device="cpu", dtype=torch.bool)[color]
+    inside, step = [_SIDE // 2, _SIDE // 2 + 1], torch.arange(STEPS, device="cpu")
     ends = step[[0, 1, STEPS // 2 - 1, STEPS // 2, STEPS // 2 + 1, -2, -1]]
     # offsets of sites inside on one axis and near a border on the other, where known pixels lie further apart
     near = [[*inside, -1, 0, 1, length, length - 1, length - 2] for length in size]
@@ -165,8 +165,10 @@ def _weights(
     """
     height, width = (length // scale for length in mask.shape)
     # distinct targets of the temporal pixels of a site at all fractions, in steps of a temporal pixel
-    moved, which = (steps[:, None] * scale + STEPS * torch.arange(scale)).unique(return_inverse=True)
-    axes = torch.tensor(rows), torch.arange(len(moved)), torch.tensor(columns), torch.arange(len(moved))
+    pixel = torch.arange(scale, device="cpu")
+    moved, which = (steps[:, None] * scale + STEPS * pixel).unique(return_inverse=True)
+    part = torch.arange(len(moved), device="cpu")
+    axes = torch.tensor(rows, device="cpu"), part, torch.tensor(columns, device="cpu"), part
     base_y, down, base_x, right = (part.flatten() for part in torch.meshgrid(*axes, indexing="ij"))
     y, x = (scale * base + moved[part] / STEPS for base, part in ((base_y, down), (base_x, right)))
     at = torch.stack([x.clamp(-0.5, scale * width - 0.5), y.clamp(-0.5, scale * height - 0.5)]).double()
@@ -174,7 +176,7 @@ def _weights(
     index, weight = search_and_weigh(products_of(mask, neighbors), neighbors, scale * width, cell.long(), at - cell)
     around = _AROUND[scale == 1]
     side = 2 * around + 1
-    dense = torch.zeros(len(y), side * side)
+    dense = torch.zeros(len(y), side * side, dtype=torch.float32, device="cpu")
     # a known temporal pixel is a bilinear mixture of features, as in torch.nn.functional.interpolate
     for i, weight_y in _mixture(index // (scale * width), scale, height):
         for j, weight_x in _mixture(index % (scale * width), scale, width):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from kornia.geometry.transform import remap
 from torch import Tensor, nn
 
 from spikekit.check import check_planes, check_whole
@@ -57,6 +56,8 @@ def flow_warp(image: Tensor, flow: Tensor) -> Tensor:
     if image.is_cuda and torch.are_deterministic_algorithms_enabled():
         warped = _bilinear(planes, x, y)
     else:
+        from kornia.geometry.transform import remap  # a quarter of a second
+
         warped = remap(planes, x, y, mode="bilinear", padding_mode="border", align_corners=True)
     return warped.to(image.dtype).reshape(image.shape)
 

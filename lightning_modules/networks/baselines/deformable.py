@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from kornia.feature.aliked.deform_conv2d import deform_conv2d
 from torch import Tensor, nn
 
 from lightning_modules.networks.layers import conv
@@ -40,6 +39,8 @@ class DeformableConv2d(nn.Module):
         self.weight, self.bias = taps.weight, taps.bias
 
     def forward(self, features: Tensor, guide: Tensor) -> Tensor:  # noqa: D102
+        from kornia.feature.aliked.deform_conv2d import deform_conv2d
+
         where = self.where(guide).to(self.weight.dtype)
         offsets, masks = where.split([where.shape[1] * 2 // 3, where.shape[1] // 3], dim=1)
         with torch.autocast(features.device.type, enabled=False):

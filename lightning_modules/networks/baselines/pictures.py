@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
-from kornia.core.utils import is_exporting
 from torch import Tensor, nn
+from torch.compiler import is_exporting
 
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks.layers import conv
