@@ -187,9 +187,9 @@ def _weights(
     dense = dense.reshape(len(rows), len(moved), len(columns), len(moved), -1).transpose(1, 2).flatten(0, 1)
     counts, offsets, weights = [], [], []
     for pair in dense:
-        near = (pair.amax(dim=(0, 1)) > _LEAST).nonzero()[:, 0]
+        near = (pair > _LEAST).flatten(0, 1).any(dim=0).nonzero()[:, 0]
         part = pair[..., near][which][:, :, which].transpose(1, 2).flatten(2, 3).flatten(0, 1)
-        used = part.amax(dim=1) > _LEAST
+        used = (part > _LEAST).any(dim=1)
         site, tap = used.nonzero(as_tuple=True)
         counts.append(used.sum(dim=1))
         offsets.append(torch.stack([near[tap] // side - around, near[tap] % side - around], dim=1))
