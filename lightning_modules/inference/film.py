@@ -235,7 +235,8 @@ class FilmMaker:
             raise ValueError(f"clocks: expected {len(spikes)} increasing ones, got {list(clocks)}")
         if self.rest is not None and not static:
             light = torch.as_tensor(exposure).flatten().expand(len(spikes)).tolist()
-            return torch.cat([*map(self._where_it_moves, spikes.split(1), clocks, light)])
+            pictures = [*map(self._where_it_moves, spikes.split(1), clocks, light)]
+            return torch.cat(pictures) if len(pictures) > 1 else pictures[0]
         if not self.interpolated:
             return self._made(spikes, list(clocks), None, static, exposure)
         every, total = self.interpolated + 1, len(clocks)
@@ -256,7 +257,7 @@ class FilmMaker:
         """Return a picture of which only moving parts are computed; the state of the other parts is kept."""
         whole, before, state = Box(0, 0, *spikes.shape[-2:]), self._known, None
         if before is not None and clock - before.clock <= self.network.frames:
-            state = before.state.clone()
+            state = before.state
 
         def make(box: Box, static: bool) -> Tensor:
             nonlocal state
@@ -268,8 +269,11 @@ class FilmMaker:
             rgb = self._made(outer.of(spikes), [clock], flow, flow is None, exposure)[0]
             if self.carries_on:
                 part = self._known.state
-                state = part.new_zeros(*part.shape[:2], *spikes.shape[-2:]) if state is None else state
-                box.of(state).copy_(box.of(part, outer[:2]))
+                if box == whole:
+                    state = part
+                else:
+                    state = state.clone() if state is before.state else state
+                    box.of(state).copy_(box.of(part, outer[:2]))
             return box.of(rgb, outer[:2], self.network.scale)
 
         rgb = self.rest(spikes[0], clock, make, exposure)

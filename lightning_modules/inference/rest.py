@@ -23,6 +23,7 @@ _RISK = 1e-5  # probability that a cell at rest counts as moved
 _TESTS = 5  # tests per cell: blocks of 1, 2 and 4 pixels, all of them, and the cell
 _PICTURES = 8  # pictures of the network that a cell at rest shows the mean of
 _SURE = 80  # clocks without a change before the clip of a resting cell
+_BUSY, _UNTESTED = 0.9, 4  # share of cells that makes a picture busy, and pictures after it that are not tested
 _LEAST = 1 / 12  # smallest variance of a count, as light is not known exactly
 _NOISY = 0.01  # additional variance per spike of a noisy sensor: photon noise for 100 electrons per threshold
 
@@ -78,19 +79,22 @@ def find_changes(recent: Tensor, reference: Tensor, share: Tensor, noise: float 
     gain = _gain(_sum(recent, CELL)[known], _sum(expected, CELL)[known])
     expected, each = gain * expected, gain * each
     off = recent - expected
-    part = (expected - expected.floor() - 0.5).abs()
-    variance = (0.25 - (part - each).clamp(min=0).square()).clamp(min=_LEAST) + each * (each + 1) / 4
-    variance = variance + noise * expected * (1 + each)
-    size = 1 + each + 0.1 + 6 * (noise * expected * (1 + each)).sqrt()
+    part = (expected - expected.floor() - 0.5).abs_()
+    extra = noise * expected * (1 + each)
+    variance = (0.25 - (part - each).clamp_(min=0).square_()).clamp_(min=_LEAST) + each * (each + 1) / 4 + extra
+    size = each + 1.1 + 6 * extra.sqrt()
     moved = F.max_pool2d((off.abs() - size)[None], CELL, ceil_mode=True)[0] > 0
     x = math.log(_TESTS / _RISK)
     for block in (1, 2, 4, CELL):
-        squares = _sum(off, block).square() / _sum(variance, block)
-        count = _sum(torch.ones_like(squares), CELL // block)
-        moved |= _sum(squares, CELL // block) > count + 2 * (count * x).sqrt() + 2 * x
+        if block > 1:
+            off, variance = _sum(off, 2), _sum(variance, 2)
+        squares, side = off.square() / variance, CELL // block
+        rows, columns = (_sum(squares.new_ones(shape), side) for shape in ((len(off), 1), (1, off.shape[1])))
+        count = rows * columns
+        moved |= _sum(squares, side) > count + 2 * (count * x).sqrt() + 2 * x
         if block in (2, 4):
-            most = F.max_pool2d(squares[None], CELL // block, ceil_mode=True)[0]
-            moved |= most > 2 * (x + math.log(2 * (CELL // block) ** 2))
+            most = F.max_pool2d(squares[None], side, ceil_mode=True)[0]
+            moved |= most > 2 * (x + math.log(2 * side**2))
     return Changes(moved | ~known, gain)
 
 
@@ -116,11 +120,22 @@ def _grown(cells: Tensor) -> Tensor:
     return F.max_pool2d(cells[None].float(), 3, 1, 1)[0] > 0
 
 
+def _cells(cells: Tensor, box: Box) -> Tensor:
+    """Return the cells of a box that begins with a cell."""
+    return Box(box.top // CELL, box.left // CELL, -(-box.bottom // CELL), -(-box.right // CELL)).of(cells)
+
+
 def _pixels(cells: Tensor, box: Box, scale: int = 1) -> Tensor:
     """Return the value of its cell for every pixel of a box."""
-    around = Box(box.top // CELL, box.left // CELL, -(-box.bottom // CELL), -(-box.right // CELL))
-    pixels = around.of(cells).repeat_interleave(CELL * scale, -2).repeat_interleave(CELL * scale, -1)
-    return box.of(pixels, (CELL * around.top, CELL * around.left), scale)
+    pixels = _cells(cells, box).repeat_interleave(CELL * scale, -2).repeat_interleave(CELL * scale, -1)
+    return box.of(pixels, box[:2], scale)
+
+
+def _blend(cells: Tensor, box: Box, scale: int) -> Tensor:
+    """Return weights of a box's picture: 1 in cells and up to a quarter of a cell around, 0 from three quarters on."""
+    halves = _grown(_cells(cells, box).repeat_interleave(2, 0).repeat_interleave(2, 1))
+    weight = F.interpolate(halves[None, None].float(), scale_factor=CELL // 2 * scale, mode="bilinear")[0, 0]
+    return box.of(weight, box[:2], scale)
 
 
 class Rest:
@@ -155,7 +170,7 @@ class Rest:
 
     def __init__(self, scale: int, pattern: str, white: float, noisy: bool = False) -> None:
         self.scale, self.pattern, self.white, self.noisy = scale, pattern, white, noisy
-        self._clock = -math.inf
+        self._clock, self._untested = -math.inf, 0
 
     def _start(self, spikes: Tensor) -> None:
         planes = spikes.new_zeros(2, *spikes.shape[-2:], dtype=torch.float32)
@@ -176,6 +191,11 @@ class Rest:
             exposure: factor of the network's pictures.
         """
         frames, whole, scale = len(spikes), Box(0, 0, *spikes.shape[-2:]), self.scale
+        if self._untested:
+            self._untested -= 1
+            self._clock = -math.inf
+            self.moving = self.computed = torch.ones_like(self.computed)
+            return make(whole, False)
         came = int(min(clock - self._clock, frames + 1))
         if came > frames or self._earlier.shape != spikes.shape[-2:]:
             self._start(spikes)
@@ -183,46 +203,62 @@ class Rest:
             self._compare(spikes[frames - came :])
         self._clock = clock
         still = self._calm >= frames - 1
-        self.moving = near = _grown(self._calm < frames - 1 + _SURE)
+        unsure = self._calm < frames - 1 + _SURE
+        self.moving = near = _grown(unsure)
         new = still & (self._count < _PICTURES)
         self.computed = near | new
         self._count = (self._count + new) * still
-        boxes = _boxes(self.computed, near, whole)
-        parts = [(box, make(box, static).float()) for box, static in boxes]
         if not still.any():
             self._mean = None
-            return parts[0][1].clamp(0, 1)
+            return make(whole, False)
+        boxes = _boxes(self.computed, near, whole)
+        parts = [(box, make(box, static).float()) for box, static in boxes]
         middle = spikes[frames // 2 - came // 2 :][:came]
         clocks = self._before + self._since
         expected = _sum(self._earlier + self._later, CELL) * (came / clocks)
         gain = _gain(_sum(middle.sum(0, dtype=torch.float32), CELL)[clocks > 0], expected[clocks > 0])
-        weight = torch.where(new, 1 / self._count, (self._count == 0).float())
+        if self._mean is None:
+            self._mean = torch.zeros_like(parts[0][1])  # the first pictures are whole
+            self._seen = self._mean.new_zeros(spikes.shape[1:])
         for box, part in parts:
-            if self._mean is None:
-                self._mean = part.new_zeros(len(part), scale * whole.bottom, scale * whole.right)
-            mean = box.of(self._mean, scale=scale)
-            mean.lerp_(part if gain == 1 else part / gain, _pixels(weight, box, scale))
+            weight = _pixels(new / self._count.clamp(min=1), box, scale)
+            if weight.any():
+                mean = box.of(self._mean, scale=scale)
+                mean.lerp_(part if gain == 1 else part / gain, weight)
+                box.of(self._seen).copy_(self._mosaic(mean))
         if boxes[:1] == [(whole, False)]:  # blending the few cells at rest would cost more than it gains
-            return parts[0][1].clamp(0, 1)
-        shown = (self._mean.clone() if self.noisy else self._drawn(exposure)).mul_(gain)
+            return parts[0][1]
+        shown = self._mean.clone() if self.noisy else self._drawn(exposure)
+        if gain != 1:
+            shown *= gain
         if near.any():
-            share = F.interpolate(near[None, None].float(), scale_factor=CELL * scale, mode="bilinear")[0, 0]
             for box, part in parts:
-                box.of(shown, scale=scale).lerp_(part, box.of(share, scale=scale))
+                box.of(shown, scale=scale).lerp_(part, _blend(unsure, box, scale))
         return shown.clamp_(0, 1)
+
+    def _mosaic(self, picture: Tensor) -> Tensor:
+        """Return what the sensor sees of a picture."""
+        if len(picture) == 1:
+            return F.avg_pool2d(picture, self.scale)[0]
+        return bin_to_sensor(picture, self.pattern, scale=self.scale)
 
     def _compare(self, spikes: Tensor) -> None:
         """Add new spikes to the counts, which start anew where the scene has changed."""
         recent, noise = spikes.sum(0, dtype=torch.float32), _NOISY * self.noisy
-        came = len(spikes) * self._light
-        alone = find_changes(recent, self._earlier, came / self._before, noise)
-        self._light *= alone.gain
+        changed, longer = self._before > 0, self._since.any()
+        if changed.any():
+            alone = find_changes(recent, self._earlier, len(spikes) * self._light / self._before, noise)
+            self._light *= alone.gain
+            changed &= alone.moved
         self._later += recent
-        self._since += came * alone.gain
-        joint = find_changes(self._later, self._earlier, self._since / self._before, noise)
-        self._since *= joint.gain
+        self._since += len(spikes) * self._light
+        if longer:  # otherwise this is the same test
+            joint = find_changes(self._later, self._earlier, self._since / self._before, noise)
+            self._since *= joint.gain
+            changed |= joint.moved & (self._before > 0)
+        if _grown(changed).float().mean() > _BUSY:
+            self._untested = _UNTESTED
         self._calm += len(spikes)
-        changed = (alone.moved | joint.moved) & (self._before > 0)
         self._calm[changed] = self._before[changed] = self._since[changed] = 0
         full = self._since >= self._before
         whole = Box(0, 0, *recent.shape)
@@ -238,21 +274,16 @@ class Rest:
         """Return the mean of pictures, corrected towards that of all spikes."""
         clocks = self._before + self._since
         share = (exposure / self.white / clocks).nan_to_num(posinf=0)
-        picture = self._mean
-        if len(picture) == 1:
-            seen = F.avg_pool2d(picture, self.scale)[0]
-        else:
-            seen = bin_to_sensor(picture, self.pattern, scale=self.scale)
-        whole = Box(0, 0, *seen.shape)
-        off = (self._earlier + self._later) * _pixels(share, whole) - seen
-        power = _sum(off.square(), CELL) / _sum(torch.ones_like(off), CELL)
-        trust = (1 - share.square() / 6 / power).nan_to_num(0).clamp(min=0) * (share > 0)
+        whole = Box(0, 0, *self._seen.shape)
+        off = (self._earlier + self._later) * _pixels(share, whole) - self._seen
+        power = F.avg_pool2d(off.square()[None], CELL, ceil_mode=True)[0]
+        trust = (1 - share.square() / 6 / power).nan_to_num(0).clamp(min=0) * (self._count > 0)
         off = off * _pixels(trust, whole)
         colors = off[None] if self.pattern == GREY else demosaic(off, self.pattern)
         if self.scale > 1:
             # antialias does not change the result of enlarging, but is three times faster
             colors = F.interpolate(colors[None], scale_factor=self.scale, mode="bilinear", antialias=True)[0]
-        return picture + colors
+        return colors.add_(self._mean)
 
 
 def _boxes(computed: Tensor, near: Tensor, whole: Box) -> list[tuple[Box, bool]]:
@@ -263,7 +294,7 @@ def _boxes(computed: Tensor, near: Tensor, whole: Box) -> list[tuple[Box, bool]]
     groups = label(_grown(computed).cpu().numpy())[0] * computed.cpu().numpy()
     for rows, columns in find_objects(groups):
         box = Box(*(CELL * end for end in (rows.start, columns.start, rows.stop, columns.stop)))
-        found.append((box.grown(CELL // 2, whole), not near[rows, columns].any().item()))
+        found.append((box.grown(0, whole), not near[rows, columns].any().item()))
         top, left, bottom, right = box.grown(AROUND, whole)
         area += (bottom - top) * (right - left)
     if found and area >= 1.2 * whole.bottom * whole.right:
