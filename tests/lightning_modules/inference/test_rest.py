@@ -112,6 +112,14 @@ def test_where_all_moves_pictures_are_those_of_every_clip_by_itself():
         assert found.equal(plain)
 
 
+def test_a_camera_that_stops_lets_the_scene_rest():
+    scene = Scene([Layer(texture(2 * SIDE), Motion(velocity=(0.3, 0.1)))], 2 * SIDE, 2 * SIDE, 121)
+    light = scene.light(scale=2)
+    computed = [cells for _, cells in film(torch.cat([light, light[-1:].expand(520, -1, -1)]), psnr_tolerance=0.1)]
+    assert all(cells.all() for cells in computed[:7])
+    assert not computed[-1].any()
+
+
 def test_slow_drift_is_seen_before_it_is_half_a_pixel():
     scene = Scene([Layer(texture(2 * SIDE), Motion(velocity=(1 / 300, 0.0)))], 2 * SIDE, 2 * SIDE, 441)
     shares = [cells.float().mean().item() for _, cells in film(scene.light(scale=2), psnr_tolerance=0.1)]
