@@ -89,8 +89,7 @@ def find_changes(recent: Tensor, reference: Tensor, share: Tensor, noise: float 
         if block > 1:
             off, variance = _sum(off, 2), _sum(variance, 2)
         squares, side = off.square() / variance, CELL // block
-        rows, columns = (_sum(squares.new_ones(shape), side) for shape in ((len(off), 1), (1, off.shape[1])))
-        count = rows * columns
+        count = _sum(torch.ones_like(squares), side)
         moved |= _sum(squares, side) > count + 2 * (count * x).sqrt() + 2 * x
         if block in (2, 4):
             most = F.max_pool2d(squares[None], side, ceil_mode=True)[0]
@@ -228,9 +227,7 @@ class Rest:
                 box.of(self._seen).copy_(self._mosaic(mean))
         if boxes[:1] == [(whole, False)]:  # blending the few cells at rest would cost more than it gains
             return parts[0][1]
-        shown = self._mean.clone() if self.noisy else self._drawn(exposure)
-        if gain != 1:
-            shown *= gain
+        shown = (self._mean.clone() if self.noisy else self._drawn(exposure)).mul_(gain)
         if near.any():
             for box, part in parts:
                 box.of(shown, scale=scale).lerp_(part, _blend(unsure, box, scale))
@@ -245,17 +242,13 @@ class Rest:
     def _compare(self, spikes: Tensor) -> None:
         """Add new spikes to the counts, which start anew where the scene has changed."""
         recent, noise = spikes.sum(0, dtype=torch.float32), _NOISY * self.noisy
-        changed, longer = self._before > 0, self._since.any()
-        if changed.any():
-            alone = find_changes(recent, self._earlier, len(spikes) * self._light / self._before, noise)
-            self._light *= alone.gain
-            changed &= alone.moved
+        alone = find_changes(recent, self._earlier, len(spikes) * self._light / self._before, noise)
+        self._light *= alone.gain
         self._later += recent
         self._since += len(spikes) * self._light
-        if longer:  # otherwise this is the same test
-            joint = find_changes(self._later, self._earlier, self._since / self._before, noise)
-            self._since *= joint.gain
-            changed |= joint.moved & (self._before > 0)
+        joint = find_changes(self._later, self._earlier, self._since / self._before, noise)
+        self._since *= joint.gain
+        changed = (alone.moved | joint.moved) & (self._before > 0)
         if _grown(changed).float().mean() > _BUSY:
             self._untested = _UNTESTED
         self._calm += len(spikes)
