@@ -140,6 +140,8 @@ class SuperResolution(BaseTask):
         spikes, settings = batch["spikes"], self.network.settings
         name, decoder = type(self.network).__name__, (settings["scale"], settings["pattern"], settings["alpha"])
         film = "every" in batch
+        if "noise" in batch:  # one level for all test clips
+            self.network.noise_level = batch["noise"].flatten()[0].item()
         clips, truth = spikes, batch["rgb"]
         if film:
             judged = middle_half(batch)

@@ -14,7 +14,7 @@ def test_weights_files_have_a_row_and_a_card_and_are_small():
     folder = MODELS[0].path.parent
     assert set(folder.glob("*.safetensors")) == {model.path for model in MODELS}
     assert {path.stem for path in folder.glob("*.md")} == {model.path.stem for model in MODELS}
-    assert sum(path.stat().st_size for path in folder.glob("*.safetensors")) < 76e6  # what a wheel may hold
+    assert sum(path.stat().st_size for path in folder.glob("*.safetensors")) < 80e6  # what a wheel may hold
 
 
 def test_models_are_selected_by_scale_and_pattern():

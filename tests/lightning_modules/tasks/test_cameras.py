@@ -34,6 +34,20 @@ def test_gains_and_noise_are_learned_at_scale_1(kind, key_frames, pattern, tmp_p
     assert all(parameter.abs().max() > 0 for parameter in level.parameters())
 
 
+def test_tests_tell_the_network_the_noise():
+    torch.manual_seed(0)
+    module = SuperResolution(CSCSR(scale=1, pattern="grey", **TINY))
+    module.log = lambda *_, **__: None
+    torch.nn.init.ones_(module.network.reconstruction.noise.shift)
+    torch.nn.init.normal_(module.network.reconstruction.rgb.weight)
+    spikes = (torch.rand(1, 41, 12, 12) < 0.3).to(torch.uint8)
+    batch = {"spikes": spikes, "rgb": torch.rand(1, 1, 12, 12), "noise": torch.ones(1)}
+    told = module.test_step(batch, 0)["pictures"]["CSCSR"]
+    assert torch.equal(told, module.network(spikes, noise=1.0).clamp(0, 1))
+    module.network.noise_level = 0.0
+    assert not torch.equal(told, module(spikes))
+
+
 def test_dim_clips_do_not_dominate_the_loss(tmp_path):
     """The errors of two clips, one with a hundredth of the light, fall by similar fractions."""
     torch.manual_seed(0)
