@@ -96,7 +96,6 @@ def export_network(network: Network, path: str | Path, kind: str, *, still: bool
     if kind == "onnx":
         _check_onnx()
     network = network.eval().cpu().float()
-    network.by_sites = False  # site search has no operator in the exported formats
     films = isinstance(network, RecurrentCSCSR)
     module = as_exported(network, still)
     try:

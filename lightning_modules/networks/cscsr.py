@@ -13,7 +13,7 @@ from torch.compiler import is_exporting
 
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks.cscsr_config import CSCSRConfig
-from lightning_modules.networks.layers import enlarge, fold, start_pixel_by_pixel
+from lightning_modules.networks.layers import enlarge, enlarge_smoothly, fold, start_pixel_by_pixel
 from lightning_modules.networks.motion_fusion import assembled_motion, independent_motion, joint_motion
 from lightning_modules.networks.network import Network
 from lightning_modules.networks.reconstruction import ColorCorrelation, EarlyFusion, SeparateColors
@@ -22,11 +22,8 @@ from lightning_modules.networks.representation import IntervalRepresentation, Sp
 from lightning_modules.signatures import inherit_signature
 from spikekit import bayer_mask, demosaic, flow_warp_idw, linear_motion, split_colors, tfp_at
 from spikekit.color.cfa import count_colors
-from spikekit.warp.bayer_warp import bayer_warp_idw
-from spikekit.warp.site_search import SMALLEST, search_sites, site_table
+from spikekit.warp.site_search import SMALLEST, apart, search_sites, site_table
 
-#: motion is rounded to 1/16 of an output pixel, because exported programs search in integers
-_STEPS = 16
 _SEARCHED = 1 << 19  # positions per search on a CPU, limited by its cache
 _SEARCHED_ELSEWHERE = 1 << 25  # on other devices, where a kernel launch costs more
 
@@ -68,8 +65,7 @@ def _shares(times: tuple[int, ...], flow_times: tuple[int, int, int], device: to
     """Return the weights (T, 2) of the flows to the first and last time points in the motion to each time point."""
     first, middle, last = flow_times
     shares = [[max(0.0, (t - middle) / (end - middle)) for end in (first, last)] for t in times]
-    with torch.inference_mode(False):
-        return torch.tensor(shares, device=device)
+    return apart(lambda: torch.tensor(shares, device=device))
 
 
 @lru_cache(maxsize=6)
@@ -80,17 +76,13 @@ def _masks(height: int, width: int, pattern: str, scale: int, device: torch.devi
 
 
 def _kept_near(offsets: Tensor) -> Tensor:
-    """Clamp offsets (..., 2, H, W) so that they point no more than half a pixel beyond the picture's border.
-
-    Offsets are rounded as in exported programs, so that both find the same pixels. The gradient ignores the rounding.
-    """
+    """Clamp offsets (..., 2, H, W) so that they point no more than half a pixel beyond the picture's border."""
     kept = []
     for axis, offset in zip((-1, -2), offsets.unbind(-3), strict=True):
         length = offset.shape[axis]
         at = torch.arange(length, device=offset.device, dtype=offset.dtype)
         at = at if axis == -1 else at.unsqueeze(-1)
-        near = offset.maximum(-0.5 - at).minimum(length - 0.5 - at)
-        kept.append(near + ((near * _STEPS).round() / _STEPS - near).detach())
+        kept.append(offset.maximum(-0.5 - at).minimum(length - 0.5 - at))
     return torch.stack(kept, dim=-3)
 
 
@@ -108,8 +100,6 @@ class CSCSR(Network):
 
     Attributes:
         config: the configuration.
-        by_sites: search once per sensor pixel, with one flow each, where possible. If False, and in exported
-            programs, the network searches once per output pixel.
 
     Shape:
         - Input: spikes :math:`(B, N, H, W)`, zeros and ones of any real dtype, with H and W of at least 3. Optional:
@@ -132,7 +122,6 @@ class CSCSR(Network):
     """
 
     halo = 16  #: upper bound for all shipped networks; weights define their own
-    by_sites = True
     flow_groups = ((), (3,))
     configuration: ClassVar[type[CSCSRConfig]] = CSCSRConfig  #: class of ``config``
 
@@ -212,31 +201,33 @@ class CSCSR(Network):
         elif self._by_sites(spikes, flow):
             pixels = self._search_sites(features, flow, spikes)
             return [refine(part) for refine, part in zip(self.refinement, pixels, strict=True)]
+        elif is_exporting():
+            got = f"{self.config.neighbors} and {tuple(spikes.shape[-2:])}"
+            raise ValueError(f"neighbors, H, W: expected at most 4 and at least {SMALLEST} for export, got {got}")
         else:
-            search = self._search_in_graph if is_exporting() else self._search
-            pixels = map(search, features, self._offsets(flow, spikes), range(self.colors))
+            pixels = map(self._search, features, self._offsets(flow, spikes), range(self.colors))
         pixels = (fold(part.flatten(1, 2), self.fold) for part in pixels)
         return [refine(part) for refine, part in zip(self.refinement, pixels, strict=True)]
 
     def _by_sites(self, spikes: Tensor, flow: Tensor | None) -> bool:
         """Return whether one search per sensor pixel is possible; it has no gradient with respect to the flow."""
-        config = self.config
         learned = flow is not None and flow.requires_grad and torch.is_grad_enabled()
-        if learned or not self.by_sites or is_exporting() or torch.jit.is_tracing():
+        if learned or torch.jit.is_tracing():
             return False
-        known = config.representation == "bssr" and config.neighbors <= 4
-        return known and self.fold == self.scale and min(spikes.shape[-2:]) >= SMALLEST
+        return self.config.neighbors <= 4 and min(spikes.shape[-2:]) >= SMALLEST
 
     def _search_sites(self, features: Iterable[Tensor], flow: Tensor | None, spikes: Tensor) -> Iterator[Tensor]:
-        """Run the temporal pixel search for each colour, (B, T, C, H, W) to (B, T C s^2, H, W)."""
+        """Run the temporal pixel search for each colour, (B, T, C, H, W) to the input of the refinement."""
         height, width = spikes.shape[-2:]
         moved = spikes.new_zeros(len(spikes), 2, 2, height, width) if flow is None else flow
         flows = moved.unbind(1) if moved.ndim == 6 else [moved] * self.colors
         shares = _shares(self.times, self.flow_times, spikes.device)
         for color, (part, one) in enumerate(zip(features, flows, strict=True)):
             of_border = height % 2 == 1, width % 2 == 1
-            table = site_table(self.pattern, color, self.scale, of_border, spikes.device, self.config.neighbors)
-            yield search_sites(part, one, shares, table)
+            how = self.config.neighbors, self.config.representation != "bssr"
+            table = site_table(self.pattern, color, self.scale, of_border, spikes.device, *how)
+            pixels = search_sites(part, one, shares, table)
+            yield pixels if self.fold == self.scale else F.pixel_shuffle(pixels, self.scale)
 
     @torch.no_grad()
     def scale_picture(self, factor: float) -> None:  # noqa: D102
@@ -296,18 +287,6 @@ class CSCSR(Network):
         known = enlarge(mask[None, :: self.scale, :: self.scale].to(pixels.dtype), self.scale)
         return pixels / known.where(mask, 1)
 
-    def _search_in_graph(self, features: Tensor, offsets: Tensor, color: int) -> Tensor:
-        """Run the same search with exportable operations, for any even height and width."""
-        if self.config.neighbors > 4:
-            raise ValueError(f"neighbors: expected at most 4 for export, got {self.config.neighbors}")
-        offsets = offsets.expand(-1, features.shape[1], -1, -1, -1)
-        height, width = features.shape[-2:]
-        mask = bayer_mask(height, width, self.pattern, scale=self.scale, device=features.device, dtype=torch.bool)
-        pixels = self._enlarge(features.flatten(0, 1), mask[color])
-        how = self.scale, _STEPS, self.config.neighbors
-        found = bayer_warp_idw(pixels, offsets.flatten(0, 1), self.pattern, color, *how)
-        return found.unflatten(0, features.shape[:2])
-
     def _base(self, spikes: Tensor) -> Tensor:
         """Return the enlarged TFP picture: demosaiced and smoothed, or third-order TFP for a grey sensor."""
         if self.colors == 1:
@@ -320,6 +299,4 @@ class CSCSR(Network):
             # zero at the Nyquist frequency, to remove the zipper artefacts of demosaicing
             binomial = torch.cat([raw.new_full((1, 1), weight) for weight in (0.25, 0.5, 0.25)], dim=1)
             smooth = filter2d_separable(demosaic(raw, self.pattern), binomial, binomial)
-        if self.scale == 1:
-            return smooth
-        return F.interpolate(smooth, scale_factor=self.scale, mode="bicubic", align_corners=False)
+        return enlarge_smoothly(smooth, self.scale)

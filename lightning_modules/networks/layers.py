@@ -8,6 +8,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from spikekit.kernels import compiler_kept_out
+from spikekit.warp.site_search import apart
+
 
 def channels_last(planes: Tensor) -> Tensor:
     """Convert (B, C, H, W) to the channels-last memory format, which makes convolutions faster."""
@@ -21,6 +24,29 @@ def enlarge(features: Tensor, scale: int) -> Tensor:
     planes = features.reshape(-1, *features.shape[-3:])
     planes = F.interpolate(planes, scale_factor=scale, mode="bilinear", align_corners=False)
     return planes.reshape(*features.shape[:-2], *planes.shape[-2:])
+
+
+@compiler_kept_out
+@lru_cache
+def _cubic(scale: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return the weights of the pixels around a pixel for its s^2 enlarged pixels, (s^2, 1, 5, 5)."""
+
+    def make() -> Tensor:
+        single = torch.eye(25, dtype=dtype, device=device).reshape(25, 1, 5, 5)
+        large = F.interpolate(single, scale_factor=scale, mode="bicubic")
+        middle = slice(2 * scale, 3 * scale)
+        return large[:, 0, middle, middle].flatten(1).T.reshape(-1, 1, 5, 5).contiguous()
+
+    return apart(make)
+
+
+def enlarge_smoothly(planes: Tensor, scale: int) -> Tensor:
+    """Enlarge bicubically, (B, C, H, W) to (B, C, s H, s W), by a convolution, which is faster."""
+    if scale == 1:
+        return planes
+    around = F.pad(planes.flatten(0, 1).unsqueeze(1), (2, 2, 2, 2), "replicate")
+    large = F.conv2d(around, _cubic(scale, planes.dtype, planes.device))
+    return F.pixel_shuffle(large, scale).squeeze(1).unflatten(0, planes.shape[:2])
 
 
 def fold(planes: Tensor, size: int) -> Tensor:

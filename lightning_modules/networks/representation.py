@@ -65,11 +65,11 @@ class SpikeRepresentation(nn.Module):
         everywhere = None
         if self.whole is not None:
             # features of the whole clip are the same for all time points, so they are convolved once
-            _, weight = self.fuse[0][0].weight.chunk(2, dim=1)
-            everywhere = F.conv2d(self.whole(channels_last(spikes)), weight, padding=1).unsqueeze(1)
-        few = windows.shape[1]
-        if spikes.device.type == "cpu" and not (torch.is_grad_enabled() or torch.jit.is_tracing()):
-            few = max(1, _PIXELS // spikes[:, 0].numel())  # time points per step, to fit in the cache
+            seen = self.whole(channels_last(spikes))
+            everywhere = F.conv2d(seen, self.fuse[0][0].weight[:, -seen.shape[1] :], padding=1).unsqueeze(1)
+        if spikes.device.type != "cpu" or torch.is_grad_enabled() or torch.jit.is_tracing() or is_exporting():
+            return self._features(windows, everywhere, noise)
+        few = max(1, _PIXELS // spikes[:, 0].numel())  # time points per step, to fit in the cache
         parts = [self._features(part, everywhere, noise) for part in windows.split(few, dim=1)]
         return torch.cat(parts, dim=1)
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import torch
 from torch import Tensor
+from torch.compiler import is_exporting
 
 from spikekit.check import check_planes, check_whole
 from spikekit.options_module import OptionsModule
@@ -350,6 +351,9 @@ def split_colors(raw: Tensor, pattern: Pattern = "RGGB") -> Tensor:
     check_planes("raw", raw, 2, "(*, H, W)")
     if count_colors(pattern) == 1:
         return raw[None].clone()
+    if is_exporting():  # assignments would be exported as scattering
+        masks = bayer_mask(*raw.shape[-2:], pattern, device=raw.device, dtype=raw.dtype)
+        return raw * masks.reshape(3, *[1] * (raw.ndim - 2), *raw.shape[-2:])
     colors = raw.new_zeros(3, *raw.shape)
     for colour, row, column in bayer_sites(pattern):
         colors[colour, ..., row::2, column::2] = raw[..., row::2, column::2]

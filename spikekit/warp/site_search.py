@@ -15,6 +15,7 @@ rounding.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -22,6 +23,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.compiler import is_exporting
 
 from spikekit.check import wide_dtype
 from spikekit.color.cfa import bayer_mask
@@ -65,15 +67,15 @@ class SiteTable:
 
     def place(self, base: Tensor, length: int) -> Tensor:
         """Classify positions -1 ... ``length`` on an axis; 0 and 1 are away from the borders."""
-        place = torch.where(base < -self.low, base + 3, base & 1)
+        place = torch.where(base < -self.low, base + 3, base % 2)
         return torch.where(base + self.high >= length, 3 - self.low + length - base, place)
 
     def classes(self, y: Tensor, x: Tensor, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return bases and classes of positions in steps.
 
         Args:
-            y: rows, integer, from ``-STEPS`` to ``STEPS * height``.
-            x: columns, integer, from ``-STEPS`` to ``STEPS * width``.
+            y: rows, whole numbers, from ``-STEPS`` to ``STEPS * height``.
+            x: columns, from ``-STEPS`` to ``STEPS * width``.
             height: height of the sensor.
             width: width of the sensor.
 
@@ -86,7 +88,7 @@ class SiteTable:
         inside = ((2 * i + j) * STEPS + down) * STEPS + right
         half = STEPS // 2
         border = 4 * STEPS**2 + ((i * self.places + j) * half + down // 2) * half + right // 2
-        return rows, columns, torch.where((i < 2) & (j < 2), inside, border)
+        return rows.long(), columns.long(), torch.where((i < 2) & (j < 2), inside, border).long()
 
     @property
     def arguments(self) -> tuple[Any, ...]:
@@ -100,17 +102,22 @@ class SiteTable:
 
 
 def _steps_to(moved: Tensor, length: int, axis: int) -> Tensor:
-    """Return the rounded target of every site, (T, H, W), in steps, clamped to one site outside the sensor."""
-    at = torch.arange(length, device=moved.device) * STEPS
+    """Return the rounded target of every site, (B, T, H, W), in steps, clamped to one site outside the sensor."""
+    at = torch.arange(length, device=moved.device, dtype=moved.dtype) * STEPS
     at = at.unsqueeze(-1) if axis == -2 else at
-    moved = moved.clamp(-2.0 * length, 2.0 * length)
-    return ((moved * STEPS).round().long() + at).clamp(-STEPS, STEPS * length)
+    return ((moved * STEPS).round() + at).clamp(-STEPS, STEPS * length)
 
 
 @compiler_kept_out  # torch.compile cannot trace it, and would ignore the cache
 @lru_cache(maxsize=24)
 def site_table(
-    pattern: str, color: int, scale: int, odd: tuple[bool, bool], device: torch.device, neighbors: int = 4
+    pattern: str,
+    color: int,
+    scale: int,
+    odd: tuple[bool, bool],
+    device: torch.device,
+    neighbors: int = 4,
+    sparse: bool = False,
 ) -> SiteTable:
     """Return the table of one colour, cached.
 
@@ -121,39 +128,52 @@ def site_table(
         odd: whether height and width of the sensor are odd, which changes the phase at the far border.
         device: device of the table.
         neighbors: number of known temporal pixels that are weighted, at most 4.
+        sparse: features at pixels of other colours are zero, so the enlarged ones are renormalised.
     """
-    with torch.inference_mode(False):  # tensors of inference mode cannot be used in training
-        if device.type == "cpu":
-            return _make_table(pattern, color, scale, odd, neighbors)
-        return site_table(pattern, color, scale, odd, torch.device("cpu"), neighbors).to(device)
+    if device.type == "cpu":
+        return apart(_make_table, pattern, color, scale, odd, neighbors, sparse)
+    return site_table(pattern, color, scale, odd, torch.device("cpu"), neighbors, sparse).to(device)
 
 
-def _make_table(pattern: str, color: int, scale: int, odd: tuple[bool, bool], neighbors: int) -> SiteTable:
+def apart(make: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function in a thread of its own, where PyTorch is in none of its modes, neither inference nor export."""
+    with ThreadPoolExecutor(1) as thread:
+        return thread.submit(make, *arguments).result()
+
+
+def _make_table(
+    pattern: str, color: int, scale: int, odd: tuple[bool, bool], neighbors: int, sparse: bool
+) -> SiteTable:
     size = _SIDE + odd[0], _SIDE + odd[1]
     mask = bayer_mask(*size, pattern, scale=scale, device="cpu", dtype=torch.bool)[color]
+    gain = torch.ones(mask.shape, dtype=torch.float64, device="cpu")
+    if sparse and scale > 1:
+        known = mask[None, None, ::scale, ::scale].double()
+        gain /= F.interpolate(known, scale_factor=scale, mode="bilinear").squeeze().where(mask, 1)
     inside, step = [_SIDE // 2, _SIDE // 2 + 1], torch.arange(STEPS, device="cpu")
     ends = step[[0, 1, STEPS // 2 - 1, STEPS // 2, STEPS // 2 + 1, -2, -1]]
     # offsets of sites inside on one axis and near a border on the other, where known pixels lie further apart
     near = [[*inside, -1, 0, 1, length, length - 1, length - 2] for length in size]
-    wide = _weights(mask, neighbors, scale, near[0], inside, ends)[1][:, 1]
-    high_ones = _weights(mask, neighbors, scale, inside, near[1], ends)[1][:, 0]
+    wide = _weights(mask, gain, neighbors, scale, near[0], inside, ends)[1][:, 1]
+    high_ones = _weights(mask, gain, neighbors, scale, inside, near[1], ends)[1][:, 0]
     low, high = int(min(wide.min(), high_ones.min())), int(max(wide.max(), high_ones.max()))
     axes = [[*inside, *range(-1, -low), *range(length, length - high - 1, -1)] for length in size]
     # row by row: fits in the cache
-    found = [_weights(mask, neighbors, scale, [row], inside, step) for row in inside]
-    found += [_weights(mask, neighbors, scale, [row], axes[1], step[::2]) for row in axes[0]]
+    found = [_weights(mask, gain, neighbors, scale, [row], inside, step) for row in inside]
+    found += [_weights(mask, gain, neighbors, scale, [row], axes[1], step[::2]) for row in axes[0]]
     count, offset, weight = (torch.cat(parts) for parts in zip(*found, strict=True))
     start = F.pad(count.cumsum(0), (1, 0))
     return SiteTable(scale, low, high, int(count.max()), start.int(), offset.int(), weight)
 
 
 def _weights(
-    mask: Tensor, neighbors: int, scale: int, rows: list[int], columns: list[int], steps: Tensor
+    mask: Tensor, gain: Tensor, neighbors: int, scale: int, rows: list[int], columns: list[int], steps: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Compute the weights for all pairs of bases and all fractions.
 
     Args:
         mask: known temporal pixels, (s H, s W).
+        gain: factor of every temporal pixel, (s H, s W).
         neighbors: number of known pixels that are weighted.
         scale: super-resolution factor s.
         rows: rows of the I bases.
@@ -174,6 +194,7 @@ def _weights(
     at = torch.stack([x.clamp(-0.5, scale * width - 0.5), y.clamp(-0.5, scale * height - 0.5)]).double()
     cell = at.round()
     index, weight = search_and_weigh(products_of(mask, neighbors), neighbors, scale * width, cell.long(), at - cell)
+    weight = weight * gain.flatten()[index]
     around = _AROUND[scale == 1]
     side = 2 * around + 1
     dense = torch.zeros(len(y), side * side, dtype=torch.float32, device="cpu")
@@ -205,18 +226,60 @@ def _mixture(pixel: Tensor, scale: int, length: int) -> list[tuple[Tensor, Tenso
     return [(first.long(), 1 - share), ((first.long() + 1).clamp(max=length - 1), share)]
 
 
+def _find(flow: Tensor, shares: Tensor, table: SiteTable) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the rows and columns of the bases, and the classes, of all sites and time points, (B, T, H, W)."""
+    height, width = flow.shape[-2:]
+    moved = torch.einsum("tk,bkchw->btchw", shares.to(flow.dtype), flow)
+    y, x = _steps_to(moved[:, :, 1], height, -2), _steps_to(moved[:, :, 0], width, -1)
+    return table.classes(y, x, height, width)
+
+
 def _taps(flow: Tensor, shares: Tensor, table: SiteTable) -> Iterator[tuple[Tensor, Tensor]]:
     """Yield, feature by feature, the indices for all sites, (B T, H W), and the weights, (B T, H W, s^2)."""
-    height, width = flow.shape[-2:]
-    moved = torch.einsum("tk,bkchw->btchw", shares.to(flow.dtype), flow).flatten(0, 1)
-    y, x = _steps_to(moved[:, 1], height, -2), _steps_to(moved[:, 0], width, -1)
-    rows, columns, classes = table.classes(y, x, height, width)
+    width = flow.shape[-1]
+    rows, columns, classes = (part.flatten(0, 1) for part in _find(flow, shares, table))
     begin, end = table.start[classes].long(), table.start[classes + 1].long()
     for k in range(table.most):
         tap = (begin + k).minimum(end - 1)
         away = table.offset[tap].long()
         index = (rows + away[..., 0]) * width + columns + away[..., 1]
         yield index.flatten(1), (table.weight[tap] * (begin + k < end).unsqueeze(-1)).flatten(1, 2)
+
+
+@compiler_kept_out
+@lru_cache(maxsize=24)
+def _rows(table: SiteTable) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the distinct classes of a table: number of each class, offsets (R, K, 2) and weights (R, K, s^2)."""
+
+    def make() -> tuple[Tensor, Tensor, Tensor]:
+        begin, end = table.start[:-1, None].long(), table.start[1:, None].long()
+        tap = begin + torch.arange(table.most, device=begin.device)
+        weight = table.weight[tap.minimum(end - 1)] * (tap < end).unsqueeze(-1)
+        offset = table.offset[tap.minimum(end - 1)]
+        both = torch.cat([offset, weight.view(torch.int32)], dim=2)
+        rows, which = both.flatten(1).unique(dim=0, return_inverse=True)
+        offset, weight = rows.unflatten(1, both.shape[1:]).split([2, table.scale**2], dim=2)
+        return which, offset.long(), weight.contiguous().view(torch.float32)
+
+    return apart(make)
+
+
+def _search_in_graph(features: Tensor, flow: Tensor, shares: Tensor, table: SiteTable) -> Tensor:
+    """Compute :func:`search_sites` in operations that exported formats have, for any size."""
+    batch, _, _, height, width = features.shape
+    which, offset, weight = _rows(table)
+    rows, columns, classes = _find(flow, shares, table)
+    base = torch.arange(batch, device=flow.device).reshape(-1, 1, 1, 1) * height + rows
+    base = (base * width + columns).movedim(1, 0).flatten(1).unsqueeze(-1)
+    step = offset[..., 0] * width + offset[..., 1]
+    found = which.index_select(0, classes.movedim(1, 0).flatten()).unflatten(0, base.shape[:2])
+    result = []
+    # one time point at a time: every site has a matrix of its own
+    for part, first, row in zip(features.unbind(1), base, found, strict=True):
+        index = first + step.index_select(0, row)
+        near = part.transpose(0, 1).flatten(1).index_select(1, index.flatten()).unflatten(1, index.shape)
+        result.append((near.transpose(0, 1) @ weight.index_select(0, row).to(part.dtype)).flatten(1))
+    return torch.cat(result, dim=1).reshape(batch, height, width, -1).movedim(-1, 1)
 
 
 def _search_sites(
@@ -311,4 +374,5 @@ def search_sites(features: Tensor, flow: Tensor, shares: Tensor, table: SiteTabl
     Returns:
         (B, T F s^2, H, W), channels last, in the dtype of ``features``; differentiable in ``features`` only.
     """
-    return _SearchSites.apply(features, finite(flow.detach().float()), shares, table)
+    flow = finite(flow.detach().float())
+    return (_search_in_graph if is_exporting() else _SearchSites.apply)(features, flow, shares, table)
