@@ -30,23 +30,30 @@ def main(args: Sequence[str] | None = None) -> None:
     """Print size, difference and relative time of every format, timed in turn in one process and thread."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("weights", nargs="+", help="names or files of weights")
-    parser.add_argument("--side", type=whole(16), default=96, help="side of the clip, in sensor pixels; default: 96")
+    size = "height and width of the clip, in sensor pixels; default: 96 96"
+    parser.add_argument("--size", nargs=2, type=whole(16), default=[96, 96], metavar=("H", "W"), help=size)
     parser.add_argument("--rounds", type=whole(1), default=5, help="timings of each; default: 5")
     parser.add_argument("--formats", nargs="+", choices=FORMATS, default=list(FORMATS), help="default: all")
     asked = parser.parse_args(args)
     torch.set_num_threads(1)
-    rows = [row for name in asked.weights for row in _rows(name, asked.formats, asked.side, asked.rounds)]
+    rows = [row for name in asked.weights for row in _rows(name, asked.formats, asked.size, asked.rounds)]
     heading = ["weights", "format", "MiB", "export (s)", "largest difference", "time, network = 1", "ms"]
     print(table(heading, rows))
-    print(f"{asked.side} x {asked.side} sensor pixels, seed 0, {asked.rounds} rounds, one thread of {cpu_name()}")
+    height, width = asked.size
+    print(f"{height} x {width} sensor pixels, seed 0, {asked.rounds} rounds, one thread of {cpu_name()}")
     print(f"torch {torch.__version__}, ONNX opset {OPSET}")
 
 
 @torch.no_grad()
-def _rows(name: str, formats: Sequence[str], side: int, rounds: int) -> list[list[str]]:
+def _rows(name: str, formats: Sequence[str], size: Sequence[int], rounds: int) -> list[list[str]]:
     network = Network.from_pretrained(name)
-    module, inputs = as_exported(network), list(example_inputs(network, (side, side)).values())
-    runs, cells = {"network": lambda: module(*inputs)}, {}
+    module, inputs = as_exported(network), list(example_inputs(network, tuple(size)).values())
+
+    def in_bfloat16() -> object:
+        with torch.autocast("cpu", torch.bfloat16):
+            return module(*inputs)
+
+    runs, cells = {"network": lambda: module(*inputs), "in bfloat16": in_bfloat16}, {"in bfloat16": [""] * 3}
     with tempfile.TemporaryDirectory() as folder:
         for kind in formats:
             path, begin = Path(folder, f"network{FORMATS[kind]}"), time.process_time()
@@ -58,7 +65,7 @@ def _rows(name: str, formats: Sequence[str], side: int, rounds: int) -> list[lis
             runs[kind] = lambda run=run: run(*inputs)
         times = interleave(runs, rounds, cpu_timer(time.process_time))
     found = [[name, "network", "", "", "", "1", f"{1e3 * min(times['network']):.0f}"]]
-    for kind in formats:
+    for kind in list(runs)[1:]:
         compared = ratio(times[kind], times["network"])
         said = f"{compared.median:.2f} ({compared.least:.2f} .. {compared.most:.2f})"
         found.append([name, kind, *cells[kind], said, f"{1e3 * min(times[kind]):.0f}"])

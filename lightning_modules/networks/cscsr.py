@@ -22,6 +22,7 @@ from lightning_modules.networks.representation import IntervalRepresentation, Sp
 from lightning_modules.signatures import inherit_signature
 from spikekit import bayer_mask, demosaic, flow_warp_idw, linear_motion, split_colors, tfp_at
 from spikekit.color.cfa import count_colors
+from spikekit.kernels import compiler_kept_out
 from spikekit.warp.site_search import SMALLEST, apart, search_sites, site_table
 
 _SEARCHED = 1 << 19  # positions per search on a CPU, limited by its cache
@@ -60,6 +61,7 @@ def _representation(config: CSCSRConfig) -> nn.Module:
     )
 
 
+@compiler_kept_out
 @lru_cache(maxsize=32)
 def _shares(times: tuple[int, ...], flow_times: tuple[int, int, int], device: torch.device) -> Tensor:
     """Return the weights (T, 2) of the flows to the first and last time points in the motion to each time point."""

@@ -84,8 +84,22 @@ def test_onnx_export(kind, settings, tmp_path, program):
     pytest.importorskip("onnxruntime", reason="the extra export is not installed")
     pytest.importorskip("onnxscript", reason="the extra export is not installed")
     network = unlike_at_first(kind(scale=2, **settings))
+    path = tmp_path / "a.onnx"
+    export_network(network, path, "onnx")
+    assert sizes_differ(program(path), network) < 1e-4
+    kinds = {node.op_type for node in pytest.importorskip("onnx").load(path).graph.node}
+    assert not kinds & {"SplitToSequence", "SequenceAt", "Loop", "If", "GatherElements", "ScatterElements"}
+
+
+@pytest.mark.slow
+def test_openvino_gives_the_picture_of_the_network(tmp_path):
+    openvino = pytest.importorskip("openvino", reason="OpenVINO is not installed")
+    pytest.importorskip("onnxscript", reason="the extra export is not installed")
+    network = unlike_at_first(CSCSR(scale=2, resolution="sensor", **TINY))
     export_network(network, tmp_path / "a.onnx", "onnx")
-    assert sizes_differ(program(tmp_path / "a.onnx"), network) < 1e-4
+    model = openvino.Core().compile_model(tmp_path / "a.onnx", "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
+    run = lambda *clip: torch.from_numpy(model([one.numpy() for one in clip])[0])  # noqa: E731
+    assert sizes_differ(run, network) < 1e-4
 
 
 def test_inputs_of_an_export(tmp_path):
@@ -128,7 +142,7 @@ def test_torch_program_takes_any_even_size(tmp_path, program):
 
 
 def test_export_errors_are_one_line(tmp_path):
-    with pytest.raises(ValueError, match=r"CSCSR: cannot be exported \(neighbors: expected at most 4"):
+    with pytest.raises(ValueError, match=r"CSCSR: cannot be exported \(neighbors, H, W: expected at most 4"):
         export_network(CSCSR(scale=2, neighbors=5, motion=ZeroFlow(), **TINY), tmp_path / "a.pt2", "torch")
     assert not list(tmp_path.iterdir())
 
