@@ -225,7 +225,7 @@ class CSCSR(Network):
         flows = moved.unbind(1) if moved.ndim == 6 else [moved] * self.colors
         shares = _shares(self.times, self.flow_times, spikes.device)
         for color, (part, one) in enumerate(zip(features, flows, strict=True)):
-            of_border = height % 2 == 1, width % 2 == 1
+            of_border = bool(height % 2), bool(width % 2)  # of an export, symbols until then
             how = self.config.neighbors, self.config.representation != "bssr"
             table = site_table(self.pattern, color, self.scale, of_border, spikes.device, *how)
             pixels = search_sites(part, one, shares, table)
