@@ -2,6 +2,7 @@
 
 import copy
 import gc
+import multiprocessing
 import os
 import random
 import resource
@@ -146,6 +147,26 @@ def _fuzz(tmp_path, capfd):
     with tempfile.TemporaryDirectory(dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else tmp_path) as folder:
         folder = Path(folder)
         yield fuzz
+
+
+@pytest.fixture(name="typed_in", scope="session")
+def _typed_in():
+    """A command in a process of its own, which has imported all that this one has; another would take seconds."""
+
+    def run(folder, main, words):
+        """Call ``main(words)`` in the folder; return the exit status."""
+
+        def typed():
+            torch.set_num_threads(1)
+            os.chdir(folder)
+            raise SystemExit(main(words))
+
+        process = multiprocessing.get_context("fork").Process(target=typed)
+        process.start()
+        process.join()
+        return process.exitcode
+
+    return run
 
 
 @pytest.fixture(name="full_disk", scope="session")

@@ -17,6 +17,7 @@ import torch
 from torch import nn
 
 import spikekit as sk
+from lightning_modules.__main__ import main as lightning
 
 DOCS = Path(__file__).parents[1] / "docs"
 MADE = {"_build", "gallery", "generated", "sg_execution_times.rst"}  # by Sphinx
@@ -149,21 +150,21 @@ def test_quickstart_runs():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("page", "name"), [("training", "mynet.py"), ("motion", "myflow.py")])
-def test_own_networks_and_estimators_work_as_shown(page, name, tmp_path):
+def test_own_networks_and_estimators_work_as_shown(page, name, tmp_path, typed_in, capfd):
     """The file on the page and the commands below it."""
+    import pytorch_lightning  # noqa: F401
+
     text = PAGES[DOCS / "howto" / f"{page}.rst"]
     code, commands = re.search(rf"   # {name}\n((?:   .*\n|\n)+?)\.\. code-block:: sh\n\n((?:   .*\n)+)", text).groups()
     (tmp_path / name).write_text(textwrap.dedent(code))
     sk.write_spikes(tmp_path / "FILE.dat", torch.rand(61, 24, 32) < 0.3)
-    few = "--trainer.max_steps 4 --data.train_clips 8 --data.val_clips 2 --data.workers 0 --data.batch_size 2"
+    few = "--trainer.max_steps 2 --data.train_clips 2 --data.val_clips 1 --data.workers 0 --data.batch_size 1"
+    few += " --data.patch 16 --data.val_patch 32" + " --model.network.size tiny" * (page == "motion")
     for command in commands.splitlines():
         arguments = command.replace("250", "24").replace("400", "32").split()[1:]
         if arguments[0] != "predict":
             arguments += few.split()
-        program = [sys.executable, "-c", "from lightning_modules.__main__ import main; main()", *arguments]
-        environment = {**os.environ, "PYTHONPATH": str(DOCS.parent)}
-        done = subprocess.run(program, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, (command, done.stderr[-2000:])
+        assert typed_in(tmp_path, lightning, arguments) == 0, (command, capfd.readouterr().err)
     if page == "training":
         assert (tmp_path / "runs" / "quick" / "test.csv").is_file()
         assert len(list((tmp_path / "out").glob("*.png"))) == 2

@@ -1,7 +1,5 @@
 """Commands and Python examples of README and quickstart, on small inputs."""
 
-import multiprocessing
-import os
 import re
 import shlex
 from pathlib import Path
@@ -62,28 +60,14 @@ def _folder(tmp_path):
     return tmp_path
 
 
-def run(program, words, folder):
-    """A command in a process of its own, which has imported all that this one has; another would take seconds."""
-
-    def typed():
-        torch.set_num_threads(1)
-        os.chdir(folder)
-        raise SystemExit(PROGRAMS[program](words))
-
-    process = multiprocessing.get_context("fork").Process(target=typed)
-    process.start()
-    process.join()
-    return process.exitcode
-
-
 @pytest.mark.parametrize("text", [README, QUICKSTART], ids=["readme", "quickstart"])
-def test_commands_run_as_written(text, folder):
+def test_commands_run_as_written(text, folder, typed_in):
     import pytorch_lightning  # noqa: F401
 
     outputs = 0
     for program, words in commands(text):
         words = [SMALL.get(word, word) for word in words] + ADDED.get(words[0], [])
-        assert run(program, words, folder) == 0, words
+        assert typed_in(folder, PROGRAMS[program], words) == 0, words
         if "-o" in words:
             outputs += 1
             assert (folder / words[words.index("-o") + 1]).exists(), words

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import multiprocessing
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,11 +12,13 @@ import torch
 from operator_examples import EXAMPLES, Example
 from torch import Tensor
 
+import spikekit as sk
 from extremes.table import Cases, Measured, On, apart, differ, measured, of_largest, sums_on_gpu, worst
 
 CASES = Cases()
 
 _FLOAT32 = (torch.float32,)
+_STATUS = Path("/proc/self/status")
 _ANY_ORDER = "flow_warp"  # operators of such a name sum values in the order that the memory layout suggests
 
 
@@ -112,53 +114,62 @@ for _operator in EXAMPLES:
         CASES.add(_operator.name, _extreme, _FLOAT32, gradients=_gradients, **_bound)(partial(_measure, _operator))
 
 
-_PEAK = """
-import torch, spikekit as sk
-def peak():
-    return next(int(line.split()[1]) * 1024 for line in open("/proc/self/status") if line.startswith("VmHWM"))
-def call(stream):
-    return {call}
-call(torch.zeros(3, 4, 4, dtype={dtype}))
-stream = {stream}
-before = peak()
-result = call(stream)
-print((peak() - before - result.nbytes) / result.numel())
-"""
-_PEAK_ON_CUDA = """
-import torch, spikekit as sk
-def call(stream):
-    return {call}
-stream = {stream}.to("cuda")
-torch.cuda.reset_peak_memory_stats()
-before = torch.cuda.memory_allocated()
-result = call(stream)
-print((torch.cuda.max_memory_allocated() - before - result.nbytes) / result.numel())
-"""
-_BITS = "(torch.arange(1000000).reshape(1000, 1000) % 3 == 0).to(torch.uint8).expand(100, 1000, 1000)"
-_LIGHT = "torch.linspace(0, 1, 1000000).reshape(1000, 1000).expand(100, 1000, 1000)"
+def _bits() -> Tensor:
+    return (torch.arange(1000000).reshape(1000, 1000) % 3 == 0).to(torch.uint8).expand(100, 1000, 1000)
 
 
-def _memory(call: str, stream: str, on: On) -> Measured:
-    """Bytes a pixel that an operator takes beside its input and its result, in a process of its own."""
-    code = _PEAK_ON_CUDA if on.device.type == "cuda" else _PEAK
-    code = code.format(call=call, stream=stream, dtype=on.dtype)
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise RuntimeError(done.stderr.strip().splitlines()[-1] if done.stderr else f"exit status {done.returncode}")
-    return Measured(max(float(done.stdout), 0.0))
+def _light() -> Tensor:
+    return torch.linspace(0, 1, 1000000).reshape(1000, 1000).expand(100, 1000, 1000)
+
+
+def _peak() -> int:
+    return next(int(line.split()[1]) * 1024 for line in _STATUS.open() if line.startswith("VmHWM"))
+
+
+def _beside(call: Callable[[Tensor], Tensor], make: Callable[[], Tensor], on: On) -> float:
+    """Bytes a pixel that an operator takes beside its input and its result."""
+    cuda = on.device.type == "cuda"
+    call(torch.zeros(3, 4, 4, dtype=on.dtype, device=on.device))
+    stream = make().to(on.device)
+    if cuda:
+        torch.cuda.reset_peak_memory_stats()
+    before = torch.cuda.memory_allocated() if cuda else _peak()
+    result = call(stream)
+    after = torch.cuda.max_memory_allocated() if cuda else _peak()
+    return max((after - before - result.nbytes) / result.numel(), 0.0)
+
+
+def _memory(call: Callable[[Tensor], Tensor], make: Callable[[], Tensor], on: On) -> Measured:
+    """Measure it; on the CPU in a process of its own, whose peak is that of the operator."""
+    if on.device.type == "cuda":
+        return Measured(_beside(call, make, on))
+    context = multiprocessing.get_context("fork")
+    ours, theirs = context.Pipe()
+
+    def measure() -> None:
+        torch.set_num_threads(1)
+        theirs.send(_beside(call, make, on))
+
+    process = context.Process(target=measure)
+    process.start()
+    theirs.close()
+    found = ours.recv()  # EOFError where the process has failed
+    process.join()
+    return Measured(found)
 
 
 _BESIDE = "1 byte a pixel beside input and result"
 _STREAM: dict[str, Any] = {"limit": 1.0, "bound": _BESIDE, "gradients": "-", "slow": True}
-if Path("/proc/self/status").exists():
+if _STATUS.exists():
     for _name, _call in {
-        "spike_interval": "sk.spike_interval(stream)",
-        "tfi": "sk.tfi(stream, 255.0, dtype=torch.uint8)",
-        "tfp": "sk.tfp(stream, 41, 255.0, dtype=torch.uint8)",
+        "spike_interval": sk.spike_interval,
+        "tfi": lambda stream: sk.tfi(stream, 255.0, dtype=torch.uint8),
+        "tfp": lambda stream: sk.tfp(stream, 41, 255.0, dtype=torch.uint8),
     }.items():
         _on_gpu = (2.1, "int16 a pixel: the next spike") if _name == "tfi" else None
         CASES.add(_name, "1000 x 1000 x 100 stream", (torch.uint8,), on_gpu=_on_gpu, **_STREAM)(
-            partial(_memory, _call, _BITS)
+            partial(_memory, _call, _bits)
         )
-    _call = "sk.spike_integrate_fire(stream, dtype=torch.uint8)[0]"
-    CASES.add("spike_integrate_fire", "1000 x 1000 x 100 stream", _FLOAT32, **_STREAM)(partial(_memory, _call, _LIGHT))
+    CASES.add("spike_integrate_fire", "1000 x 1000 x 100 stream", _FLOAT32, **_STREAM)(
+        partial(_memory, lambda light: sk.spike_integrate_fire(light, dtype=torch.uint8)[0], _light)
+    )
