@@ -88,7 +88,8 @@ def test_onnx_export(kind, settings, tmp_path, program):
     export_network(network, path, "onnx")
     assert sizes_differ(program(path), network) < 1e-4
     kinds = {node.op_type for node in pytest.importorskip("onnx").load(path).graph.node}
-    assert not kinds & {"SplitToSequence", "SequenceAt", "Loop", "If", "GatherElements", "ScatterElements"}
+    refused = {"SplitToSequence", "SequenceAt", "Loop", "If", "GatherElements", "ScatterElements"}  # by some engines
+    assert not isinstance(network, CSCSR) or not kinds & refused
 
 
 @pytest.mark.slow
