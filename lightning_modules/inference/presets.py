@@ -28,7 +28,7 @@ _DECODER = "ClassicalDecoder"
 _FRAMES = 41
 
 #: largest loss against the best preset, in dB
-SPEEDS = {"fastest": float("inf"), "fast": 1.2, "balanced": 0.3, "best": 0.005}
+SPEEDS = {"fastest": float("inf"), "fast": 2.0, "balanced": 0.3, "best": 0.005}
 
 #: white level, in spikes per frame, below which the table for dim scenes is used
 _LITTLE_LIGHT = 0.2

@@ -46,10 +46,7 @@ columns:
 {COLUMNS}
 
 examples:
-  lightning trade -c configs/x4.yaml
-  lightning trade -c configs/x4.yaml -c configs/data/films.yaml --data.root DIR
   lightning trade -c configs/x4.yaml --film 20
-  lightning trade -c configs/x4.yaml -c configs/quick.yaml --ckpt_path runs/quick/checkpoints/best.ckpt
   lightning trade -c configs/x4.yaml --setting "--model.weights cscsr_small_x4" --setting "-c my.yaml --ckpt_path FILE"
 """,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import Enum
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
@@ -12,11 +12,8 @@ from torch.compiler import is_exporting
 from spikekit.check import check_planes, check_whole
 from spikekit.options_module import OptionsModule
 
-if TYPE_CHECKING:  # kornia's import takes a quarter of a second
-    from kornia.color import CFA
-
-#: Name of a Bayer phase, ``"grey"``, or kornia's name of a phase.
-Pattern: TypeAlias = "str | CFA"
+#: Name of a Bayer phase, ``"grey"``, or a ``kornia.color.CFA``, whose import takes a quarter of a second.
+Pattern: TypeAlias = str | Enum
 
 #: Bayer phases by name, read along the rows of the top-left 2 x 2 cell.
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
