@@ -39,7 +39,7 @@ html_title = f"spikekit {version}"
 # An unresolved name in a docstring is an error, unless it belongs to another project.
 nitpicky = True
 nitpick_ignore_regex = [
-    ("py:.*", r"(torch|kornia|collections|pathlib|optional|numpy|pytorch_lightning)\b.*"),
+    ("py:.*", r"(torch|kornia|collections|enum|pathlib|optional|numpy|pytorch_lightning)\b.*"),
     ("py:.*", "(CFA|Tensor|Path)|.*MeasuredPixels"),
     ("py:class", r".*\._\w+"),  # private
 ]
