@@ -26,8 +26,8 @@ NOISY = 0.3
 #: default spike frames of a clip, and default distance of two pictures in spike frames
 FRAMES, EVERY = 41, 20
 
-# parts of a recording that white and noise are measured on, least frames of a part of several, and frames read at once
-_PARTS, _LEAST_PART, _AT_ONCE = 4, 200, 40
+# parts of a recording that white and noise are measured on, and least frames of a part of several
+_PARTS, _LEAST_PART = 4, 200
 
 # spread of the gains at noise level 1, see configs/cameras.yaml, and the largest level that networks extrapolate to
 _SPREAD, _MOST = 0.06, 1.5
@@ -94,14 +94,11 @@ class RecordingClips:
     def _looks(self) -> tuple[Tensor, int, int]:
         """Mean rates (H, W) of parts evenly spread over the recording, frames of a part, and number of parts."""
         whole = self.recording.frames
-        length = min(whole, _AT_ONCE)
         parts = min(max(whole // _LEAST_PART, 1), _PARTS)
-        count = min(whole // parts, 2 * _LEAST_PART) // length
-        starts = np.linspace(0, whole - count * length, parts).astype(int).tolist()
-        middles = [start + n * length + length // 2 for start in starts for n in range(count)]
-        clips = RecordingClips(self.recording, length, crop_to=self.recording.pattern or "RGGB").in_order(middles)
-        spikes = sum(clip.numpy().sum(0, dtype=np.int32) for _, clip in clips)  # ten times as fast as torch
-        return torch.from_numpy(spikes) / (len(middles) * length), count * length, parts
+        frames = min(whole // parts, 2 * _LEAST_PART)
+        starts = np.linspace(0, whole - frames, parts).astype(int).tolist()
+        counts = sum(self.recording.counts(start, frames) for start in starts)
+        return self.recording.correct(counts / (parts * frames)), frames, parts
 
     @cached_property
     def white(self) -> float:

@@ -232,9 +232,10 @@ def choices(
 
 
 def _table(scale: int, film: bool = False, white: float = 0.4, grey: bool = False) -> list[dict[str, str]]:
-    of, light, use = ("_grey" if grey else "", "_dim" if white < _LITTLE_LIGHT else "", "_film" if film else "")
-    names = (f"x{scale}{''.join(kind)}.csv" for kind in product({of: 0, "": 0}, {light: 0, "": 0}, {use: 0, "": 0}))
-    path = next((_FOLDER / name for name in names if (_FOLDER / name).is_file()), None)
+    asked = ("_grey", grey), ("_dim", white < _LITTLE_LIGHT), ("_film", film)
+    kinds = product(*([name, ""] if holds else [""] for name, holds in asked))  # the best match first
+    paths = (_FOLDER / f"x{scale}{''.join(kind)}.csv" for kind in kinds)
+    path = next((path for path in paths if path.is_file()), None)
     if path is None:
         there = ", ".join(sorted(path.stem for path in _FOLDER.glob("x?.csv"))) or "none"
         raise ValueError(f"scale: expected one that was measured ({there}), got {scale}")

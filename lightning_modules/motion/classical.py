@@ -19,6 +19,7 @@ from spikekit.sensor.quantization_noise import flicker
 
 
 def _gaussian(length: int, sigma: float) -> list[float]:
+    """Return a normalised kernel, as kornia's, whose import takes a quarter of a second."""
     weights = [math.exp(-((n - length // 2) ** 2) / (2 * sigma**2)) for n in range(length)]
     return [weight / sum(weights) for weight in weights]
 

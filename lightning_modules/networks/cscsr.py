@@ -290,15 +290,17 @@ class CSCSR(Network):
         return pixels / known.where(mask, 1)
 
     def _base(self, spikes: Tensor) -> Tensor:
-        """Return the enlarged TFP picture: demosaiced and smoothed, or third-order TFP for a grey sensor."""
-        if self.colors == 1:
-            smooth = tfp_at(spikes, self.frames // 2, (self.frames - 1) // 6 * 2 + 1, order=3).unsqueeze(1)
-            smooth = smooth / self.config.alpha
-        else:
+        """Return the enlarged TFP picture: demosaiced and smoothed, or third-order TFP for a grey sensor.
+
+        Not in bfloat16, which has hardly more levels than the picture.
+        """
+        with torch.autocast(spikes.device.type, enabled=False):
+            if self.colors == 1:
+                smooth = tfp_at(spikes, self.frames // 2, (self.frames - 1) // 6 * 2 + 1, order=3).unsqueeze(1)
+                return enlarge_smoothly(smooth / self.config.alpha, self.scale)
             from kornia.filters import filter2d_separable
 
             raw = tfp_at(spikes, self.frames // 2, self.frames) / self.config.alpha
             # zero at the Nyquist frequency, to remove the zipper artefacts of demosaicing
             binomial = torch.cat([raw.new_full((1, 1), weight) for weight in (0.25, 0.5, 0.25)], dim=1)
-            smooth = filter2d_separable(demosaic(raw, self.pattern), binomial, binomial)
-        return enlarge_smoothly(smooth, self.scale)
+            return enlarge_smoothly(filter2d_separable(demosaic(raw, self.pattern), binomial, binomial), self.scale)

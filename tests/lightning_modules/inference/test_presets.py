@@ -69,36 +69,22 @@ def test_speeds_and_budgets_scale_with_the_frame(table, wish, expected):
     assert choose(3, **wish).name == expected
 
 
-def test_films_have_their_own_table(table):
-    assert choose(3, "fastest", film=True) == choose(3, "fastest")  # as long as there is none
+@pytest.mark.parametrize("kind", ["film", "grey"])
+def test_films_and_grey_cameras_have_their_own_tables(table, kind):
+    assert choose(3, "fastest", **{kind: True}) == choose(3, "fastest")  # as long as there is none
     lines = (table / "x3.csv").read_text().splitlines()
-    (table / "x3_film.csv").write_text("\n".join(line for line in lines if not line.startswith("tfi")))
-    assert choose(3, "fastest", film=True).name == "tfp 5"
+    (table / f"x3_{kind}.csv").write_text("\n".join(line for line in lines if not line.startswith("tfi")))
+    assert choose(3, "fastest", **{"film": True, kind: True}).name == "tfp 5"
     assert choose(3, "fastest").name == "tfi"
     with pytest.raises(ValueError, match=r"expected one that was measured \(x3\), got 4"):
-        choose(4, "fastest", film=True)
+        choose(4, "fastest", **{kind: True})
 
 
-def test_grey_cameras_have_their_own_table(table):
-    assert choose(3, "fastest", grey=True) == choose(3, "fastest")  # as long as there is none
-    lines = (table / "x3.csv").read_text().splitlines()
-    (table / "x3_grey.csv").write_text("\n".join(line for line in lines if not line.startswith("tfi")))
-    assert [choose(3, "fastest", grey=grey, film=True).name for grey in (True, False)] == ["tfp 5", "tfi"]
-    assert choose(3, "fastest", grey=True).preset.build("grey").pattern == "grey"
-
-
-@pytest.mark.parametrize(
-    ("scale", "expected"),
-    [
-        (2, "cscsr_huge_x2"),
-        (3, "cscsr_base_x3"),
-        (4, "cscsr_huge_x4"),
-    ],
-)
-def test_same_network_for_films_and_single_clips(scale, expected):
-    film, picture = (choose(scale, "balanced", film=film).preset for film in (True, False))
-    assert film.weights == picture.weights == expected
-    assert isinstance(film.build(), RecurrentCSCSR) == find_model(film.weights).film
+def test_same_network_for_films_and_single_clips():
+    for scale in (2, 3, 4):
+        film, picture = (choose(scale, "balanced", film=film).preset for film in (True, False))
+        assert film.weights == picture.weights
+        assert isinstance(film.build(), RecurrentCSCSR) == find_model(film.weights).film
 
 
 def test_dim_light_has_its_own_tables(table, monkeypatch):

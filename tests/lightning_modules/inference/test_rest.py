@@ -90,8 +90,12 @@ def film(light, network=None, **how):
         yield maker(spikes[:, clock - 20 : clock + 21], [clock])[0], maker.rest and maker.rest.computed
 
 
-def still(clocks, side=SIDE):
-    return Scene([Layer(texture(2 * side))], 2 * side, 2 * side).light(scale=2)[:1].expand(clocks, -1, -1)
+def moving(clocks, velocity=(0.3, 0.1)):
+    return Scene([Layer(texture(2 * SIDE), Motion(velocity=velocity))], 2 * SIDE, 2 * SIDE, clocks).light(scale=2)
+
+
+def still(clocks):
+    return moving(1, (0.0, 0.0)).expand(clocks, -1, -1)
 
 
 @pytest.mark.parametrize("kind", [CSCSR, RecurrentCSCSR])
@@ -103,8 +107,7 @@ def test_a_scene_at_rest_asks_the_network_for_eight_pictures_and_no_more(kind):
 
 
 def test_where_all_moves_pictures_are_those_of_every_clip_by_itself():
-    scene = Scene([Layer(texture(2 * SIDE), Motion(velocity=(0.3, 0.1)))], 2 * SIDE, 2 * SIDE, 141)
-    light = scene.light(scale=2)
+    light = moving(141)
     network = CSCSR(**TINY).eval()
     pairs = zip(film(light, network), film(light, network, psnr_tolerance=0.1), strict=True)
     for (plain, _), (found, computed) in pairs:
@@ -113,16 +116,23 @@ def test_where_all_moves_pictures_are_those_of_every_clip_by_itself():
 
 
 def test_a_camera_that_stops_lets_the_scene_rest():
-    scene = Scene([Layer(texture(2 * SIDE), Motion(velocity=(0.3, 0.1)))], 2 * SIDE, 2 * SIDE, 121)
-    light = scene.light(scale=2)
+    light = moving(121)
     computed = [cells for _, cells in film(torch.cat([light, light[-1:].expand(520, -1, -1)]), psnr_tolerance=0.1)]
     assert all(cells.all() for cells in computed[:7])
     assert not computed[-1].any()
 
 
+def test_a_small_object_leaves_most_of_the_scene_at_rest():
+    light = still(441).clone()
+    for clock in range(441):
+        light[clock, 24:32, 4 + clock // 10 : 12 + clock // 10] = 0.38
+    shares = [cells.float().mean().item() for _, cells in film(light, psnr_tolerance=0.1)][12:]
+    assert 0.01 < min(shares) <= max(shares) < 0.7
+
+
 def test_slow_drift_is_seen_before_it_is_half_a_pixel():
-    scene = Scene([Layer(texture(2 * SIDE), Motion(velocity=(1 / 300, 0.0)))], 2 * SIDE, 2 * SIDE, 441)
-    shares = [cells.float().mean().item() for _, cells in film(scene.light(scale=2), psnr_tolerance=0.1)]
+    pictures = film(moving(441, (1 / 300, 0.0)), psnr_tolerance=0.1)
+    shares = [cells.float().mean().item() for _, cells in pictures]
     assert max(shares[11:]) > 0.5
 
 

@@ -195,6 +195,15 @@ def test_tiles_use_the_flow_of_each_colour(configs):
 # F, G: search and refinement
 
 
+@pytest.mark.parametrize("letter", ["a", "b", "c", "i", "j"])
+def test_search_by_site_equals_search_by_pixel(letter, configs):
+    network, (spikes, _) = variant(letter, configs), clip(1, 17, 20)
+    flow = torch.tensor([[-2.5, 1.25], [2.5, -1.25]]).reshape(1, 2, 2, 1, 1).repeat(1, 1, 1, 17, 20)
+    with torch.no_grad():
+        by_site = network(spikes, flow)
+    torch.testing.assert_close(by_site, network(spikes, flow.requires_grad_()), rtol=0, atol=1e-4)
+
+
 def test_f_ignores_motion(configs):
     spikes, flow = clip(1, 70, 58)
     network = variant("f", configs, motion=Unwanted())

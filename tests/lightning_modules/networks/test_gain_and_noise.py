@@ -72,3 +72,11 @@ def test_invalid_gain_and_noise_are_rejected():
         _network()(_spikes(1, 41, 8, 10), static=True, noise=0.5)
     with pytest.raises(ValueError, match=r"alpha: expected a number or shape \(2,\), got \(3,\)"):
         _network()(_spikes(2, 41, 8, 10), static=True, alpha=torch.ones(3))
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "grey"])
+def test_base_picture_is_not_rounded_to_bfloat16(pattern):
+    network, spikes = CSCSR(**TINY, skip=True, pattern=pattern), _spikes(1, 41, 8, 10)  # untrained: the base alone
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        mixed = network(spikes, static=True)
+    torch.testing.assert_close(mixed, network(spikes, static=True), rtol=0, atol=1e-6)
