@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -10,14 +11,25 @@ from torch import Tensor
 
 from spikekit.kernels.compiled import compiled, in_threads
 from spikekit.kernels.layout import new_tensor
+from spikekit.kernels.vectors import sum_products
 
 _ROWS = 16  # sensor rows per job
 
 
-def _on_axis(moved: Any, at: Any, length: Any, low: Any, high: Any, steps: Any) -> Any:
+def _on_axis(flow: Any, shares: Any, at: Any, length: Any, steps: Any, out: Any) -> None:
+    """Write the moved sites of a row on an axis, in steps: flow (2, W), positions ``at`` (W), out (W)."""
+    a, b, far = shares[0], shares[1], np.float32(2 * length)
+    for x in range(len(out)):
+        moved = min(max(a * flow[0, x] + b * flow[1, x], -far), far)
+        to = np.int32(np.rint(moved * np.float32(steps))) + at[x] * steps
+        out[x] = min(max(to, -steps), length * steps)
+
+
+_to_steps = compiled(_on_axis)
+
+
+def _place(to: Any, length: Any, low: Any, high: Any, steps: Any) -> Any:
     """Return base, place and fraction of a moved site on an axis, see :meth:`SiteTable.classes`."""
-    moved = min(max(moved, np.float32(-2 * length)), np.float32(2 * length))
-    to = min(max(np.int64(np.rint(moved * np.float32(steps))) + at * steps, -steps), length * steps)
     base = to // steps
     place = base & 1
     if base < -low:
@@ -27,71 +39,51 @@ def _on_axis(moved: Any, at: Any, length: Any, low: Any, high: Any, steps: Any) 
     return base, place, to - base * steps
 
 
-_place = compiled(_on_axis)
+_placed = compiled(_place)
 
 
-def _find(flow: Any, shares: Any, t: Any, y: Any, x: Any, low: Any, high: Any, steps: Any) -> Any:
-    """Return row and column of the base of a site at a time point, and its class."""
-    height, width = flow.shape[2:]
-    a, b = shares[t, 0], shares[t, 1]
-    row, i, down = _place(a * flow[0, 1, y, x] + b * flow[1, 1, y, x], y, height, low, high, steps)
-    column, j, right = _place(a * flow[0, 0, y, x] + b * flow[1, 0, y, x], x, width, low, high, steps)
+def _find(to_y: Any, to_x: Any, height: Any, width: Any, low: Any, high: Any, steps: Any) -> Any:
+    """Return the base of a moved site, as an index, and its class."""
+    row, i, down = _placed(to_y, height, low, high, steps)
+    column, j, right = _placed(to_x, width, low, high, steps)
+    base, coarse = row * width + column, steps // 2
     if i < 2 and j < 2:
-        return row, column, ((2 * i + j) * steps + down) * steps + right
-    coarse = steps // 2
+        return base, ((2 * i + j) * steps + down) * steps + right
     border = ((i * (4 - low + high) + j) * coarse + down // 2) * coarse + right // 2
-    return row, column, 4 * steps * steps + border
+    return base, 4 * steps * steps + border
 
 
 _class = compiled(_find)
 
 
-def _search(
-    features: Any, flow: Any, shares: Any, start: Any, jump: Any, weight: Any, low: Any, high: Any, steps: Any,
-    rows: Any, out: Any, half: Any,
-) -> None:  # fmt: skip
-    """Compute the temporal pixels of some rows: features (T, H, W, F), flow (2, 2, H, W), out (H, W, T, F, s^2)."""
-    times, height, width, channels = features.shape
-    pixels = weight.shape[1]
-    flat = features.reshape(times, height * width * channels)
-    total = np.empty((channels, pixels), np.float32)
-    bits = total.view(np.uint32)
-    for y in range(rows[0], rows[1]):
-        for x in range(width):
+@lru_cache
+def _searcher(channels: int, pixels: int, steps: int) -> Any:
+    """Return the loop for features of ``channels`` and s^2 = ``pixels``, which the compiler has to know."""
+    lanes, calls = (1, channels) if pixels > 1 else (channels, 1)
+
+    def search(
+        features: Any, flow: Any, shares: Any, start: Any, jump: Any, weight: Any, low: Any, high: Any, rows: Any,
+        out: Any,
+    ) -> None:  # fmt: skip
+        """Compute the temporal pixels of some rows: features (T, H, W, F), flow (2, 2, H, W), out (H, W, T, F, s^2)."""
+        times, height, width, _ = features.shape
+        flat, weights, results = features.ravel(), weight.ravel(), out.ravel()
+        columns, to_y, to_x = np.arange(width), np.empty(width, np.int32), np.empty(width, np.int32)
+        for y in range(rows[0], rows[1]):
             for t in range(times):
-                row, column, which = _class(flow, shares, t, y, x, low, high, steps)
-                at = (row * width + column) * channels
-                k, last = start[which], start[which + 1]
-                total[:] = 0
-                if pixels == 1:
-                    while k < last:
-                        for c in range(channels):
-                            total[c, 0] += weight[k, 0] * flat[t, at + jump[k] + c]
-                        k += 1
-                while k + 4 <= last:  # four at a time, to keep the sums in registers
-                    for c in range(channels):
-                        p, q = flat[t, at + jump[k] + c], flat[t, at + jump[k + 1] + c]
-                        r, s = flat[t, at + jump[k + 2] + c], flat[t, at + jump[k + 3] + c]
-                        for n in range(pixels):
-                            more = weight[k, n] * p + weight[k + 1, n] * q
-                            total[c, n] += more + (weight[k + 2, n] * r + weight[k + 3, n] * s)
-                    k += 4
-                while k < last:
-                    for c in range(channels):
-                        p = flat[t, at + jump[k] + c]
-                        for n in range(pixels):
-                            total[c, n] += weight[k, n] * p
-                    k += 1
-                for c in range(channels):
-                    for n in range(pixels):
-                        if half:  # bfloat16 is the upper half of a float32, rounded to even
-                            word = bits[c, n]
-                            out[y, x, t, c, n] = (word + np.uint32(0x7FFF) + ((word >> 16) & np.uint32(1))) >> 16
-                        else:
-                            out[y, x, t, c, n] = total[c, n]
+                _to_steps(flow[:, 1, y], shares[t], np.full(width, y), height, steps, to_y)
+                _to_steps(flow[:, 0, y], shares[t], columns, width, steps, to_x)
+                for x in range(width):
+                    base, which = _class(to_y[x], to_x[x], height, width, low, high, steps)
+                    at = (t * height * width + base) * channels
+                    to = ((y * width + x) * times + t) * channels * pixels
+                    for c in range(calls):
+                        sum_products(
+                            flat, lanes, weights, pixels, jump, start[which], start[which + 1], at + c, results,
+                            to + c * pixels,
+                        )  # fmt: skip
 
-
-_search_rows = compiled(_search)
+    return compiled(search)
 
 
 def _spread(
@@ -102,16 +94,18 @@ def _spread(
     _, height, width, channels = out.shape
     pixels = weight.shape[1]
     flat = out.reshape(len(out), height * width * channels)
+    columns, to_y, to_x = np.arange(width), np.empty(width, np.int32), np.empty(width, np.int32)
     for y in range(height):
+        _to_steps(flow[:, 1, y], shares[t], np.full(width, y), height, steps, to_y)
+        _to_steps(flow[:, 0, y], shares[t], columns, width, steps, to_x)
         for x in range(width):
-            row, column, which = _class(flow, shares, t, y, x, low, high, steps)
-            at = (row * width + column) * channels
+            base, which = _class(to_y[x], to_x[x], height, width, low, high, steps)
             for k in range(start[which], start[which + 1]):
                 for c in range(channels):
                     total = np.float32(0)
                     for n in range(pixels):
                         total += weight[k, n] * grad[y, x, t, c, n]
-                    flat[t, at + jump[k] + c] += total
+                    flat[t, base * channels + jump[k] + c] += total
 
 
 _spread_time = compiled(_spread)
@@ -124,6 +118,7 @@ def search_sites(
     """Map (B, T, F, H, W) to (B, T F s^2, H, W), float32 or bfloat16."""
     batch, times, channels, height, width = features.shape
     half = features.dtype is torch.bfloat16
+    search = _searcher(channels, scale**2, steps)
     out = new_tensor((batch, height, width, times, channels, scale**2), features.dtype)
     rows = features.permute(0, 1, 3, 4, 2).float().contiguous()
     jump = (offset[:, 0] * width + offset[:, 1]) * channels
@@ -131,8 +126,8 @@ def search_sites(
     for features_b, flow_b, out_b in zip(rows.numpy(), flow.contiguous().numpy(), out, strict=True):
         result = (out_b.view(torch.uint16) if half else out_b).numpy()
         jobs = ((y, min(y + _ROWS, height)) for y in range(0, height, _ROWS))
-        arguments = features_b, flow_b, *table, low, high, steps
-        in_threads(_search_rows, ((*arguments, job, result, half) for job in jobs))
+        arguments = features_b, flow_b, *table, low, high
+        in_threads(search, ((*arguments, job, result) for job in jobs))
     return out.flatten(3).movedim(-1, 1)
 
 
