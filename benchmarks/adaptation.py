@@ -104,7 +104,7 @@ def main() -> None:
             rows.append([before[0], after[0], one.psnr(teacher), *alike, before[1], after[1]])
     rows.append(torch.tensor(rows).mean(0).tolist())
     names = [*(path.name for path in chosen), "mean"]
-    head = ["", "before", "after", "teacher", "likeness before", "after", "next recording before", "after"]
+    head = ["", "before", "after", "teacher", "likeness before", "after", "other recording, before", "after"]
     lines = [[name, *(f"{value:.2f}" for value in row)] for name, row in zip(names, rows, strict=True)]
     print(table(head, lines))
 

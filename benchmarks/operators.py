@@ -25,7 +25,7 @@ import spikekit as sk
 from spikekit.timing import cpu_name, software, timer_of
 
 ROOT = Path(__file__).parents[1]
-HEADING = "operator", "case", "beside", "ours ms", "theirs ms", "ratio", "least", "most", "equal"
+HEADING = "operator", "case", "alternative", "ours (ms)", "its (ms)", "ratio", "lowest", "highest", "equal values"
 Run = Callable[[], Any]
 #: operator, case, ours, {alternative: theirs}; results are compared if both are tensors of one shape
 Case = tuple[str, str, Run, dict[str, Run]]

@@ -52,10 +52,10 @@ def measure(name: str, pictures: list[Path], device: str) -> dict[str, object]:
     return {
         "weights": name,
         "clips": len(clips),
-        "speed": f"{took[False] / took[True]:.2f}",
-        "psnr": f"{sum(scores[False]) / len(clips):.3f}",
-        "mean_loss": f"{sum(losses) / len(clips):.4f}",
-        "worst_loss": f"{max(losses):.4f}",
+        "times as fast": f"{took[False] / took[True]:.2f}",
+        "PSNR (dB)": f"{sum(scores[False]) / len(clips):.3f}",
+        "mean loss": f"{sum(losses) / len(clips):.4f}",
+        "largest loss": f"{max(losses):.4f}",
     }
 
 

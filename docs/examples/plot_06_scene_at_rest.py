@@ -46,8 +46,8 @@ for clock in range(network.frames // 2, clocks - network.frames // 2, every):
 figure, axes = plt.subplots(1, 3, figsize=(9, 2.4), layout="constrained")
 titles = {
     "last picture": shown[-1][0],
-    "second, computed green": shown[1][1],
-    "last, computed green": shown[-1][1],
+    "second; computed cells are green": shown[1][1],
+    "last; computed cells are green": shown[-1][1],
 }
 for ax, (title, picture) in zip(axes, titles.items(), strict=True):
     ax.imshow(picture.movedim(0, -1))

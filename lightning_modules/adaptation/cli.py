@@ -34,18 +34,18 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the verb."""
     made = VerbParser(
         prog="lightning adapt",
-        description="Fine-tune fast weights on a recording of your camera without ground truth. They learn from the "
-        "pictures of slower weights. The end of the recording is held out, and the new weights are written only if "
-        "its pictures improve. Use them with lightning predict --weights OUT/adapted.safetensors; for a noisy "
-        "camera, also on its other recordings.",
+        description="Fine-tune a small model on a recording of your camera, with a large one as teacher and without "
+        "ground truth. The end of the recording is held out, and the new weights are written only if its pictures "
+        "improve. Use them with lightning predict --weights OUT/adapted.safetensors; for a noisy camera, also on its "
+        "other recordings.",
     )
     recordings.add_arguments(made)
     add = made.add_argument
     add("--weights", default="cscsr_small_x4", help="weights to fine-tune (default: cscsr_small_x4)")
     add(
         "--teacher",
-        help="weights to learn from (default: the slowest weights in the package whose clips fit the recording; those "
-        "for noisy sensors if the sensor was not calibrated)",
+        help="weights to learn from (default: the largest model in the package whose clips fit the recording three "
+        "times; one for noisy sensors if the sensor turns out to be noisy)",
     )
     add("--steps", type=whole(1), default=100, help="training steps (default: 100)")
     add("-o", "--output", type=Path, required=True, metavar="OUT", help="output folder")
@@ -89,8 +89,8 @@ def _student(weights: str) -> Network:
 def clips_and_teacher(
     recording: Recording, student: Network, teacher: str | None, noisy: bool = True
 ) -> tuple[RecordingClips, str, Network]:
-    """Return clips of the recording, the name of the teacher, and the teacher, by default the slowest that fits."""
-    name = teacher or _slowest(recording, student, noisy)
+    """Return clips of the recording, the name of the teacher, and the teacher, by default the largest that fits."""
+    name = teacher or _largest(recording, student, noisy)
     network = Network.from_pretrained(name)
     for setting in ("scale", "pattern"):
         here, there = student.settings[setting], network.settings[setting]
@@ -102,8 +102,8 @@ def clips_and_teacher(
     return RecordingClips(recording, frames, crop_to=student.pattern), name, network
 
 
-def _slowest(recording: Recording, student: Network, noisy: bool) -> str:
-    """Return the name of the slowest weights for this recording, which are expected to give the best pictures."""
+def _largest(recording: Recording, student: Network, noisy: bool) -> str:
+    """Return the name of the model with most multiplications for this recording, as it should be the best."""
     room = recording.frames // ROOM
     models = list_models(student.scale, student.pattern)
     fit = [one for one in models if one.frames and one.frames <= room]

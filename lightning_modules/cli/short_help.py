@@ -10,16 +10,16 @@ VERBS = {
     "predict": "Make pictures of a recording.",
     "sweep": "Train and test every combination of overlays, values and seeds.",
     "trade": "Measure cost and quality of every setting.",
-    "adapt": "Fine-tune fast weights on a recording, without ground truth.",
+    "adapt": "Fine-tune a small model on a recording, with a large one as teacher.",
     "export": "Export a network for other programs: safetensors, torch.export or ONNX.",
     "models": "List the weights of the package.",
 }
 
 #: an example for each of Lightning's verbs
 _EXAMPLES = {
-    "fit": "lightning fit -c configs/x4.yaml -c configs/quick.yaml -o runs/mine",
-    "validate": "lightning validate -c configs/x4.yaml --ckpt_path best",
-    "test": "lightning test -c configs/x4.yaml --model.weights cscsr_small_x4",
+    "fit": "lightning fit -c x4 -c quick -o runs/mine",
+    "validate": "lightning validate -c x4 --ckpt_path best",
+    "test": "lightning test -c x4 --model.weights cscsr_small_x4",
 }
 
 _OPTIONS = {

@@ -162,12 +162,12 @@ class Choice:
     below: float
     ms: float
     mib: float
-    where: str = "on the machine of the table"
+    where: str = "on the reference machine"
 
     def __str__(self) -> str:
         time = f"{self.ms:.3g} ms" if self.ms < 1e3 else f"{self.ms / 1e3:.3g} s"
         memory = f"{self.mib:.3g} MiB" if self.mib < 1e3 else f"{self.mib / 1024:.3g} GiB"
-        cost = f"about {time} and {memory} a frame {self.where}"
+        cost = f"about {time} and {memory} per picture {self.where}"
         return f"{self.name}: {cost}, {self.below:.2f} dB below the best"
 
 
@@ -271,7 +271,7 @@ def pace(scale: int, film: bool = False, white: float = 0.4, grey: bool = False)
         grey: use the table of grey cameras.
 
     Returns:
-        1 on the machine of the table, 2 on one that takes twice as long.
+        1 on the reference machine, 2 on one that takes twice as long.
     """
     row = _reference(_table(scale, film, white, grey))
     preset = Preset.read(row)

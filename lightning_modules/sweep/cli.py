@@ -128,7 +128,7 @@ def sweep(args: Sequence[str]) -> None:
     configs = [find_configs(name)[0] for name in asked.configs] + asked.config
     over = [[file for name in group for file in find_configs(name)] for group in asked.over]
     if not configs:
-        raise UsageError("sweep: expected a configuration, such as configs/x4.yaml")
+        raise UsageError("sweep: expected a configuration, such as x4, got none")
     check_folder(asked.output)
     budget = {"steps": asked.steps, "seconds": asked.time, "flops": asked.flops}
     budget = {name: value for name, value in budget.items() if value is not None}

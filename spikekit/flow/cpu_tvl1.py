@@ -27,8 +27,8 @@ def _warp(image, time, flow, out):
 
 
 @compiled
-def _linearize(moved, times, flow, slope, rest):
-    """Linearize the difference of two warped pictures in the flow: slope, and value at zero flow."""
+def _linearise(moved, times, flow, slope, rest):
+    """Linearise the difference of two warped pictures in the flow: slope, and value at zero flow."""
     height, width = rest.shape
     for y in range(height):
         above, below = max(y - 1, 0), min(y + 1, height - 1)
@@ -91,7 +91,7 @@ def _level(pictures, times, limit, flow, warps, step, damping):
     for _ in range(warps):
         for k in range(2):
             _warp(pictures[k], times[k], flow, moved[k])
-        _linearize(moved, times, flow, slope, rest)
+        _linearise(moved, times, flow, slope, rest)
         for _ in range(ROUNDS):
             _follow(flow, slope, rest, limit, near)
             for axis in range(2):

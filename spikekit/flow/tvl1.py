@@ -30,7 +30,7 @@ def tvl1_flow(
     r"""Estimate the motion v between two times of a scene: :math:`I_0(x + t_0 v) = I_1(x + t_1 v)`.
 
     It minimises :math:`\int |\nabla v_x| + |\nabla v_y| + \lambda |I_1(x + t_1 v) - I_0(x + t_0 v)|` from coarse to
-    fine. The data term is linearized around the current v, and both terms are solved alternately, coupled by
+    fine. The data term is linearised around the current v, and both terms are solved alternately, coupled by
     :math:`\theta = 0.25`. The times 0 and 1 give optical flow from the first picture to the second, -1/2 and 1/2 the
     motion at the time between.
 

@@ -45,8 +45,8 @@ def _slopes(image, flow, time, plane, y, x, height, width, inside):
 
 
 @triton.jit(do_not_specialize=["height", "width"])
-def _linearize_kernel(pictures, times, flow, slope, rest, height, width, block: tl.constexpr):
-    """Linearize the difference of two warped pictures in the flow: slope, and value at zero flow."""
+def _linearise_kernel(pictures, times, flow, slope, rest, height, width, block: tl.constexpr):
+    """Linearise the difference of two warped pictures in the flow: slope, and value at zero flow."""
     plane = height * width
     clip, pixel, inside = my_pixels(plane, block)
     pixel = pixel.to(tl.int32)
@@ -141,7 +141,7 @@ def tvl1_level(
     blocks = triton.cdiv(height * width, _BLOCK) * clips
     size = height, width
     for _ in range(warps):
-        launch(_linearize_kernel, blocks, pictures, times, flow, slope, rest, *size, block=_BLOCK)
+        launch(_linearise_kernel, blocks, pictures, times, flow, slope, rest, *size, block=_BLOCK)
         # near is the flow to which the dual variable is added
         for _ in range(rounds):
             launch(_follow_kernel, blocks, near, duals[0], flow, slope, rest, limit, *size, follow=True, block=_BLOCK)

@@ -128,10 +128,10 @@ def simulate(path: Path, settings: Settings, output: Path) -> list[str]:
     return [
         f"source       {path}: {video.height} x {video.width} (H x W), cropped to {film.height} x {film.width}",
         f"sensor       {height} x {width}, {film.pattern}, white level {settings.alpha:g} spikes per clock",
-        f"latent       {sum(latent)} frames in {len(latent)} intervals, none in {latent.count(0)} of them",
-        f"left out     {', '.join(left_out) or 'no source of noise'}",
+        f"latent       {sum(latent)} frames in {len(latent)} intervals, {latent.count(0)} of which need none",
+        f"left out     {', '.join(left_out) or 'nothing'}",
         f"stream       {output}: {count} frames, {bits / (count * height * width):.2%} of the bits set",
-        f"truth        {output.parent / next(iter(pictures.values()))}, {len(pictures)} in all",
+        f"truth        {output.parent / next(iter(pictures.values()))}, {len(pictures)} in total",
         f"side-car     {output.with_suffix('.json')}: all settings, and SHA-256 {digest[:16]}...",
     ]
 

@@ -25,7 +25,7 @@ def pair(*lead, size=(9, 12)):
 
 
 @JUDGES
-@pytest.mark.parametrize(("lead", "size"), [((), (7, 7)), ((3,), (9, 12)), ((2, 3), (20, 8))])
+@pytest.mark.parametrize(("lead", "size"), [((), (7, 7)), ((3,), (9, 12)), ((2, 3), (20, 8)), ((0,), (7, 7))])
 def test_one_value_per_picture(metric, judge, lead, size):
     rgb, target = pair(*lead, size=size)
     figures = metric(rgb, target)

@@ -135,7 +135,7 @@ def test_errors_are_one_line(recording, tmp_path, capsys, more, expected):
         ("cscsr_tiny_x4", 100, None, None),
     ],
 )
-def test_default_teacher_is_the_slowest_for_the_sensor(tmp_path, weights, frames, measured, expected):
+def test_default_teacher_is_the_largest_for_the_sensor(tmp_path, weights, frames, measured, expected):
     path = tmp_path / "camera.npz"
     write_spikes(path, torch.ones(frames, 6, 6, dtype=torch.uint8))
     if measured is not None:

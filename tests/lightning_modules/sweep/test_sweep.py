@@ -267,7 +267,7 @@ def _written(trial):
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        ([], "expected a configuration, such as configs/x4.yaml"),
+        ([], "expected a configuration, such as x4, got none"),
         (["X", "--time", "1:60:00"], "--time: expected HH:MM:SS or DD:HH:MM:SS, got 1:60:00"),
         (["X", "--time", "00:00:00"], "--time: expected a time above 0, got 00:00:00"),
         (["X", "--set", "width"], "--set: expected KEY=VALUE"),

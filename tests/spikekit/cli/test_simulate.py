@@ -97,7 +97,7 @@ def test_a_clip(film, capsys):
 def test_the_whole_film(film, capsys):
     """The stream equals that of a single run, every frame has a ground truth, and memory is bounded."""
     simulate(film, "-o", "a.npz", "--all", *QUICK, "--photons", 50)
-    assert "no source of noise" in capsys.readouterr().out
+    assert "left out     nothing" in capsys.readouterr().out
     known = read_sidecar(Path("a.json"))
     assert known.truth == {f"a/f{n}.png": 20 * n for n in range(5)}
     for n in range(5):
@@ -121,7 +121,7 @@ def test_negligible_noise_is_left_out_and_the_plan_can_be_given(film, capsys):
     words = film, "--scale", 2, "--photons", 20, "--dark-current", 1e-9
     for plan, said, dark in (
         ("scene", "left out     dark_current", 0),
-        ("everything", "left out     no source of noise", 1e-9),
+        ("everything", "left out     nothing", 1e-9),
         (3, "left out     dark_current", 0),
     ):
         simulate(*words, "-o", "a.dat", "--plan", plan)
