@@ -113,7 +113,7 @@ def test_public_names_are_listed_with_their_package():
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_docstring_of_function(name):
+def test_docstrings_of_functions_are_complete(name):
     function, parts = FUNCTIONS[name], sections(FUNCTIONS[name])
     explained, raised = (re.findall(r"^(\w+): ", parts[part], flags=re.MULTILINE) for part in ("Args", "Raises"))
     assert explained == list(inspect.signature(function).parameters)
@@ -132,7 +132,7 @@ def test_docstring_of_function(name):
 
 
 @pytest.mark.parametrize("name", MODULES)
-def test_docstring_of_module(name):
+def test_docstrings_of_modules_are_complete(name):
     parts = sections(MODULES[name])
     (function,) = [operator for operator in OPERATORS if camel(operator) == name]
     assert parts["Summary"].splitlines()[0] == f"See the Convention block on :func:`{function}`."

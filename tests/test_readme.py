@@ -113,7 +113,7 @@ def test_figures_match_the_tables():
         assert cells == [found[4], *(cell for cell in found[5:] if cell)], row
 
 
-def test_length():
+def test_readme_has_at_most_140_lines():
     assert len(README.splitlines()) <= 140
 
 

@@ -27,7 +27,7 @@ ROWS = [
 
 
 @pytest.mark.parametrize(("case", "dtype"), ROWS)
-def test_row(case, dtype, device, note):
+def test_error_stays_within_the_bound_of_its_row(case, dtype, device, note):
     row = case.row(dtype, device)
     note(row)
     assert row.passed, row
@@ -91,7 +91,7 @@ def test_an_outcome_that_is_not_the_documented_one_fails():
     assert [case.row(torch.float32).passed for case in cases] == [True, False, False, False]
 
 
-def test_reference_by_hand():
+def test_references_give_values_found_by_hand():
     assert brute_force.integrate_fire([0.5, 0.75, -0.5, 3.25], 1.0) == ([False, True, False, True], 0)
     assert brute_force.straight_through(1.0, 1.0) == 1
     assert brute_force.straight_through(float("nan"), 1.0) == 0
@@ -108,7 +108,7 @@ def test_reference_by_hand():
     assert brute_force.bilinear(features, flow).tolist() == [[[5.0, 9.0, 6.5]]]
 
 
-def test_yardsticks():
+def test_errors_are_measured_in_units_in_the_last_place():
     one = torch.tensor([1.0, 2.0], dtype=torch.float16)
     assert ulps(one, torch.tensor([1.0 + 2**-10, 2.0], dtype=torch.float64)) == 1
     assert ulps(one * float("nan"), one.double()) != 0

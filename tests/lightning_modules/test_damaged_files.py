@@ -104,13 +104,13 @@ VALUES = {RESULT: FINISHED, "budget.json": BUDGET, "trial.yaml": CONFIG}
 
 
 @pytest.mark.parametrize("name", GOOD)
-def test_damaged_bytes(fuzz, name):
+def test_damaged_bytes_give_one_line(fuzz, name):
     read, errors, good = READ[name], InputError if name in VALUES else ValueError, GOOD[name]
     assert fuzz(read, lambda rng: fuzz.damage(good, rng), name, errors, 120) > 5
 
 
 @pytest.mark.parametrize(("name", "value"), VALUES.items())
-def test_odd_values(fuzz, name, value):
+def test_odd_values_give_one_line(fuzz, name, value):
     assert fuzz(READ[name], lambda rng: _json(fuzz.values(value, rng)), name, InputError, 120) > 20
 
 

@@ -18,7 +18,7 @@ CONFIGS = Path(__file__).parents[2] / "configs"
 
 
 @pytest.mark.parametrize("letter", "abcdefghij")
-def test_training(letter):
+def test_networks_train(letter):
     network = variant(letter, CONFIGS)
     spikes, flow = clip()
     flow = flow[:, None].expand(-1, 3, -1, -1, -1, -1) if letter == "d" else flow
@@ -33,7 +33,7 @@ def test_training(letter):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
 @pytest.mark.parametrize("motion", [ZeroFlow, ClassicalFlow, Spike2Flow])
-def test_motion(motion, dtype):
+def test_motion_is_estimated(motion, dtype):
     torch.manual_seed(0)
     network = CSCSR(2, **TINY, motion=motion()).to(dtype)
     spikes, _ = clip(height=24, width=32)
@@ -45,7 +45,7 @@ def test_motion(motion, dtype):
     torch.testing.assert_close(got.cpu().float(), expected.float(), rtol=0, atol=0.05)  # motion of chance is loose
 
 
-def test_nothing_is_waited_for():
+def test_nothing_waits_for_the_device():
     """With motion given, from the second picture of a size on."""
     network = CSCSR(2, **TINY).to(DEVICE)
     spikes, flow = (tensor.to(DEVICE) for tensor in clip())
@@ -55,7 +55,7 @@ def test_nothing_is_waited_for():
     assert pretend.waits == []
 
 
-def test_tiles():
+def test_tiles_are_computed_there():
     torch.manual_seed(0)
     network = CSCSR(2, **TINY, motion=ZeroFlow())
     spikes, _ = clip(height=40, width=56)

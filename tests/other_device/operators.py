@@ -25,7 +25,7 @@ def test_the_device_does_not_mix():
 
 @EVERY
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16, torch.float16])
-def test_operators(op, options, tensors, dtype):
+def test_operators_give_the_results_of_the_cpu(op, options, tensors, dtype):
     moved = [tensor.requires_grad_() for tensor in there(*(tensor.to(dtype) for tensor in tensors))]
     kept = [tensor.detach().to(dtype).requires_grad_() for tensor in tensors]
     for got, expected in zip(outputs(op(*moved, **options)), outputs(op(*kept, **options)), strict=True):
@@ -68,12 +68,12 @@ def test_operators(op, options, tensors, dtype):
         ),
     ],
 )
-def test_what_makes_something_of_tensors(call, tensors):
+def test_results_are_on_the_device_of_the_tensors(call, tensors):
     got = call(*there(*tensors))
     assert got.device == DEVICE
     torch.testing.assert_close(got.cpu(), call(*tensors))
 
 
-def test_what_is_made_there():
+def test_new_tensors_are_on_the_given_device():
     assert torch.equal(sk.bayer_mask(4, 6, scale=3, device=DEVICE).cpu(), sk.bayer_mask(4, 6, scale=3))
     assert sk.simulate_spikes(torch.rand(5, 4, 6, device=DEVICE)).device == DEVICE

@@ -12,7 +12,7 @@ CASES = [HERE / f"{name}.py" for name in ("operators", "networks")]
 
 
 @pytest.mark.slow
-def test_on_another_device():
+def test_nothing_is_computed_on_the_wrong_device():
     # in a process of its own: PyTorch takes up such a device for good
     folders = (folder for beside in ("spikekit", "lightning_modules") for folder in (HERE.parent / beside).rglob(""))
     path = os.pathsep.join([str(HERE), *map(str, folders), *filter(None, [os.environ.get("PYTHONPATH")])])

@@ -26,7 +26,7 @@ def test_good_and_wrong_values(check, good, wrong):
         assert "\n" not in str(refused.value)
 
 
-def test_types_of_results():
+def test_only_given_types_of_results_are_accepted():
     for good in (None, torch.float16, torch.uint8):
         check_dtype(good, torch.uint8)
     for wrong in (torch.int16, torch.bool, "uint8", float):

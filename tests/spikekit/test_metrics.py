@@ -36,7 +36,7 @@ def test_one_value_per_picture(metric, judge, lead, size):
 
 
 @JUDGES
-def test_both_are_clamped(metric, judge):
+def test_both_pictures_are_clamped(metric, judge):
     rgb, target = torch.randn(2, 3, 9, 12, dtype=torch.float64)
     assert metric(rgb, target).item() == pytest.approx(judge(rgb.clamp(0, 1), target.clamp(0, 1)), rel=1e-10)
 
@@ -47,7 +47,7 @@ def test_ssim_of_flat_bright_pictures():
     assert ssim(rgb, target).item() == pytest.approx(skimage_ssim(rgb.double(), target.double()), rel=1e-5)
 
 
-def test_gradcheck():
+def test_gradients_equal_finite_differences():
     rgb, target = pair(size=(7, 8))
     rgb = (0.1 + 0.8 * rgb).requires_grad_()
     assert gradcheck(lambda x: psnr(x, target), rgb)
@@ -64,7 +64,7 @@ def test_gradcheck():
         (TypeError, torch.ones(3, 8, 8, dtype=torch.uint8), torch.ones(3, 8, 8, dtype=torch.uint8)),
     ],
 )
-def test_errors(metric, error, rgb, target):
+def test_invalid_pictures_are_rejected(metric, error, rgb, target):
     with pytest.raises(error):
         metric(rgb, target)
 

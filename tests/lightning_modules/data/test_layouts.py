@@ -34,7 +34,7 @@ def found(root):
         ("train_orig_part15/train_orig", "val_orig_part1/val_orig"),
     ],
 )
-def test_reds(tmp_path, train, val, reds):
+def test_sequences_of_reds_are_found(tmp_path, train, val, reds):
     reds(tmp_path, train, val)
     films = found(tmp_path)
     assert (films.name, films.clips, films.scale) == ("REDS", 5, None)
@@ -60,7 +60,7 @@ def test_vid4_is_for_tests(tmp_path, folder, write_film):
 
 
 @pytest.mark.parametrize("small", [None, "BIx4", "../vimeo_septuplet_matlabLRx4/sequences"])
-def test_vimeo_septuplets(tmp_path, small, septuplets):
+def test_septuplets_of_vimeo_are_found(tmp_path, small, septuplets):
     root = tmp_path / "vimeo_septuplet"
     septuplets(root, ["00001/0001", "00001/0002", "00002/0001"])
     (root / "sep_trainlist.txt").write_text("00001/0001\n00002/0001\n")
@@ -100,7 +100,7 @@ def test_camera_sees_low_resolution_frames_of_vimeo(tmp_path, made_small, septup
         found(tmp_path)
 
 
-def test_other_films(tmp_path, write_film):
+def test_other_films_are_found(tmp_path, write_film):
     for name in ("a2", "a10", "b"):
         write_film(tmp_path / name, 3, name="f{}.png", first=9)
     write_film(tmp_path / ".hidden", 3)

@@ -40,7 +40,7 @@ def film(tmp_path):
     return SequenceFiles("film", tmp_path, tuple(names))
 
 
-def test_spikes_and_ground_truth(film):
+def test_spikes_and_ground_truth_are_those_of_the_version(film):
     """Sums of halves and quarters, which are exact on every machine."""
     recipe = ClipRecipe(scale=2, alpha=0.5, clocks=16, flow_times=(), interpolation=Blend(), seed=3)
     clip = recipe.clip(film, 2)
@@ -48,7 +48,7 @@ def test_spikes_and_ground_truth(film):
     assert found.hexdigest() == EXPECTED["clip"], CHANGED
 
 
-def test_noise(film):
+def test_noise_is_that_of_the_version(film):
     """Number of changed bits; single bits depend on the logarithm of the machine."""
     noise = SensorNoise(photons=100, dark_current=0.01)
     plain, noisy = (
@@ -58,7 +58,7 @@ def test_noise(film):
     assert (plain != noisy).sum().item() == pytest.approx(EXPECTED["noise"], rel=5e-3), CHANGED
 
 
-def test_latent_frames_and_flow():
+def test_latent_frames_and_flow_are_those_of_the_version():
     """At some pixels and approximately, as rounding decides when optical flow stops."""
     y, x = np.mgrid[:48, :64]
     waves = [np.sin((x - 3 * n) / 5 + k) * np.cos(y / 4 - k) for n in range(3) for k in range(3)]

@@ -80,7 +80,7 @@ def sizes_differ(run, network):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "settings"), MADE)
-def test_onnx_export(kind, settings, tmp_path, program):
+def test_onnx_gives_the_picture_of_the_network(kind, settings, tmp_path, program):
     pytest.importorskip("onnxruntime", reason="the extra export is not installed")
     pytest.importorskip("onnxscript", reason="the extra export is not installed")
     network = unlike_at_first(kind(scale=2, **settings))

@@ -31,14 +31,14 @@ def counts(light, before, after, seed=0):
 
 @pytest.mark.parametrize("clocks", [20, 400])
 @pytest.mark.parametrize("bright", [1.0, 0.3, 0.01, 0.0])
-def test_hardly_a_cell_at_rest_is_called_moved(clocks, bright):
+def test_cells_at_rest_are_rarely_taken_for_moved(clocks, bright):
     light = bright * torch.rand(256, 256, generator=generator())
     share = torch.full((32, 32), 20 / clocks)
     wrong = [find_changes(*counts(light, clocks, 20, seed), share).moved.sum() for seed in range(4)]
     assert sum(wrong) <= 1
 
 
-def test_counts_stay_within_the_bound_and_the_variance_that_are_said():
+def test_counts_stay_within_the_documented_bound_and_variance():
     light = torch.linspace(0.01, 0.9, 4096).expand(64, -1)
     recent, reference = counts(light, 400, 20)
     off = recent - reference * 20 / 400
@@ -74,7 +74,7 @@ def test_a_faint_change_of_any_fineness_is_seen(side, spikes):
 
 
 @pytest.mark.parametrize("gain", [0.5, 0.9, 1.4])
-def test_a_lamp_that_changes_is_a_gain_and_no_motion(gain):
+def test_a_changing_lamp_is_a_gain_and_no_motion(gain):
     light = 0.1 + 0.3 * torch.rand(SIDE, SIDE, generator=generator())
     reference, recent = counts(light, 60, 20)[1], counts(gain * light, 60, 20, 1)[0]
     moved, found = find_changes(recent, reference, torch.full((8, 8), 20 / 60))
@@ -106,7 +106,7 @@ def test_a_scene_at_rest_asks_the_network_for_eight_pictures_and_no_more(kind):
     assert not any(computed[11:])
 
 
-def test_where_all_moves_pictures_are_those_of_every_clip_by_itself():
+def test_where_everything_moves_pictures_equal_those_without_tolerance():
     light = moving(141)
     network = CSCSR(**TINY).eval()
     pairs = zip(film(light, network), film(light, network, psnr_tolerance=0.1), strict=True)
@@ -145,7 +145,7 @@ class Sensor(CSCSR):
         return spikes.float().mean(1, keepdim=True) / 0.4
 
 
-def test_a_picture_at_rest_becomes_that_of_all_its_clocks():
+def test_a_picture_at_rest_becomes_the_mean_of_all_its_clocks():
     pattern = 0.3 + 0.1 * torch.rand(SIDE, SIDE, generator=generator())
     network = Sensor(**{**TINY, "scale": 1, "pattern": "grey"})
     pictures = [rgb for rgb, _ in film(pattern.expand(801, -1, -1), network, psnr_tolerance=0.1)]
@@ -174,7 +174,7 @@ def test_a_lamp_that_flickers_leaves_the_picture_at_rest_and_its_light_is_shown(
         assert found[n][0].mean().item() == pytest.approx(light[clock].mean().item() / 0.4, rel=0.03)
 
 
-def test_a_film_of_one_picture_is_the_plain_one():
+def test_a_film_of_one_picture_is_computed_in_full():
     network = CSCSR(**TINY).eval()
     ((plain, _),), ((found, computed),) = film(still(41), network), film(still(41), network, psnr_tolerance=0.1)
     assert found.equal(plain)
@@ -189,7 +189,7 @@ def test_a_film_of_one_picture_is_the_plain_one():
         (0.1, {"interpolated": 1}, "expected 0 with future or interpolated pictures, got 0.1"),
     ],
 )
-def test_tolerances_that_cannot_be(tolerance, how, message):
+def test_invalid_tolerances_are_rejected(tolerance, how, message):
     with pytest.raises(ValueError, match=f"^psnr_tolerance: {message}$"):
         FilmMaker(CSCSR(**TINY), psnr_tolerance=tolerance, **how)
 

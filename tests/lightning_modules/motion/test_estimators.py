@@ -42,7 +42,7 @@ def test_classical_flow_ignores_autocast_and_the_default_device(around):
 
 
 @pytest.mark.parametrize("size", [(33, 35), (3, 3)])
-def test_any_size(size):
+def test_flow_has_the_size_of_the_clip(size):
     spikes = (torch.rand(2, 41, *size) < 0.4).to(torch.uint8)
     for estimator in (ClassicalFlow(), ZeroFlow()):
         for flow in estimator(spikes, TIMES, "RGGB"):

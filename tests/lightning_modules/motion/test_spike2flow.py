@@ -156,7 +156,7 @@ def test_coarse_correlations_are_centred_on_the_same_point():
     torch.testing.assert_close(found[:, 5, 8, 8] - found[:, 4, 8, 8], torch.tensor([1.0, 2, 4]))  # x varies fastest
 
 
-def test_convex_upsampling():
+def test_convex_upsampling_keeps_constant_flow():
     generator = torch.Generator().manual_seed(0)
     flow = torch.randn(2, 3, 2, 4, 5, generator=generator)
     fine = upsample_convex(flow, torch.randn(2, 9 * 16, 4, 5, generator=generator), 4)

@@ -150,7 +150,7 @@ def test_true_flow_warps_the_ground_truth_of_a_film(base):
     assert moved < 0.7 * still, (moved, still)
 
 
-def test_flicker():
+def test_flicker_ignores_errors_that_move_with_the_scene():
     truth, flow = torch.rand(3, 3, 16, 16, generator=torch.Generator().manual_seed(0)), torch.zeros(3, 2, 16, 16)
     flow[:, 0] = 2.0
     then = truth.roll(2, dims=-1)

@@ -63,7 +63,7 @@ def test_a_sensor_is_recovered_from_a_flat_and_a_dark_recording(truth):
     assert found.dark_error < 3e-4
 
 
-def test_one_recording_alone(truth):
+def test_one_recording_alone_gives_gains_or_dark_rates(truth):
     noise = SensorNoise(calibration=truth)
     flat = calibrate(halves(SpikeSensor(noise).expose(torch.full((400, *SIZE), 0.3))), None, "BGGR")
     assert flat.dark_error is None
@@ -80,7 +80,7 @@ def test_one_recording_alone(truth):
 @pytest.mark.parametrize(
     ("light", "said"), [(1.0, "without saturation"), (0.0, "brighter than the dark one")], ids=["white", "black"]
 )
-def test_a_flat_recording_of_the_wrong_brightness(light, said):
+def test_a_flat_recording_of_the_wrong_brightness_is_rejected(light, said):
     flat = SpikeSensor().expose(torch.full((200, 4, 4), light))
     with pytest.raises(ValueError, match=said):
         calibrate(halves(flat), halves(torch.zeros(200, 4, 4)))
@@ -126,7 +126,7 @@ def test_defects_are_filled_from_the_nearest_pixels_of_their_colour(truth, patte
     assert found[works].equal(light[works])
 
 
-def test_corrected_spikes(truth):
+def test_corrected_spikes_have_the_rate_of_an_ideal_sensor(truth):
     light = torch.linspace(0.05, 0.4, SIZE[1]).expand(41, *SIZE)
     spikes = SpikeSensor(SensorNoise(calibration=truth), seed=2).expose(light)
     found = correct_spikes(spikes, truth, "BGGR")
@@ -179,12 +179,12 @@ def test_invalid_values_are_rejected(changed, said):
         Calibration(**(good | changed))
 
 
-def test_no_pixel_of_a_colour_works():
+def test_a_colour_without_working_pixels_is_rejected():
     with pytest.raises(ValueError, match="working pixels of every colour"):
         Calibration(*torch.ones(2, 2, 2), torch.eye(2).byte()).correct(torch.ones(2, 2), "RGGB")
 
 
-def test_noise_of_a_measured_sensor(truth):
+def test_simulated_pixels_are_those_of_the_measured_sensor(truth):
     noise = SensorNoise(calibration=truth)
     spikes = SpikeSensor(noise).expose(torch.full((500, *SIZE), 0.2))
     expected = torch.where(truth.defects == WORKS, 0.2 * truth.gain + truth.dark, (truth.defects == HOT).float())

@@ -100,7 +100,7 @@ def test_ideal_sensor_and_still_texture_give_no_gains(truth, motion, ideal):
     assert measured(SpikeSensor(noise, seed=6).expose(light), "BGGR") is None
 
 
-def test_flickering_light(truth, recording):
+def test_gains_are_found_in_flickering_light(truth, recording):
     lamp = 1 + 0.3 * torch.sin(torch.arange(FRAMES) * 2 * torch.pi / 160)
     light = 0.2 * raw(recording[0], "BGGR") * lamp[:, None, None]
     known = measured(SpikeSensor(SensorNoise(calibration=truth), seed=7).expose(light), "BGGR").calibration
@@ -117,7 +117,7 @@ def test_counts_do_not_depend_on_the_chunks(chunk):
 
 @pytest.mark.parametrize(("size", "pattern"), [((1, 1), None), ((1, 40), "BGGR"), ((5, 40), "BGGR")])
 @pytest.mark.parametrize("share", [0.0, 0.3])
-def test_recordings_without_visible_motion(size, pattern, share):
+def test_recordings_without_visible_motion_give_no_gains(size, pattern, share):
     spikes = torch.rand(260, *size, generator=chance(10)) < share
     ideal = Calibration(torch.ones(size), torch.zeros(size), torch.zeros(size, dtype=torch.uint8))
     assert measured(spikes, pattern, ideal) is None

@@ -140,7 +140,7 @@ KIND = {"kind": "spikekit calibration 1"}
     ],
     ids=lambda value: "",
 )
-def test_invalid_calibration_files(tensors, metadata, said, fails):
+def test_invalid_calibration_files_are_named_in_one_line(tensors, metadata, said, fails):
     save_file(tensors, "bad.safetensors", metadata)
     error = fails(1, "decode", "scene.dat", *HOW, "-o", "x.png", "--calibration", "bad.safetensors")
     assert error.startswith("spikekit: bad.safetensors: ")

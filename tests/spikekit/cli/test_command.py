@@ -43,7 +43,7 @@ def sized(path, height=12, width=20):
 # --- info and cameras -------------------------------------------------------------------------------------------------
 
 
-def test_info(clip, capsys):
+def test_info_prints_size_and_statistics(clip, capsys):
     command("info", *sized(clip))
     out, err = capsys.readouterr()
     assert err == ""
@@ -60,7 +60,7 @@ def test_info(clip, capsys):
         assert f"\n{line}" in f"\n{out}"
 
 
-def test_cameras(capsys):
+def test_cameras_are_listed(capsys):
     command("cameras")
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == ["camera", "m1k40", "m1k40-bayer", "uhsr", "vidar"]
@@ -76,7 +76,7 @@ def test_cameras(capsys):
         (30, "none of 250 x 250, 250 x 400, 250 x 416, 1000 x 1000, 1000 x 1024 divides its 30 bytes exactly"),
     ],
 )
-def test_headerless_recording_without_size(tmp_path, fails, size, expected):
+def test_headerless_recording_needs_a_size(tmp_path, fails, size, expected):
     path = tmp_path / "a.dat"
     path.touch()
     os.truncate(path, size)
@@ -90,7 +90,7 @@ def test_headerless_recording_without_size(tmp_path, fails, size, expected):
 
 
 @pytest.mark.parametrize(("method", "least"), [("tfi", 20), ("tfp", 30)])
-def test_decode(clip, tmp_path, capsys, method, least):
+def test_decode_recovers_the_scene(clip, tmp_path, capsys, method, least):
     """The scene is recovered: with alpha at its own brightness, without it scaled to white."""
     out = tmp_path / "made" / "a.png"
     words = ["decode", *sized(clip), "--method", method, "-o", out]
@@ -146,7 +146,7 @@ print(run("0::1000") - before)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="kilobytes of ru_maxrss are Linux's")
-def test_decode_many_in_bounded_memory(tmp_path):
+def test_many_pictures_are_decoded_in_bounded_memory(tmp_path):
     """20,000 frames, or 80 MB, take at most 8 MB more than 1000 frames."""
     chunk = (torch.rand(200, 50, 80) < 0.2).byte()
     write_spikes(tmp_path / "a.dat", (chunk for _ in range(100)))
@@ -161,7 +161,7 @@ def test_decode_many_in_bounded_memory(tmp_path):
 
 
 @pytest.mark.parametrize("pattern", ["GRBG", "bggr"])
-def test_decode_colour(tmp_path, pattern, monkeypatch):
+def test_decode_keeps_the_colour_of_a_wall(tmp_path, pattern, monkeypatch):
     """A coloured wall, stored upside down, keeps its colour; ``~`` is expanded."""
     monkeypatch.setenv("HOME", str(tmp_path))
     rgb = torch.tensor([0.9, 0.5, 0.2])[:, None, None].expand(3, 10, 14)
@@ -220,13 +220,13 @@ def test_recording_with_time_last_is_noted(tmp_path, capsys, save):
         (["decode", "CLIP", "-o", "a.dat"], "ends in .png, .jpg, .jpeg, .bmp, .tif, .tiff, .pgm, .ppm, .pnm, got"),
     ],
 )
-def test_wrong_command_lines(clip, fails, words, message):
+def test_wrong_command_lines_give_one_line(clip, fails, words, message):
     if "CLIP" in words:
         words = [words[0], *sized(clip), "-o", clip.with_suffix(".png"), *words[2:]]
     assert message in fails(2, *words)
 
 
-def test_wrong_files(clip, tmp_path, fails):
+def test_wrong_files_give_one_line(clip, tmp_path, fails):
     (tmp_path / "clip.raw").write_bytes(b"raw")
     (tmp_path / "folder.png").mkdir()
     for path, message in [
@@ -245,7 +245,7 @@ def test_wrong_files(clip, tmp_path, fails):
 
 
 @pytest.mark.parametrize("words", [["--help"], *([verb, "--help"] for verb in VERBS)])
-def test_help(words, capsys):
+def test_help_names_every_option(words, capsys):
     command(*words)
     out = capsys.readouterr().out
     assert out.startswith("usage: spikekit")

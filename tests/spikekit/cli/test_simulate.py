@@ -72,7 +72,7 @@ def believed(stream):
 # --- a clip -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_clip(film, capsys):
+def test_a_clip_equals_that_of_python(film, capsys):
     simulate(film, "-o", "made/a.dat", "--scale", 2, "--seed", 3, "--pattern", "gbrg", "--frame", 2)
     report, err = capsys.readouterr()
     assert err == ""
@@ -94,7 +94,7 @@ def test_a_clip(film, capsys):
     assert (tfp(spikes, 41)[20] - light).abs().max() < 0.03
 
 
-def test_the_whole_film(film, capsys):
+def test_a_whole_film_equals_a_single_run_in_bounded_memory(film, capsys):
     """The stream equals that of a single run, every frame has a ground truth, and memory is bounded."""
     simulate(film, "-o", "a.npz", "--all", *QUICK, "--photons", 50)
     assert "left out     nothing" in capsys.readouterr().out
@@ -145,7 +145,7 @@ def test_negligible_noise_is_left_out_and_the_plan_can_be_given(film, capsys):
     ],
     ids=str,
 )
-def test_a_sidecar_edited_by_hand(tmp_path, monkeypatch, fails, capsys, part, value, said):
+def test_a_damaged_sidecar_is_named_in_one_line(tmp_path, monkeypatch, fails, capsys, part, value, said):
     """Every verb that reads it gives a one-line error that names it."""
     monkeypatch.chdir(tmp_path)
     write_spikes("a.dat", torch.ones(3, 4, 8))
@@ -167,7 +167,7 @@ def test_a_sidecar_edited_by_hand(tmp_path, monkeypatch, fails, capsys, part, va
     assert main(["info", "a.dat", "--height", "4", "--width", "8"]) == 0  # without it
 
 
-def test_two_processes_with_one_output(film):
+def test_two_processes_with_one_output_give_the_same_files(film):
     """Concurrent processes with one output, and a process with all threads, give the same files."""
     words = ["simulate", str(film), *QUICK, "--photons", "30", "-o", "a.dat"]
     started = [sys.executable, "-c", "from spikekit.cli.command import main; raise SystemExit(main())", *words]
@@ -185,7 +185,7 @@ def test_two_processes_with_one_output(film):
 
 
 @pytest.mark.parametrize("step", [0, 1, 4, 6, 7])
-def test_process_killed_while_publishing(film, monkeypatch, step):
+def test_a_process_killed_while_publishing_leaves_one_set_of_files(film, monkeypatch, step):
     """After every step, the files are the old set, the new set, or a set without side-car."""
     simulate(film, "-o", "a.dat", "--all", *QUICK)
     old = Path("a.dat").read_bytes()
@@ -219,7 +219,7 @@ def test_leftovers_are_removed_and_a_second_process_waits(film):
 
 
 @pytest.mark.parametrize(("room", "words", "name"), [(8000, ["--all", "--clocks", "200"], "a.dat"), (500, [], "a.png")])
-def test_a_full_disk(film, fails, full_disk, room, words, name):
+def test_a_full_disk_gives_one_line_and_keeps_old_files(film, fails, full_disk, room, words, name):
     """The error is one line that names the file; existing files are kept."""
     simulate(film, "-o", "a.dat", *QUICK)
     with full_disk(room):
@@ -269,7 +269,7 @@ def test_other_files_are_not_overwritten(film, fails):
         (["nothing", "--scale", "2"], 1, "nothing: no such file or folder"),
     ],
 )
-def test_mistakes(film, fails, words, status, said):
+def test_mistakes_give_one_line(film, fails, words, status, said):
     Path("damaged").mkdir()
     Path("damaged/0.png").write_bytes(Path("film/f4.png").read_bytes()[:150])
     assert said in fails(status, *words, "-o", "a.dat")
@@ -283,7 +283,7 @@ def calibrated(path, width=18):
     write_calibration(path, Calibration(gains, torch.zeros(16, width), defects))
 
 
-def test_pixels_of_a_calibrated_sensor(film, fails):
+def test_pixels_of_a_calibrated_sensor_are_simulated(film, fails):
     Path("cameras").mkdir()
     calibrated("cameras/one.safetensors")
     words = [film, "--frames", 400, "--frame", 2, "--clocks", 200, "--alpha", 0.8, *QUICK]

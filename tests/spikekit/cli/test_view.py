@@ -96,7 +96,7 @@ def test_metadata_come_from_the_sidecar(still, capsys):
 
 
 @pytest.mark.parametrize(("shape", "value"), [((1, 1, 1), 0), ((1, 1, 1), 1), ((30, 40, 40), 0)])
-def test_dim_short_and_small_recordings(tmp_path, monkeypatch, shape, value):
+def test_dim_short_and_small_recordings_give_a_picture(tmp_path, monkeypatch, shape, value):
     """A few pixels, one frame, no spikes or only spikes still give a picture."""
     monkeypatch.chdir(tmp_path)
     write_spikes("a.npz", torch.full(shape, value))
@@ -108,7 +108,7 @@ def test_dim_short_and_small_recordings(tmp_path, monkeypatch, shape, value):
 
 
 @pytest.mark.parametrize("header", [True, False])
-def test_a_camera_is_known(tmp_path, monkeypatch, capsys, header):
+def test_camera_sets_size_flip_and_crop(tmp_path, monkeypatch, capsys, header):
     """Every verb drops the header columns, flips the frames and crops the border."""
     monkeypatch.chdir(tmp_path)
     known = {
@@ -150,7 +150,7 @@ def test_a_camera_is_known(tmp_path, monkeypatch, capsys, header):
         (["a.dat", "--frames", "40:42"], 2, "--frames: expected frames within 0 .. 40, got 40:42"),
     ],
 )
-def test_mistakes(still, fails, words, status, said):
+def test_mistakes_give_one_line(still, fails, words, status, said):
     Path("b.dat").write_bytes(Path("a.dat").read_bytes()[:-192])
     Path("b.json").write_text(Path("a.json").read_text().replace("a.dat", "b.dat"))
     assert said in fails(status, "view", *words, "-o", "out.png")

@@ -17,7 +17,7 @@ def color_at(pattern, y, x):
 @pytest.mark.parametrize("pattern", PATTERNS)
 @pytest.mark.parametrize("scale", [1, 3, 4])
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 5), (4, 2)])
-def test_bayer_mask(pattern, scale, height, width):
+def test_bayer_mask_equals_a_loop(pattern, scale, height, width):
     expected = np.zeros((3, scale * height, scale * width))
     for y in range(scale * height):
         for x in range(scale * width):
@@ -29,7 +29,7 @@ def test_bayer_mask(pattern, scale, height, width):
 
 
 @pytest.mark.parametrize("cfa", list(CFA))
-def test_kornia_cfa(cfa):
+def test_phases_are_those_of_kornia(cfa):
     rgb = torch.rand(2, 3, 4, 6)
     pattern = sk.bayer_pattern(cfa)
     assert torch.equal(sk.mosaic(rgb, cfa), rgb_to_raw(rgb, cfa)[:, 0])
@@ -37,7 +37,7 @@ def test_kornia_cfa(cfa):
     assert torch.equal(sk.bayer_mask(4, 6, cfa), sk.bayer_mask(4, 6, pattern))
 
 
-def test_pattern_in_lower_case():
+def test_pattern_may_be_in_lower_case():
     assert sk.bayer_mask(4, 4, "grbg").equal(sk.bayer_mask(4, 4, "GRBG"))
     assert sk.BinToSensor("bggr", scale=2).pattern == "BGGR"
 
@@ -45,7 +45,7 @@ def test_pattern_in_lower_case():
 @pytest.mark.parametrize("pattern", PATTERNS)
 @pytest.mark.parametrize("scale", [1, 3, 4])
 @pytest.mark.parametrize("lead", [(), (2, 3)])
-def test_bin_to_sensor(pattern, scale, lead):
+def test_bin_to_sensor_equals_a_loop(pattern, scale, lead):
     rows, columns = 3, 5
     # multiples of scale^2: every mean is a whole number
     rgb = torch.randint(0, 256, (*lead, 3, scale * rows, scale * columns)).double() * scale**2
@@ -70,7 +70,7 @@ def test_bin_to_sensor_sums_in_float32():
 @pytest.mark.parametrize("pattern", PATTERNS)
 @pytest.mark.parametrize("lead", [(), (2, 3)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.uint8, torch.bool])
-def test_split_and_merge(pattern, lead, dtype):
+def test_merge_undoes_split(pattern, lead, dtype):
     raw = (torch.rand(*lead, 4, 6) * 8).to(dtype)
     planes = sk.split_bayer(raw, pattern)
     assert planes.dtype == dtype
@@ -100,7 +100,7 @@ def test_split_and_merge(pattern, lead, dtype):
         (ValueError, lambda: sk.merge_bayer(torch.ones(3, 2, 2))),
     ],
 )
-def test_errors(error, call):
+def test_invalid_arguments_are_rejected(error, call):
     with pytest.raises(error):
         call()
 
@@ -114,7 +114,7 @@ def test_split_colors_keeps_nan_in_its_plane():
     assert blue.tolist() == [[0, 0], [0, 1]]
 
 
-def test_scale_of_numpy():
+def test_scale_may_be_an_integer_of_numpy():
     """A uint8 scale must not overflow sizes."""
     expected = sk.bayer_mask(100, 90, scale=3)
     assert torch.equal(sk.bayer_mask(100, np.uint8(90), scale=np.uint8(3)), expected)

@@ -42,7 +42,7 @@ def malvar(raw, pattern):
 
 @pytest.mark.parametrize("pattern", PATTERNS)
 @pytest.mark.parametrize("size", [(3, 3), (5, 8), (6, 7)])
-def test_malvar(pattern, size):
+def test_pictures_equal_those_of_the_published_filters(pattern, size):
     raw = torch.randint(-64, 65, size).double()  # whole numbers in, sixteenths out: exact
     expected = torch.from_numpy(malvar(raw.numpy(), pattern))
     for dtype in (torch.float64, torch.float32):

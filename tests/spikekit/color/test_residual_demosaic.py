@@ -96,7 +96,7 @@ def residual_interpolation(raw, pattern):
 
 
 @pytest.mark.parametrize(("pattern", "size"), [("RGGB", (3, 4)), ("GBRG", (7, 6)), ("BGGR", (5, 4))])
-def test_against_loops(pattern, size):
+def test_pictures_equal_those_of_loops(pattern, size):
     raw = torch.rand(size, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     expected = torch.from_numpy(residual_interpolation(raw.numpy(), pattern))
     torch.testing.assert_close(demosaic_residual(raw, pattern), expected, rtol=0, atol=1e-10)

@@ -27,7 +27,7 @@ def in_chunks(decode, spikes, cuts, overlap):
 
 
 @given(CUTS, st.sampled_from([1, 3, 11, 41]), st.floats(0, 1), SEEDS)
-def test_tfp_in_chunks(cuts, window, rate, seed):
+def test_tfp_in_chunks_equals_that_of_the_whole(cuts, window, rate, seed):
     spikes = stream(sum(cuts), rate, seed).reshape(1, -1, 2, 5).half()
     got = in_chunks(lambda part: tfp(part, window), spikes, cuts, window // 2)
     assert got.equal(tfp(spikes, window))
@@ -51,7 +51,7 @@ def decided(spikes, overlap):
 
 
 @given(CUTS, st.integers(0, 30), st.floats(0, 1), SEEDS)
-def test_tfi_in_chunks(cuts, overlap, rate, seed):
+def test_tfi_in_chunks_equals_that_of_the_whole(cuts, overlap, rate, seed):
     """The result is exact wherever the docstring promises it."""
     spikes = stream(sum(cuts), rate, seed)
     exact = decided(spikes, overlap)
@@ -95,6 +95,6 @@ def test_pieces_are_returned_as_early_as_possible():
         ([torch.ones(7, 4, 5)], 2, lambda _: None, TypeError, "decode: expected a function that returns a tensor"),
     ],
 )
-def test_bad_arguments(chunks, overlap, decode, error, message):
+def test_bad_arguments_are_rejected(chunks, overlap, decode, error, message):
     with pytest.raises(error, match=message):
         list(decode_in_chunks(decode, chunks, overlap))

@@ -18,7 +18,7 @@ def streams(frames, seed=0):
 
 
 @given(st.lists(st.booleans(), min_size=1, max_size=41), st.integers(0, 50))
-def test_any_stream(fired, half):
+def test_any_stream_is_decoded_as_by_brute_force(fired, half):
     spikes = torch.tensor(fired).reshape(-1, 1, 1)
     assert spike_interval(spikes).flatten().tolist() == brute_force.spike_interval(fired)
     assert tfi(spikes.double(), 3.0).flatten().tolist() == pytest.approx(list(map(float, brute_force.tfi(fired, 3.0))))
@@ -64,7 +64,7 @@ def test_large_values_leave_no_error_in_the_running_sum_of_tfp():
 @pytest.mark.parametrize(
     "wrong", [*({"window": window} for window in (0, 2, 2.5)), {"order": 0}, {"max_range": 0}], ids=str
 )
-def test_wrong_options(wrong):
+def test_wrong_options_are_rejected(wrong):
     (name,) = wrong
     calls = [lambda **options: tfp(torch.ones(3, 2, 2), **options), Tfp]
     for call in calls:
@@ -77,7 +77,7 @@ def test_wrong_options(wrong):
             tfi(torch.ones(3, 2, 2), **wrong)
 
 
-def test_a_window_in_a_clip_of_any_length():
+def test_compiled_tfp_takes_clips_of_any_length():
     torch.compiler.reset()
     compiled = torch.compile(lambda spikes: tfp(spikes, 11), fullgraph=True, backend="aot_eager", dynamic=True)
     shapes = ({0: torch.export.Dim("batch"), 1: torch.export.Dim("frames")},)

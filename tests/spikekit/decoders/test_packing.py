@@ -27,7 +27,7 @@ def packed_by_hand(spikes):
     st.sampled_from(DTYPES),
     st.booleans(),
 )
-def test_against_one_pixel_at_a_time(lead, width, dtype, strided):
+def test_bytes_equal_those_of_one_pixel_at_a_time(lead, width, dtype, strided):
     spikes = random_spikes(*lead, width).to(dtype)
     if strided:
         spikes = spikes.mT.contiguous().mT
@@ -40,7 +40,7 @@ def test_against_one_pixel_at_a_time(lead, width, dtype, strided):
 
 
 @pytest.mark.parametrize("width", [1, 7, 8, 9, 24])
-def test_torch_path(width):
+def test_torch_path_gives_the_same_bytes(width):
     """The torch path, which runs on devices other than the CPU."""
     spikes = random_spikes(2, 3, 4, width)
     packed = packed_by_hand(spikes)
@@ -51,7 +51,7 @@ def test_torch_path(width):
 
 
 @pytest.mark.parametrize("value", [2, -1, 0.5, float("nan"), float("inf")])
-def test_values_other_than_0_and_1(value):
+def test_values_other_than_0_and_1_are_rejected(value):
     for dtype in (torch.float32, torch.bfloat16, torch.float64, *([torch.uint8] if value == 2 else [])):
         with pytest.raises(ValueError, match="expected zeros and ones"):
             pack_spikes(torch.tensor([[0, 1, value]], dtype=dtype))
@@ -65,13 +65,13 @@ def test_values_other_than_0_and_1(value):
         (lambda: unpack_spikes(torch.zeros(3, 2).byte(), 9, dtype="int8"), TypeError, r"to\(\)"),
     ],
 )
-def test_bad_arguments(call, error, message):
+def test_bad_arguments_are_rejected(call, error, message):
     with pytest.raises(error, match=message):
         call()
 
 
 @pytest.mark.parametrize("axis", [0, 1, 3])
-def test_vmap(capfd, axis):
+def test_vmap_gives_the_same_bytes(capfd, axis):
     spikes = random_spikes(3, 5, 4, 13)
     packed = pack_spikes(spikes)
     assert torch.func.vmap(pack_spikes, axis)(spikes.movedim(0, axis)).equal(packed)
@@ -80,7 +80,7 @@ def test_vmap(capfd, axis):
     assert capfd.readouterr().err == ""  # without a rule of its own vmap loops, and says so
 
 
-def test_compile():
+def test_compiled_packing_gives_the_same_bytes():
     spikes = random_spikes(2, 5, 4, 13)
     torch.compiler.reset()
     both = torch.compile(lambda bits: unpack_spikes(pack_spikes(bits), 13), fullgraph=True, backend="aot_eager")

@@ -12,7 +12,7 @@ from spikekit.decoders.single_frame import _spike_interval_at, search, tfp_weigh
 
 
 @given(st.integers(1, 40), st.floats(0, 1), st.integers(0, 2**31), st.data())
-def test_against_one_pixel_at_a_time(frames, rate, seed, data):
+def test_results_equal_those_of_one_pixel_at_a_time(frames, rate, seed, data):
     spikes = torch.rand(frames, 3, 4, generator=torch.Generator().manual_seed(seed)) < rate
     frame = data.draw(st.integers(0, frames - 1))
     pixels = spikes.flatten(1).T.tolist()
@@ -36,7 +36,7 @@ def test_equals_the_frame_of_the_dense_decoder(dtype):
 
 
 @pytest.mark.parametrize("frames", [255, 256, 40_000])
-def test_long_silence(frames):
+def test_long_intervals_do_not_overflow(frames):
     """One-byte counters must not overflow."""
     spikes = torch.zeros(frames, 1, 3, dtype=torch.uint8)
     spikes[3, 0, 0] = spikes[-1, 0, 0] = 1
@@ -102,7 +102,7 @@ def test_mean_of_a_pixel_that_always_fires_is_exact_at_the_extremes():
 
 
 @pytest.mark.parametrize("op", [spike_interval_at, tfi_at, lambda spikes, frame: tfp_at(spikes, frame, 3)])
-def test_compile_and_vmap(op, capfd):
+def test_compiled_and_mapped_results_are_equal(op, capfd):
     spikes = torch.rand(3, 9, 4, 6) < 0.3
     torch.compiler.reset()
     assert torch.compile(op, fullgraph=True, backend="aot_eager")(spikes, 4).equal(op(spikes, 4))
@@ -124,6 +124,6 @@ def test_compile_and_vmap(op, capfd):
         (lambda spikes: tfp_at(spikes, 1, 3, order=0), ValueError, "order"),
     ],
 )
-def test_bad_options(call, error, name):
+def test_bad_options_are_rejected(call, error, name):
     with pytest.raises(error, match=name):
         call(torch.ones(5, 4, 4))

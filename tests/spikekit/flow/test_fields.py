@@ -10,7 +10,7 @@ LEADS = pytest.mark.parametrize("lead", [(), (3, 2)])
 
 
 @LEADS
-def test_joint_flow(lead):
+def test_joint_flow_is_the_mean(lead):
     flows = torch.randint(-32, 33, (4, *lead, 2, 3, 5)).double()
     expected = (flows[0] + flows[1] + flows[2] + flows[3]) / 4
     assert torch.equal(joint_flow(flows), expected)
@@ -34,14 +34,14 @@ def upsample_loop(flow, scale):
 @LEADS
 @pytest.mark.parametrize("scale", [1, 3, 4])
 @pytest.mark.parametrize("size", [(1, 1), (3, 4)])
-def test_upsample_flow(lead, scale, size):
+def test_upsample_flow_equals_a_loop(lead, scale, size):
     flow = torch.randn(*lead, 2, *size, dtype=torch.float64)
     assert np.allclose(upsample_flow(flow, scale).numpy(), upsample_loop(flow.numpy(), scale), atol=1e-12)
 
 
 @LEADS
 @pytest.mark.parametrize("scale", [1, 3])
-def test_linear_motion(lead, scale):
+def test_linear_motion_is_linear_on_either_side_of_the_middle(lead, scale):
     to_first, to_last = torch.randn(2, *lead, 2, 3, 4, dtype=torch.float64)
     times, (i, j, k) = [0.0, 5, 19.5, 20, 20.5, 38, 40, 44], (1, 20, 39)
     offsets = linear_motion(to_first, to_last, times, first=i, middle=j, last=k, scale=scale)
@@ -80,7 +80,7 @@ FLOW = torch.zeros(1, 2, 3, 3)
         (TypeError, lambda: linear_motion(FLOW, None, [0, 4])),
     ],
 )
-def test_errors(error, call):
+def test_invalid_arguments_are_rejected(error, call):
     with pytest.raises(error):
         call()
 

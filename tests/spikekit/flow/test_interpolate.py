@@ -91,7 +91,7 @@ def test_frames_with_nan_or_infinity_are_rejected():
 
 @pytest.mark.parametrize("size", [(1, 1), (5, 3), (31, 45)])
 @pytest.mark.parametrize("shrink", [1, 3])
-def test_any_size(size, shrink):
+def test_frames_of_any_size_are_interpolated(size, shrink):
     first, second = torch.rand(2, 3, *size).sort(dim=0).values
     picture = FlowInterpolation(shrink)(first, second).at(0.4)
     assert picture.shape == first.shape
@@ -104,7 +104,7 @@ def test_any_size(size, shrink):
 
 
 @pytest.mark.parametrize(("x", "y"), [(1.0, 0.5), (10.0, 8.0)])
-def test_known_translation(x, y):
+def test_known_translation_is_followed(x, y):
     scene = panning(x, y)
     between = FlowInterpolation(shrink=1)(*ends(scene))
     for tau in (0.25, 0.5, 0.8):
@@ -120,7 +120,7 @@ def test_known_translation(x, y):
         assert error.abs().mean() < 0.1
 
 
-def test_occluded_background():
+def test_occluded_background_comes_from_the_frame_that_shows_it():
     scene, tau = passing(), 0.25
     truth = scene.rgb(20 * tau)
     made, blend = (method(*ends(scene)).at(tau) for method in (FlowInterpolation(), Blend()))

@@ -29,7 +29,7 @@ def stored(tmp_path, **changes):
     return path
 
 
-def test_presets():
+def test_cameras_of_the_package_are_described_fully():
     known = {name: camera(name) for name in CAMERAS}
     assert {name for name, c in known.items() if c.flip} == {"m1k40", "m1k40-bayer", "vidar"}
     assert all(c.source and c.title and c.rate == 20_000 for c in known.values())
@@ -100,7 +100,7 @@ def test_camera_from_a_json_file(tmp_path):
         ('{"title": "a', "line 1"),
     ],
 )
-def test_invalid_camera_files(tmp_path, given, message):
+def test_invalid_camera_files_are_rejected(tmp_path, given, message):
     path = tmp_path / "own.json"
     path.write_text(
         given if isinstance(given, str) else json.dumps(PLAIN | given if isinstance(given, dict) else given)

@@ -140,7 +140,7 @@ FILES = {  # what is damaged: how it is read, what makes a good one, the error, 
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_damaged_bytes(fuzz, name, tmp_path, monkeypatch):
+def test_damaged_bytes_give_one_line(fuzz, name, tmp_path, monkeypatch):
     read, make, error, cases = FILES[name]
     good = make(tmp_path / name)
     for module in ("images", "video"):  # so that this is what bounds the memory
@@ -154,13 +154,13 @@ def test_damaged_bytes(fuzz, name, tmp_path, monkeypatch):
     [(read_sidecar, SIDECAR), (lambda path: find_sidecar(path.with_suffix(".dat")), SIDECAR), (camera, CAMERA)],
     ids=["read_sidecar", "find_sidecar", "camera"],
 )
-def test_damaged_json(fuzz, read, good):
+def test_damaged_json_gives_one_line(fuzz, read, good):
     text = json.dumps(good, indent=1).encode()
     fuzz(read, lambda rng: fuzz.damage(text, rng), "walk.json", cases=500)
     fuzz(read, lambda rng: json.dumps(fuzz.values(good, rng)).encode(), "walk.json")
 
 
-def test_damaged_headers_of_npz(fuzz):
+def test_damaged_headers_of_npz_give_one_line(fuzz):
     """The archive is valid but its array is not."""
 
     def make(rng):
@@ -220,7 +220,7 @@ def test_a_film_or_a_picture_opens_no_other_file(tmp_path):
             (read_video if name == "a.mp4" else read_picture)(tmp_path / name)
 
 
-def test_folders_of_pictures(fuzz, tmp_path):
+def test_damaged_pictures_of_a_folder_are_named(fuzz, tmp_path):
     """Circular links, pipes, folders and invalid files among the pictures of a film."""
     good = [PICTURES["a.png"](tmp_path / "a.png"), PICTURES["a.jpg"](tmp_path / "a.jpg")]
     good += [good[0][:60], b"", b"\x89PNG"]

@@ -24,7 +24,7 @@ def clip(tmp_path):
     return tmp_path / "clip.dat"
 
 
-def test_bits_by_hand(tmp_path):
+def test_bits_are_in_the_order_of_the_format(tmp_path):
     """The leftmost pixel is the least significant bit, rows share bytes, and frames are padded to whole bytes."""
     (tmp_path / "a.dat").write_bytes(bytes([0b00000001, 0b11000000, 0b00010010, 0b11111111]))
     expected = [
@@ -101,7 +101,7 @@ def test_memory_is_bounded(tmp_path, name):
 
 @pytest.mark.parametrize("dtype", ["bool", "int8", ">i2", "<u4", "float16", ">f4", "float64"])
 @pytest.mark.parametrize("order", ["C", "F"])
-def test_array_dtypes_and_orders(tmp_path, dtype, order):
+def test_arrays_of_any_dtype_and_order_are_read(tmp_path, dtype, order):
     spikes = random_spikes(4, 3, 5)
     np.savez(tmp_path / "a.npz", spk=np.asarray(spikes.numpy(), dtype=dtype, order=order))
     assert read_spikes(tmp_path / "a.npz").equal(spikes)
@@ -109,7 +109,7 @@ def test_array_dtypes_and_orders(tmp_path, dtype, order):
 
 
 @pytest.mark.parametrize("name", ["spk", "spikes", "anything"])
-def test_array_names(tmp_path, name):
+def test_array_is_found_by_its_name_or_shape(tmp_path, name):
     spikes = random_spikes(4, 3, 5)
     others = {"label": np.int64(3), "title": np.array("street"), "picture": np.zeros((3, 5))}
     others |= {} if name == "anything" else {"flow": np.zeros((2, 3, 5))}
@@ -133,7 +133,7 @@ def test_array_names(tmp_path, name):
         ({"spk": np.full((1, 2, 2), np.nan)}, "got values from nan to nan in frame 0"),
     ],
 )
-def test_wrong_arrays(tmp_path, arrays, message):
+def test_wrong_arrays_are_rejected(tmp_path, arrays, message):
     np.savez(tmp_path / "a.npz", **arrays)
     with pytest.raises(SpikeFileError, match=f"a.npz: .*{message}") as caught:
         read_spikes(tmp_path / "a.npz")
@@ -141,7 +141,7 @@ def test_wrong_arrays(tmp_path, arrays, message):
 
 
 @pytest.mark.parametrize("read", [read_spikes, iter_spikes, spikes_shape])
-def test_wrong_files_and_sizes(clip, read):
+def test_wrong_files_and_sizes_are_rejected(clip, read):
     """Errors that do not depend on the frames are raised at the call."""
     folder = clip.parent
     for name in ("empty.dat", "empty.npz"):
@@ -177,12 +177,12 @@ def test_wrong_files_and_sizes(clip, read):
         ({"frames": 6}, SpikeFileError, "got 6 from frame 0 on"),
     ],
 )
-def test_frames_out_of_range(clip, options, error, message):
+def test_frames_out_of_range_are_rejected(clip, options, error, message):
     with pytest.raises(error, match=message):
         iter_spikes(clip, **{"height": 3, "width": 5} | options)
 
 
-def test_file_truncated_while_it_is_read(clip):
+def test_a_file_truncated_while_it_is_read_is_reported(clip):
     frames = iter_spikes(clip, 3, 5)
     clip.write_bytes(b"")
     with pytest.raises(SpikeFileError, match=r"clip\.dat: truncated while it was read, at frame 0"):
@@ -213,7 +213,7 @@ def test_failed_write_keeps_the_old_file(tmp_path, name, spikes, error, message)
 
 
 @pytest.mark.skipif(not SPIKES.is_dir(), reason="the shared recordings are not beside the repository")
-def test_public_recordings(tmp_path):
+def test_public_recordings_are_read(tmp_path):
     file = SPIKES / "reds_sim_mono_203_250x400.dat"
     spikes = read_spikes(file, 250, 400, flip=True)
     assert spikes.shape == (301, 250, 400)

@@ -147,7 +147,7 @@ def test_pngs_of_every_mode(tmp_path, mode, color, expected):
 
 @pytest.mark.parametrize(("ending", "bits"), [("png", 8), ("bmp", 8), ("ppm", 8), ("png", 16), ("TIFF", 16)])
 @pytest.mark.parametrize("shape", [(3, 6, 9), (6, 9)])
-def test_write_and_read(tmp_path, ending, bits, shape):
+def test_written_pictures_are_read_back(tmp_path, ending, bits, shape):
     image = torch.randint(0, 1 << bits, shape) / (2**bits - 1)
     write_picture(tmp_path / "made" / "on the way" / f"a.{ending}", image, bits=bits)
     reads(tmp_path / "made" / "on the way" / f"a.{ending}", image.expand(3, 6, 9).numpy(), 1e-6)

@@ -155,7 +155,7 @@ def level_of(rgb):
         ("a.y4m", "wrapped_avframe", {}),
     ],
 )
-def test_a_video_file(tmp_path, name, codec, options):
+def test_frames_of_a_video_file_are_read(tmp_path, name, codec, options):
     """Frames do not depend on the order of reading, on slices, or on pickling."""
     frames = read_video(write_film(tmp_path / name, codec=codec, **options))
     assert (len(frames), frames.height, frames.width, frames.fps) == (12, *SIZE, 25)
@@ -239,7 +239,7 @@ def test_ten_bits_keep_their_depth(tmp_path):
     assert level_of(frames[11]) == pytest.approx(11, abs=0.1)
 
 
-def test_truncated_film(tmp_path):
+def test_a_truncated_film_is_reported(tmp_path):
     """Earlier frames stay readable; missing ones raise every time."""
     write_film(tmp_path / "a.avi", codec="ffv1")
     write_film(tmp_path / "a.mp4", bf="0")

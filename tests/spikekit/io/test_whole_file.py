@@ -60,7 +60,7 @@ def test_error_or_full_disk_keeps_the_old_file(tmp_path, monkeypatch, error):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-def test_two_killed_writers(tmp_path):
+def test_two_killed_writers_leave_a_complete_file(tmp_path):
     """Killed at random times: the file is always complete, and leftovers are removed."""
     target = tmp_path / "a.bin"
     chance = random.Random(24)
@@ -122,7 +122,7 @@ def test_modes_links_and_pipes(tmp_path):
     assert (tmp_path / "pipe").is_fifo()
 
 
-def test_unwritable_paths(tmp_path):
+def test_unwritable_paths_are_named(tmp_path):
     (tmp_path / "file").touch()
     for name in ("", "file/a"):
         with pytest.raises(OSError, match=str(tmp_path / name)), whole_file(tmp_path / name):
@@ -130,7 +130,7 @@ def test_unwritable_paths(tmp_path):
     assert files(tmp_path) == {"file": b""}
 
 
-def test_longest_possible_name(tmp_path):
+def test_the_longest_possible_name_is_written(tmp_path):
     for name in ("a" * 255, "ä" * 127):
         with whole_file(tmp_path / name) as file:
             file.write(b"1")

@@ -96,7 +96,7 @@ def test_operators_do_not_import_the_compiler():
 
 @pytest.mark.filterwarnings("ignore:invalid value")
 @pytest.mark.parametrize("dtype", FLOATS)
-def test_any_light(run, dtype):
+def test_sensor_equals_the_torch_path_for_any_light(run, dtype):
     """Three clocks of ordinary and extreme light in all combinations."""
     wide, inf = torch.promote_types(dtype, torch.float32), float("inf")
     theta = torch.tensor(0.3, dtype=wide)
@@ -123,7 +123,7 @@ def draw(size, dtype):
 
 
 @pytest.mark.parametrize("dtype", [torch.bool, torch.uint8, torch.int8, torch.int64, *FLOATS])
-def test_decoders(run, dtype):
+def test_decoders_equal_the_torch_path(run, dtype):
     for size in sizes(dtype):
         spikes = draw(size, dtype)
         check(run, "spike_interval", spikes)
@@ -134,7 +134,7 @@ def test_decoders(run, dtype):
 
 
 @pytest.mark.parametrize("dtype", FLOATS)
-def test_gradients(run, dtype):
+def test_gradients_equal_the_torch_path(run, dtype):
     """With multiples of 1/8, whose sums are exact."""
     for size in sizes(dtype):
         grad = (torch.randint(-16, 17, size) / 8).to(dtype)
@@ -142,7 +142,7 @@ def test_gradients(run, dtype):
             check(run, "tfp_grad", grad, window, 2.0, dtype, atol=64 * torch.finfo(dtype).eps)
 
 
-def test_nonbinary_spikes(run):
+def test_nonbinary_spikes_are_decoded_as_documented(run):
     """Any value but 0 is a spike for TFI; TFP sums the values."""
     for spikes in (torch.tensor([0.0, -0.0, 1e-45, float("nan"), -2.0, 0.0]), torch.tensor([0, 2**40, 0])):
         check(run, "spike_interval", spikes.reshape(-1, 1, 1))
@@ -152,7 +152,7 @@ def test_nonbinary_spikes(run):
     check(run, "tfp", torch.randn(30, 2, 3, dtype=torch.float64), 7, 2.0, torch.float64, atol=1e-13)
 
 
-def test_long_streams(run, monkeypatch):
+def test_long_streams_have_intervals_of_32_bits(run, monkeypatch):
     """From T = 32767 on intervals need 32 bits; the interpreter, at two milliseconds per frame, gets fewer frames."""
     for frames in (32766, 32767):
         dtype = torch.int16 if frames < 32767 else torch.int32
@@ -169,7 +169,7 @@ def test_long_streams(run, monkeypatch):
 
 
 @pytest.mark.parametrize(("name", "args"), ARGUMENTS.items())
-def test_layouts(run, name, args):
+def test_any_memory_layout_gives_the_same_result(run, name, args):
     """Any layout of the input; GPU results keep it."""
     x = torch.rand(2, 9, 5, 4)
     views = [x[:, :1].expand(2, 9, 5, 4), torch.rand(2, 9, 5, 8)[..., 1::2], x[0], x[:0]]

@@ -65,7 +65,7 @@ def known_pixels():
 
 @computes
 @pytest.mark.parametrize(("which", "dtype"), [*((w, FLOATS[0]) for w in known_pixels()), ("green", FLOATS[1])])
-def test_nearest_known(which, dtype):
+def test_nearest_pixels_equal_those_of_the_torch_path(which, dtype):
     """For zero, whole, half, arbitrary and very large flow."""
     mask, count = known_pixels()[which]
     unit = 64  # in these units all positions are whole numbers, so that ties are exact
@@ -97,7 +97,7 @@ def gathering(sizes, dtype, last=False):
 @computes
 @pytest.mark.parametrize(("sizes", "dtype"), [*((s, FLOATS[1]) for s in GATHERS), *((GATHERS[1], d) for d in FLOATS)])
 @pytest.mark.parametrize("last", [False, True])
-def test_weighted(sizes, dtype, last):
+def test_weighted_sums_equal_the_torch_path(sizes, dtype, last):
     values, grad, index, weight = gathering(sizes, dtype, last)
     for name, args in (
         ("gather", (values, index, weight)),
@@ -127,7 +127,7 @@ def test_atomic_sums_are_not_used_in_deterministic_mode():
 
 @computes
 @pytest.mark.parametrize(("scale", "channels", "size"), [(4, 2, (12, 13)), (1, 3, (13, 12))])
-def test_the_site_wise_search_and_its_derivative(scale, channels, size):
+def test_site_wise_search_and_its_derivative_equal_the_torch_path(scale, channels, size):
     table = site_search.site_table("RGGB", 1, scale, (size[0] % 2 == 1, size[1] % 2 == 1), torch.device("cpu"))
     shares = torch.tensor([[0.25, 0.0], [0.0, 1.0]])
     flow = torch.randn(1, 2, 2, *size) * 3
@@ -143,7 +143,7 @@ def test_the_site_wise_search_and_its_derivative(scale, channels, size):
 
 
 @computes
-def test_a_level_of_tvl1():
+def test_a_level_of_tvl1_equals_the_torch_path():
     """Compared with the torch path in float32, up to the order of sums."""
     clips, height, width = 2, 9, 13
     smooth = torch.nn.functional.avg_pool2d(torch.rand(clips, 3, height + 8, width + 8), 9, 1)
@@ -198,7 +198,7 @@ class Machine:
 
 @pytest.mark.slow
 @pytest.mark.skipif(INTERPRETED or torch.cuda.is_available(), reason="only where Triton has no GPU to compile for")
-def test_compiles(monkeypatch, tmp_path):
+def test_compiled_kernels_round_every_operation(monkeypatch, tmp_path):
     """No product is fused with a sum, and no quotient is approximate."""
     texts = []
 

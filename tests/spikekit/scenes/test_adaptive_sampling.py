@@ -152,6 +152,6 @@ def test_the_region_has_a_margin_and_whole_cells():
         (lambda: Plan(1, (1, 0, 4, 4)), "region: expected an even row and column"),
     ],
 )
-def test_errors(make, message):
+def test_invalid_arguments_are_rejected(make, message):
     with pytest.raises(ValueError, match=message):
         make()

@@ -82,7 +82,7 @@ def brute_rgb(scene, clock):
 
 
 @pytest.mark.parametrize("clock", [0, 7, 20, 33.5, 40])
-def test_against_loops(clock):
+def test_pictures_and_flow_equal_those_of_loops(clock):
     scene = busy_scene(12, 17)
     torch.testing.assert_close(scene.rgb(clock), brute_rgb(scene, clock), atol=1e-12, rtol=0)
 
@@ -171,6 +171,6 @@ PICTURE = torch.rand(3, 8, 8)
         (lambda: Scene([Layer(PICTURE)], 8, 8, 0), ValueError, "frames: expected at least 1"),
     ],
 )
-def test_errors(make, error, said):
+def test_invalid_arguments_are_rejected(make, error, said):
     with pytest.raises(error, match=said):
         make()

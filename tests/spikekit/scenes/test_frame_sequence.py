@@ -314,7 +314,7 @@ def film_of(frames=FRAMES, **settings):
         (lambda: film_of().clip(0), r"needs frames -1 to 1, got 0 to 2"),
     ],
 )
-def test_errors(make, message):
+def test_invalid_arguments_are_rejected(make, message):
     with pytest.raises(ValueError, match=message):
         make()
 

@@ -29,7 +29,7 @@ def loop(light, threshold, charge):
 @pytest.mark.parametrize("threshold", [0.3, 1, 7])
 @pytest.mark.parametrize("most", [0.2, 5])
 @pytest.mark.parametrize("lead", [(), (2, 1)])
-def test_against_a_loop(dtype, threshold, most, lead):
+def test_spikes_and_charge_equal_those_of_a_loop(dtype, threshold, most, lead):
     rng = np.random.default_rng(0)
     light = (rng.random((*lead, 17, 3, 2)) * most * threshold).astype(dtype)
     start = (rng.random((*lead, 3, 2)) * threshold * 0.99).astype(dtype)
@@ -70,7 +70,7 @@ def test_dtype_of_the_spikes(dtype):
     assert spikes.requires_grad == dtype.is_floating_point
 
 
-def test_second_gradient():
+def test_second_gradient_is_the_same_mask():
     """The gradient is linear in the incoming gradient, so its own gradient is the same mask."""
     light = (torch.rand(3, 2, 2, dtype=torch.float64) * 3 - 1).requires_grad_()
     weight = torch.randn(3, 2, 2, dtype=torch.float64, requires_grad=True)
@@ -117,7 +117,7 @@ def test_initial_charge_gets_no_gradient():
         (TypeError, (torch.ones(3, 2, 2), 1.0, None, torch.int16)),
     ],
 )
-def test_errors(error, arguments):
+def test_invalid_arguments_are_rejected(error, arguments):
     *positional, dtype = arguments if len(arguments) == 4 else (*arguments, None)
     with pytest.raises(error):
         spike_integrate_fire(*positional, dtype=dtype)

@@ -60,7 +60,7 @@ def results(values, grad, index, weight):
 @pytest.mark.parametrize("dtype", FLOATS)
 @pytest.mark.parametrize("last", [False, True])
 @pytest.mark.parametrize(("batch", "channels", "bags"), [(1, 1, 1), (3, 2, 4), (2, 20, 4), (0, 9, 4)])
-def test_against_loops(batch, channels, bags, last, dtype):
+def test_weighted_sums_equal_those_of_loops(batch, channels, bags, last, dtype):
     values, grad, index, weight = draw(batch, channels, bags, dtype, last)
     got = results(values, grad, index, weight)
     wide = torch.promote_types(dtype, torch.float32)

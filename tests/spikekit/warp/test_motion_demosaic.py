@@ -44,7 +44,7 @@ def correct(estimate, raw, flow, mask):
 
 
 @pytest.mark.parametrize("pattern", ["RGGB", "GRBG"])
-def test_against_loops(pattern):
+def test_pictures_equal_those_of_loops(pattern):
     generator = torch.Generator().manual_seed(0)
     raw = torch.rand(3, 6, 7, dtype=torch.float64, generator=generator)
     flow = 3 * torch.randn(3, 2, 6, 7, dtype=torch.float64, generator=generator)
@@ -93,7 +93,7 @@ def test_outliers_are_rejected():
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e4])
-def test_flow_out_of_the_sensor_or_not_finite(value):
+def test_pictures_are_finite_for_any_flow(value):
     raw = torch.rand(3, 6, 8, dtype=torch.float64)
     flow = torch.zeros(3, 2, 6, 8, dtype=torch.float64)
     flow[0] = value
@@ -112,6 +112,6 @@ def test_flow_out_of_the_sensor_or_not_finite(value):
         (torch.rand(3, 5, 5), torch.zeros(3, 2, 5, 5), {"pattern": "RGBG"}, "pattern: expected one of"),
     ],
 )
-def test_errors(raw, flow, options, message):
+def test_invalid_arguments_are_rejected(raw, flow, options, message):
     with pytest.raises(ValueError, match=f"^{message}"):
         demosaic_along_motion(raw, flow, **options)

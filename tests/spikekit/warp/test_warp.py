@@ -92,7 +92,7 @@ IMAGE, FLOW, MASK = torch.rand(2, 3, 4, 6), torch.rand(2, 2, 4, 6), torch.ones(4
         (ValueError, IMAGE, IMAGE),
     ],
 )
-def test_wrong_sizes(op, error, image, flow):
+def test_wrong_sizes_are_rejected(op, error, image, flow):
     with pytest.raises(error):
         op(image, flow)
 
@@ -104,7 +104,7 @@ def test_wrong_sizes(op, error, image, flow):
         *((MASK, neighbors, "neighbors") for neighbors in (0, 1.5)),
     ],
 )
-def test_wrong_masks_and_neighbors(mask, neighbors, name):
+def test_wrong_masks_and_neighbors_are_rejected(mask, neighbors, name):
     with pytest.raises(ValueError, match=name):
         flow_warp_idw(IMAGE, FLOW, mask, neighbors=neighbors)
 
