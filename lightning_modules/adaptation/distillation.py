@@ -1,4 +1,4 @@
-"""Examples from a recording: clips, and pictures of them by a slower network, the teacher."""
+"""Examples from a recording: clips, and pictures of them by a larger network, the teacher."""
 
 from __future__ import annotations
 

@@ -60,9 +60,9 @@ def reconstruct(
     """Reconstruct the pictures of a recording.
 
     Convention:
-        Without a ``network``, ``speed`` or ``budget`` chooses weights of the package whose clips fit the recording. If
-        the sensor has no calibration and the recording no simulator's side-car, the weights are those trained for
-        noisy sensors; ``calibration="none"`` declares the pixels ideal.
+        Without a ``network``, ``speed`` or ``budget`` chooses weights of the package whose clips fit the recording.
+        Unless the sensor was calibrated in the dark or the recording is simulated, its noise is measured; if it is
+        strong, the weights are those trained for noisy sensors. ``calibration="none"`` declares the pixels ideal.
 
         Films of ``"fast"`` and ``"balanced"`` run the network only where something moves, unless pictures are
         interpolated; ``psnr_tolerance=0`` runs it everywhere.

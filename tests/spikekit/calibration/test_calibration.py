@@ -63,7 +63,7 @@ def test_a_sensor_is_recovered_from_a_flat_and_a_dark_recording(truth):
     assert found.dark_error < 3e-4
 
 
-def test_one_recording_alone_gives_gains_or_dark_rates(truth):
+def test_one_recording_alone_gives_a_part_of_the_calibration(truth):
     noise = SensorNoise(calibration=truth)
     flat = calibrate(halves(SpikeSensor(noise).expose(torch.full((400, *SIZE), 0.3))), None, "BGGR")
     assert flat.dark_error is None

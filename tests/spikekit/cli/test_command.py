@@ -245,7 +245,7 @@ def test_wrong_files_give_one_line(clip, tmp_path, fails):
 
 
 @pytest.mark.parametrize("words", [["--help"], *([verb, "--help"] for verb in VERBS)])
-def test_help_names_every_option(words, capsys):
+def test_help_has_an_example_for_every_verb(words, capsys):
     command(*words)
     out = capsys.readouterr().out
     assert out.startswith("usage: spikekit")
