@@ -12,7 +12,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 
 import lightning_modules
-from lightning_modules.inference.presets import choose
+from lightning_modules.inference.presets import Conditions, choose
 
 with Path(lightning_modules.__file__).with_name("weights").joinpath("x4.csv").open(newline="") as file:
     rows = [row for row in csv.DictReader(file) if not row["failed"]]
@@ -37,10 +37,11 @@ ax.legend()
 # %%
 # The choice of every speed at 250 x 400 sensor pixels:
 
+conditions = Conditions(scale=4, size=(250, 400))
 for speed in ("fastest", "fast", "balanced", "best"):
-    print(f"{speed:9}{choose(4, speed, size=(250, 400))}")
+    print(f"{speed:9}{choose(conditions, speed)}")
 
 # %%
 # The best setting within 600 MB:
 
-print(choose(4, budget="600MB", size=(250, 400)))
+print(choose(conditions, budget="600MB"))

@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from itertools import product
+from math import prod
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -143,6 +144,32 @@ class Preset:
 
 
 @dataclass(frozen=True)
+class Conditions:
+    """What is to be reconstructed; the choice of a preset depends on it.
+
+    Args:
+        scale: super-resolution factor.
+        size: size of a frame, (H, W) in sensor pixels.
+        film: use the table of films (``lightning trade --film``), if the package has one for the scale.
+        frames: spike frames available for a clip; presets that need more are left out. From 101 on, presets with longer
+            clips take part.
+        white: white level in spikes per frame; below 0.2 the table of dim scenes (0.1) is used, if the package has
+            one for the scale. Longer clips gain more there.
+        noisy: of the networks keep only those with weights trained for noisy sensors, and use these weights; no effect
+            if the package has none for the scale.
+        grey: use the table of grey cameras, if the package has one for the scale.
+    """
+
+    scale: int
+    size: tuple[int, int] = (250, 400)
+    film: bool = False
+    frames: int = _FRAMES
+    white: float = 0.4
+    noisy: bool = False
+    grey: bool = False
+
+
+@dataclass(frozen=True)
 class Choice:
     """A measured preset and its expected cost.
 
@@ -171,15 +198,7 @@ class Choice:
         return f"{self.name}: {cost}, {self.below:.2f} dB below the best"
 
 
-def choices(
-    scale: int,
-    size: tuple[int, int],
-    film: bool = False,
-    frames: int = _FRAMES,
-    white: float = 0.4,
-    noisy: bool = False,
-    grey: bool = False,
-) -> list[Choice]:
+def choices(conditions: Conditions) -> list[Choice]:
     """Return the measured presets for a scale that keep the default precision, fastest first.
 
     The expected time grows with the number of pixels: the ratio in the table times the time of the table's reference
@@ -187,33 +206,22 @@ def choices(
     Beyond that, only the part that covers the whole frame grows: the picture and the estimate of motion. Presets
     without tiles are left out, as their memory has no bound.
 
-    Args:
-        scale: super-resolution factor.
-        size: size of a frame, (H, W) in sensor pixels.
-        film: use the table of films (``lightning trade --film``), if the package has one for the scale.
-        frames: spike frames available for a clip; presets that need more are left out.
-        white: white level in spikes per frame; below 0.2 the table of dim scenes (0.1) is used, if the package has
-            one for the scale. Longer clips gain more there.
-        noisy: of the networks keep only those with weights trained for noisy sensors, and use these weights; no effect
-            if the package has none for the scale.
-        grey: use the table of grey cameras, if the package has one for the scale.
-
     Raises:
         ValueError: the package has no table for this scale.
     """
-    rows = _table(scale, film, white, grey)
-    twins = for_noise(scale) if noisy else {}
+    rows = _table(conditions)
+    twins = for_noise(conditions.scale) if conditions.noisy else {}
     frame = min(float(row["mib"]) for row in rows)
     found = []
     for row in rows:
         preset = Preset.read(row)
         if preset.precision is not None or preset.tile == 0 or not (preset.weights or preset.network):
             continue
-        if preset.clip > frames or (twins and preset.weights not in {*twins, None}):
+        if preset.clip > conditions.frames or (twins and preset.weights not in {*twins, None}):
             continue
         preset = replace(preset, weights=twins.get(preset.weights, preset.weights))
         measured = int(row["height"]) * int(row["width"])
-        pixels = size[0] * size[1] / measured
+        pixels = prod(conditions.size) / measured
         model = find_model(preset.weights or "")
         margin = model.margin if model else CSCSR.halo
         in_tile = min(pixels, ((preset.tile or TILE) + 2 * (margin + FAR)) ** 2 / measured)
@@ -225,14 +233,15 @@ def choices(
         name = row["setting"].replace(row["weights"], preset.weights) if preset.weights else row["setting"]
         found.append(Choice(name, preset, psnr, 0.0, ms, mib))
     if not found:
-        raise ValueError(f"{_FOLDER / f'x{scale}.csv'}: expected presets with tiles, got none")
+        raise ValueError(f"{_FOLDER / f'x{conditions.scale}.csv'}: expected presets with tiles, got none")
     best = max(choice.psnr for choice in found)
     found = [replace(choice, below=best - choice.psnr) for choice in found]
     return sorted(found, key=lambda choice: choice.ms)
 
 
-def _table(scale: int, film: bool = False, white: float = 0.4, grey: bool = False) -> list[dict[str, str]]:
-    asked = ("_grey", grey), ("_dim", white < _LITTLE_LIGHT), ("_film", film)
+def _table(conditions: Conditions) -> list[dict[str, str]]:
+    scale, dim = conditions.scale, conditions.white < _LITTLE_LIGHT
+    asked = ("_grey", conditions.grey), ("_dim", dim), ("_film", conditions.film)
     kinds = product(*([name, ""] if holds else [""] for name, holds in asked))  # the best match first
     paths = (_FOLDER / f"x{scale}{''.join(kind)}.csv" for kind in kinds)
     path = next((path for path in paths if path.is_file()), None)
@@ -259,21 +268,15 @@ def _reference(rows: list[dict[str, str]]) -> dict[str, str]:
     return next(row for row in rows if row["setting"] == row["reference"])
 
 
-def pace(scale: int, film: bool = False, white: float = 0.4, grey: bool = False) -> float:
+def pace(conditions: Conditions) -> float:
     """Measure the time of a frame on this machine, relative to the table.
 
     Runs the reference preset on a quarter of the area of a clip.
 
-    Args:
-        scale: super-resolution factor.
-        film: use the table of films.
-        white: white level in spikes per frame, see :func:`choices`.
-        grey: use the table of grey cameras.
-
     Returns:
         1 on the reference machine, 2 on one that takes twice as long.
     """
-    row = _reference(_table(scale, film, white, grey))
+    row = _reference(_table(conditions))
     preset = Preset.read(row)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network = preset.build().to(device)
@@ -286,49 +289,33 @@ def pace(scale: int, film: bool = False, white: float = 0.4, grey: bool = False)
         return 4e3 * timer(lambda: predict(network, spikes, **options), 3) / float(row["ms"])
 
 
-def choose(
-    scale: int,
-    speed: str | None = None,
-    budget: str | None = None,
-    size: tuple[int, int] = (250, 400),
-    film: bool = False,
-    frames: int = _FRAMES,
-    white: float = 0.4,
-    noisy: bool = False,
-    grey: bool = False,
-) -> Choice:
+def choose(conditions: Conditions, speed: str | None = None, budget: str | None = None) -> Choice:
     """Choose the best preset for a speed or a budget.
 
     A time budget first measures this machine (:func:`pace`), which takes about a second.
 
     Args:
-        scale: super-resolution factor.
+        conditions: what is to be reconstructed; a budget depends on the size of its frames.
         speed: ``"best"``, ``"balanced"``, ``"fast"`` or ``"fastest"``: the fastest preset within the loss of
             :data:`SPEEDS`. Of presets that are about as fast, the one with the highest PSNR.
         budget: in place of ``speed``, the largest time or memory per frame, such as ``"40ms"``, ``"25fps"`` or
             ``"200MB"``. The preset with the highest PSNR that fits is chosen.
-        size: size of a frame, (H, W) in sensor pixels; a budget depends on it.
-        film: use the table of films, see :func:`choices`.
-        frames: spike frames available for a clip; from 101 on, presets with longer clips take part.
-        white: white level in spikes per frame, see :func:`choices`.
-        noisy: the sensor may be noisy, see :func:`choices`.
-        grey: the camera is grey, see :func:`choices`.
 
     Raises:
         ValueError: the speed is unknown, the budget cannot be read, no preset fits it, or the package has no table for
             the scale.
 
     Example:
-        >>> choose(4, "fastest").ms <= choose(4, "best").ms
+        >>> choose(Conditions(4), "fastest").ms <= choose(Conditions(4), "best").ms
         True
-        >>> choose(4, budget="1h")
+        >>> choose(Conditions(4), budget="1h")
         Traceback (most recent call last):
             ...
         ValueError: budget: expected a time or memory, such as 40ms, 2s, 25fps, 200MB or 1GiB, got '1h'
     """
     if (speed is None) == (budget is None):
         raise ValueError(f"speed, budget: expected one of them, got {speed!r} and {budget!r}")
-    found = choices(scale, size, film, frames, white, noisy, grey)
+    found = choices(conditions)
     if speed is not None:
         if speed not in SPEEDS:
             raise ValueError(f"speed: expected one of {', '.join(SPEEDS)}, got {speed!r}")
@@ -340,11 +327,12 @@ def choose(
     what, unit = _UNITS.get(read[2], ("ms", 1e3))
     limit = unit / float(read[1]) if read[2] == "fps" else unit * float(read[1])
     if what == "ms":
-        here = pace(scale, film, white, grey)
+        here = pace(conditions)
         where = f"on this machine, which takes {here:.2g} times as long as that of the table"
         found = [replace(choice, ms=here * choice.ms, where=where) for choice in found]
     fitting = [choice for choice in found if getattr(choice, what) <= limit]
     if not fitting:
         least = min(found, key=lambda choice: getattr(choice, what))
-        raise ValueError(f"budget: no preset fits {budget} at {size[0]} x {size[1]} sensor pixels; leanest: {least}")
+        size = " x ".join(map(str, conditions.size))
+        raise ValueError(f"budget: no preset fits {budget} at {size} sensor pixels; leanest: {least}")
     return max(fitting, key=lambda choice: choice.psnr)

@@ -17,7 +17,7 @@ from lightning_modules.inference.clips import FRAMES, NOISY, RecordingClips, fil
 from lightning_modules.inference.film import FilmFrame, FilmMaker
 from lightning_modules.inference.output import file_identity
 from lightning_modules.inference.predict import precision_of
-from lightning_modules.inference.presets import SPEEDS, Choice, Preset, choose
+from lightning_modules.inference.presets import SPEEDS, Choice, Conditions, Preset, choose
 from lightning_modules.networks import ClassicalDecoder, Network
 from lightning_modules.registry import find_model
 from spikekit import __version__
@@ -298,13 +298,13 @@ def _chosen(
     around = 2 * min(clips.chosen[0], recording.frames - 1 - clips.chosen[-1]) + 1
     room = max(FRAMES, recording.frames // _MANY if frame is None else around)
     noisy, grey = level > NOISY, recording.pattern == GREY
-    asked = {"scale": scale, "size": clips.size, "film": film, "white": white, "noisy": noisy, "grey": grey}
-    choice = choose(speed=speed, budget=budget, frames=room, **asked)
+    conditions = Conditions(scale, clips.size, film, room, white, noisy, grey)
+    choice = choose(conditions, speed, budget)
     interpolated = 0 if resting else _interpolated(choice.preset, every, speed)
     said = [str(choice)]
     if speed not in (None, "fastest"):
         sooner = list(SPEEDS)[list(SPEEDS).index(speed) - 1]
-        other = choose(speed=sooner, frames=room, **asked)
+        other = choose(conditions, sooner)
         said += [f"faster, --speed {sooner}: {other}"] if other != choice else []
     if interpolated:
         said.append(
@@ -312,7 +312,7 @@ def _chosen(
             "--interpolated 0 computes all with the network"
         )
     if speed:
-        said += _longer(choose(speed=speed, frames=recording.frames, **asked), choice, recording)
+        said += _longer(choose(replace(conditions, frames=recording.frames), speed), choice, recording)
     if noisy and choice.preset.weights:
         said.append(_unmeasured(choice.preset, recording, scale, level))
     return replace(choice.preset, interpolated=interpolated or None), said

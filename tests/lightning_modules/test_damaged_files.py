@@ -61,7 +61,7 @@ def _read_configuration(path):
 def _read_presets(path):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(presets, "_FOLDER", path.parent)
-        presets.choose(4, "balanced")
+        presets.choose(presets.Conditions(4), "balanced")
 
 
 def _read_clip(path):

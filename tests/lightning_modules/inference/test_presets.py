@@ -1,13 +1,14 @@
 """Choice of presets by speed and budget."""
 
 import csv
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 import torch
 
 from lightning_modules.inference import presets as speed
-from lightning_modules.inference.presets import SPEEDS, Preset, choices, choose, pace
+from lightning_modules.inference.presets import SPEEDS, Conditions, Preset, choices, choose, pace
 from lightning_modules.networks import CSCSR, RecurrentCSCSR
 from lightning_modules.registry import find_model
 from lightning_modules.storage.pretrained import settings_of
@@ -56,70 +57,74 @@ def _table(tmp_path, monkeypatch):
         ({"speed": "balanced"}, "no motion"),
         ({"speed": "fast"}, "tfp"),
         ({"speed": "fastest"}, "tfi"),
-        ({"budget": "400ms", "size": (40, 50)}, "all"),
+        ({"budget": "400ms"}, "all"),
         ({"budget": "399ms", "size": (20, 50)}, "all"),
         ({"budget": "399ms", "size": (80, 100)}, "tfp"),
-        ({"budget": "20MiB", "size": (40, 50)}, "small tiles"),
-        ({"budget": "20MB", "size": (40, 50)}, "tfp"),
-        ({"budget": "0.4s", "size": (40, 50)}, "all"),
-        ({"budget": "2.6 fps", "size": (40, 50)}, "no motion"),
+        ({"budget": "20MiB"}, "small tiles"),
+        ({"budget": "20MB"}, "tfp"),
+        ({"budget": "0.4s"}, "all"),
+        ({"budget": "2.6 fps"}, "no motion"),
     ],
 )
 def test_speeds_and_budgets_scale_with_the_frame(table, wish, expected):
-    assert choose(3, **wish).name == expected
+    size = wish.pop("size", (40, 50))
+    assert choose(Conditions(3, size), **wish).name == expected
 
 
 @pytest.mark.parametrize("kind", ["film", "grey"])
 def test_films_and_grey_cameras_have_their_own_tables(table, kind):
-    assert choose(3, "fastest", **{kind: True}) == choose(3, "fastest")  # as long as there is none
+    asked = Conditions(3, **{kind: True})
+    assert choose(asked, "fastest") == choose(Conditions(3), "fastest")  # as long as there is none
     lines = (table / "x3.csv").read_text().splitlines()
     (table / f"x3_{kind}.csv").write_text("\n".join(line for line in lines if not line.startswith("tfi")))
-    assert choose(3, "fastest", **{"film": True, kind: True}).name == "tfp 5"
-    assert choose(3, "fastest").name == "tfi"
+    assert choose(replace(asked, film=True), "fastest").name == "tfp 5"
+    assert choose(Conditions(3), "fastest").name == "tfi"
     with pytest.raises(ValueError, match=r"expected one that was measured \(x3\), got 4"):
-        choose(4, "fastest", **{kind: True})
+        choose(replace(asked, scale=4), "fastest")
 
 
 def test_same_network_for_films_and_single_clips():
     for scale in (2, 3, 4):
-        film, picture = (choose(scale, "balanced", film=film).preset for film in (True, False))
+        film, picture = (choose(Conditions(scale, film=film), "balanced").preset for film in (True, False))
         assert film.weights == picture.weights
         assert isinstance(film.build(), RecurrentCSCSR) == find_model(film.weights).film
 
 
 def test_dim_light_has_its_own_tables(table, monkeypatch):
     """The table of films comes first; without any for dim light, the one for bright light."""
-    assert choose(3, "best", white=0.1).name == choose(3, "best").name == "all"
+    assert choose(Conditions(3, white=0.1), "best").name == choose(Conditions(3), "best").name == "all"
     lines = (table / "x3.csv").read_text().splitlines()
     reference = next(line for line in lines if line.startswith("all,")).replace(",30.0,", ",20.0,")
     for name, best in (("x3_dim", "tfp"), ("x3_film", "tfi"), ("x3_dim_film", "no motion")):
         row = next(line for line in lines if line.startswith(f"{best},"))
         (table / f"{name}.csv").write_text("\n".join([lines[0], reference, row]))
     whites, films = (0.19, 0.2), (False, True)
-    found = [choose(3, "best", film=film, white=white).name for white in whites for film in films]
+    found = [choose(Conditions(3, film=film, white=white), "best").name for white in whites for film in films]
     assert found == ["tfp", "no motion", "all", "tfi"]
-    monkeypatch.setattr(speed, "pace", lambda *asked: asked[1] + asked[2])
-    assert choose(3, budget="2s", size=(40, 50), film=True, white=0.1).where.split(",")[1].split()[2] == "1.1"
+    monkeypatch.setattr(speed, "pace", lambda asked: asked.film + asked.white)
+    film = Conditions(3, (40, 50), film=True, white=0.1)
+    assert choose(film, budget="2s").where.split(",")[1].split()[2] == "1.1"
     (table / "x3_dim_film.csv").unlink()
-    assert choose(3, "best", film=True, white=0.1).name == "tfp"
+    assert choose(film, "best").name == "tfp"
 
 
 def test_longer_clips_are_chosen_in_dim_light():
     """At x4, which has weights for long clips, if the recording is long enough."""
     weights = "cscsr_huge_long_x4"
     for film in (False, True):
-        assert choose(4, "best", film=film, frames=101, white=0.07).preset.weights == weights
-        assert choose(4, "best", film=film, frames=100, white=0.07).preset.clip == 41
-        assert choose(4, "best", film=film, frames=101, white=0.4).preset.weights != weights
+        dim = Conditions(4, film=film, frames=101, white=0.07)
+        assert choose(dim, "best").preset.weights == weights
+        assert choose(replace(dim, frames=100), "best").preset.clip == 41
+        assert choose(replace(dim, white=0.4), "best").preset.weights != weights
         # hardly slower than the other decoders, and 4 dB better
-        assert choose(4, "fastest", film=film, frames=101, white=0.07).name == "TFP 33, order 3"
+        assert choose(dim, "fastest").name == "TFP 33, order 3"
 
 
 def test_time_budget_is_for_this_machine(table, monkeypatch):
     monkeypatch.setattr(speed, "pace", lambda *_: 2.0)
-    choice = choose(3, budget="400ms", size=(40, 50))
+    choice = choose(Conditions(3, (40, 50)), budget="400ms")
     assert (choice.name, choice.ms) == ("no motion", 2 * 200)
-    assert choose(3, budget="1GB", size=(40, 50)).ms == 400  # memory is the same here
+    assert choose(Conditions(3, (40, 50)), budget="1GB").ms == 400  # memory is the same here
 
 
 @pytest.mark.usefixtures("table")
@@ -131,7 +136,7 @@ def test_pace_is_measured_on_the_reference(monkeypatch):
         return 1.0
 
     monkeypatch.setattr(speed, "timer_of", lambda device, threads: (timer, "a second whatever it does"))
-    assert pace(3) == 4 * 1000 / 400
+    assert pace(Conditions(3)) == 4 * 1000 / 400
 
 
 @pytest.mark.parametrize(
@@ -147,7 +152,7 @@ def test_pace_is_measured_on_the_reference(monkeypatch):
 )
 def test_invalid_speeds_and_budgets_are_rejected(table, arguments, message):
     with pytest.raises(ValueError, match=message):
-        choose(**{"scale": 3, **arguments})
+        choose(Conditions(arguments.pop("scale", 3)), **arguments)
 
 
 def test_presets_survive_writing_and_reading():
@@ -169,24 +174,26 @@ def test_invalid_presets_are_rejected():
 
 def test_tables_of_the_package_are_valid():
     for scale, grey in ((1, True), (1, False), (2, False), (3, False), (4, False)):
-        picked = list(dict.fromkeys(choose(scale, name, frames=101, grey=grey) for name in SPEEDS))
+        conditions = Conditions(scale, frames=101, grey=grey)
+        picked = list(dict.fromkeys(choose(conditions, name) for name in SPEEDS))
         assert len(picked) == (3 if (scale, grey) == (1, False) else 4)  # one network for colour at x1
         assert all(faster.ms < 0.9 * slower.ms for faster, slower in pairwise(picked))  # every speed is worth its name
         assert picked[-2].preset.self_ensemble is None  # several views are for the best alone
-        reference = speed._reference(speed._table(scale, grey=grey))
+        reference = speed._reference(speed._table(conditions))
         assert (reference["ratio"], Preset.read(reference)) == ("1", Preset(reference["setting"]))
-        for choice in choices(scale, (250, 400), grey=grey):
+        for choice in choices(conditions):
             assert (find_model(choice.preset.weights).scale if choice.preset.weights else choice.preset.scale) == scale
 
 
 def test_noisy_sensors_get_weights_for_noise_at_the_same_cost():
     for film in (False, True):
         for white in (0.4, 0.1):
-            noisy = choices(4, (250, 400), film, 101, white, noisy=True)
-            ideal = {choice.name: choice for choice in choices(4, (250, 400), film, 101, white)}
+            conditions = Conditions(4, film=film, frames=101, white=white)
+            noisy = choices(replace(conditions, noisy=True))
+            ideal = {choice.name: choice for choice in choices(conditions)}
             assert noisy[0].preset.network == "ClassicalDecoder"  # nothing to train
             for choice in noisy:
                 assert choice.preset.weights is None or find_model(choice.preset.weights).noise
                 assert any(choice.ms == other.ms and choice.psnr == other.psnr for other in ideal.values())
             assert min(choice.below for choice in noisy) == 0
-    assert choices(2, (250, 400), noisy=True) == choices(2, (250, 400))  # there are no such weights
+    assert choices(Conditions(2, noisy=True)) == choices(Conditions(2))  # there are no such weights

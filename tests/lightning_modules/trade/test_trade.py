@@ -258,7 +258,7 @@ def test_presets_read_the_written_table(tmp_path, monkeypatch):
     rows[0].reason = "no such file"
     write_csv(rows, Timed(1, (8, 8), 2, "wall time"), tmp_path / "x4.csv")
     monkeypatch.setattr(presets, "_FOLDER", tmp_path)
-    [choice] = presets.choices(4, (8, 8))
+    [choice] = presets.choices(presets.Conditions(4, (8, 8)))
     assert (choice.name, choice.preset, choice.ms) == ("tfi", Preset(network="ClassicalDecoder", method="tfi"), 2000.0)
 
 
