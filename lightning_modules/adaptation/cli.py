@@ -61,7 +61,9 @@ def adapt(args: Sequence[str]) -> None:
     with input_errors():
         check_folder(asked.output)
         check_place(written)
-        student = _student(weights).to(device)
+        student = Network.from_pretrained(weights).to(device)
+        if student.settings.get("motion_fusion", "joint") != "joint":
+            raise UsageError(f"--weights: expected a network with one flow for all colours, got {weights}")
         recording = recordings.opened(asked)
         level = 0.0 if asked.calibration == "none" else RecordingClips(recording).noise_level
         clips, name, teacher = clips_and_teacher(recording, student, asked.teacher, level > NOISY)
@@ -77,13 +79,6 @@ def adapt(args: Sequence[str]) -> None:
             tensors = student.cpu().state_dict()
             write_weights(Weights(written, settings_of(student), motion_of(student), tensors), written)
     print(f"{said}\n{written}: in {duration(perf_counter() - begin)}; for lightning predict --weights {written}")
-
-
-def _student(weights: str) -> Network:
-    student = Network.from_pretrained(weights)
-    if student.settings.get("motion_fusion", "joint") != "joint":
-        raise UsageError(f"--weights: expected a network with one flow for all colours, got {weights}")
-    return student.eval()
 
 
 def clips_and_teacher(

@@ -52,10 +52,6 @@ def likeness(network: Network, examples: DistillationSet) -> float:
     return torch.stack(values).mean().item()
 
 
-def _rate(step: int, steps: int) -> float:
-    return _RATE * min(1, (step + 1) / _RISING) * (1 - step / (steps + 1))
-
-
 def fine_tune(
     student: Network, examples: DistillationSet, steps: int, precision: str = "32-true"
 ) -> tuple[float, float]:
@@ -79,7 +75,7 @@ def fine_tune(
     for step in progress(range(steps), "steps", steps):
         batch = [patch_of(taught, student.pattern, student.scale, _BATCH * step + n) for n in range(_BATCH)]
         clips, truth, flow = (_stacked(batch, name, device) for name in ("spikes", "rgb", "flow"))
-        optimizer.param_groups[0]["lr"] = _rate(step, steps)
+        optimizer.param_groups[0]["lr"] = _RATE * min(1, (step + 1) / _RISING) * (1 - step / (steps + 1))
         optimizer.zero_grad()
         with mixed:
             loss = F.l1_loss(student(clips, flow), truth)

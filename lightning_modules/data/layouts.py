@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from lightning_modules.data.pictures import existing_folder
-from spikekit.io.video import PICTURE_ENDINGS
+from spikekit.io.video import PICTURE_ENDINGS, natural_order
 
 #: description of the layouts, for messages
 EXPECTED = """\
@@ -88,12 +87,6 @@ def find_sequences(root: str | Path, hold_out: Callable[[list], tuple[list, list
     return found
 
 
-def natural(name: str) -> list[tuple[bool, int, str]]:
-    """Return a sort key that puts ``f2`` before ``f10``."""
-    parts = re.findall(r"[0-9]+|[^0-9]+", name)
-    return [(part.isdecimal(), int(part) if part.isdecimal() else 0, part) for part in parts]
-
-
 def _reds(root: Path) -> Collection | None:
     train, val = (
         _films(folder for pattern in _REDS for folder in sorted(root.glob(pattern.format(split))))
@@ -165,10 +158,10 @@ def _films(folders: Iterable[Path], only: str | None = None) -> tuple[SequenceFi
     films: dict[str, SequenceFiles] = {}
     for folder in folders:
         for name in [only] if only else _subfolders(folder):
-            frames = tuple(sorted(_pictures(folder / name), key=natural))
+            frames = tuple(sorted(_pictures(folder / name), key=natural_order))
             if frames:
                 films.setdefault(name, SequenceFiles(name, folder / name, frames))
-    return tuple(films[name] for name in sorted(films, key=natural))
+    return tuple(films[name] for name in sorted(films, key=natural_order))
 
 
 def _subfolders(folder: Path) -> list[str]:

@@ -148,10 +148,11 @@ def start_worker(_: int) -> None:
 
 def end_when_orphaned() -> None:
     """End this process soon after its parent, even if the parent is killed."""
-    threading.Thread(target=_end_without, args=(os.getppid(),), daemon=True).start()
+    parent = os.getppid()
 
+    def wait() -> None:
+        while os.getppid() == parent:
+            time.sleep(_A_MOMENT)
+        os._exit(1)
 
-def _end_without(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(_A_MOMENT)
-    os._exit(1)
+    threading.Thread(target=wait, daemon=True).start()

@@ -117,9 +117,9 @@ class ClipRecipe:
             ValueError: the frames are too small for the sensor, or the ground truth has the wrong size.
         """
         clip, paths = self.view(sequence, middle), self.files(sequence, middle)
-        spikes = torch.cat(
-            list(clip.sequence.spikes(clip.first, clip.frames, noise=self.noise, seed=self._chance(paths)))
-        )
+        # the seed of the sensor depends on the content of the frames, not on their paths
+        chance = int(clip_key(seed=self.seed, files=[file_digest(path) for path in paths])[:15], 16)
+        spikes = torch.cat(list(clip.sequence.spikes(clip.first, clip.frames, noise=self.noise, seed=chance)))
         if self.key_frames > 1:
             around = range(-(self.key_frames // 2), self.key_frames // 2 + 1)
             rgb = torch.stack([clip.rgb(clip.middle + n * self.clocks) for n in around])
@@ -154,10 +154,6 @@ class ClipRecipe:
             if not isinstance(self.interpolation, FlowInterpolation):
                 raise
             return torch.zeros(2, clip.height // clip.sequence.scale, clip.width // clip.sequence.scale)  # across a cut
-
-    def _chance(self, paths: list[Path]) -> int:
-        """Return a seed for the sensor that depends on the content of the frames, not on their paths."""
-        return int(clip_key(seed=self.seed, files=[file_digest(path) for path in paths])[:15], 16)
 
 
 def _shrunk(rgb: Tensor, factor: int) -> Tensor:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from inspect import signature
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -97,22 +97,16 @@ def tiled(
     planes = None
     rows, columns = (2 * -(-length // -(-length // tile) // 2) for length in (height, width))
     corners = [(top, left) for top in range(0, height, rows) for left in range(0, width, columns)]
-    for top, left in _told(corners, done):
+    for count, (top, left) in enumerate(corners, 1):
         box = Box(top, left, top + rows, left + columns).grown(0, whole)
         outer = box.grown(around(box), whole)
         part = run(outer)
         if planes is None:
             planes = part.new_empty(*part.shape[:-2], scale * height, scale * width)
         box.of(planes, scale=scale).copy_(box.of(part, outer[:2], scale))
-    return planes
-
-
-def _told(tiles: Iterable[Any], done: Callable[[float], object] | None) -> Iterator[Any]:
-    tiles = list(tiles)
-    for count, tile in enumerate(tiles, 1):
-        yield tile
         if done is not None:
-            done(count / len(tiles))
+            done(count / len(corners))
+    return planes
 
 
 class Box(NamedTuple):

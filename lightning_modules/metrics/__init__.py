@@ -1,1 +1,1 @@
-"""Metrics for pictures, films and optical flow."""
+"""Metrics for pictures and films."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from spikekit import flow_warp
+from spikekit.flow.fields import ends_inside
 
 
 def film_flicker(rgb: Tensor, then: Tensor, truth: Tensor, truth_then: Tensor, flow: Tensor) -> Tensor:
@@ -27,6 +27,7 @@ def film_flicker(rgb: Tensor, then: Tensor, truth: Tensor, truth_then: Tensor, f
         Root mean square in steps of 8 bits, :math:`(B)`; lower is better. NaN if all flow ends outside the picture.
 
     Example:
+        >>> import torch
         >>> truth, flow = torch.rand(1, 3, 8, 8), torch.zeros(1, 2, 8, 8)
         >>> film_flicker(truth + 0.1, truth + 0.1, truth, truth, flow).round(decimals=3).item()
         0.0
@@ -36,9 +37,6 @@ def film_flicker(rgb: Tensor, then: Tensor, truth: Tensor, truth_then: Tensor, f
     Reference:
         Lai et al., Learning Blind Video Temporal Consistency, ECCV 2018.
     """
-    height, width = flow.shape[-2:]
-    axes = (torch.arange(length, dtype=flow.dtype, device=flow.device) for length in (width, height))
-    ends = flow + torch.stack(torch.meshgrid(*axes, indexing="xy"))
-    inside = ((ends >= 0) & (ends <= ends.new_tensor([width - 1, height - 1])[:, None, None])).all(dim=1)
+    inside = ends_inside(flow)
     error = (flow_warp(then - truth_then, flow) - (rgb - truth)).square().mean(dim=1)
     return 255 * ((error * inside).sum(dim=(1, 2)) / inside.sum(dim=(1, 2))).sqrt()

@@ -4,16 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-
-def _widths(width: int, representation_width: int, **depths: int) -> dict[str, int]:
-    return {"width": width, "representation_width": representation_width, **depths}
-
-
 #: as in the paper: refinement and reconstruction at the resolution of the picture
 _FULL = {"resolution": "output", "blocks": 1}
 #: at sensor resolution, with the temporal pixels of each sensor pixel as channels: a fraction of the work
 _SENSOR = {"resolution": "sensor", "blocks": 1}
-_CLIP = {**_SENSOR, "width": 32, "representation_width": 16, "features": 2, "stages": 3}
+_CLIP = dict(_SENSOR, width=32, representation_width=16, features=2, stages=3)
 
 #: fields of :class:`lightning_modules.networks.CSCSRConfig` by size. Parameters, and million multiplications per sensor
 #: pixel, at x4: tiny 0.30 M and 0.36, small 1.08 M and 1.48, base 1.32 M and 1.72, large 2.26 M and 2.66, huge 3.78 M
@@ -21,16 +16,16 @@ _CLIP = {**_SENSOR, "width": 32, "representation_width": 16, "features": 2, "sta
 #: sensor: small_x1 0.53 M and 0.67, large_x1 1.72 M and 2.02. Sizes for x1 have more features, as there is one temporal
 #: pixel per sensor pixel
 SIZES: dict[str, dict[str, Any]] = {
-    "tiny": {**_SENSOR, "stride": 6, **_widths(24, 8, features=1, stages=2, end_blocks=1)},
-    "small": {**_CLIP, "end_blocks": 3},
-    "base": {**_CLIP, "end_blocks": 16},
-    "large": {**_CLIP, "end_blocks": 16, "end_width": 64},
-    "huge": {**_CLIP, "end_blocks": 16, "end_width": 96},
-    "small_x1": {**_SENSOR, **_widths(32, 16, features=6, stages=1, end_blocks=10), "end_width": 48},
-    "large_x1": {**_SENSOR, **_widths(48, 24, features=8, stages=1, end_blocks=20), "end_width": 64},
-    "full_small": {**_FULL, **_widths(16, 16, features=2, stages=2, end_blocks=2)},
-    "full_base": {**_FULL, **_widths(32, 32, features=4, stages=3, end_blocks=3)},
-    "full_large": {**_FULL, **_widths(64, 32, features=8, stages=3, end_blocks=4), "blocks": 2},
+    "tiny": dict(_SENSOR, stride=6, width=24, representation_width=8, features=1, stages=2, end_blocks=1),
+    "small": dict(_CLIP, end_blocks=3),
+    "base": dict(_CLIP, end_blocks=16),
+    "large": dict(_CLIP, end_blocks=16, end_width=64),
+    "huge": dict(_CLIP, end_blocks=16, end_width=96),
+    "small_x1": dict(_SENSOR, width=32, representation_width=16, features=6, stages=1, end_blocks=10, end_width=48),
+    "large_x1": dict(_SENSOR, width=48, representation_width=24, features=8, stages=1, end_blocks=20, end_width=64),
+    "full_small": dict(_FULL, width=16, representation_width=16, features=2, stages=2, end_blocks=2),
+    "full_base": dict(_FULL, width=32, representation_width=32, features=4, stages=3, end_blocks=3),
+    "full_large": dict(_FULL, width=64, representation_width=32, features=8, stages=3, end_blocks=4, blocks=2),
 }
 
 

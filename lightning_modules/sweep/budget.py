@@ -35,7 +35,7 @@ def with_budget(config: dict[str, Any], budget: dict[str, float]) -> dict[str, A
         return config
     config = deepcopy(config)
     steps, time = budget.get("steps"), budget.get("seconds")
-    config["trainer"] |= {"max_epochs": -1, "max_steps": steps or -1, "max_time": time and _duration(time)}
+    config["trainer"] |= {"max_epochs": -1, "max_steps": steps or -1, "max_time": time and {"seconds": time}}
     for name in _ends(config):
         if steps:
             config["model"]["init_args"]["lr_scheduler"]["init_args"][name] = steps
@@ -43,11 +43,6 @@ def with_budget(config: dict[str, Any], budget: dict[str, float]) -> dict[str, A
             config["model"]["init_args"]["lr_scheduler"] = _CONSTANT
             config["trainer"]["callbacks"] = [*(config["trainer"]["callbacks"] or []), _PACE]
     return config
-
-
-def _duration(time: float) -> str:
-    hours, time = divmod(round(time), 3600)
-    return f"{hours // 24:02}:{hours % 24:02}:{time // 60:02}:{time % 60:02}"
 
 
 def _ends(config: dict[str, Any]) -> list[str]:

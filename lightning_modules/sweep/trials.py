@@ -100,7 +100,8 @@ def make_trials(
         config = _resolve(args, f"{'-'.join(labels)}: ") if combination else base
         for seed in seeds or [None]:
             name = "-".join(labels) + ("" if seed is None else f"-seed{seed}")
-            folder = output / _folder_name(name)
+            # a valid name: file systems allow 255 bytes; the end of a long one, with its seed, is kept
+            folder = output / re.sub(r"[^\w.=+-]+", "_", name, flags=re.ASCII)[-_LONGEST:]
             own = {} if seed is None else {"seed_everything": seed}
             resolved = with_budget({**config, **own, "output": str(folder)}, budget)
             trials.append(Trial(labels, seed, folder, resolved, budget))
@@ -110,11 +111,6 @@ def make_trials(
         raise UsageError(f"two trials have the name {twice.name}: give overlays and values different names")
     _check_differences(trials)
     return trials
-
-
-def _folder_name(name: str) -> str:
-    """Return a valid name of a folder; file systems allow 255 bytes. The end of a long name, with its seed, is kept."""
-    return re.sub(r"[^\w.=+-]+", "_", name, flags=re.ASCII)[-_LONGEST:]
 
 
 def _check_differences(trials: Sequence[Trial]) -> None:

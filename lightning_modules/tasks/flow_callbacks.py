@@ -27,8 +27,8 @@ class FlowReport(TestReport):
     """Print the table of a test, with all estimators on the same clips, and write ``test.csv`` and ``test.png``.
 
     The columns are the end-point error in sensor pixels, the share of pixels with an error above one sensor pixel,
-    KITTI's outliers (:func:`lightning_modules.metrics.flow.outliers`), all over both flows of a clip, and the time of a
-    batch divided by its clips.
+    KITTI's outliers (errors above three pixels and 5 % of the true flow), all over both flows of a clip, and the time
+    of a batch divided by its clips.
     """
 
     def columns(self) -> list[tuple[str, str, int]]:  # noqa: D102

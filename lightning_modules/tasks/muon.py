@@ -13,6 +13,8 @@ from torch import Tensor
 _QUINTIC = 3.4445, -4.7750, 2.0315
 _REPEATS = 5
 
+_MOMENTUM, _BETAS, _EPS = 0.95, (0.9, 0.99), 1e-8
+
 
 def orthogonalized(matrix: Tensor) -> Tensor:
     r"""Bring all singular values of a matrix close to 1, between 0.6 and 1.3, by Newton-Schulz iterations.
@@ -48,13 +50,10 @@ class MuonWithAdam(torch.optim.Optimizer):
 
     Args:
         params: parameters or parameter groups.
-        lr: learning rate.
-        momentum: momentum of Muon.
-        betas: decay rates of mean and mean square of Adam.
-        eps: term of Adam that is added to the root of the mean square.
+        lr: learning rate. The momentum of Muon is 0.95; the betas of Adam are 0.9 and 0.99, its eps is 1e-8.
 
     Raises:
-        ValueError: an argument is out of range.
+        ValueError: the learning rate is out of range.
 
     Example:
         >>> layer = torch.nn.Conv2d(8, 8, 3)
@@ -67,23 +66,10 @@ class MuonWithAdam(torch.optim.Optimizer):
         LLM Training, 2025, for the size of the step; Kingma and Ba, Adam, ICLR 2015.
     """
 
-    def __init__(
-        self,
-        params: Iterable[Tensor] | Iterable[dict[str, Any]],
-        lr: float = 1e-3,
-        momentum: float = 0.95,
-        betas: tuple[float, float] = (0.9, 0.99),
-        eps: float = 1e-8,
-    ) -> None:
+    def __init__(self, params: Iterable[Tensor] | Iterable[dict[str, Any]], lr: float = 1e-3) -> None:
         if not 0 <= lr < math.inf:
             raise ValueError(f"lr: expected 0 or more, got {lr}")
-        if not 0 <= momentum < 1:
-            raise ValueError(f"momentum: expected 0 or more and below 1, got {momentum}")
-        if not all(0 <= beta < 1 for beta in betas):
-            raise ValueError(f"betas: expected 0 or more and below 1, got {betas}")
-        if not eps > 0:
-            raise ValueError(f"eps: expected more than 0, got {eps}")
-        super().__init__(params, {"lr": lr, "momentum": momentum, "betas": tuple(betas), "eps": eps})
+        super().__init__(params, {"lr": lr})
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:
@@ -112,26 +98,26 @@ class MuonWithAdam(torch.optim.Optimizer):
                     others.append(parameter)
             # on a GPU, one operation on all parameters is faster than one for each
             for parameters in alike.values():
-                torch._foreach_add_(parameters, self._muon(parameters, group), alpha=-group["lr"])
+                torch._foreach_add_(parameters, self._muon(parameters), alpha=-group["lr"])
             if others:
-                torch._foreach_add_(others, self._adam(others, group), alpha=-group["lr"])
+                torch._foreach_add_(others, self._adam(others), alpha=-group["lr"])
         return loss
 
-    def _muon(self, parameters: list[Tensor], group: dict[str, Any]) -> list[Tensor]:
+    def _muon(self, parameters: list[Tensor]) -> list[Tensor]:
         """Return the steps for weights whose matrices have the same size."""
         for parameter in parameters:
             if not self.state[parameter]:
                 self.state[parameter]["momentum"] = torch.zeros_like(parameter)
         momenta = [self.state[parameter]["momentum"] for parameter in parameters]
         gradients = [parameter.grad for parameter in parameters]
-        torch._foreach_lerp_(momenta, gradients, 1 - group["momentum"])
-        ahead = torch._foreach_lerp(gradients, momenta, group["momentum"])  # Nesterov momentum
+        torch._foreach_lerp_(momenta, gradients, 1 - _MOMENTUM)
+        ahead = torch._foreach_lerp(gradients, momenta, _MOMENTUM)  # Nesterov momentum
         matrices = torch.stack([one.flatten(1) for one in ahead])
         changes = 0.2 * math.sqrt(max(matrices.shape[1:])) * orthogonalized(matrices)
         return [change.reshape(parameter.shape) for change, parameter in zip(changes, parameters, strict=True)]
 
-    def _adam(self, parameters: list[Tensor], group: dict[str, Any]) -> list[Tensor]:
-        first, second = group["betas"]
+    def _adam(self, parameters: list[Tensor]) -> list[Tensor]:
+        first, second = _BETAS
         states = [self.state[parameter] for parameter in parameters]
         for state, parameter in zip(states, parameters, strict=True):
             if not state:
@@ -143,4 +129,4 @@ class MuonWithAdam(torch.optim.Optimizer):
         torch._foreach_lerp_(squares, torch._foreach_mul(gradients, gradients), 1 - second)
         mean = torch._foreach_div(means, [1 - first ** state["steps"] for state in states])
         root = torch._foreach_sqrt(torch._foreach_div(squares, [1 - second ** state["steps"] for state in states]))
-        return torch._foreach_div(mean, torch._foreach_add(root, group["eps"]))
+        return torch._foreach_div(mean, torch._foreach_add(root, _EPS))

@@ -10,7 +10,6 @@ import torch
 from pytorch_lightning.cli import LRSchedulerCallable, OptimizerCallable
 from torch import Tensor, nn
 
-from lightning_modules.metrics.flow import end_point_error, outliers
 from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
 from lightning_modules.tasks.base import BaseTask, step_schedule
 from lightning_modules.tasks.flow_callbacks import FlowPictures, FlowReport
@@ -102,7 +101,11 @@ class FlowTraining(BaseTask):
 
 
 def _scores(flow: Tensor, truth: Tensor) -> dict[str, Tensor]:
-    """Return end-point error and fractions of wrong pixels for every clip."""
-    error = end_point_error(flow, truth)
-    measures = {"epe": error, "over_1px": (error > 1).float(), "outliers": outliers(error, truth).float()}
-    return {name: values.flatten(1).mean(dim=1) for name, values in measures.items()}
+    """Return the end-point error (Baker et al., IJCV 2011) and fractions of wrong pixels for every clip.
+
+    Outliers are those of KITTI (Menze and Geiger, CVPR 2015): errors above three pixels and 5 % of the true flow.
+    """
+    error = (flow - truth).norm(dim=2)
+    outliers = (error > 3) & (error > 0.05 * truth.norm(dim=2))
+    measures = {"epe": error, "over_1px": error > 1, "outliers": outliers}
+    return {name: values.float().flatten(1).mean(dim=1) for name, values in measures.items()}

@@ -102,16 +102,12 @@ def time_in_turns(rows: Sequence[Measurement], clips: Sequence[Tensor], rounds: 
 
     Other load on the machine and differences between clips then affect all rows alike, and no row is always first.
     """
-    turns = [(turn, row) for turn in range(rounds) for row in _from(rows, turn)]
+    firsts = [turn % max(1, len(rows)) for turn in range(rounds)]
+    turns = [(turn, row) for turn, first in enumerate(firsts) for row in [*rows[first:], *rows[:first]]]
     for turn, row in progress(turns, "timings"):
         spikes = clips[turn % len(clips)].to(row.runner.device)
         timer, _ = _timer(row)
         row.seconds.append(timer(lambda row=row, spikes=spikes: row.runner(spikes), 1))
-
-
-def _from(rows: Sequence[Measurement], turn: int) -> list[Measurement]:
-    first = turn % max(1, len(rows))
-    return [*rows[first:], *rows[:first]]
 
 
 def _timer(row: Measurement) -> tuple[Timer, str]:

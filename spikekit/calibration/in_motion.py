@@ -15,6 +15,7 @@ from spikekit.calibration.calibration import Calibration, colors
 from spikekit.calibration.measure import Measured
 from spikekit.color.cfa import bayer_mask
 from spikekit.color.demosaic import demosaic
+from spikekit.flow.fields import ends_inside
 from spikekit.flow.tvl1 import tvl1_flow
 from spikekit.progress import progress
 from spikekit.sensor.noise import WORKS
@@ -117,6 +118,9 @@ def _expected(segments: Segments, known: Calibration, pattern: str | None) -> It
     def light(number: int) -> Tensor:
         return known.correct(segments.counts[number] / segments.frames, pattern)
 
+    def picture(number: int) -> Tensor:
+        return light(number)[None] if pattern is None else demosaic(light(number), pattern)
+
     place = _places(light, count, pattern is not None)
     passed = torch.stack([part.mean(0) for part in place.tensor_split(4)])
     enough = (passed.amax(0) - passed.amin(0)).norm(dim=0) * 4 / 3 >= _PATH
@@ -125,10 +129,10 @@ def _expected(segments: Segments, known: Calibration, pattern: str | None) -> It
     for number in progress(range(count), "gains"):
         rate, (total, sources) = segments.counts[number] / segments.frames, torch.zeros(2, *size)
         near = range(max(number - _SOURCES, 0), min(number + _SOURCES + 1, count))
-        pictures = {n: pictures[n] if n in pictures else _colored(light(n), pattern) for n in near}
+        pictures = {n: pictures[n] if n in pictures else picture(n) for n in near}
         for n in near:
             flow = place[n] - place[number]
-            use = enough & (flow.norm(dim=0) <= _FAR) & _inside(flow)
+            use = enough & (flow.norm(dim=0) <= _FAR) & ends_inside(flow)
             if use.any():
                 seen = flow_warp(pictures[n], flow)
                 seen = use * (seen[0] if mask is None else (seen * mask).sum(0))
@@ -156,16 +160,6 @@ def _places(light: Callable[[int], Tensor], count: int, color: bool) -> Tensor:
             place[number] = place[number - 1] + (before + velocity) / 2
         before = velocity
     return place
-
-
-def _colored(light: Tensor, pattern: str | None) -> Tensor:
-    return light[None] if pattern is None else demosaic(light, pattern)
-
-
-def _inside(flow: Tensor) -> Tensor:
-    height, width = flow.shape[-2:]
-    x, y = flow[0] + torch.arange(width), flow[1] + torch.arange(height)[:, None]
-    return (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
 
 
 def _most_likely(halves: Tensor, works: Tensor, planes: list[Tensor], known: Calibration) -> Measured | None:

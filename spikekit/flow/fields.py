@@ -18,6 +18,14 @@ def _check_flow(name: str, flow: Tensor) -> None:
         raise ValueError(f"{name}: expected (*, 2, H, W), got {tuple(flow.shape)}")
 
 
+def ends_inside(flow: Tensor, beyond: float = 0.0) -> Tensor:
+    """Return a mask (*, H, W) of the pixels whose flow (*, 2, H, W) ends inside, or ``beyond`` pixels outside."""
+    height, width = flow.shape[-2:]
+    rows, columns = (torch.arange(side, device=flow.device) for side in (height, width))
+    x, y = flow[..., 0, :, :] + columns, flow[..., 1, :, :] + rows[:, None]
+    return (x >= -beyond) & (x <= width - 1 + beyond) & (y >= -beyond) & (y <= height - 1 + beyond)
+
+
 def joint_flow(flows: Tensor | Sequence[Tensor]) -> Tensor:
     r"""Average the flows estimated from the sub-streams R, G1, G2 and B.
 

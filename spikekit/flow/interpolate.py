@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from spikekit.check import check_picture, check_planes, check_whole
-from spikekit.flow.fields import upsample_flow
+from spikekit.flow.fields import ends_inside, upsample_flow
 
 # Radius, in pixels, of the window in which frames are compared.
 _REACH = 2
@@ -198,7 +198,8 @@ class FlowInterpolation:
         if self.shrink > 1:
             padding = (0, -width % self.shrink, 0, -height % self.shrink)
             small = F.avg_pool2d(F.pad(pair, padding, "replicate"), self.shrink)
-        candidates = _estimates(_luma(small)).to(pair)
+        luma = (small * small.new_tensor([0.299, 0.587, 0.114]).reshape(3, 1, 1)).sum(dim=-3)
+        candidates = _estimates(luma.float().cpu().numpy()).to(pair)
         flows = _best(candidates, _mismatch(small, candidates))
         return upsample_flow(flows, self.shrink)[..., :height, :width]
 
@@ -222,7 +223,7 @@ class _Carried(Between):
         seen = torch.stack([_sample(self._pair, shares * motion) for motion in candidates])
         motion = _best(candidates, _around((seen[:, 0] - seen[:, 1]).abs().mean(dim=1)))
         near = shares.flip(0).abs()
-        weight = near * torch.where(_inside(shares * motion), 1.0, 1e-6)
+        weight = near * torch.where(ends_inside(shares * motion, beyond=0.5)[:, None], 1.0, 1e-6)
         views = _sample(self._pair, shares * motion, "bicubic")
         picture = (weight * views).sum(dim=0) / weight.sum(dim=0) * (near * self._light).sum()
         low, high = (self._pair * self._light).aminmax()
@@ -243,10 +244,6 @@ def _light(pair: Tensor) -> Tensor:
     """Return the relative brightness of the frames, (2, 1, 1, 1), to separate changing light from motion."""
     means = pair.mean(dim=(1, 2, 3), keepdim=True)
     return means / means.mean() if (means > 0).all() else torch.ones_like(means)
-
-
-def _luma(rgb: Tensor) -> np.ndarray:
-    return (rgb * rgb.new_tensor([0.299, 0.587, 0.114]).reshape(3, 1, 1)).sum(dim=-3).float().cpu().numpy()
 
 
 def _estimates(luma: np.ndarray) -> Tensor:
@@ -279,13 +276,6 @@ def _positions(flow: Tensor) -> tuple[Tensor, Tensor]:
     x = flow[:, 0] + torch.arange(width, device=flow.device, dtype=flow.dtype)
     y = flow[:, 1] + torch.arange(height, device=flow.device, dtype=flow.dtype)[:, None]
     return x, y
-
-
-def _inside(flow: Tensor) -> Tensor:
-    """Return a mask (B, 1, H, W) of the pixels whose flow (B, 2, H, W) ends inside the picture."""
-    x, y = _positions(flow)
-    height, width = flow.shape[-2:]
-    return ((x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5))[:, None]
 
 
 def _around(error: Tensor) -> Tensor:

@@ -139,14 +139,15 @@ def _open(path: Path) -> _Pictures | _Film:
 # --- folders ----------------------------------------------------------------------------------------------------------
 
 
-def _natural(path: Path) -> tuple[list[str | int], str]:
-    """Return a key of natural order: alternating text and numbers, then the name."""
-    parts = re.split(r"([0-9]+)", path.name)
-    return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
+def natural_order(name: str) -> tuple[list[str | int], str]:
+    """Return a sort key that puts ``f2`` before ``f10``: alternating text and numbers, then the name."""
+    parts = re.split(r"([0-9]+)", name)
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], name
 
 
 def _pictures_of(folder: Path) -> list[Path]:
-    seen = sorted((entry for entry in folder.iterdir() if not entry.name.startswith(".")), key=_natural)
+    entries = (entry for entry in folder.iterdir() if not entry.name.startswith("."))
+    seen = sorted(entries, key=lambda entry: natural_order(entry.name))
     folders = [entry.name for entry in seen if entry.is_dir()]
     pictures = [entry for entry in seen if entry.suffix.lower() in PICTURE_ENDINGS and entry.name not in folders]
     if not pictures:

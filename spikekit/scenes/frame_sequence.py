@@ -204,20 +204,6 @@ class FrameSequence:
             )
         return SequenceClip(self, frame, frames)
 
-    def profile(self, interval: int) -> SceneProfile:
-        """Return the profile of the interval between frame ``interval`` and the next.
-
-        Args:
-            interval: 0 to ``len(frames) - 2``.
-
-        Returns:
-            The profile.
-
-        Raises:
-            ValueError: ``interval`` is out of range, or a frame differs in size from the first.
-        """
-        return self._interval(interval).profile
-
     def plan(self, interval: int) -> Plan:
         """Return the plan of the interval between frame ``interval`` and the next.
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks.baselines.pictures import (
     Baseline,
     decode_pictures,
@@ -15,9 +15,11 @@ from lightning_modules.networks.baselines.pictures import (
     whole_sizes,
 )
 from lightning_modules.networks.layers import conv, enlarge, res_blocks
-from spikekit import demosaic_along_motion, demosaic_residual, flow_warp
+from lightning_modules.signatures import inherit_signature
+from spikekit import demosaic_along_motion, flow_warp
 
 _TIMES = 11
+_NEIGHBORS = 2  # pictures on either side in time that demosaicing uses
 
 
 class BasicVSR(Baseline):
@@ -35,15 +37,9 @@ class BasicVSR(Baseline):
     More than 70 convolutions follow each other, so the receptive field is too large for tiles.
 
     Args:
-        scale: super-resolution factor s.
-        frames: number N of spike frames per clip, odd, at least 13.
-        pattern: Bayer phase.
-        alpha: gain of the camera: light of a white pixel per clock, in thresholds. The picture is light divided by it.
+        scale, frames, pattern, alpha, motion: see :class:`Baseline`; clips have at least 13 frames.
         width: channels.
         blocks: residual blocks per direction.
-        neighbors: pictures on either side in time that demosaicing uses; 0 for residual interpolation only.
-        motion: motion estimator, called when no flow is given. Default:
-            :class:`lightning_modules.motion.ClassicalFlow`.
 
     Shape:
         - Input: spikes :math:`(B, N, H, W)`, zeros and ones of any real dtype; optionally the flows from the middle to
@@ -56,28 +52,18 @@ class BasicVSR(Baseline):
         torch.Size([1, 3, 16, 12])
     """
 
-    def __init__(
-        self,
-        scale: int = 4,
-        frames: int = 41,
-        pattern: str = "RGGB",
-        alpha: float = 0.4,
-        width: int = 64,
-        blocks: int = 10,
-        neighbors: int = 2,
-        motion: MotionEstimator | None = None,
-    ) -> None:
-        sizes = whole_sizes(width=width, blocks=blocks)
-        if not 0 <= neighbors < _TIMES // 2:
-            raise ValueError(f"neighbors: expected 0 to {_TIMES // 2 - 1}, got {neighbors}")
-        super().__init__(scale, frames, pattern, alpha, {**sizes, "neighbors": neighbors}, motion)
-        step = (frames // 2 - frames // 8) // (_TIMES // 2)
+    @inherit_signature(Baseline, "more")
+    def __init__(self, *args: Any, width: int = 64, blocks: int = 10, **common: Any) -> None:
+        super().__init__(*args, **common, more=whole_sizes(width=width, blocks=blocks))
+        middle = self.frames // 2
+        step = (middle - self.frames // 8) // (_TIMES // 2)
         if step < 1:
-            raise ValueError(f"frames: expected at least 13, got {frames}")
-        self.neighbors = neighbors
-        self.times = tuple(frames // 2 + step * n for n in range(-(_TIMES // 2), _TIMES // 2 + 1))
-        self.backward_trunk, self.forward_trunk = (_trunk(width, blocks) for _ in range(2))
+            raise ValueError(f"frames: expected at least 13, got {self.frames}")
+        self.times = tuple(middle + step * n for n in range(-(_TIMES // 2), _TIMES // 2 + 1))
         act = nn.LeakyReLU(0.1)
+        self.backward_trunk, self.forward_trunk = (
+            nn.Sequential(conv(3 + width, width), nn.LeakyReLU(0.1), *res_blocks(width, blocks)) for _ in range(2)
+        )
         self.merge = nn.Sequential(nn.Conv2d(2 * width, width, 1), act)
         self.enlarge = sub_pixel_convolutions(width, self.scale, act)
         self.picture = nn.Sequential(conv(width, width), act, conv(width, 3))
@@ -98,12 +84,10 @@ class BasicVSR(Baseline):
     def _demosaic(self, spikes: Tensor, offsets: Tensor) -> Tensor:
         """Return the demosaiced pictures at all times, (B, T, 3, H, W)."""
         raws = decode_pictures(spikes, self.times, self.alpha)
-        if not self.neighbors:
-            return demosaic_residual(raws, self.pattern)
         pictures = []
         for n in range(_TIMES):
             # mirrored in time, to keep the picture in the middle
-            around = [_TIMES - 1 - abs(_TIMES - 1 - abs(n + k)) for k in range(-self.neighbors, self.neighbors + 1)]
+            around = [_TIMES - 1 - abs(_TIMES - 1 - abs(n + k)) for k in range(-_NEIGHBORS, _NEIGHBORS + 1)]
             motion = offsets[:, around] - offsets[:, n : n + 1]
             pictures.append(demosaic_along_motion(raws[:, around], motion, self.pattern))
         return torch.stack(pictures, dim=1)
@@ -118,7 +102,3 @@ class BasicVSR(Baseline):
                 state = flow_warp(state, offsets[:, before] - offsets[:, time])
             state, before = trunk(torch.cat([pictures[:, time], state], dim=1)), time
         return state
-
-
-def _trunk(width: int, blocks: int) -> nn.Sequential:
-    return nn.Sequential(conv(3 + width, width), nn.LeakyReLU(0.1), *res_blocks(width, blocks))

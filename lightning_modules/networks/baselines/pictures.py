@@ -18,26 +18,24 @@ from spikekit.check import check_positive, check_whole
 
 Decoder = Literal["tfi", "tfp"]
 
+_TFP_WINDOW = 41  # spike frames that TFP averages
+
 
 def whole_sizes(**sizes: int) -> dict[str, int]:
     """Return sizes by name, after a check that each is a positive integer."""
     return {name: check_whole(name, size) for name, size in sizes.items()}
 
 
-def check_decoder(decoder: str, window: int) -> None:
-    """Check that the decoder is TFI or TFP, and the window odd."""
+def check_decoder(decoder: str) -> None:
+    """Check that the decoder is TFI or TFP."""
     if decoder not in ("tfi", "tfp"):
         raise ValueError(f"decoder: expected 'tfi' or 'tfp', got {decoder!r}")
-    if window % 2 == 0:
-        raise ValueError(f"tfp_window: expected an odd number, got {window}")
 
 
 @torch.no_grad()
-def decode_pictures(
-    spikes: Tensor, times: Sequence[int], alpha: float, decoder: Decoder = "tfi", window: int = 41
-) -> Tensor:
+def decode_pictures(spikes: Tensor, times: Sequence[int], alpha: float, decoder: Decoder = "tfi") -> Tensor:
     """Decode mosaics (B, T, H, W) at T frames of a clip, with white at 1, without gradient."""
-    decoded = [tfi_at(spikes, n) if decoder == "tfi" else tfp_at(spikes, n, window) for n in times]
+    decoded = [tfi_at(spikes, n) if decoder == "tfi" else tfp_at(spikes, n, _TFP_WINDOW) for n in times]
     return torch.stack(decoded, dim=1) / alpha
 
 
@@ -67,19 +65,29 @@ def cut_to(planes: Tensor, height: int, width: int) -> Tensor:
 
 
 class Baseline(Network):
-    """Base class of the learned baselines, with the common settings and ``more`` settings of each subclass.
+    """Base class of the learned baselines, with the settings that all of them share.
 
     Their flows run between frames 5, 20 and 35 of 41, as for CSCSR.
+
+    Args:
+        scale: super-resolution factor s.
+        frames: number N of spike frames per clip, odd, at least 9.
+        pattern: Bayer phase.
+        alpha: gain of the camera: light of a white pixel per clock, in thresholds. The picture is light divided by it.
+        motion: motion estimator, called when no flow is given. Default:
+            :class:`lightning_modules.motion.ClassicalFlow`.
+        more: further settings, of a subclass.
     """
 
     def __init__(
         self,
-        scale: int,
-        frames: int,
-        pattern: str,
-        alpha: float,
-        more: dict[str, Any],
+        scale: int = 4,
+        frames: int = 41,
+        pattern: str = "RGGB",
+        alpha: float = 0.4,
+        *,
         motion: MotionEstimator | None = None,
+        more: dict[str, Any],
     ) -> None:
         scale, frames = check_whole("scale", scale), check_whole("frames", frames)
         check_positive("alpha", alpha)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -20,6 +22,7 @@ from lightning_modules.networks.baselines.pictures import (
     whole_sizes,
 )
 from lightning_modules.networks.layers import ResBlock, conv, enlarge
+from lightning_modules.signatures import inherit_signature
 from spikekit import split_bayer
 
 _LEVELS = 3
@@ -42,12 +45,8 @@ class RealRawVSR(Baseline):
     Attention and the selective kernel depend on the whole picture, so the network does not run in tiles.
 
     Args:
-        decoder: ``"tfi"`` or ``"tfp"``.
-        scale: super-resolution factor s.
-        frames: number N of spike frames per clip, odd, at least 9.
-        pattern: Bayer phase.
-        alpha: gain of the camera: light of a white pixel per clock, in thresholds. The picture is light divided by it.
-        tfp_window: number of spike frames that TFP averages, odd.
+        scale, frames, pattern, alpha: see :class:`Baseline`.
+        decoder: ``"tfi"``, or ``"tfp"``, which averages 41 frames.
         width: channels, a multiple of 8.
         blocks: residual blocks after fusion; each branch has half as many before it.
         skip: predict a residual, which is added to the middle mosaic, demosaiced by residual interpolation and enlarged
@@ -64,23 +63,22 @@ class RealRawVSR(Baseline):
 
     takes_flow = False
 
+    @inherit_signature(Baseline, "more", "motion")
     def __init__(
         self,
+        *args: Any,
         decoder: Decoder = "tfi",
-        scale: int = 4,
-        frames: int = 41,
-        pattern: str = "RGGB",
-        alpha: float = 0.4,
-        tfp_window: int = 41,
         width: int = 64,
         blocks: int = 10,
         skip: bool = False,
+        **common: Any,
     ) -> None:
-        sizes = whole_sizes(tfp_window=tfp_window, width=width, blocks=blocks)
-        check_decoder(decoder, tfp_window)
-        super().__init__(scale, frames, pattern, alpha, {"decoder": decoder, **sizes, "skip": skip}, ZeroFlow())
-        self.decoder, self.tfp_window, self.skip = decoder, tfp_window, skip
-        self.times = tuple(frames // 2 + n * (frames // 8) for n in range(-(_FRAMES // 2), _FRAMES // 2 + 1))
+        check_decoder(decoder)
+        more = {"decoder": decoder, **whole_sizes(width=width, blocks=blocks), "skip": skip}
+        super().__init__(*args, **common, motion=ZeroFlow(), more=more)
+        self.decoder, self.skip = decoder, skip
+        middle, apart = self.frames // 2, self.frames // 8
+        self.times = tuple(middle + n * apart for n in range(-(_FRAMES // 2), _FRAMES // 2 + 1))
         self.raw_features, self.packed_features = (_Pyramid(inputs, width, blocks // 2) for inputs in (1, 4))
         self.align = _Alignment(width)
         self.to_raw = nn.Sequential(conv(width, 4 * width), nn.PixelShuffle(2), _relu())
@@ -99,7 +97,7 @@ class RealRawVSR(Baseline):
         self.check_spikes(spikes)
         height, width = spikes.shape[-2:]
         spikes = mirror_to_multiple(spikes, 8).to(self.align.cascade.weight.dtype)
-        raws = decode_pictures(spikes, self.times, self.alpha, self.decoder, self.tfp_window)  # (B, T, H, W)
+        raws = decode_pictures(spikes, self.times, self.alpha, self.decoder)  # (B, T, H, W)
         packed = split_bayer(raws, self.pattern).movedim(0, 2)  # (B, T, 4, H / 2, W / 2)
         fused = self._fuse(*self._align(raws.unsqueeze(2), packed))
         middle = _FRAMES // 2

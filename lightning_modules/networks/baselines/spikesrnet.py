@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
@@ -17,7 +19,11 @@ from lightning_modules.networks.baselines.pictures import (
     whole_sizes,
 )
 from lightning_modules.networks.layers import ConvBlock, conv, res_blocks
+from lightning_modules.signatures import inherit_signature
 from spikekit import split_colors
+
+_LENGTH = 13  # spike frames per representation
+_EVERY = 7  # spike frames between two representations
 
 
 class SpikeSRNetLike(Baseline):
@@ -37,13 +43,8 @@ class SpikeSRNetLike(Baseline):
     Offsets are unbounded, so the network does not run in tiles.
 
     Args:
-        scale: super-resolution factor s.
-        frames: number N of spike frames per clip, odd.
-        length: number of spike frames per representation, odd.
-        every: spike frames between two representations; (frames - length) / every must be even, so that one
+        scale, frames, pattern, alpha: see :class:`Baseline`; ``frames`` is 13 plus a multiple of 14, so that one
             representation is centred on the middle frame.
-        pattern: Bayer phase.
-        alpha: gain of the camera: light of a white pixel per clock, in thresholds. The picture is light divided by it.
         width: channels, a multiple of 8.
         maps: number of kernels per pixel.
         corrections: number of corrections of the picture's features.
@@ -62,33 +63,29 @@ class SpikeSRNetLike(Baseline):
 
     takes_flow = False
 
+    @inherit_signature(Baseline, "more", "motion")
     def __init__(
         self,
-        scale: int = 4,
-        frames: int = 41,
-        length: int = 13,
-        every: int = 7,
-        pattern: str = "RGGB",
-        alpha: float = 0.4,
+        *args: Any,
         width: int = 64,
         maps: int = 16,
         corrections: int = 4,
         per_channel: bool = False,
         skip: bool = False,
+        **common: Any,
     ) -> None:
-        sizes = whole_sizes(length=length, every=every, width=width, maps=maps, corrections=corrections)
-        super().__init__(scale, frames, pattern, alpha, {**sizes, "per_channel": per_channel, "skip": skip}, ZeroFlow())
-        if length % 2 == 0 or length > frames or (frames - length) % (2 * every):
-            raise ValueError(
-                "length, every: expected an odd length and an even (frames - length) / every, "
-                f"got {length} and {every} with {frames} frames"
-            )
-        self.length, self.every, self.maps = length, every, maps
+        more = whole_sizes(width=width, maps=maps, corrections=corrections)
+        more |= {"per_channel": per_channel, "skip": skip}
+        super().__init__(*args, **common, motion=ZeroFlow(), more=more)
+        if self.frames < _LENGTH or (self.frames - _LENGTH) % (2 * _EVERY):
+            expected = f"{_LENGTH} plus a multiple of {2 * _EVERY}, such as 41"
+            raise ValueError(f"frames: expected {expected}, got {self.frames}")
+        self.maps = maps
         self.per_channel, self.skip = per_channel, skip
         planes, enlarged = (1, 2 * self.scale) if per_channel else (3, self.scale)
         self.enlarged = enlarged
         self.kernels = nn.Sequential(
-            *ConvBlock(length, width), *ConvBlock(width, width), nn.Conv2d(width, maps * length, 1)
+            *ConvBlock(_LENGTH, width), *ConvBlock(width, width), nn.Conv2d(width, maps * _LENGTH, 1)
         )
         self.represent = conv(maps * planes, width)
         self.guide = nn.Sequential(*ConvBlock(2 * width, width), *ConvBlock(width, width))
@@ -112,7 +109,7 @@ class SpikeSRNetLike(Baseline):
 
     def _reconstruct(self, spikes: Tensor) -> Tensor:
         """Return pictures (B, 3, s H, s W), or (B, 1, 2 s H, 2 s W) of a sub-stream."""
-        windows = spikes.unfold(1, self.length, self.every).movedim(-1, 2)  # (B, M, length, H, W)
+        windows = spikes.unfold(1, _LENGTH, _EVERY).movedim(-1, 2)  # (B, M, length, H, W)
         count = windows.shape[1]
         features = self._represent(windows.flatten(0, 1)).unflatten(0, (-1, count))
         middle = features[:, count // 2]
@@ -130,7 +127,7 @@ class SpikeSRNetLike(Baseline):
 
     def _represent(self, window: Tensor) -> Tensor:
         """Filter the spikes with kernels predicted per pixel, (B, length, H, W) to (B, width, H, W)."""
-        kernels = self.kernels(window).unflatten(1, (self.maps, self.length)).softmax(dim=2)
+        kernels = self.kernels(window).unflatten(1, (self.maps, _LENGTH)).softmax(dim=2)
         maps = torch.einsum("bkthw,bthw->bkhw", kernels, window.to(kernels.dtype)) / self.alpha
         if not self.per_channel:
             maps = split_colors(maps, self.pattern).movedim(0, 1).flatten(1, 2)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks.baselines.pictures import (
     Baseline,
     along_motion,
@@ -16,42 +15,34 @@ from lightning_modules.networks.baselines.pictures import (
     cut_to,
     enlarge_picture,
     mirror_to_multiple,
-    sub_pixel_convolutions,
     whole_sizes,
 )
 from lightning_modules.networks.layers import conv
+from lightning_modules.signatures import inherit_signature
 
 _MEAN = 0.4488, 0.4371, 0.4040  # mean colour of DIV2K, SwinIR's training data
 _SIDE = 8  # side of an attention window, in pixels
 _SHIFT = _SIDE // 2
+_DROP = 0.1  # probability of skipping the last layer in training (stochastic depth); 0 for the first, linear between
 
 
 class SwinIR(Baseline):
     r"""SwinIR, residual groups of window attention, on the 3DRI-like picture of the middle frame.
 
-    As published: all layers, their widths and their order; parameters and initialisation are those of SwinIR for RGB,
-    light or full. Differences: the picture is :func:`spikekit.demosaic_along_motion` of five TFI mosaics, without
+    As published: all layers, their widths and their order; parameters and initialisation are those of the light SwinIR
+    for RGB. Differences: the picture is :func:`spikekit.demosaic_along_motion` of five TFI mosaics, without
     gradient; padding reflects without repeating the edge pixel; ``skip`` is optional; the training is that of all
     networks here. The original uses the l1 loss and Adam at 2e-4 with betas of 0.9 and 0.99, for 500,000 steps, halved
     at 250, 400, 450 and 475 thousand.
 
     Args:
-        scale: super-resolution factor s.
-        frames: number N of spike frames per clip, odd.
-        pattern: Bayer phase.
-        alpha: gain of the camera: light of a white pixel per clock, in thresholds. The picture is light divided by it.
-        width: channels; 60 for the light network, 180 for the full one.
-        groups: residual groups; 4 for the light network, 6 for the full one.
+        scale, frames, pattern, alpha, motion: see :class:`Baseline`.
+        width: channels.
+        groups: residual groups.
         layers: attention layers per group; every other one shifts its windows by half their side.
         heads: attention heads, a divisor of ``width``.
-        upsampler: ``"direct"``, one sub-pixel convolution, as in the light network; or ``"steps"``, one sub-pixel
-            convolution of 64 channels per prime factor, as in the full one.
-        drop_path: probability of skipping the last layer in training (stochastic depth); it rises linearly from 0 at
-            the first layer.
         skip: predict a residual, which is added to the bicubically enlarged picture, so that training starts from the
             result of demosaicing. The publication has no such skip.
-        motion: motion estimator, called when no flow is given. Default:
-            :class:`lightning_modules.motion.ClassicalFlow`.
 
     Shape:
         - Input: spikes :math:`(B, N, H, W)` of any real dtype, with H and W of at least 3; optionally flow
@@ -59,8 +50,7 @@ class SwinIR(Baseline):
         - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
 
     Raises:
-        ValueError: a size is below 1, heads do not divide the width, the upsampler is unknown, or ``drop_path`` is
-            outside [0, 1).
+        ValueError: a size is below 1, or heads do not divide the width.
 
     Example:
         >>> network = SwinIR(scale=2, width=12, groups=1, layers=2, heads=2)
@@ -73,47 +63,37 @@ class SwinIR(Baseline):
 
     halo = None  # shifted windows widen the receptive field: 24 layers see about a hundred pixels
 
+    @inherit_signature(Baseline, "more")
     def __init__(
         self,
-        scale: int = 4,
-        frames: int = 41,
-        pattern: str = "RGGB",
-        alpha: float = 0.4,
+        *args: Any,
         width: int = 60,
         groups: int = 4,
         layers: int = 6,
         heads: int = 6,
-        upsampler: Literal["direct", "steps"] = "direct",
-        drop_path: float = 0.1,
         skip: bool = False,
-        motion: MotionEstimator | None = None,
+        **common: Any,
     ) -> None:
         sizes = whole_sizes(width=width, groups=groups, layers=layers, heads=heads)
         if width % heads:
             raise ValueError(f"heads: expected a divisor of width = {width}, got {heads}")
-        if upsampler not in ("direct", "steps"):
-            raise ValueError(f"upsampler: expected 'direct' or 'steps', got {upsampler!r}")
-        if not 0 <= drop_path < 1:
-            raise ValueError(f"drop_path: expected a probability in [0, 1), got {drop_path}")
-        more = {**sizes, "upsampler": upsampler, "drop_path": drop_path, "skip": skip}
-        super().__init__(scale, frames, pattern, alpha, more, motion)
+        super().__init__(*args, **common, more={**sizes, "skip": skip})
         self.skip = skip
         count = groups * layers
-        drops = [drop_path * n / max(count - 1, 1) for n in range(count)]
+        drops = [_DROP * n / max(count - 1, 1) for n in range(count)]
         self.first = conv(3, width)
         self.embed = nn.LayerNorm(width)
         self.groups = nn.ModuleList(ResidualGroup(width, heads, drops[n : n + layers]) for n in range(0, count, layers))
         self.norm = nn.LayerNorm(width)
         self.after = conv(width, width)
-        self.upsample = _direct(width, scale) if upsampler == "direct" else _in_steps(width, scale)
+        self.upsample = nn.Sequential(conv(width, 3 * self.scale**2), nn.PixelShuffle(self.scale))
         self.register_buffer("mean", torch.tensor(_MEAN).reshape(3, 1, 1), persistent=False)
         for module in self.groups.modules():
             if isinstance(module, nn.Linear):
                 nn.init.trunc_normal_(module.weight, std=0.02)
                 nn.init.zeros_(module.bias)
         if skip:
-            (*_, last) = (module for module in self.upsample.modules() if isinstance(module, nn.Conv2d))
-            begin_at_zero(last)
+            begin_at_zero(self.upsample[0])
 
     def forward(self, spikes: Tensor, flow: Tensor | None = None, static: bool = False) -> Tensor:  # noqa: D102
         self.check_spikes(spikes)
@@ -204,11 +184,3 @@ def _hidden(height: int, width: int, device: torch.device) -> Tensor:
         parts.append((at >= length - _SIDE).long() + (at >= length - _SHIFT))
     part = _windows((3 * parts[0][:, None] + parts[1])[None, :, :, None])[0, :, :, 0]
     return torch.where(part[:, :, None] == part[:, None, :], 0.0, -100.0)[:, None]
-
-
-def _direct(width: int, scale: int) -> nn.Sequential:
-    return nn.Sequential(conv(width, 3 * scale**2), nn.PixelShuffle(scale))
-
-
-def _in_steps(width: int, scale: int) -> nn.Sequential:
-    return nn.Sequential(conv(width, 64), nn.LeakyReLU(), *sub_pixel_convolutions(64, scale), conv(64, 3))

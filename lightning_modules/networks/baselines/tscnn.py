@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -18,6 +20,7 @@ from lightning_modules.networks.baselines.pictures import (
     whole_sizes,
 )
 from lightning_modules.networks.layers import ConvBlock, ResBlock, conv
+from lightning_modules.signatures import inherit_signature
 from spikekit import bayer_mask, demosaic_residual
 
 _SQUEEZED = 4  # hidden channels of a channel attention
@@ -35,12 +38,8 @@ class TSCNN(Baseline):
     stage, and the global skip begins at the first convolution of the second stage.
 
     Args:
-        decoder: decoder of the mosaic, ``"tfi"`` or ``"tfp"``.
-        scale: super-resolution factor s.
-        frames: number N of spike frames per clip, odd.
-        pattern: Bayer phase.
-        alpha: gain of the camera: light of a white pixel per clock, in thresholds. The picture is light divided by it.
-        tfp_window: number of spike frames that TFP averages, odd.
+        scale, frames, pattern, alpha: see :class:`Baseline`.
+        decoder: ``"tfi"``, or ``"tfp"``, which averages 41 frames.
         width: channels, a multiple of 8.
         blocks: parallel octave residual dense blocks; 3 for TSCNN-L, 4 for TSCNN-H.
         low: groups of attention blocks at half the resolution, in each of a block's two rounds; 2 or 4.
@@ -53,10 +52,10 @@ class TSCNN(Baseline):
         - Output: rgb :math:`(B, 3, s H, s W)`, not clamped
 
     Raises:
-        ValueError: the decoder is unknown, the window is even, a size is below 1, or the width is not a multiple of 8.
+        ValueError: the decoder is unknown, a size is below 1, or the width is not a multiple of 8.
 
     Example:
-        >>> network = TSCNN("tfp", scale=2, width=8, blocks=1, low=1, high=1)
+        >>> network = TSCNN(scale=2, decoder="tfp", width=8, blocks=1, low=1, high=1)
         >>> network(torch.zeros(1, 41, 12, 9)).shape
         torch.Size([1, 3, 24, 18])
 
@@ -67,31 +66,29 @@ class TSCNN(Baseline):
     halo = None  # channel attention pools over the whole picture
     takes_flow = False
 
+    @inherit_signature(Baseline, "more", "motion")
     def __init__(
         self,
+        *args: Any,
         decoder: Decoder = "tfi",
-        scale: int = 4,
-        frames: int = 41,
-        pattern: str = "RGGB",
-        alpha: float = 0.4,
-        tfp_window: int = 41,
         width: int = 64,
         blocks: int = 3,
         low: int = 2,
         high: int = 3,
         skip: bool = False,
+        **common: Any,
     ) -> None:
-        sizes = whole_sizes(tfp_window=tfp_window, width=width, blocks=blocks, low=low, high=high)
-        check_decoder(decoder, tfp_window)
+        sizes = whole_sizes(width=width, blocks=blocks, low=low, high=high)
+        check_decoder(decoder)
         if width % 8:
             raise ValueError(f"width: expected a multiple of 8, got {width}")
-        super().__init__(scale, frames, pattern, alpha, {"decoder": decoder, **sizes, "skip": skip}, ZeroFlow())
-        self.decoder, self.tfp_window, self.skip = decoder, tfp_window, skip
+        super().__init__(*args, **common, motion=ZeroFlow(), more={"decoder": decoder, **sizes, "skip": skip})
+        self.decoder, self.skip = decoder, skip
         self.colors = DemosaicingStage(width)
         self.first, self.second = conv(3, width), conv(width, width)
         self.blocks = nn.ModuleList(OctaveBlock(width, low, high) for _ in range(blocks))
         self.fuse = nn.Sequential(nn.Conv2d(blocks * width, width, 1), conv(width, width))
-        self.upsample = nn.Sequential(conv(width, 3 * scale**2), nn.PixelShuffle(scale))
+        self.upsample = nn.Sequential(conv(width, 3 * self.scale**2), nn.PixelShuffle(self.scale))
         if skip:
             begin_at_zero(self.upsample[0])
 
@@ -99,7 +96,7 @@ class TSCNN(Baseline):
         """Return rgb; the flow is ignored."""
         self.check_spikes(spikes)
         height, width = spikes.shape[-2:]
-        raw = decode_pictures(spikes, [self.frames // 2], self.alpha, self.decoder, self.tfp_window)
+        raw = decode_pictures(spikes, [self.frames // 2], self.alpha, self.decoder)
         raw = mirror_to_multiple(raw.to(self.first.weight.dtype), 2)
         picture = demosaic_residual(raw[:, 0], self.pattern)
         mask = bayer_mask(*raw.shape[-2:], self.pattern, device=raw.device, dtype=raw.dtype)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks.baselines.per_channel import per_channel as run_per_channel
 from lightning_modules.networks.baselines.pictures import (
     Baseline,
@@ -17,6 +17,7 @@ from lightning_modules.networks.baselines.pictures import (
     whole_sizes,
 )
 from lightning_modules.networks.layers import conv
+from lightning_modules.signatures import inherit_signature
 from spikekit import split_colors
 
 _Move = Callable[[int, int, int], nn.Module]
@@ -38,17 +39,12 @@ class VidarSR(Baseline):
     At x2 the receptive field reaches 102 sensor pixels in each direction, which is too large for tiles.
 
     Args:
-        scale: super-resolution factor s.
-        frames: number N of spike frames per clip, odd, at least 9.
-        pattern: Bayer phase.
-        alpha: gain of the camera: light of a white pixel per clock, in thresholds. The picture is light divided by it.
+        scale, frames, pattern, alpha, motion: see :class:`Baseline`.
         width: channels at the sensor's resolution.
         features: channels at the picture's resolution.
         per_channel: reconstruct each Bayer sub-stream separately, as the paper's VidarSR with a star.
         skip: predict a residual, which is added to the demosaiced and bicubically enlarged TFI picture, so that
             training starts from the result of the decoder. The publication has no such skip.
-        motion: motion estimator, called when no flow is given. Default:
-            :class:`lightning_modules.motion.ClassicalFlow`.
 
     Shape:
         - Input: spikes :math:`(B, N, H, W)`, zeros and ones of any real dtype; optionally the flows from the middle to
@@ -61,20 +57,19 @@ class VidarSR(Baseline):
         torch.Size([1, 3, 16, 12])
     """
 
+    @inherit_signature(Baseline, "more")
     def __init__(
         self,
-        scale: int = 4,
-        frames: int = 41,
-        pattern: str = "RGGB",
-        alpha: float = 0.4,
+        *args: Any,
         width: int = 64,
         features: int = 32,
         per_channel: bool = False,
         skip: bool = False,
-        motion: MotionEstimator | None = None,
+        **common: Any,
     ) -> None:
         more = {**whole_sizes(width=width, features=features), "per_channel": per_channel, "skip": skip}
-        super().__init__(scale, frames, pattern, alpha, more, motion)
+        super().__init__(*args, **common, more=more)
+        frames = self.frames
         self.per_channel, self.skip = per_channel, skip
         #: the middle frame and its neighbours in time
         self.times = frames // 2, frames // 6, frames // 3, frames - 1 - frames // 3, frames - 1 - frames // 6

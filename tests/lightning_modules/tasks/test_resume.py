@@ -2,7 +2,6 @@
 
 import os
 import re
-import subprocess
 import sys
 
 import pytest
@@ -115,12 +114,11 @@ def test_plateau_schedule_monitors_the_best_metric(fit):
 
 
 @pytest.mark.slow
-def test_spawned_processes(tmp_path, configs):
+def test_spawned_processes(tmp_path, configs, monkeypatch):
     (tmp_path / "tiny.yaml").write_text(TINY)
+    monkeypatch.chdir(tmp_path)
     words = ["fit", "-c", str(configs / "x4.yaml"), "-c", "tiny.yaml", "--trainer.max_steps=2", "--trainer.devices=1"]
-    words = [sys.executable, "-m", "lightning_modules", *words, "--trainer.strategy=ddp_spawn", "-o", "run"]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=900)
-    assert done.returncode == 0, done.stderr
+    main([*words, "--trainer.strategy=ddp_spawn", "-o", "run"])
     assert torch.load(tmp_path / "run/checkpoints/last.ckpt", weights_only=True)["global_step"] == 2
 
 

@@ -1,6 +1,6 @@
 """``lightning fit`` with several processes."""
 
-import subprocess
+import importlib.util
 import sys
 from pathlib import Path
 
@@ -25,13 +25,18 @@ def trained(output):
 
 
 @pytest.mark.slow
-def test_two_processes_equal_one_with_twice_the_batch(tmp_path, monkeypatch):
+def test_two_processes_equal_one_with_twice_the_batch(tmp_path, monkeypatch, forked):
     (tmp_path / "tiny.yaml").write_text(TINY)
     words = ["fit", "-c", CONFIGS / "x2.yaml", "-c", CONFIGS / "quick.yaml", "-c", tmp_path / "tiny.yaml"]
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     two = [*words, "-o", tmp_path / "two", "--data.batch_size", 2, "--trainer.max_steps", 4]
-    line = [sys.executable, "-m", "lightning_modules", *two, "--trainer.devices", 2, "--trainer.strategy", "ddp"]
-    subprocess.run([*map(str, line)], check=True, stdout=subprocess.DEVNULL)
+    two = [*map(str, [*two, "--trainer.devices", 2, "--trainer.strategy", "ddp"])]
+    with monkeypatch.context() as patch:  # Lightning starts the second process as the first one was started
+        patch.setattr(sys.modules["__main__"], "__spec__", importlib.util.find_spec("lightning_modules.__main__"))
+        patch.setattr(sys, "argv", ["lightning", *two])
+        first = forked(two)
+    first.join()
+    assert first.exitcode == 0
     main([*map(str, [*words, "-o", tmp_path / "one", "--trainer.max_steps", 4, "--data.batch_size", 4])])
     (ours, step, score), (theirs, theirs_step, theirs_score) = trained(tmp_path / "two"), trained(tmp_path / "one")
     assert step == theirs_step == 4

@@ -1,30 +1,22 @@
 """Atomic writing: errors, full disks, killed and concurrent writers, links and devices."""
 
 import errno
+import multiprocessing
 import os
 import random
-import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 
-from spikekit.io import whole_file as module
 from spikekit.io.whole_file import whole_file
 
-MODULE = module.__file__
-WRITER = """
-import runpy, sys
-module, path, letter = sys.argv[1:]
-whole_file = runpy.run_path(module)["whole_file"]  # the rest of the package takes seconds
-print("ready", flush=True)
-while True:
-    with whole_file(path) as file:
-        for _ in range(50):
-            file.write(letter.encode() * 4096)
-"""
+
+def write_forever(path, letter):
+    while True:
+        with whole_file(path) as file:
+            for _ in range(50):
+                file.write(letter.encode() * 4096)
 
 
 def files(folder):
@@ -66,21 +58,18 @@ def test_two_killed_writers_leave_a_complete_file(tmp_path):
     chance = random.Random(24)
     whole = {letter.encode() * 4096 * 50 for letter in "ab"}
     for _ in range(3):
-        writers = [
-            subprocess.Popen([sys.executable, "-c", WRITER, MODULE, target, letter], stdout=subprocess.PIPE)
-            for letter in "ab"
-        ]
+        fork = multiprocessing.get_context("fork")  # another Python would take a second to import the package
+        writers = [fork.Process(target=write_forever, args=(target, letter)) for letter in "ab"]
         for writer in writers:
-            writer.stdout.readline()
+            writer.start()
         while not target.exists():
             time.sleep(0.001)
         for writer in writers:
             time.sleep(chance.uniform(0, 0.05))
-            assert writer.poll() is None, "died of the other one"
+            assert writer.is_alive(), "died of the other one"
             assert target.read_bytes() in whole
-            writer.send_signal(signal.SIGKILL)
-            writer.wait()
-            writer.stdout.close()
+            writer.kill()
+            writer.join()
         assert target.read_bytes() in whole
     with whole_file(target) as file:
         file.write(b"end")

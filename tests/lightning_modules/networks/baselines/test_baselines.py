@@ -10,12 +10,11 @@ from spikekit import demosaic_along_motion, demosaic_residual, linear_motion, tf
 
 STAR = {"per_channel": True}
 CASES = [
-    ("BasicVSR", {"width": 4, "blocks": 1, "neighbors": 1}),
+    ("BasicVSR", {"width": 4, "blocks": 1}),
     ("RealRawVSR", {"width": 8, "blocks": 2}),
     ("SpikeSRNetLike", {"width": 8, "maps": 3, "corrections": 2}),
     ("SpikeSRNetLike", {"width": 8, "maps": 3, "corrections": 2, **STAR}),
-    ("SwinIR", {"width": 12, "groups": 2, "layers": 2, "heads": 2, "drop_path": 0.0}),
-    ("SwinIR", {"width": 12, "groups": 1, "layers": 2, "heads": 2, "drop_path": 0.0, "upsampler": "steps"}),
+    ("SwinIR", {"width": 12, "groups": 2, "layers": 2, "heads": 2}),
     ("TSCNN", {"width": 32, "blocks": 1, "low": 1, "high": 1}),
     ("VidarSR", {"width": 6, "features": 3}),
     ("VidarSR", {"width": 6, "features": 3, **STAR}),
@@ -30,7 +29,7 @@ def clip(batch=1, height=12, width=16):
 
 
 def build(name, seed=0, **settings):
-    """A network with random weights instead of those initialised with zeros."""
+    """A network with random weights instead of those initialised with zeros, and without stochastic depth."""
     torch.manual_seed(seed)
     network = getattr(networks, name)(**{"scale": 2, **settings})
     for module in network.modules():
@@ -38,6 +37,8 @@ def build(name, seed=0, **settings):
             torch.nn.init.normal_(module.where.weight, std=0.1)
         if hasattr(module, "gamma"):
             torch.nn.init.ones_(module.gamma)
+        if hasattr(module, "drop"):
+            module.drop = 0.0
     return network
 
 
@@ -96,11 +97,6 @@ def test_bfloat16_keeps_the_picture_in_float32(name, tiny):
         ("RealRawVSR", {}, {2: 4_476_509, 3: 4_678_459, 4: 4_773_853}),
         ("SpikeSRNetLike", {}, {2: 2_278_443, 3: 2_889_067, 4: 3_343_659}),
         ("SwinIR", {}, {2: 910_152, 3: 918_267, 4: 929_628}),
-        (
-            "SwinIR",
-            {"width": 180, "groups": 6, "upsampler": "steps"},
-            {2: 11_752_487, 3: 11_937_127, 4: 11_900_199},
-        ),
         ("TSCNN", {}, {2: 1_424_903, 3: 1_433_558, 4: 1_445_675}),
         ("TSCNN", {"blocks": 4, "low": 4, "high": 6}, {2: 3_388_303, 3: 3_396_958, 4: 3_409_075}),
         ("VidarSR", {"width": 256, "features": 64}, {2: 10_161_896, 3: 11_386_600, 4: 12_799_720}),
@@ -122,11 +118,7 @@ def test_number_of_parameters_as_published(name, settings, counts):
         ("RealRawVSR", {"width": 8, "blocks": 2}, tfi),
         ("RealRawVSR", {"width": 8, "blocks": 2, "decoder": "tfp"}, lambda spikes: tfp(spikes, 41)),
         ("TSCNN", {"width": 8, "blocks": 1, "low": 1, "high": 1}, tfi),
-        (
-            "TSCNN",
-            {"width": 8, "blocks": 1, "low": 1, "high": 1, "decoder": "tfp", "tfp_window": 13},
-            lambda spikes: tfp(spikes, 13),
-        ),
+        ("TSCNN", {"width": 8, "blocks": 1, "low": 1, "high": 1, "decoder": "tfp"}, lambda spikes: tfp(spikes, 41)),
         ("SwinIR", {"width": 12, "groups": 1, "layers": 2, "heads": 2}, None),
     ],
 )
@@ -144,7 +136,7 @@ def test_skip_starts_from_the_decoded_picture(name, settings, decode):
     assert sum(p.grad is not None and p.grad.abs().sum() > 0 for p in network.parameters()) >= 2
 
 
-@pytest.mark.parametrize("case", [3, 7])  # networks that split the colours themselves
+@pytest.mark.parametrize("case", [3, 6])  # networks that split the colours themselves
 def test_mosaic_shifted_by_a_pixel_has_another_phase(case):
     name, tiny = CASES[case]
     tiny = {**tiny, **({"corrections": 1} if "corrections" in tiny else {})}
@@ -160,15 +152,11 @@ def test_mosaic_shifted_by_a_pixel_has_another_phase(case):
 @pytest.mark.parametrize(
     ("name", "settings", "message"),
     [
-        ("BasicVSR", {"neighbors": 5}, "neighbors: expected 0 to 4, got 5"),
         ("BasicVSR", {"frames": 11}, "frames: expected at least 13, got 11"),
         ("RealRawVSR", {"decoder": "tfx"}, "decoder: expected 'tfi' or 'tfp', got 'tfx'"),
         ("RealRawVSR", {"width": 12}, "width: expected a multiple of 8, .*, got 12"),
-        ("SpikeSRNetLike", {"length": 12}, "length, every: expected .*, got 12 and 7 with 41 frames"),
+        ("SpikeSRNetLike", {"frames": 43}, "frames: expected 13 plus a multiple of 14, such as 41, got 43"),
         ("SwinIR", {"width": 12, "heads": 5}, "heads: expected a divisor of width = 12, got 5"),
-        ("SwinIR", {"upsampler": "bicubic"}, "upsampler: expected 'direct' or 'steps', got 'bicubic'"),
-        ("SwinIR", {"drop_path": 1.0}, r"drop_path: expected a probability in \[0, 1\), got 1.0"),
-        ("TSCNN", {"tfp_window": 40}, "tfp_window: expected an odd number, got 40"),
         ("TSCNN", {"width": 12}, "width: expected a multiple of 8, got 12"),
         ("VidarSR", {"frames": 40}, "frames: expected an odd number, 9 or more, got 40"),
     ],

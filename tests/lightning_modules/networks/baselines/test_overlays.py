@@ -17,7 +17,7 @@ from spikekit import read_picture, write_spikes
 CONFIGS = Path(__file__).parents[4] / "configs"
 BASELINES = ["BasicVSR", "RealRawVSR", "SpikeSRNetLike", "SwinIR", "TSCNN", "VidarSR"]
 
-TINY = {"BasicVSR": {"width": 4, "blocks": 1, "neighbors": 1}, "RealRawVSR": {"width": 8, "blocks": 2}}
+TINY = {"BasicVSR": {"width": 4, "blocks": 1}, "RealRawVSR": {"width": 8, "blocks": 2}}
 
 
 @pytest.mark.parametrize("name", BASELINES)
