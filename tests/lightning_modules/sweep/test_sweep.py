@@ -1,5 +1,6 @@
 """``lightning sweep``; most trials run in this process."""
 
+import copy
 import csv
 import re
 import statistics
@@ -15,6 +16,7 @@ import yaml
 
 from lightning_modules.__main__ import main
 from lightning_modules.cli.command import run
+from lightning_modules.cli.errors import InputError
 from lightning_modules.storage.checkpoint import DivergedError
 from lightning_modules.sweep import cli, engines, worker
 from lightning_modules.sweep.state import RESULT, read_result, say_progress, write_json
@@ -146,20 +148,18 @@ def test_table_matches_the_tests(swept):
         if row is rows[0]:
             tested = csv.DictReader((folder / "test.csv").open())
             mean = next(line for line in tested if line["method"] == "CSCSR" and line["clip"] == "mean")
-        assert [row[name] for name in ("psnr", "ssim")] == [
-            str(round(float(mean[name]), 4)) for name in ("psnr", "ssim")
-        ]
+        assert all(row[name] == str(round(float(mean[name]), 4)) for name in ("psnr", "ssim"))
         assert row["steps"] == "4"
         scores.append(float(row["psnr"]))
     assert c[0] != c[1]
     gaps = [ours - theirs for ours, theirs in zip(c, j, strict=True)]
     lines = (line.strip("| ").split(" | ") for line in (output / "sweep.md").read_text().splitlines()[:4])
-    header, _, c_row, j_row = ([cell.strip() for cell in line] for line in lines)
+    header, _, c_row, _ = ([cell.strip() for cell in line] for line in lines)
     cells = dict(zip(header, c_row, strict=True))
     assert cells["n"] == "2"
     assert cells["PSNR (dB)"] == f"{statistics.mean(c):.2f} ± {statistics.stdev(c):.2f}"
     assert cells["PSNR (dB) - j"] == f"{statistics.mean(gaps):+.2f} ± {statistics.stdev(gaps):.2f}"
-    assert dict(zip(header, j_row, strict=True))["parameters"] == "14,310"
+    assert cells["parameters"] == "5,019"
 
 
 @pytest.mark.slow
@@ -170,13 +170,12 @@ def test_finished_trials_are_kept_and_other_settings_rejected(swept, capsys, mon
     monkeypatch.setitem(cli._ENGINES, "local", lambda *_: pytest.fail("something was run"))
     main(command)
     assert "4 trials, 4 of them finished before" in capsys.readouterr().out
-    steps = command.index("--steps") + 1
-    for words, message in (
-        ([*command[:steps], "5", *command[steps + 1 :]], "budget.steps=4, expected 5 for this sweep"),
-        ([*command, "--set", "model.network.width=5"], "model.network.width=4, expected 5 for this sweep"),
-    ):
-        with pytest.raises(SystemExit, match=f"c-seed0: holds .*{message}"):
-            main(words)
+    config = yaml.safe_load((output / "c-seed0" / "trial.yaml").read_text())
+    wider = copy.deepcopy(config)
+    wider["model"]["init_args"]["network"]["init_args"]["width"] = 5
+    for there, steps, message in ((config, 5, "budget.steps=4"), (wider, 4, "model.network.width=4")):
+        with pytest.raises(InputError, match=f"c-seed0: holds .*{message}, expected 5 for this sweep"):
+            Trial(("c",), 0, output / "c-seed0", there, {"steps": steps}).write()
     assert {path: path.stat().st_mtime_ns for path in files} == before
 
 
