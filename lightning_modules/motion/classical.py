@@ -33,6 +33,7 @@ _NOISE = 0.002  # standard deviation, in firing rates, that halves the weight of
 _RATES = 1024
 _NEAR = _gaussian(17, 2.0)  # window of the test for linear motion
 _PART = 1.25, 1.75  # error ratios at which the flows begin to differ, and at which they are independent
+_OWN = 3  # warping iterations that refine the velocity of a half, from a joint velocity that is nearly right
 _UNSEEN = 1e-6  # negligible squared difference of two pictures, in firing rates
 
 
@@ -55,7 +56,7 @@ class ClassicalFlow(MotionEstimator):
 
     Args:
         attachment: weight of the data term for pictures in firing rates; smaller values give smoother flow.
-        warps: warping iterations per pyramid level; fewer are faster and less accurate.
+        warps: warping iterations per pyramid level; fewer are faster and less accurate. At most three refine a half.
 
     Shape:
         As :class:`MotionEstimator`; no gradient.
@@ -134,7 +135,7 @@ def _velocities(pictures: Tensor, clock: tuple[float, float, float], attachment:
     away = _times(pictures[:1], before, after).reshape(2, 1, 1, 1)
     halves = torch.stack([pictures[:, 1:2].expand_as(ends), ends], dim=2).flatten(0, 1)
     start, weight = (one * away).flatten(0, 1), attachment.repeat_interleave(2, dim=0)
-    own = tvl1_flow(halves, _times(halves, 0.0, 1.0), weight, start, warps).reshape(one.shape) / away
+    own = tvl1_flow(halves, _times(halves, 0.0, 1.0), weight, start, min(warps, _OWN)).reshape(one.shape) / away
     unlike, less = (_unlike(pictures, velocities * away) for velocities in (one, own))
     bent = ((unlike / (less + _UNSEEN) - _PART[0]) / (_PART[1] - _PART[0])).clamp(0, 1)
     return torch.lerp(one, own, bent.unsqueeze(1))
