@@ -115,8 +115,23 @@ class ClassicalFlow(MotionEstimator):
             _filtered(part, weights, border) for part, weights in ((raw, kernel), (variance, [w**2 for w in kernel]))
         )
         attachment = self.attachment / (1 + variance[:, 0] / _NOISE**2)
-        velocities = _velocities(pictures, clock, attachment, self.warps)
+        velocities = self._velocities(pictures, clock, attachment)
         return velocities.unflatten(0, (-1, len(spikes))) if by_site else velocities
+
+    def _velocities(self, pictures: Tensor, clock: tuple[float, float, float], attachment: Tensor) -> Tensor:
+        """Return the velocities before and after the middle, (B, 2, 2, h, w), in pixels per clock."""
+        ends, span = pictures[:, ::2], clock[2] - clock[0]
+        before, after = clock[0] - clock[1], clock[2] - clock[1]
+        one = tvl1_flow(ends, _times(pictures, before / span, after / span), attachment, warps=self.warps) / span
+        one = one.unsqueeze(1).expand(-1, 2, -1, -1, -1)
+        away = _times(pictures[:1], before, after).reshape(2, 1, 1, 1)
+        halves = torch.stack([pictures[:, 1:2].expand_as(ends), ends], dim=2).flatten(0, 1)
+        start, weight = (one * away).flatten(0, 1), attachment.repeat_interleave(2, dim=0)
+        own = tvl1_flow(halves, _times(halves, 0.0, 1.0), weight, start, min(self.warps, _OWN))
+        own = own.reshape(one.shape) / away
+        unlike, less = (_unlike(pictures, velocities * away) for velocities in (one, own))
+        bent = ((unlike / (less + _UNSEEN) - _PART[0]) / (_PART[1] - _PART[0])).clamp(0, 1)
+        return torch.lerp(one, own, bent.unsqueeze(1))
 
 
 def _filtered(planes: Tensor, weights: Sequence[float], border: str) -> Tensor:
@@ -124,21 +139,6 @@ def _filtered(planes: Tensor, weights: Sequence[float], border: str) -> Tensor:
 
     kernel = torch.cat([planes.new_full((1, 1), weight) for weight in weights], dim=1)
     return filter2d_separable(planes, kernel, kernel, border)
-
-
-def _velocities(pictures: Tensor, clock: tuple[float, float, float], attachment: Tensor, warps: int) -> Tensor:
-    """Return the velocities before and after the middle, (B, 2, 2, h, w), in pixels per clock."""
-    ends, span = pictures[:, ::2], clock[2] - clock[0]
-    before, after = clock[0] - clock[1], clock[2] - clock[1]
-    one = tvl1_flow(ends, _times(pictures, before / span, after / span), attachment, warps=warps) / span
-    one = one.unsqueeze(1).expand(-1, 2, -1, -1, -1)
-    away = _times(pictures[:1], before, after).reshape(2, 1, 1, 1)
-    halves = torch.stack([pictures[:, 1:2].expand_as(ends), ends], dim=2).flatten(0, 1)
-    start, weight = (one * away).flatten(0, 1), attachment.repeat_interleave(2, dim=0)
-    own = tvl1_flow(halves, _times(halves, 0.0, 1.0), weight, start, min(warps, _OWN)).reshape(one.shape) / away
-    unlike, less = (_unlike(pictures, velocities * away) for velocities in (one, own))
-    bent = ((unlike / (less + _UNSEEN) - _PART[0]) / (_PART[1] - _PART[0])).clamp(0, 1)
-    return torch.lerp(one, own, bent.unsqueeze(1))
 
 
 def _times(pictures: Tensor, first: float, second: float) -> Tensor:
