@@ -11,7 +11,7 @@ from torch import Tensor
 
 from spikekit.kernels.compiled import compiled, in_threads
 from spikekit.kernels.layout import new_tensor
-from spikekit.kernels.vectors import sum_products
+from spikekit.kernels.vectors import add_products, sum_products
 
 _ROWS = 16  # sensor rows per job
 
@@ -86,29 +86,32 @@ def _searcher(channels: int, pixels: int, steps: int) -> Any:
     return compiled(search)
 
 
-def _spread(
-    grad: Any, flow: Any, shares: Any, start: Any, jump: Any, weight: Any, low: Any, high: Any, steps: Any,
-    t: Any, out: Any,
-) -> None:  # fmt: skip
-    """Add the gradient of the features of a time point to zeros ``out`` (T, H, W, F), from grad (H, W, T, F, s^2)."""
-    _, height, width, channels = out.shape
-    pixels = weight.shape[1]
-    flat = out.reshape(len(out), height * width * channels)
-    columns, to_y, to_x = np.arange(width), np.empty(width, np.int32), np.empty(width, np.int32)
-    for y in range(height):
-        _to_steps(flow[:, 1, y], shares[t], np.full(width, y), height, steps, to_y)
-        _to_steps(flow[:, 0, y], shares[t], columns, width, steps, to_x)
-        for x in range(width):
-            base, which = _class(to_y[x], to_x[x], height, width, low, high, steps)
-            for k in range(start[which], start[which + 1]):
-                for c in range(channels):
-                    total = np.float32(0)
-                    for n in range(pixels):
-                        total += weight[k, n] * grad[y, x, t, c, n]
-                    flat[t, base * channels + jump[k] + c] += total
+@lru_cache
+def _spreader(channels: int, pixels: int, steps: int) -> Any:
+    """Return the loop of the derivative, see :func:`_searcher`."""
+    lanes, calls = (1, channels) if pixels > 1 else (channels, 1)
 
+    def spread(
+        grad: Any, flow: Any, shares: Any, start: Any, jump: Any, weight: Any, low: Any, high: Any, t: Any, out: Any
+    ) -> None:
+        """Add the gradient of the features of a time point to zeros ``out`` (T, H, W, F), from (H, W, T, F, s^2)."""
+        times, height, width, _ = out.shape
+        flat, weights, results = grad.ravel(), weight.ravel(), out.ravel()
+        columns, to_y, to_x = np.arange(width), np.empty(width, np.int32), np.empty(width, np.int32)
+        for y in range(height):
+            _to_steps(flow[:, 1, y], shares[t], np.full(width, y), height, steps, to_y)
+            _to_steps(flow[:, 0, y], shares[t], columns, width, steps, to_x)
+            for x in range(width):
+                base, which = _class(to_y[x], to_x[x], height, width, low, high, steps)
+                at = ((y * width + x) * times + t) * channels * pixels
+                to = (t * height * width + base) * channels
+                for c in range(calls):
+                    add_products(
+                        flat, lanes, weights, pixels, jump, start[which], start[which + 1], at + c * pixels, results,
+                        to + c,
+                    )  # fmt: skip
 
-_spread_time = compiled(_spread)
+    return compiled(spread)
 
 
 def search_sites(
@@ -139,10 +142,11 @@ def spread_sites(
     times = len(shares)
     rows = grad.movedim(1, -1).float().contiguous().unflatten(-1, (times, -1, scale**2))
     batch, height, width, _, channels, _ = rows.shape
+    spread = _spreader(channels, scale**2, steps)
     out = new_tensor((batch, times, height, width, channels), torch.float32, np.zeros)
     jump = (offset[:, 0] * width + offset[:, 1]) * channels
     table = [part.numpy() for part in (shares.float(), start, jump, weight)]
     for rows_b, flow_b, out_b in zip(rows.numpy(), flow.contiguous().numpy(), out.numpy(), strict=True):
-        arguments = rows_b, flow_b, *table, low, high, steps
-        in_threads(_spread_time, ((*arguments, t, out_b) for t in range(times)))
+        arguments = rows_b, flow_b, *table, low, high
+        in_threads(spread, ((*arguments, t, out_b) for t in range(times)))
     return out.permute(0, 1, 4, 2, 3)

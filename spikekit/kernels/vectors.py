@@ -1,4 +1,8 @@
-"""Sums in vector registers, which Numba does not find in loops as short as a few temporal pixels."""
+"""Sums of products in vector registers, which Numba does not use for loops as short as a few temporal pixels.
+
+All arrays are flat and contiguous: values, weights and sums float32, jumps int32. The literals ``lanes`` and ``others``
+are the numbers of features and of weights that an index k stands for. One of the two is n, the other is 1.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,46 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-_LONG = ir.IntType(64)
+_LONG, _WORD, _REAL = ir.IntType(64), ir.IntType(32), ir.FloatType()
+_FUSED = ("contract",)  # may be fused to a multiply-add
+
+
+class _Vectors:
+    """Code for vectors of ``count`` numbers."""
+
+    def __init__(self, context: Any, builder: Any, signature: Any, arguments: Any) -> None:
+        self.builder, self.arguments, self.types = builder, arguments, signature.args
+        self.lanes, self.others = (signature.args[n].literal_value for n in (1, 3))
+        self.count = max(self.lanes, self.others)
+        self.vector = ir.VectorType(_REAL, self.count)
+        self.data = {n: context.make_array(self.types[n])(context, builder, arguments[n]).data for n in (0, 2, 4, 8)}
+
+    def same(self, number: int) -> ir.Constant:
+        return ir.Constant(ir.VectorType(_WORD, self.count), [number] * self.count)
+
+    def place(self, array: int, index: Any, kind: Any) -> Any:
+        return self.builder.bitcast(self.builder.gep(self.data[array], [index]), kind.as_pointer())
+
+    def read(self, array: int, index: Any, size: int) -> Any:
+        """Load ``count`` numbers, or one into all lanes."""
+        if size == self.count:
+            return self.builder.load(self.place(array, index, self.vector), align=4)
+        one = self.builder.load(self.place(array, index, _REAL))
+        alone = self.builder.insert_element(self.vector(ir.Undefined), one, _WORD(0))
+        return self.builder.shuffle_vector(alone, alone, self.same(0))
+
+    def loop(self) -> Any:
+        return cgutils.for_range_slice(self.builder, *self.arguments[5:7], _LONG(1))
+
+    def jumped(self, start: Any, k: Any) -> Any:
+        return self.builder.add(start, self.builder.sext(self.builder.load(self.place(4, k, _WORD)), _LONG))
+
+    def weight(self, k: Any) -> Any:
+        return self.read(2, self.builder.mul(k, _LONG(self.others)), self.others)
+
+
+def _signature(*arguments: Any) -> Any:
+    return types.void(*arguments[:5], *[types.int64] * 3, arguments[8], types.int64)
 
 
 @intrinsic(prefer_literal=True)
@@ -18,45 +61,48 @@ def sum_products(
 ) -> Any:  # fmt: skip
     """Compute ``out[to : to + n] = sum(values[at + jump[k] :] * weights[k * others :] for k in range(first, last))``.
 
-    Here n is the larger one of the literals ``lanes`` and ``others``, the numbers of values and of weights that each k
-    reads; the other one is 1. All arrays are flat and contiguous, ``values`` and ``weights`` float32, ``jump`` int32.
     ``out`` is float32, or uint16 for bfloat16, rounded to even.
     """
-    count = max(lanes.literal_value, others.literal_value)
-    vector, words = ir.VectorType(ir.FloatType(), count), ir.VectorType(ir.IntType(32), count)
-
-    def same(number: int) -> ir.Constant:
-        return ir.Constant(words, [number] * count)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        def data(n: int) -> Any:
-            return context.make_array(signature.args[n])(context, builder, arguments[n]).data
-
-        def read(array: Any, index: Any, size: int) -> Any:
-            place = builder.gep(array, [index])
-            if size == count:
-                return builder.load(builder.bitcast(place, vector.as_pointer()), align=4)
-            alone = builder.insert_element(ir.Constant(vector, ir.Undefined), builder.load(place), ir.IntType(32)(0))
-            return builder.shuffle_vector(alone, alone, same(0))
-
-        array, factors, jumps, result = (data(n) for n in (0, 2, 4, 8))
-        begin, end, start, target = (arguments[n] for n in (5, 6, 7, 9))
-        total = cgutils.alloca_once_value(builder, ir.Constant(vector, [0.0] * count))
-        with cgutils.for_range_slice(builder, begin, end, _LONG(1)) as (k, _):
-            index = builder.add(start, builder.sext(builder.load(builder.gep(jumps, [k])), _LONG))
-            value = read(array, index, lanes.literal_value)
-            weight = read(factors, builder.mul(k, _LONG(others.literal_value)), others.literal_value)
-            product = builder.fmul(value, weight, flags=("contract",))
-            builder.store(builder.fadd(builder.load(total), product, flags=("contract",)), total)
+        code = _Vectors(context, builder, signature, arguments)
+        total = cgutils.alloca_once_value(builder, ir.Constant(code.vector, [0.0] * code.count))
+        with code.loop() as (k, _):
+            product = builder.fmul(code.read(0, code.jumped(arguments[7], k), code.lanes), code.weight(k), flags=_FUSED)
+            builder.store(builder.fadd(builder.load(total), product, flags=_FUSED), total)
         found = builder.load(total)
         if out.dtype == types.uint16:
-            word = builder.bitcast(found, words)
-            even = builder.and_(builder.lshr(word, same(16)), same(1))
-            found = builder.lshr(builder.add(builder.add(word, same(0x7FFF)), even), same(16))
-            found = builder.trunc(found, ir.VectorType(ir.IntType(16), count))
-        place = builder.bitcast(builder.gep(result, [target]), found.type.as_pointer())
-        builder.store(found, place, align=out.dtype.bitwidth // 8)
+            word = builder.bitcast(found, code.same(0).type)
+            even = builder.and_(builder.lshr(word, code.same(16)), code.same(1))
+            found = builder.lshr(builder.add(builder.add(word, code.same(0x7FFF)), even), code.same(16))
+            found = builder.trunc(found, ir.VectorType(ir.IntType(16), code.count))
+        builder.store(found, code.place(8, arguments[9], found.type), align=out.dtype.bitwidth // 8)
         return context.get_dummy_value()
 
-    whole = types.int64
-    return types.void(values, lanes, weights, others, jump, whole, whole, whole, out, whole), generate
+    return _signature(values, lanes, weights, others, jump, first, last, at, out, to), generate
+
+
+@intrinsic(prefer_literal=True)
+def add_products(
+    typing: Any, values: Any, lanes: Any, weights: Any, others: Any, jump: Any, first: Any, last: Any, at: Any,
+    out: Any, to: Any,
+) -> Any:  # fmt: skip
+    """Do the transpose of :func:`sum_products`: add products of ``values[at : at + n]`` to ``out[to + jump[k] :]``."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        code = _Vectors(context, builder, signature, arguments)
+        value = code.read(0, arguments[7], code.count)
+        with code.loop() as (k, _):
+            product = builder.fmul(value, code.weight(k), flags=_FUSED)
+            if code.lanes < code.count:  # the sum of the products
+                function = cgutils.get_or_insert_function(
+                    builder.module,
+                    ir.FunctionType(_REAL, [_REAL, code.vector]),
+                    f"llvm.vector.reduce.fadd.v{code.count}f32",
+                )
+                product = builder.call(function, [_REAL(0.0), product], fastmath=("reassoc",))
+            place = code.place(8, code.jumped(arguments[9], k), product.type)
+            builder.store(builder.fadd(builder.load(place, align=4), product), place, align=4)
+        return context.get_dummy_value()
+
+    return _signature(values, lanes, weights, others, jump, first, last, at, out, to), generate
