@@ -83,11 +83,9 @@ def ssim(rgb: Tensor, target: Tensor) -> Tensor:
     rgb, target = _pair(rgb, target)
     if rgb.shape[-2] < 7 or rgb.shape[-1] < 7:
         raise ValueError(f"rgb: expected at least 7 x 7 pixels, got {tuple(rgb.shape)}")
-    if rgb.numel() == 0:  # no pictures
-        return rgb.sum(dim=(-3, -2, -1))
-    height, width = rgb.shape[-2:]
-    planes = (picture.reshape(-1, height, width).unbind() for picture in (rgb, target))
-    similar = torch.stack([_similarity(a, b) for a, b in zip(*planes, strict=True)])
+    planes = (picture.flatten(0, -3).unbind() for picture in (rgb, target))
+    each = [_similarity(a, b) for a, b in zip(*planes, strict=True)]
+    similar = torch.stack(each) if each else rgb[..., 0, 0]  # of no pictures
     return similar.reshape(rgb.shape[:-2]).mean(dim=-1).to(rgb.dtype)
 
 
