@@ -33,8 +33,8 @@ def parser() -> argparse.ArgumentParser:
     made = VerbParser(
         prog="lightning predict",
         allow_abbrev=False,
-        description="Make pictures of a recording. By default, --speed balanced chooses the weights, for the measured "
-        "noise of a sensor that was not calibrated. Existing pictures are not made again.",
+        description="Make pictures of a recording. By default, --speed balanced chooses the weights, those for noisy "
+        "sensors if the recording turns out to be noisy. Existing pictures are not made again.",
         epilog="example: lightning predict FILE.dat --height 250 --width 400 --flip -o film.mp4",
     )
     recordings.add_arguments(made)
