@@ -1,71 +1,73 @@
 """Loading of clips."""
 
+import multiprocessing
 import os
 import signal
-import subprocess
 import sys
 import time
 from types import SimpleNamespace
 
 import pytest
+import torch
+from pytorch_lightning.utilities import rank_zero_only
 
-from lightning_modules.data.loading import FreshClips
+from lightning_modules.cli import command
+from lightning_modules.data.loading import FreshClips, load_clips
 
-# A clip is larger than a pipe: its worker waits for somebody to take it.
-LOAD = """
-import os, torch
-from lightning_modules.data.loading import load_clips
+FORK = multiprocessing.get_context("fork") if sys.platform != "win32" else None
+
+
 class Clips(torch.utils.data.Dataset):
-    def __len__(self): return 100
-    def __getitem__(self, index): return dict(pid=torch.tensor(os.getpid()), rgb=torch.zeros(1 << 20))
-clips = iter(load_clips(Clips(), 1, 2))
-print(*set(int(next(clips)["pid"]) for _ in range(8)), flush=True)
-input()
-"""
+    """Clips larger than a pipe: a worker waits for somebody to take them."""
+
+    def __len__(self):
+        return 100
+
+    def __getitem__(self, index):
+        return {"pid": torch.tensor(os.getpid()), "rgb": torch.zeros(1 << 20)}
 
 
-def alive(pid):
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
+def killed(start):
+    """Kill a process once it has sent something; return that, and whether all processes it started have ended."""
+    there, here = FORK.Pipe(duplex=False)
+    process = FORK.Process(target=start, args=(here,))
+    process.start()
+    here.close()
+    sent = there.recv()
+    process.kill()
+    process.join()
+    return sent, there.poll(60)  # the pipe ends with the last process that holds it
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signals")
 def test_workers_end_with_a_killed_run():
-    process = subprocess.Popen([sys.executable, "-c", LOAD], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    workers = [int(pid) for pid in process.stdout.readline().split()]
-    assert len(workers) == 2
-    assert all(map(alive, workers))
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    for _ in range(120):
-        if not any(map(alive, workers)):
-            break
-        time.sleep(0.5)
-    assert not any(map(alive, workers))
+    def load(pipe):
+        clips = iter(load_clips(Clips(), 1, 2))
+        pipe.send({int(next(clips)["pid"]) for _ in range(8)})
+        time.sleep(600)
+
+    workers, ended = killed(load)
+    for pid in () if ended else workers:
+        os.kill(pid, signal.SIGKILL)
+    assert (len(workers), ended) == (2, True)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signals")
-def test_processes_end_with_the_first():
-    started = """
-from lightning_modules.cli import command
-command.run(None, lambda *_, **__: print("begun", flush=True) or input())
-"""
-    first = """
-import os, subprocess, sys
-from lightning_modules.cli import command
-command.run(None, lambda *_, **__: None)
-subprocess.run([sys.executable, "-c", sys.argv[1]], env=dict(os.environ, LOCAL_RANK="1"))
-"""
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    earlier = {**os.environ, "SPIKEKIT_FIRST_PROCESS": str(os.getpid())}  # as a run in this process would leave it
-    with subprocess.Popen([sys.executable, "-c", first, started], env=earlier, **pipes) as process:
-        assert process.stdout.readline() == "begun\n"
-        process.send_signal(signal.SIGKILL)
-        assert process.stdout.read() == ""  # the pipe ends with the last process that holds it
+def test_processes_end_with_the_first(monkeypatch):
+    monkeypatch.setenv("SPIKEKIT_FIRST_PROCESS", str(os.getpid()))  # as a run in this process would leave it
+
+    def last(pipe):
+        rank_zero_only.rank = 1
+        command.run(None, lambda *_: [pipe.send("begun"), time.sleep(90)])
+
+    def first(pipe):
+        command.run(None, lambda *_: None)
+        started = FORK.Process(target=last, args=(pipe,))
+        started.start()
+        started.join()
+
+    assert killed(first) == ("begun", True)
 
 
 def of_process(rank, processes, step=0, accumulated=1):

@@ -108,9 +108,8 @@ def test_plateau_schedule_monitors_the_best_metric(fit):
     words = ["--model.lr_scheduler=torch.optim.lr_scheduler.ReduceLROnPlateau", "--model.lr_scheduler.mode=max"]
     words += ["--model.lr_scheduler.patience=0", "--model.lr_scheduler.threshold=1000"]
     checkpoint = fit("run", "--trainer.check_val_every_n_epoch=1", "--trainer.max_steps=12", *words)
-    assert checkpoint["optimizer_states"][0]["param_groups"][0]["lr"] == pytest.approx(
-        1e-5
-    )  # after the second of two validations
+    rate = checkpoint["optimizer_states"][0]["param_groups"][0]["lr"]
+    assert rate == pytest.approx(1e-5)  # after the second of two validations
 
 
 @pytest.mark.slow

@@ -158,8 +158,8 @@ def test_long_streams_have_intervals_of_32_bits(run, monkeypatch):
         dtype = torch.int16 if frames < 32767 else torch.int32
         assert run("spike_interval", torch.zeros(0, frames, 1, 1))[0].dtype is dtype
         if INTERPRETED:
-            frames -= 32500
-            monkeypatch.setattr(run.kernels, "_LONGEST", 266)
+            frames -= 32650
+            monkeypatch.setattr(run.kernels, "_LONGEST", 116)
         spikes = torch.zeros(frames, 1, 4, dtype=torch.uint8)
         spikes[[5, frames - 3], :, 1] = 1
         spikes[0, :, 2] = spikes[-1, :, 3] = 1

@@ -126,7 +126,7 @@ def test_atomic_sums_are_not_used_in_deterministic_mode():
 
 
 @computes
-@pytest.mark.parametrize(("scale", "channels", "size"), [(4, 2, (12, 13)), (1, 3, (13, 12))])
+@pytest.mark.parametrize(("scale", "channels", "size"), [(4, 2, (6, 7)), (1, 3, (7, 6))])
 def test_site_wise_search_and_its_derivative_equal_the_torch_path(scale, channels, size):
     table = site_search.site_table("RGGB", 1, scale, (size[0] % 2 == 1, size[1] % 2 == 1), torch.device("cpu"))
     shares = torch.tensor([[0.25, 0.0], [0.0, 1.0]])
@@ -145,7 +145,7 @@ def test_site_wise_search_and_its_derivative_equal_the_torch_path(scale, channel
 @computes
 def test_a_level_of_tvl1_equals_the_torch_path():
     """Compared with the torch path in float32, up to the order of sums."""
-    clips, height, width = 2, 9, 13
+    clips, height, width = 2, 5, 9
     smooth = torch.nn.functional.avg_pool2d(torch.rand(clips, 3, height + 8, width + 8), 9, 1)
     pictures = torch.cat([smooth[:, :1], smooth[:, :1].roll((1, 1), (2, 3)) + 0.01 * smooth[:, 1:2]], dim=1)
     times, limit = torch.tensor([[-0.5, 0.5], [0.0, 1.0]]), 20 * smooth[:, 2]
