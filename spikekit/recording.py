@@ -17,7 +17,7 @@ from spikekit.calibration.spikes import correct_spikes
 from spikekit.color.cfa import GREY, cfa_pattern
 from spikekit.io.cameras import Camera, usual_sizes
 from spikekit.io.cameras import camera as load_camera
-from spikekit.io.files import iter_spikes, read_spikes, spikes_shape
+from spikekit.io.files import iter_spikes, spikes_shape
 from spikekit.io.formats import SpikeFileError
 from spikekit.io.sidecar import find_sidecar
 from spikekit.progress import progress
@@ -53,10 +53,6 @@ class Recording:
     def prepare(self, upright: Tensor) -> Tensor:
         """Crop upright frames (*, H, W) to the pixels of the sensor."""
         return self.camera.prepare(upright, flip=False) if self.camera else upright
-
-    def read(self, start: int, frames: int) -> Tensor:
-        """Return ``frames`` frames from ``start`` on, (T, H, W), uint8."""
-        return self.prepare(read_spikes(self.path, *self.stored, flip=self.flip, start=start, frames=frames))
 
     def frames_from(self, start: int) -> Iterator[Tensor]:
         """Iterate over the frames from ``start`` on, each (H, W), uint8."""

@@ -16,11 +16,13 @@ from lightning_modules.cli.folder_lock import check_folder, locked_folder
 from lightning_modules.inference.clips import NOISY, RecordingClips
 from lightning_modules.inference.output import check_place
 from lightning_modules.inference.predict import precision_of
+from lightning_modules.inference.reconstruct import other_sensor
 from lightning_modules.networks import Network
 from lightning_modules.registry import list_models
 from lightning_modules.storage.pretrained import Weights, motion_of, settings_of, write_weights
 from spikekit.arguments import whole
 from spikekit.cli import recordings
+from spikekit.color.cfa import GREY
 from spikekit.recording import Recording
 from spikekit.timing import duration
 
@@ -41,7 +43,7 @@ def parser() -> argparse.ArgumentParser:
     )
     recordings.add_arguments(made)
     add = made.add_argument
-    add("--weights", default="cscsr_small_x4", help="weights to fine-tune (default: cscsr_small_x4)")
+    add("--weights", help="weights to fine-tune (default: cscsr_small_x4, or cscsr_small_grey_x1 for a grey camera)")
     add(
         "--teacher",
         help="weights to learn from (default: the largest model in the package whose clips fit the recording three "
@@ -55,16 +57,18 @@ def parser() -> argparse.ArgumentParser:
 def adapt(args: Sequence[str]) -> None:
     """Fine-tune weights on a recording, given the arguments after ``lightning adapt``."""
     asked = parser().parse_args(args)
-    weights = asked.weights
     begin, written = perf_counter(), asked.output / _WRITTEN
     device = "cuda" if torch.cuda.is_available() else "cpu"
     with input_errors():
         check_folder(asked.output)
         check_place(written)
+        recording = recordings.opened(asked)
+        weights = asked.weights or ("cscsr_small_grey_x1" if recording.pattern == GREY else "cscsr_small_x4")
         student = Network.from_pretrained(weights).to(device)
         if student.settings.get("motion_fusion", "joint") != "joint":
             raise UsageError(f"--weights: expected a network with one flow for all colours, got {weights}")
-        recording = recordings.opened(asked)
+        if warning := other_sensor(recording, student.pattern):
+            print(warning, flush=True)
         level = 0.0 if asked.calibration == "none" else RecordingClips(recording).noise_level
         clips, name, teacher = clips_and_teacher(recording, student, asked.teacher, level > NOISY)
         student.noise_level = teacher.noise_level = level

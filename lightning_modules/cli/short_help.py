@@ -24,7 +24,7 @@ _EXAMPLES = {
 
 _OPTIONS = {
     "-c FILE": "configuration; later ones override earlier ones",
-    "--data NAME": "StillScenes, from pictures (default), or FilmScenes, from films",
+    "--data NAME": "StillScenes, from pictures (default), FilmScenes, from films, or for test RecordingScenes",
     "--data.root FOLDER": "folder of pictures or films; default: pictures of scikit-image",
     "--model.weights NAME": "initial weights: a name listed by lightning models, a .safetensors or a .ckpt file",
     "--ckpt_path FILE": "checkpoint of this configuration; best and last: of the folder; fit resumes with last",

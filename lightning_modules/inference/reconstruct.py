@@ -131,7 +131,7 @@ def reconstruct(
         network = preset.build(GREY if recording.pattern == GREY else "RGGB")
     network.noise_level = level
     clips = RecordingClips(recording, network.frames, frame, network.pattern)
-    notes = [line for line in (recording.note, _other_sensor(recording, network.pattern), *notes) if line]
+    notes = [line for line in (recording.note, other_sensor(recording, network.pattern), *notes) if line]
     return Reconstruction(network, clips, white, device, precision, notes, **how)
 
 
@@ -259,10 +259,10 @@ class Reconstruction:
         }
 
 
-def _other_sensor(recording: Recording, pattern: str) -> str | None:
+def other_sensor(recording: Recording, pattern: str) -> str | None:
     """Return a warning if the camera is grey and the weights are for colour, or the reverse."""
     if recording.pattern == GREY and pattern != GREY:
-        return f"the camera is grey, but the weights are for {pattern}: expect false colours"
+        return f"the camera is grey, but the weights are for {pattern}: they take texture for colour"
     if recording.pattern in PATTERNS and pattern == GREY:
         return f"the camera is {recording.pattern}, but the weights are for grey: they take its mosaic for texture"
     return None

@@ -66,8 +66,8 @@ class TestReport(Callback):
     """Print the table of a test, with all methods on the same clips, and write ``test.csv`` and ``test.png``.
 
     The columns are :func:`spikekit.psnr`, :func:`spikekit.ssim` and, if available, LPIPS, averaged over clips, see
-    :mod:`lightning_modules.metrics.image`. ``test.csv`` also has a row per clip, named after the ``test_names`` of the
-    data if there are any.
+    :mod:`lightning_modules.metrics.image`. Without ground truth, as of a recording, they are blur and noise.
+    ``test.csv`` also has a row per clip, named after the ``test_names`` of the data if there are any.
 
     Args:
         output: folder of the run.
@@ -75,6 +75,7 @@ class TestReport(Callback):
     """
 
     __test__ = False  # not a test for pytest
+    truth = True  # whether there is any
 
     def __init__(self, output: str | Path, clips: int = 6) -> None:
         self.output = Path(output)
@@ -82,18 +83,15 @@ class TestReport(Callback):
 
     def columns(self) -> list[tuple[str, str, int]]:
         """Return columns of ``test.csv``, their headings in the table, and their decimal places there."""
-        return [(measure.name, measure.heading, measure.digits) for measure in measures()]
-
-    def missing(self) -> str | None:
-        """Return a line that tells which metric is missing, and why; ``None`` if none is."""
-        return why_no_lpips()
+        return [(measure.name, measure.heading, measure.digits) for measure in measures(self.truth)]
 
     def rows(self, pictures: dict[str, Tensor], batch: dict[str, Tensor]) -> list[list[Tensor]]:
         """Return one row per clip of a batch: a picture of every method, and the truth; of films, the middle one."""
         if "every" in batch:
             pictures = {method: rgb[:, rgb.shape[1] // 2] for method, rgb in pictures.items()}
             batch = middle_clip(batch)
-        return [[rgb.clamp(0, 1).cpu() for rgb in row] for row in zip(*pictures.values(), batch["rgb"], strict=True)]
+        shown = [*pictures.values(), *([batch["rgb"]] if self.truth else [])]
+        return [[rgb.clamp(0, 1).cpu() for rgb in row] for row in zip(*shown, strict=True)]
 
     def on_test_start(self, trainer: Trainer, module: LightningModule) -> None:  # noqa: D102
         self._scores: dict[str, list[tuple[float, ...]]] = defaultdict(list)
@@ -102,6 +100,7 @@ class TestReport(Callback):
     def on_test_batch_end(  # noqa: D102
         self, trainer: Trainer, module: LightningModule, outputs: dict[str, Any], batch: dict[str, Tensor], *_: Any
     ) -> None:
+        self.truth = "white" not in batch
         for method, scores in outputs["scores"].items():
             self._scores[method] += zip(*(scores[column].tolist() for column, _, _ in self.columns()), strict=True)
         if len(self._rows) < self.clips:
@@ -122,9 +121,10 @@ class TestReport(Callback):
                 writer.writerows([method, n, *map(_rounded, score)] for n, score in zip(names, scores, strict=True))
                 writer.writerow([method, "mean", *map(_rounded, means[method])])
         write_picture(self.output / "test.png", panel(self._rows))
-        missing = self.missing()
+        missing = why_no_lpips() if any(name == "psnr" for name, *_ in self.columns()) else None
+        shown = [*self._scores, *(["truth"] if self.truth else [])]
         print(f"\n{self._table(f'mean of {clips} clips', means)}\n\n{missing or ''}")  # noqa: T201
-        print(f"{self.output / 'test.csv'}, {self.output / 'test.png'} (columns: {', '.join(self._scores)}, truth)")  # noqa: T201
+        print(f"{self.output / 'test.csv'}, {self.output / 'test.png'} (columns: {', '.join(shown)})")  # noqa: T201
 
     def _table(self, clips: str, scores: dict[str, Sequence[float]]) -> str:
         lines = []

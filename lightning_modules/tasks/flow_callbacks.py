@@ -39,9 +39,6 @@ class FlowReport(TestReport):
             ("milliseconds", "ms/clip", 1),
         ]
 
-    def missing(self) -> None:
-        """Return ``None``: no metric is missing."""
-
     def rows(self, pictures: dict[str, Tensor], batch: dict[str, Tensor]) -> list[list[Tensor]]:  # noqa: D102
         flows = [flow[:, 1] for flow in pictures.values()]
         return [flow_row(row[:-1], row[-1]) for row in zip(*flows, batch["flow"][:, 1], strict=True)]

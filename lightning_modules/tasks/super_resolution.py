@@ -138,16 +138,18 @@ class SuperResolution(BaseTask):
     def test_step(self, batch: dict[str, Tensor], batch_index: int) -> dict[str, dict[str, Any]]:
         """Return ``pictures`` by method, of a film the scored ones, (B, K, 3, s H, s W), and their ``scores``."""
         spikes, settings = batch["spikes"], self.network.settings
-        name, decoder = type(self.network).__name__, (settings["scale"], settings["pattern"], settings["alpha"])
+        white = batch["white"].item() if "white" in batch else settings["alpha"]  # recordings have their own
+        name, decoder = type(self.network).__name__, (settings["scale"], settings["pattern"], white)
         film = "every" in batch
         if "noise" in batch:  # one level for all test clips
             self.network.noise_level = batch["noise"].flatten()[0].item()
-        clips, truth = spikes, batch["rgb"]
+        clips, truth = spikes, batch.get("rgb")
         if film:
             judged = middle_half(batch)
             clips, truth = spikes[:, judged].flatten(0, 1), truth[:, judged]
         pictures = {method.upper(): ClassicalDecoder(method, *decoder)(clips) for method in METHODS}
-        pictures[f"{name}, single clips" if film else name] = self(clips)
+        exposed = predict(self.network, clips, exposure=settings["alpha"] / white)
+        pictures[f"{name}, single clips" if film else name] = exposed
         if film:
             pictures = {method: rgb.unflatten(0, truth.shape[:2]) for method, rgb in pictures.items()}
             if isinstance(self.network, RecurrentCSCSR):

@@ -14,7 +14,7 @@ _OF_NOISE = 0.555  # that quantile for a block of white noise of variance 1
 _LEAST_SPIKES = 8  # of a pixel, on average over a block
 
 #: the second difference in both directions, with which white noise keeps its variance
-_FILTER = torch.tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]]) / 6
+SECOND_DIFFERENCE = torch.tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]]) / 6
 
 
 def gain_spread(rate: Tensor, frames: int, parts: int = 1, pattern: str = GREY) -> float | None:
@@ -45,7 +45,7 @@ def gain_spread(rate: Tensor, frames: int, parts: int = 1, pattern: str = GREY) 
     for plane in (rate[row::step, column::step].float() for row in range(step) for column in range(step)):
         if min(plane.shape) < _SIDE + 2:
             return None
-        noise = F.conv2d(plane[None, None], _FILTER.to(plane)[None, None]).square()
+        noise = F.conv2d(plane[None, None], SECOND_DIFFERENCE.to(plane)[None, None]).square()
         noise = F.avg_pool2d(noise, _SIDE) - 1 / (6 * parts * frames**2)
         mean = F.avg_pool2d(plane[None, None, 1:-1, 1:-1], _SIDE)
         found.append((noise / mean.square())[mean * parts * frames >= _LEAST_SPIKES])

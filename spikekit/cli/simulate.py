@@ -9,7 +9,8 @@ from typing import Any
 
 from spikekit.arguments import UsageError, ending_in, home_path, positive, whole
 from spikekit.calibration.files import read_calibration
-from spikekit.color.cfa import PATTERNS
+from spikekit.cli.recordings import pattern
+from spikekit.color.cfa import GREY, PATTERNS
 from spikekit.io.files import RECORDING_ENDINGS
 from spikekit.scenes.simulation import INTERPOLATIONS, Settings, simulate
 from spikekit.sensor.noise import SensorNoise
@@ -26,12 +27,12 @@ _NOISE = {
 
 
 def run(args: argparse.Namespace) -> None:
-    """Record a film with a simulated colour spike camera.
+    """Record a film with a simulated spike camera.
 
     OUT.dat holds the stream, 8 pixels per byte: a clip around one frame of the film, or the whole film. OUT.png holds
-    the ground truth: that frame in 8 bits, cropped to whole cells of the sensor. With --all, the folder OUT holds every
-    frame instead. OUT.json, the side-car, records every setting, what was modelled, and a hash of the stream. The same
-    settings give the same stream, bit for bit.
+    the ground truth: that frame in 8 bits, cropped to whole cells of the sensor, and grey if the sensor is. With --all,
+    the folder OUT holds every frame instead. OUT.json, the side-car, records every setting, what was modelled, and a
+    hash of the stream. The same settings give the same stream, bit for bit.
 
     Files appear under their names when they are complete, the side-car last. A stream without one may be incomplete.
     """
@@ -62,8 +63,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     stream = ending_in(*RECORDING_ENDINGS, said=f"a stream that ends in {', '.join(RECORDING_ENDINGS)}")
     add("-o", "--output", required=True, type=stream, metavar="OUT.dat", help="stream to write")
     add("--scale", required=True, type=whole(1), metavar="S", help="width of a sensor pixel in pixels of a film frame")
-    said = f"Bayer phase of the sensor; default: {Settings.pattern}"
-    add("--pattern", type=str.upper, choices=PATTERNS, help=said)
+    said = f"Bayer phase of the sensor, or {GREY}; default: {Settings.pattern}"
+    add("--pattern", type=pattern, choices=(*PATTERNS, GREY), help=said)
     option("alpha", positive, "A", "spikes of a white pixel per clock")
     option("clocks", whole(1), "N", "clocks from one film frame to the next")
     part = parser.add_mutually_exclusive_group()

@@ -14,7 +14,7 @@ from typing import Any
 
 from spikekit.arguments import one_line
 from spikekit.check import check_positive, check_whole
-from spikekit.color.cfa import PATTERNS
+from spikekit.color.cfa import GREY, PATTERNS
 from spikekit.io.failures import no_pipe
 from spikekit.io.whole_file import flush_folder, hidden_name
 
@@ -71,8 +71,8 @@ def _check(sidecar: Sidecar) -> None:
     if type(alpha) not in (int, float):
         raise ValueError(f"settings.alpha: expected a number, got {alpha!r}")
     check_positive("settings.alpha", float(alpha))
-    if pattern not in PATTERNS:
-        raise ValueError(f"settings.pattern: expected one of {', '.join(PATTERNS)}, got {pattern!r}")
+    if pattern not in (*PATTERNS, GREY):
+        raise ValueError(f"settings.pattern: expected one of {', '.join(PATTERNS)}, {GREY}, got {pattern!r}")
 
 
 def find_sidecar(stream: Path) -> Sidecar | None:

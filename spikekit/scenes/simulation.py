@@ -15,6 +15,7 @@ from torch import Tensor
 
 from spikekit._version import __version__
 from spikekit.arguments import UsageError
+from spikekit.color.cfa import GREY, bin_to_sensor
 from spikekit.flow.interpolate import Blend, FlowInterpolation, Still
 from spikekit.io.files import write_spikes
 from spikekit.io.formats import dat_bytes
@@ -107,7 +108,8 @@ def simulate(path: Path, settings: Settings, output: Path) -> list[str]:
     with _one_thread(), published(output) as part:
         for frame, picture in progress(pictures.items(), "pictures"):
             with whole_file(part / picture) as file:
-                file.write(png_bytes(film.rgb(frame)))
+                rgb = film.rgb(frame)
+                file.write(png_bytes(bin_to_sensor(rgb, GREY, scale=1) if film.pattern == GREY else rgb))
         noise, left_out = _needed_noise(settings, film, looked_at)
         plans: dict[int, Plan] = {}
         bits, digest = _expose(settings, film, (first, count), noise, part / output.name, plans)

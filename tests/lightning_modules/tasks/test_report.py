@@ -6,12 +6,14 @@ from types import SimpleNamespace
 import pytest
 import torch
 from pytorch_lightning import Trainer
+from torch.nn.functional import avg_pool2d
 
-from lightning_modules.data import StillScenes
-from lightning_modules.networks import CSCSR
+from lightning_modules.data import RecordingScenes, StillScenes
+from lightning_modules.metrics.image import score
+from lightning_modules.networks import CSCSR, ClassicalDecoder
 from lightning_modules.tasks.callbacks import TestReport
 from lightning_modules.tasks.super_resolution import SuperResolution
-from spikekit import psnr, read_picture
+from spikekit import psnr, read_picture, simulate_spikes, write_spikes
 
 
 def report_of(folder, clips, names, count=8):
@@ -56,3 +58,24 @@ def test_scores_are_returned_to_python(tmp_path):
     with torch.no_grad():
         known = [psnr(module(clip["spikes"][None]), clip["rgb"][None]).item() for clip in clips]
     assert scores["test/psnr"] == pytest.approx(sum(known) / 2, abs=1e-4)
+
+
+def test_blur_and_noise_without_ground_truth():
+    y, x = torch.meshgrid(torch.arange(64.0), torch.arange(64.0), indexing="ij")
+    sharp = (0.5 + 0.3 * torch.sign(torch.sin(x / 5) * torch.sin(y / 7))).expand(1, 3, -1, -1)
+    noisy = sharp + 0.05 * torch.randn(1, 1, 64, 64, generator=torch.Generator().manual_seed(0))
+    clean, blurred, noised = (score(rgb, None) for rgb in (sharp, avg_pool2d(sharp, 5, 1), noisy))
+    assert blurred["blur"] > clean["blur"] + 0.1
+    assert clean["noise"] < 0.005
+    assert noised["noise"].item() == pytest.approx(0.05, rel=0.15)
+
+
+def test_recordings_are_measured_at_their_white_level(tmp_path):
+    write_spikes(tmp_path / "a.npz", simulate_spikes(0.1 * (torch.arange(48) // 8 % 2) * torch.ones(81, 32, 1)))
+    data = RecordingScenes(str(tmp_path / "a.npz"), pattern="grey", calibration="none")
+    trainer = Trainer(logger=False, callbacks=[TestReport(tmp_path)], enable_progress_bar=False, accelerator="cpu")
+    [scores] = trainer.test(SuperResolution(ClassicalDecoder("tfp", 1, "grey")), data, verbose=False)
+    assert scores.keys() == {"test/blur", "test/noise"}
+    shown = read_picture(tmp_path / "test.png")
+    assert shown.shape == (3, 3 * 32 + 2 * 4, 3 * 48 + 2 * 4)
+    assert shown[:, :32, -48:].mean().item() == pytest.approx(0.5, abs=0.1)  # half black, half white

@@ -109,11 +109,14 @@ def test_a_whole_film_equals_a_single_run_in_bounded_memory(film, capsys):
     assert known.plan["intervals"] == [{"latent": 0, "region": None}] * 4
 
 
-def test_single_picture_is_a_still_scene(film):
-    simulate("film/f1.png", "-o", "a.dat", "--scale", 2)
-    assert believed(Path("a.dat"))
+@pytest.mark.parametrize("pattern", ["RGGB", "grey"])
+def test_single_picture_is_a_still_scene(film, pattern):
+    simulate("film/f1.png", "-o", "a.dat", "--scale", 2, "--pattern", pattern)
+    assert find_sidecar(Path("a.dat")).settings["pattern"] == pattern
+    assert read_picture("a.png").ndim == (2 if pattern == "grey" else 3)
     spikes = read_spikes("a.dat", 16, 18)
-    assert (spikes.sum(0) - 41 * FrameSequence(frames(2)[1:], scale=2).light()[0]).abs().max() < 1
+    light = FrameSequence(frames(2)[1:], scale=2, pattern=pattern).light()[0]
+    assert (spikes.sum(0) - 41 * light).abs().max() < 1
 
 
 def test_negligible_noise_is_left_out_and_the_plan_can_be_given(film, capsys):
@@ -140,7 +143,7 @@ def test_negligible_noise_is_left_out_and_the_plan_can_be_given(film, capsys):
         ("source", None, "source: expected names and values, got None"),
         ("stream.frames", True, "stream.frames: expected a whole number >= 1, got True"),
         ("settings.alpha", float("nan"), "settings.alpha: expected a finite number above 0, got nan"),
-        ("settings.pattern", "RGB", "settings.pattern: expected one of RGGB, BGGR, GRBG, GBRG, got 'RGB'"),
+        ("settings.pattern", "RGB", "settings.pattern: expected one of RGGB, BGGR, GRBG, GBRG, grey, got 'RGB'"),
     ],
     ids=str,
 )

@@ -12,6 +12,7 @@ from spikekit import (
     Motion,
     Scene,
     read_picture,
+    read_spikes,
     recording,
     simulate_spikes,
     tfi,
@@ -64,7 +65,7 @@ def moment(path, **known):
 def test_pictures_equal_those_of_the_decoders(moving):
     """TFP and TFI of the middle frame, motion, and the spikes of a row."""
     here = moment("a.dat", frames=101, size=(40, 48))
-    spikes = recording.Recording(Path("a.dat"), 101, (40, 48)).read(0, 101)
+    spikes = read_spikes("a.dat", 40, 48)
     assert here.tfp().equal((tfp(spikes, 41)[50] / 0.5).clamp(0, 1))
     assert here.tfi().equal((1 / spike_interval(spikes)[50].float() / 0.5).clamp(0, 1))
     assert here.tfi().equal((tfi(spikes)[50] / 0.5).clamp(0, 1))
@@ -137,8 +138,8 @@ def test_camera_sets_size_flip_and_crop(tmp_path, monkeypatch, capsys, header):
     known[::2, 1::2], known[1::2, ::2] = shown[1, ::2, 1::2], shown[1, 1::2, ::2]
     assert (known - (1.5 * inner).sqrt()).abs().max() < 0.01
     shown = recording.open_recording("a.dat", camera="own.json")
-    assert shown.read(7, 3).equal(shown.camera.prepare(spikes[7:10]))
-    assert (shown.unpack(next(shown.packed(7, 1))) == shown.read(7, 1)[0].numpy()).all()
+    assert next(shown.frames_from(7)).equal(shown.camera.prepare(spikes[7]))
+    assert (shown.unpack(next(shown.packed(7, 1))) == next(shown.frames_from(7)).numpy()).all()
 
 
 @pytest.mark.parametrize(
