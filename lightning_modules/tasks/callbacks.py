@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 from collections import defaultdict
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -123,15 +122,11 @@ class TestReport(Callback):
         write_picture(self.output / "test.png", panel(self._rows))
         missing = why_no_lpips() if any(name == "psnr" for name, *_ in self.columns()) else None
         shown = [*self._scores, *(["truth"] if self.truth else [])]
-        print(f"\n{self._table(f'mean of {clips} clips', means)}\n\n{missing or ''}")  # noqa: T201
+        head = [f"mean of {clips} clips", *(title for _, title, _ in self.columns())]
+        places = [digits for _, _, digits in self.columns()]
+        lines = [[method, *map("{:.{}f}".format, values, places)] for method, values in means.items()]
+        print(f"\n{table(head, lines)}\n\n{missing or ''}")  # noqa: T201
         print(f"{self.output / 'test.csv'}, {self.output / 'test.png'} (columns: {', '.join(shown)})")  # noqa: T201
-
-    def _table(self, clips: str, scores: dict[str, Sequence[float]]) -> str:
-        lines = []
-        for method, values in scores.items():
-            columns = zip(values, self.columns(), strict=True)
-            lines.append([method, *(f"{value:.{digits}f}" for value, (_, _, digits) in columns)])
-        return table([clips, *(title for _, title, _ in self.columns())], lines)
 
 
 def _rounded(value: float) -> str:
