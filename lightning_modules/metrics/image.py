@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from skimage.measure import blur_effect
 from torch import Tensor
 
 from lightning_modules.metrics.lpips import find_weights, lpips
@@ -19,7 +18,7 @@ class Measure(NamedTuple):
     """Metric for pictures: column in CSV files, heading and decimal places in tables.
 
     ``of`` maps pictures and ground truth, :math:`(B, 3, H, W)`, to a value per picture, :math:`(B)`; without ground
-    truth, pictures alone.
+    truth, it maps grey pictures, :math:`(B, 1, H, W)`.
     """
 
     name: str
@@ -43,24 +42,23 @@ def measures(truth: bool = True) -> list[Measure]:
 
 def score(rgb: Tensor, truth: Tensor | None) -> dict[str, Tensor]:
     """Return all metrics of pictures (B, ..., 3, H, W) by name, as values (B), averaged over the pictures of a film."""
-    flat = [planes.reshape(-1, *planes.shape[-3:]) for planes in (rgb, truth) if planes is not None]
+    pair = (rgb.clamp(0, 1).mean(dim=-3, keepdim=True),) if truth is None else (rgb, truth)
+    flat = [planes.reshape(-1, *planes.shape[-3:]) for planes in pair]
     found = measures(truth is not None)
     return {measure.name: measure.of(*flat).reshape(len(rgb), -1).mean(dim=1) for measure in found}
 
 
-def _blur(rgb: Tensor) -> Tensor:
+def _blur(grey: Tensor) -> Tensor:
     """Return the blur of Crété et al. 2007, from 0 for sharp to 1."""
-    return torch.tensor([blur_effect(picture.numpy()) for picture in _grey(rgb)[:, 0]])
+    from skimage.measure import blur_effect
+
+    return torch.tensor([blur_effect(picture.numpy()) for picture in grey[:, 0].float().cpu()])
 
 
-def _noise(rgb: Tensor) -> Tensor:
+def _noise(grey: Tensor) -> Tensor:
     """Return the standard deviation of white noise, white being 1, after Immerkaer 1996 but from the median."""
-    noise = F.conv2d(_grey(rgb), SECOND_DIFFERENCE[None, None])
+    noise = F.conv2d(grey.float(), SECOND_DIFFERENCE[None, None].to(grey.device))
     return noise.abs().flatten(1).median(dim=1).values / 0.6745
-
-
-def _grey(rgb: Tensor) -> Tensor:
-    return rgb.mean(dim=1, keepdim=True).float().cpu().clamp(0, 1)
 
 
 def why_no_lpips() -> str | None:

@@ -30,9 +30,9 @@ def run(args: argparse.Namespace) -> None:
     """Record a film with a simulated spike camera.
 
     OUT.dat holds the stream, 8 pixels per byte: a clip around one frame of the film, or the whole film. OUT.png holds
-    the ground truth: that frame in 8 bits, cropped to whole cells of the sensor, and grey if the sensor is. With --all,
-    the folder OUT holds every frame instead. OUT.json, the side-car, records every setting, what was modelled, and a
-    hash of the stream. The same settings give the same stream, bit for bit.
+    the ground truth: that frame, in 8 bits of colour or grey, cropped to whole cells of the sensor. With --all, the
+    folder OUT holds every frame instead. OUT.json, the side-car, records every setting, what was modelled, and a hash
+    of the stream. The same settings give the same stream, bit for bit.
 
     Files appear under their names when they are complete, the side-car last. A stream without one may be incomplete.
     """
