@@ -44,8 +44,7 @@ def score(rgb: Tensor, truth: Tensor | None) -> dict[str, Tensor]:
     """Return all metrics of pictures (B, ..., 3, H, W) by name, as values (B), averaged over the pictures of a film."""
     pair = (rgb.clamp(0, 1).mean(dim=-3, keepdim=True),) if truth is None else (rgb, truth)
     flat = [planes.reshape(-1, *planes.shape[-3:]) for planes in pair]
-    found = measures(truth is not None)
-    return {measure.name: measure.of(*flat).reshape(len(rgb), -1).mean(dim=1) for measure in found}
+    return {one.name: one.of(*flat).reshape(len(rgb), -1).mean(dim=1) for one in measures(truth is not None)}
 
 
 def _blur(grey: Tensor) -> Tensor:
