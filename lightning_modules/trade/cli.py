@@ -73,7 +73,9 @@ def trade(args: Sequence[str]) -> None:
         base = Runner(shared)
     except CannotRunError as error:
         raise InputError(f"trade: {error}") from error
-    own = _own_weights(base)
+    weights = base.config["model"]["init_args"].get("weights")
+    options = {"--ckpt_path": base.config["ckpt_path"], "--model.weights": weights}
+    own = [option for option, value in options.items() if value is not None]
     network, film = base.network, asked.film is not None
     usual = usual_settings(network.scale, own, network if own else None, film, network.frames, network.pattern)
     settings = given or usual
@@ -108,15 +110,6 @@ def _measured(rows: Sequence[Measurement], base: Runner, asked: argparse.Namespa
     write_csv(rows, timed, asked.output / "trade.csv")
     print(f"\n{text}")
     print(", ".join(str(path) for path in (asked.output / "trade.csv", asked.output / "trade.md")))
-
-
-def _own_weights(base: Runner) -> list[str]:
-    """Return the shared options that give weights to the network."""
-    given = {
-        "--ckpt_path": base.config["ckpt_path"],
-        "--model.weights": base.config["model"]["init_args"].get("weights"),
-    }
-    return [option for option, value in given.items() if value is not None]
 
 
 def _row(setting: Setting, shared: Sequence[str], base: Runner) -> Measurement:
