@@ -9,8 +9,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from lightning_modules.motion import ESTIMATORS, MotionEstimator
 from lightning_modules.networks import NETWORKS
 from lightning_modules.storage.pretrained import check_weights, read_weights
@@ -89,10 +87,11 @@ def read_config(path: str | Path) -> dict[str, Any]:
     Raises:
         ValueError: the file cannot be read, or is not YAML in UTF-8; the message is one line that names the file.
     """
+    import yaml
+
     path = Path(path).expanduser()
     try:
-        text = no_pipe(path).read_text(encoding="utf-8")
-        content = yaml.safe_load(text)
+        content = yaml.safe_load(no_pipe(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise ValueError(f"{path}: {one_line(error)}") from error
     except Exception as error:  # the type depends on the text

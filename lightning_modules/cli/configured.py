@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from jsonargparse import ArgumentError, ArgumentParser
-
 from lightning_modules.cli.arguments import inner_arguments, read_config
 from lightning_modules.cli.errors import InputError, UsageError
 from lightning_modules.cli.reasons import reason
@@ -27,6 +25,8 @@ def configured_network(
         weights: name or path of weights; overrides the weights of the configurations.
         checkpoint: path of a checkpoint, in place of weights.
     """
+    from jsonargparse import ArgumentError, ArgumentParser  # slow, and most predictions need no configuration
+
     chosen, named = None, weights
     parser = ArgumentParser(exit_on_error=False)
     parser.add_subclass_arguments(Network, "network", required=False)

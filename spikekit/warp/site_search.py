@@ -74,7 +74,7 @@ class SiteTable:
         """Return bases and classes of positions in steps.
 
         Args:
-            y: rows, whole numbers, from ``-STEPS`` to ``STEPS * height``.
+            y: rows, int32, from ``-STEPS`` to ``STEPS * height``.
             x: columns, from ``-STEPS`` to ``STEPS * width``.
             height: height of the sensor.
             width: width of the sensor.
@@ -82,13 +82,13 @@ class SiteTable:
         Returns:
             Rows and columns of the bases, and the classes, in the shape of ``y``.
         """
-        rows, columns = y.div(STEPS, rounding_mode="floor"), x.div(STEPS, rounding_mode="floor")
+        rows, columns = y // STEPS, x // STEPS
         down, right = y - STEPS * rows, x - STEPS * columns
         i, j = self.place(rows, height), self.place(columns, width)
         inside = ((2 * i + j) * STEPS + down) * STEPS + right
         half = STEPS // 2
         border = 4 * STEPS**2 + ((i * self.places + j) * half + down // 2) * half + right // 2
-        return rows.long(), columns.long(), torch.where((i < 2) & (j < 2), inside, border).long()
+        return rows, columns, torch.where((i < 2) & (j < 2), inside, border)
 
     @property
     def arguments(self) -> tuple[Any, ...]:
@@ -102,10 +102,11 @@ class SiteTable:
 
 
 def _steps_to(moved: Tensor, length: int, axis: int) -> Tensor:
-    """Return the rounded target of every site, (B, T, H, W), in steps, clamped to one site outside the sensor."""
-    at = torch.arange(length, device=moved.device, dtype=moved.dtype) * STEPS
+    """Return the rounded target of each site, int32 (B, T, H, W), in steps, clamped to one site outside the sensor."""
+    at = torch.arange(length, device=moved.device, dtype=torch.int32) * STEPS  # bfloat16 of an engine would round it
     at = at.unsqueeze(-1) if axis == -2 else at
-    return ((moved * STEPS).round() + at).clamp(-STEPS, STEPS * length)
+    steps = (moved.clamp(-2 * length, 2 * length) * STEPS).round().int()
+    return (steps + at).clamp(-STEPS, STEPS * length)
 
 
 @compiler_kept_out  # torch.compile cannot trace it, and would ignore the cache
@@ -230,8 +231,7 @@ def _find(flow: Tensor, shares: Tensor, table: SiteTable) -> tuple[Tensor, Tenso
     """Return the rows and columns of the bases, and the classes, of all sites and time points, (B, T, H, W)."""
     height, width = flow.shape[-2:]
     moved = torch.einsum("tk,bkchw->btchw", shares.to(flow.dtype), flow)
-    y, x = _steps_to(moved[:, :, 1], height, -2), _steps_to(moved[:, :, 0], width, -1)
-    return table.classes(y, x, height, width)
+    return table.classes(_steps_to(moved[:, :, 1], height, -2), _steps_to(moved[:, :, 0], width, -1), height, width)
 
 
 def _taps(flow: Tensor, shares: Tensor, table: SiteTable) -> Iterator[tuple[Tensor, Tensor]]:
@@ -259,26 +259,27 @@ def _rows(table: SiteTable) -> tuple[Tensor, Tensor, Tensor]:
         both = torch.cat([offset, weight.view(torch.int32)], dim=2)
         rows, which = both.flatten(1).unique(dim=0, return_inverse=True)
         offset, weight = rows.unflatten(1, both.shape[1:]).split([2, table.scale**2], dim=2)
-        return which, offset.long(), weight.contiguous().view(torch.float32)
+        return which.int(), offset, weight.contiguous().view(torch.float32)
 
     return apart(make)
 
 
 def _search_in_graph(features: Tensor, flow: Tensor, shares: Tensor, table: SiteTable) -> Tensor:
     """Compute :func:`search_sites` in operations that exported formats have, for any size."""
-    batch, _, _, height, width = features.shape
+    batch, times, channels, height, width = features.shape
     which, offset, weight = _rows(table)
     rows, columns, classes = _find(flow, shares, table)
-    base = torch.arange(batch, device=flow.device).reshape(-1, 1, 1, 1) * height + rows
+    base = torch.arange(batch, dtype=torch.int32, device=flow.device).reshape(-1, 1, 1, 1) * height + rows
     base = (base * width + columns).movedim(1, 0).flatten(1).unsqueeze(-1)
     step = offset[..., 0] * width + offset[..., 1]
     found = which.index_select(0, classes.movedim(1, 0).flatten()).unflatten(0, base.shape[:2])
+    pixels = features.permute(1, 0, 3, 4, 2).reshape(times, -1, channels)  # the features of a pixel are copied at once
     result = []
     # one time point at a time: every site has a matrix of its own
-    for part, first, row in zip(features.unbind(1), base, found, strict=True):
+    for part, first, row in zip(pixels.unbind(0), base, found, strict=True):
         index = first + step.index_select(0, row)
-        near = part.transpose(0, 1).flatten(1).index_select(1, index.flatten()).unflatten(1, index.shape)
-        result.append((near.transpose(0, 1) @ weight.index_select(0, row).to(part.dtype)).flatten(1))
+        near = part.index_select(0, index.flatten()).unflatten(0, index.shape)
+        result.append((near.mT @ weight.index_select(0, row).to(part.dtype)).flatten(1))
     return torch.cat(result, dim=1).reshape(batch, height, width, -1).movedim(-1, 1)
 
 
