@@ -57,61 +57,38 @@ _class = compiled(_find)
 
 
 @lru_cache
-def _searcher(channels: int, pixels: int, steps: int) -> Any:
-    """Return the loop for features of ``channels`` and s^2 = ``pixels``, which the compiler has to know."""
+def _loop(spread: bool, channels: int, pixels: int, steps: int) -> Any:
+    """Compile the loop over sites for F = ``channels`` and s^2 = ``pixels``, or that of the derivative, ``spread``."""
     lanes, calls = (1, channels) if pixels > 1 else (channels, 1)
 
-    def search(
-        features: Any, flow: Any, shares: Any, start: Any, jump: Any, weight: Any, low: Any, high: Any, rows: Any,
-        out: Any,
+    def loop(
+        values: Any, flow: Any, shares: Any, start: Any, jump: Any, weight: Any, low: Any, high: Any, rows: Any,
+        times: Any, out: Any,
     ) -> None:  # fmt: skip
-        """Compute the temporal pixels of some rows: features (T, H, W, F), flow (2, 2, H, W), out (H, W, T, F, s^2)."""
-        times, height, width, _ = features.shape
-        flat, weights, results = features.ravel(), weight.ravel(), out.ravel()
+        """Map features (T, H, W, F) to temporal pixels (H, W, T, F, s^2), or their gradients back, added to zeros.
+
+        All arrays are contiguous; flow (2, 2, H, W), first and last of the rows of the sensor and of the time points.
+        """
+        height, width = flow.shape[2:]
+        given, weights, results = values.ravel(), weight.ravel(), out.ravel()
         columns, to_y, to_x = np.arange(width), np.empty(width, np.int32), np.empty(width, np.int32)
         for y in range(rows[0], rows[1]):
-            for t in range(times):
+            for t in range(times[0], times[1]):
                 _to_steps(flow[:, 1, y], shares[t], np.full(width, y), height, steps, to_y)
                 _to_steps(flow[:, 0, y], shares[t], columns, width, steps, to_x)
                 for x in range(width):
                     base, which = _class(to_y[x], to_x[x], height, width, low, high, steps)
-                    at = (t * height * width + base) * channels
-                    to = ((y * width + x) * times + t) * channels * pixels
+                    first, last = start[which], start[which + 1]
+                    site = (t * height * width + base) * channels
+                    pixel = ((y * width + x) * len(shares) + t) * channels * pixels
                     for c in range(calls):
-                        sum_products(
-                            flat, lanes, weights, pixels, jump, start[which], start[which + 1], at + c, results,
-                            to + c * pixels,
-                        )  # fmt: skip
+                        one, other = site + c, pixel + c * pixels
+                        if spread:
+                            add_products(given, lanes, weights, pixels, jump, first, last, other, results, one)
+                        else:
+                            sum_products(given, lanes, weights, pixels, jump, first, last, one, results, other)
 
-    return compiled(search)
-
-
-@lru_cache
-def _spreader(channels: int, pixels: int, steps: int) -> Any:
-    """Return the loop of the derivative, see :func:`_searcher`."""
-    lanes, calls = (1, channels) if pixels > 1 else (channels, 1)
-
-    def spread(
-        grad: Any, flow: Any, shares: Any, start: Any, jump: Any, weight: Any, low: Any, high: Any, t: Any, out: Any
-    ) -> None:
-        """Add the gradient of the features of a time point to zeros ``out`` (T, H, W, F), from (H, W, T, F, s^2)."""
-        times, height, width, _ = out.shape
-        flat, weights, results = grad.ravel(), weight.ravel(), out.ravel()
-        columns, to_y, to_x = np.arange(width), np.empty(width, np.int32), np.empty(width, np.int32)
-        for y in range(height):
-            _to_steps(flow[:, 1, y], shares[t], np.full(width, y), height, steps, to_y)
-            _to_steps(flow[:, 0, y], shares[t], columns, width, steps, to_x)
-            for x in range(width):
-                base, which = _class(to_y[x], to_x[x], height, width, low, high, steps)
-                at = ((y * width + x) * times + t) * channels * pixels
-                to = (t * height * width + base) * channels
-                for c in range(calls):
-                    add_products(
-                        flat, lanes, weights, pixels, jump, start[which], start[which + 1], at + c * pixels, results,
-                        to + c,
-                    )  # fmt: skip
-
-    return compiled(spread)
+    return compiled(loop)
 
 
 def search_sites(
@@ -121,7 +98,7 @@ def search_sites(
     """Map (B, T, F, H, W) to (B, T F s^2, H, W), float32 or bfloat16."""
     batch, times, channels, height, width = features.shape
     half = features.dtype is torch.bfloat16
-    search = _searcher(channels, scale**2, steps)
+    search = _loop(False, channels, scale**2, steps)
     out = new_tensor((batch, height, width, times, channels, scale**2), features.dtype)
     rows = features.permute(0, 1, 3, 4, 2).float().contiguous()
     jump = (offset[:, 0] * width + offset[:, 1]) * channels
@@ -130,7 +107,7 @@ def search_sites(
         result = (out_b.view(torch.uint16) if half else out_b).numpy()
         jobs = ((y, min(y + _ROWS, height)) for y in range(0, height, _ROWS))
         arguments = features_b, flow_b, *table, low, high
-        in_threads(search, ((*arguments, job, result) for job in jobs))
+        in_threads(search, ((*arguments, job, (0, times), result) for job in jobs))
     return out.flatten(3).movedim(-1, 1)
 
 
@@ -142,11 +119,11 @@ def spread_sites(
     times = len(shares)
     rows = grad.movedim(1, -1).float().contiguous().unflatten(-1, (times, -1, scale**2))
     batch, height, width, _, channels, _ = rows.shape
-    spread = _spreader(channels, scale**2, steps)
+    spread = _loop(True, channels, scale**2, steps)
     out = new_tensor((batch, times, height, width, channels), torch.float32, np.zeros)
     jump = (offset[:, 0] * width + offset[:, 1]) * channels
     table = [part.numpy() for part in (shares.float(), start, jump, weight)]
     for rows_b, flow_b, out_b in zip(rows.numpy(), flow.contiguous().numpy(), out.numpy(), strict=True):
         arguments = rows_b, flow_b, *table, low, high
-        in_threads(spread, ((*arguments, t, out_b) for t in range(times)))
+        in_threads(spread, ((*arguments, (0, height), (t, t + 1), out_b) for t in range(times)))
     return out.permute(0, 1, 4, 2, 3)
