@@ -2,7 +2,8 @@
 
 The scenes have known truth. The film is compared with one that recomputes everything, timed in turn. ``--overlay
 FOLDER`` writes pictures of both side by side, with recomputed parts in green. ``--false-rests`` measures
-instead how often cells count as resting while the scene moves by half a sensor pixel from picture to picture.
+instead how often cells count as resting while the scene moves by half a sensor pixel from picture to picture. ``exact
+light`` is the limit of a still scene: the network's picture of exact light instead of spikes.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from lightning_modules.data.pictures import embedded_pictures
 from lightning_modules.inference.film import FilmMaker
 from lightning_modules.inference.rest import CELL, Rest
 from lightning_modules.networks import Network
-from spikekit import SensorNoise, bin_to_sensor, psnr, read_picture, simulate_spikes, write_picture
+from spikekit import SensorNoise, bin_to_sensor, demosaic, psnr, read_picture, simulate_spikes, write_picture
 from spikekit.arguments import whole
 from spikekit.scenes.analytic import Layer, Motion, Scene
 
@@ -109,6 +110,20 @@ def main() -> None:
         written = [f"{figure:.2f}" for figure in figures] + [f"{mean(moving):.2f}" if moving else ""]
         size = " x ".join(map(str, args.size))
         print(f"{args.weights},{size},{name},{ratio:.3f},{share:.3f},{','.join(written)}", flush=True)
+        if name == "still":
+            gain = psnr(of_exact_light(network, scene.rgb(0)), scene.rgb(0)).item() - figures[0]
+            print(f"{args.weights},{size},exact light,,,{figures[0]:.2f},,,{gain:.2f},", flush=True)
+
+
+def of_exact_light(network: Network, truth: Tensor) -> Tensor:
+    """Return the network's picture of the exact light of every sensor pixel, corrected towards it like a film's."""
+    light = bin_to_sensor(truth, network.pattern, scale=network.scale)
+    clip = (network.settings["alpha"] * light).expand(1, network.frames, -1, -1)
+    with torch.no_grad():
+        picture = network(clip, static=True)[0].clamp(0, 1)
+    off = demosaic(light - bin_to_sensor(picture, network.pattern, scale=network.scale), network.pattern)
+    enlarged = F.interpolate(off[None], scale_factor=network.scale, mode="bilinear", antialias=True)[0]
+    return (picture + enlarged).clamp(0, 1)
 
 
 def apart(picture: Tensor, truth: Tensor, part: Tensor) -> float:

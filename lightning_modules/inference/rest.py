@@ -17,10 +17,10 @@ from spikekit.color.cfa import GREY
 #: side of a cell, the smallest part that can rest, in sensor pixels
 CELL = 8
 #: margins around a box, in sensor pixels, for the network and for the estimate of motion
-SEEN, AROUND = 8, 16
+SEEN, AROUND = 4, 16
 
 _RISK = 1e-5  # probability that a cell at rest counts as moved
-_TESTS = 5  # tests per cell: blocks of 1, 2 and 4 pixels, all of them, and the cell
+_TESTS = 6  # tests per cell: blocks of 1, 2 and 4 pixels, all of them, the cell, and 5 x 5 cells
 _PICTURES = 8  # pictures of the network that a cell at rest shows the mean of
 _SURE = 80  # clocks without a change before the clip of a resting cell
 _BUSY, _UNTESTED = 0.9, 4  # share of cells that makes a picture busy, and pictures after it that are not tested
@@ -52,12 +52,14 @@ def find_changes(recent: Tensor, reference: Tensor, share: Tensor, noise: float 
 
     where the first term is the largest variance for any light that agrees with the rounded reference, and the second is
     the rounding of the reference, which is correlated with that of the next count. The gain g of flickering lamps is
-    the median ratio over all cells, weighted by their light; it is 1 unless it differs by five standard deviations.
+    the median ratio over all cells, weighted by their light. It is 1 unless it differs by five standard deviations, and
+    no cell has moved with it, or fewer than without.
 
     A cell has moved if a pixel exceeds the bound, or if the sum of :math:`d^2 / \operatorname{var}` over its K blocks
     of 1, 2, 4 or 8 pixels exceeds :math:`K + 2 \sqrt{K x} + 2 x` with :math:`x = \ln(\text{tests} / \text{risk})`,
     which K normal numbers exceed with the probability of the risk, or if a single block does. Large blocks detect faint
     motion, whose changes have the same sign at neighbouring pixels; single blocks detect objects smaller than a cell.
+    The sum over the 5 x 5 cells around, without those that have moved, detects soft light that is too faint for one.
     The risk is 0.00001 per cell.
 
     Args:
@@ -74,27 +76,44 @@ def find_changes(recent: Tensor, reference: Tensor, share: Tensor, noise: float 
         (False, 1.5)
     """
     known = share.isfinite()
-    each = _pixels(share.where(known, 0.0), Box(0, 0, *recent.shape))
+    share = share.where(known, 0.0)
+    gain = _gain(_sum(recent, CELL)[known], (share * _sum(reference, CELL))[known])
+    moved = _moved(recent, reference, gain * share, noise)
+    if gain != 1 and moved[known].any():
+        without = _moved(recent, reference, share, noise)
+        if without.sum() <= moved.sum():
+            moved, gain = without, 1.0
+    return Changes(moved | ~known, gain)
+
+
+def _moved(recent: Tensor, reference: Tensor, share: Tensor, noise: float) -> Tensor:
+    """Return the cells whose light has changed."""
+    each = _pixels(share, Box(0, 0, *recent.shape))
     expected = each * reference
-    gain = _gain(_sum(recent, CELL)[known], _sum(expected, CELL)[known])
-    expected, each = gain * expected, gain * each
     off = recent - expected
     part = (expected - expected.floor() - 0.5).abs_()
     extra = noise * expected * (1 + each)
     variance = (0.25 - (part - each).clamp_(min=0).square_()).clamp_(min=_LEAST) + each * (each + 1) / 4 + extra
     size = each + 1.1 + 6 * extra.sqrt()
     moved = F.max_pool2d((off.abs() - size)[None], CELL, ceil_mode=True)[0] > 0
-    x = math.log(_TESTS / _RISK)
     for block in (1, 2, 4, CELL):
         if block > 1:
             off, variance = _sum(off, 2), _sum(variance, 2)
         squares, side = off.square() / variance, CELL // block
-        count = _sum(torch.ones_like(squares), side)
-        moved |= _sum(squares, side) > count + 2 * (count * x).sqrt() + 2 * x
+        moved |= _sum(squares, side) > _limit(_sum(torch.ones_like(squares), side))
         if block in (2, 4):
             most = F.max_pool2d(squares[None], side, ceil_mode=True)[0]
-            moved |= most > 2 * (x + math.log(2 * side**2))
-    return Changes(moved | ~known, gain)
+            moved |= most > _limit(torch.ones(()), side**2)
+    around = ((part * ~moved)[None] for part in (off, variance))
+    off, variance = (F.avg_pool2d(part, 5, 1, 2, divisor_override=1)[0] for part in around)
+    moved |= off.square() > variance * _limit(torch.ones(()))
+    return moved
+
+
+def _limit(count: Tensor, tests: int = 1) -> Tensor:
+    """Return what the sum of squares of normal numbers exceeds with the probability of the risk."""
+    x = math.log(_TESTS * tests / _RISK)
+    return count + 2 * (count * x).sqrt() + 2 * x
 
 
 def _gain(recent: Tensor, expected: Tensor) -> float:
@@ -216,7 +235,7 @@ class Rest:
         middle = spikes[frames // 2 - came // 2 :][:came]
         clocks = self._before + self._since
         expected = _sum(self._earlier + self._later, CELL) * (came / clocks)
-        gain = _gain(_sum(middle.sum(0, dtype=torch.float32), CELL)[clocks > 0], expected[clocks > 0])
+        gain = _gain(_sum(middle.sum(0, dtype=torch.float32), CELL)[still], expected[still])
         if self._mean is None:
             self._mean = torch.zeros_like(parts[0][1])  # the first pictures are whole
             self._seen = self._mean.new_zeros(spikes.shape[1:])
