@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from math import prod
 from pathlib import Path
@@ -97,11 +97,6 @@ class Preset:
         """Spike frames of a clip; 41 is assumed for weights from outside the package."""
         model = find_model(self.weights or "")
         return (model and model.frames) or self.frames or _FRAMES
-
-    @classmethod
-    def columns(cls) -> list[str]:
-        """Return the names of the arguments, which are the columns of a table."""
-        return [field.name for field in fields(cls)]
 
     @classmethod
     def read(cls, row: Mapping[str, str]) -> Preset:

@@ -6,6 +6,7 @@ are the numbers of features and of weights that an index k stands for. One of th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
@@ -50,59 +51,50 @@ class _Vectors:
         return self.read(2, self.builder.mul(k, _LONG(self.others)), self.others)
 
 
-def _signature(*arguments: Any) -> Any:
-    return types.void(*arguments[:5], *[types.int64] * 3, arguments[8], types.int64)
+def _intrinsic(generate: Callable[[_Vectors], None]) -> Any:
+    def typed(
+        typing: Any, values: Any, lanes: Any, weights: Any, others: Any, jump: Any, first: Any, last: Any, at: Any,
+        out: Any, to: Any,
+    ) -> Any:  # fmt: skip
+        def compile_vectors(*known: Any) -> Any:
+            generate(_Vectors(*known))
+            return known[0].get_dummy_value()
+
+        return types.void(values, lanes, weights, others, jump, *[types.int64] * 3, out, types.int64), compile_vectors
+
+    return intrinsic(prefer_literal=True)(typed)
 
 
-@intrinsic(prefer_literal=True)
-def sum_products(
-    typing: Any, values: Any, lanes: Any, weights: Any, others: Any, jump: Any, first: Any, last: Any, at: Any,
-    out: Any, to: Any,
-) -> Any:  # fmt: skip
+@_intrinsic
+def sum_products(code: _Vectors) -> None:
     """Compute ``out[to : to + n] = sum(values[at + jump[k] :] * weights[k * others :] for k in range(first, last))``.
 
     ``out`` is float32, or uint16 for bfloat16, rounded to even.
     """
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        code = _Vectors(context, builder, signature, arguments)
-        total = cgutils.alloca_once_value(builder, ir.Constant(code.vector, [0.0] * code.count))
-        with code.loop() as (k, _):
-            product = builder.fmul(code.read(0, code.jumped(arguments[7], k), code.lanes), code.weight(k), flags=_FUSED)
-            builder.store(builder.fadd(builder.load(total), product, flags=_FUSED), total)
-        found = builder.load(total)
-        if out.dtype == types.uint16:
-            word = builder.bitcast(found, code.same(0).type)
-            even = builder.and_(builder.lshr(word, code.same(16)), code.same(1))
-            found = builder.lshr(builder.add(builder.add(word, code.same(0x7FFF)), even), code.same(16))
-            found = builder.trunc(found, ir.VectorType(ir.IntType(16), code.count))
-        builder.store(found, code.place(8, arguments[9], found.type), align=out.dtype.bitwidth // 8)
-        return context.get_dummy_value()
-
-    return _signature(values, lanes, weights, others, jump, first, last, at, out, to), generate
+    builder, at, to = code.builder, code.arguments[7], code.arguments[9]
+    total = cgutils.alloca_once_value(builder, ir.Constant(code.vector, [0.0] * code.count))
+    with code.loop() as (k, _):
+        product = builder.fmul(code.read(0, code.jumped(at, k), code.lanes), code.weight(k), flags=_FUSED)
+        builder.store(builder.fadd(builder.load(total), product, flags=_FUSED), total)
+    found, kind = builder.load(total), code.types[8].dtype
+    if kind == types.uint16:
+        word = builder.bitcast(found, code.same(0).type)
+        even = builder.and_(builder.lshr(word, code.same(16)), code.same(1))
+        found = builder.lshr(builder.add(builder.add(word, code.same(0x7FFF)), even), code.same(16))
+        found = builder.trunc(found, ir.VectorType(ir.IntType(16), code.count))
+    builder.store(found, code.place(8, to, found.type), align=kind.bitwidth // 8)
 
 
-@intrinsic(prefer_literal=True)
-def add_products(
-    typing: Any, values: Any, lanes: Any, weights: Any, others: Any, jump: Any, first: Any, last: Any, at: Any,
-    out: Any, to: Any,
-) -> Any:  # fmt: skip
+@_intrinsic
+def add_products(code: _Vectors) -> None:
     """Do the transpose of :func:`sum_products`: add products of ``values[at : at + n]`` to ``out[to + jump[k] :]``."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        code = _Vectors(context, builder, signature, arguments)
-        value = code.read(0, arguments[7], code.count)
-        with code.loop() as (k, _):
-            product = builder.fmul(value, code.weight(k), flags=_FUSED)
-            if code.lanes < code.count:  # the sum of the products
-                function = cgutils.get_or_insert_function(
-                    builder.module,
-                    ir.FunctionType(_REAL, [_REAL, code.vector]),
-                    f"llvm.vector.reduce.fadd.v{code.count}f32",
-                )
-                product = builder.call(function, [_REAL(0.0), product], fastmath=("reassoc",))
-            place = code.place(8, code.jumped(arguments[9], k), product.type)
-            builder.store(builder.fadd(builder.load(place, align=4), product), place, align=4)
-        return context.get_dummy_value()
-
-    return _signature(values, lanes, weights, others, jump, first, last, at, out, to), generate
+    builder, at, to = code.builder, code.arguments[7], code.arguments[9]
+    value = code.read(0, at, code.count)
+    with code.loop() as (k, _):
+        product = builder.fmul(value, code.weight(k), flags=_FUSED)
+        if code.lanes < code.count:  # the sum of the products
+            kind = ir.FunctionType(_REAL, [_REAL, code.vector])
+            add = cgutils.get_or_insert_function(builder.module, kind, f"llvm.vector.reduce.fadd.v{code.count}f32")
+            product = builder.call(add, [_REAL(0.0), product], fastmath=("reassoc",))
+        place = code.place(8, code.jumped(to, k), product.type)
+        builder.store(builder.fadd(builder.load(place, align=4), product), place, align=4)
