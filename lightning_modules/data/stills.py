@@ -58,7 +58,8 @@ class StillClips(Dataset):
         objects: largest number of objects in front of the background.
         brightness: lowest and highest exposure; a random number in between multiplies ground truth and light of a clip.
         noise: noise of the sensor, such as ``{photons: 3000, gain_spread: 0.06}``. With ``augment``, as in training,
-            every clip has a random share of it, given as its ``noise``, so that a network learns all levels up to it.
+            every clip has a random share of it, given as its ``noise``, and a third have none, so that a network learns
+            ideal sensors and all levels of noise.
         gains: lowest and highest alpha with ``augment``, drawn log-uniformly and given as the clip's ``alpha``. Null
             for a constant alpha.
         flow_times: spike frames to which the flow from the middle frame is given; for 41 frames and a window of 11, 5
@@ -258,7 +259,7 @@ class StillClips(Dataset):
         if self.noise is None:
             return drawn
         drawn["photons"], drawn["electrons"] = rng.integers(2**62, size=2)
-        drawn["noise"] = np.float32(1 - rng.uniform() if self.augment else 1)
+        drawn["noise"] = np.float32(max(0.0, 1.5 * rng.uniform() - 0.5) if self.augment else 1)
         for name, wanted in (("gain", self.noise.gain_spread), ("dark", self.noise.dark_current)):
             if wanted:
                 drawn[name] = rng.standard_normal((side, side), "float32")

@@ -112,10 +112,6 @@ class Preset:
         kinds = {name: get_args(hint)[0] for name, hint in get_type_hints(cls).items()}
         return cls(**{name: kind(row[name]) for name, kind in kinds.items() if row.get(name)})
 
-    def write(self) -> dict[str, str]:
-        """Return a row of a table, the inverse of :meth:`read`."""
-        return {name: "" if value is None else str(value) for name, value in vars(self).items()}
-
     def build(self, pattern: str = "RGGB") -> Network:
         """Build the network in evaluation mode, on the CPU.
 

@@ -25,9 +25,6 @@ from spikekit.color.cfa import count_colors
 from spikekit.kernels import compiler_kept_out
 from spikekit.warp.site_search import SMALLEST, apart, search_sites, site_table
 
-_SEARCHED = 1 << 19  # positions per search on a CPU, limited by its cache
-_SEARCHED_ELSEWHERE = 1 << 25  # on other devices, where a kernel launch costs more
-
 _MOTION_FUSIONS = {"joint": joint_motion, "independent": independent_motion, "assembled": assembled_motion}
 _RECONSTRUCTIONS = {"correlated": ColorCorrelation, "separate": SeparateColors, "early": EarlyFusion}
 
@@ -272,14 +269,11 @@ class CSCSR(Network):
         if offsets.shape[1] == 1:
             pixels = self._enlarge(features, mask)
             return flow_warp_idw(pixels.flatten(1, 2), offsets[:, 0], mask, neighbors=neighbors).reshape(pixels.shape)
-        # in chunks of time points: the search needs many times the memory of its result
-        searched = _SEARCHED if features.device.type == "cpu" else _SEARCHED_ELSEWHERE
-        few = max(1, searched // (offsets.shape[-2] * offsets.shape[-1]))
-        pixels = [
+        pixels = [  # one time point at a time: the search needs many times the memory of its result
             flow_warp_idw(self._enlarge(part, mask), offset, mask, neighbors=neighbors)
-            for part, offset in zip(features.flatten(0, 1).split(few), offsets.flatten(0, 1).split(few), strict=True)
+            for part, offset in zip(features.unbind(1), offsets.unbind(1), strict=True)
         ]
-        return torch.cat(pixels).unflatten(0, features.shape[:2])
+        return torch.stack(pixels, dim=1)
 
     def _enlarge(self, features: Tensor, mask: Tensor) -> Tensor:
         """Enlarge features; those without weights are zero at other colours' pixels, so they are renormalised."""

@@ -144,17 +144,7 @@ class RecurrentCSCSR(CSCSR):
         alpha: float | Tensor | None = None,
         noise: float | Tensor | None = None,
     ) -> Tensor:
-        """Return the picture of a clip, or the pictures of a film.
-
-        Args:
-            spikes: a clip (B, N, H, W) or a film (B, K, N, H, W).
-            flow: see the class. Default: estimated from the spikes.
-            static: the scene does not move, instead of a flow.
-            every: clocks between two key frames.
-            future: number of later key frames that a picture may depend on; see :meth:`film`.
-            alpha: gain of the camera, a number or (B,). Default: that of the configuration.
-            noise: noise level, a number or (B,); see :class:`CSCSR`.
-        """
+        """Return the picture of a clip (B, N, H, W), or the pictures of a film; other arguments as for :meth:`film`."""
         if spikes.ndim == 5:
             return self.film(spikes, flow, static, every, future, alpha, noise)[-1]
         self.check_spikes(spikes)

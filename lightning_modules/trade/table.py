@@ -131,7 +131,7 @@ def write_csv(rows: Sequence[Measurement], timed: Timed, path: Path) -> None:
     lines = [
         {
             "setting": row.setting.name,
-            **(row.setting.preset or Preset()).write(),
+            **vars(row.setting.preset or Preset()),
             **{name: _text(value, ".10g") for name, value in values.items()},
             "every": timed.every,
             "reference": reference,

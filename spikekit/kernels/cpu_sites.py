@@ -16,7 +16,8 @@ from spikekit.kernels.vectors import add_products, sum_products
 _ROWS = 16  # sensor rows per job
 
 
-def _on_axis(flow: Any, shares: Any, at: Any, length: Any, steps: Any, out: Any) -> None:
+@compiled
+def _to_steps(flow: Any, shares: Any, at: Any, length: Any, steps: Any, out: Any) -> None:
     """Write the moved sites of a row on an axis, in steps: flow (2, W), positions ``at`` (W), out (W)."""
     a, b, far = shares[0], shares[1], np.float32(2 * length)
     for x in range(len(out)):
@@ -25,10 +26,8 @@ def _on_axis(flow: Any, shares: Any, at: Any, length: Any, steps: Any, out: Any)
         out[x] = min(max(to, -steps), length * steps)
 
 
-_to_steps = compiled(_on_axis)
-
-
-def _place(to: Any, length: Any, low: Any, high: Any, steps: Any) -> Any:
+@compiled
+def _placed(to: Any, length: Any, low: Any, high: Any, steps: Any) -> Any:
     """Return base, place and fraction of a moved site on an axis, see :meth:`SiteTable.classes`."""
     base = to // steps
     place = base & 1
@@ -39,10 +38,8 @@ def _place(to: Any, length: Any, low: Any, high: Any, steps: Any) -> Any:
     return base, place, to - base * steps
 
 
-_placed = compiled(_place)
-
-
-def _find(to_y: Any, to_x: Any, height: Any, width: Any, low: Any, high: Any, steps: Any) -> Any:
+@compiled
+def _class(to_y: Any, to_x: Any, height: Any, width: Any, low: Any, high: Any, steps: Any) -> Any:
     """Return the base of a moved site, as an index, and its class."""
     row, i, down = _placed(to_y, height, low, high, steps)
     column, j, right = _placed(to_x, width, low, high, steps)
@@ -51,9 +48,6 @@ def _find(to_y: Any, to_x: Any, height: Any, width: Any, low: Any, high: Any, st
         return base, ((2 * i + j) * steps + down) * steps + right
     border = ((i * (4 - low + high) + j) * coarse + down // 2) * coarse + right // 2
     return base, 4 * steps * steps + border
-
-
-_class = compiled(_find)
 
 
 @lru_cache

@@ -142,13 +142,13 @@ def test_options_change_the_scene():
 
 
 def test_training_covers_all_noise_levels():
-    """White light on a sensor with dead pixels: at most 4 %, on average 2 %."""
+    """White light on a sensor with dead pixels: at most 4 %, on average 1.3 %, as a third have none."""
     options = {"brightness": (1.0, 1.0), "motion": 0.0, "objects": 0, "alpha": 1.0, "patch": 32, "val_patch": 32}
     noisy, clean = (scenes(noise=noise, **options).train_set for noise in (SensorNoise(dead=0.04), None))
     dead = [[(clips[n]["spikes"].amax(dim=0) == 0).double().mean() for n in range(12)] for clips in (noisy, clean)]
     more = torch.tensor(dead[0]) - torch.tensor(dead[1])
     assert more.min() < 0.01 < 0.03 < more.max() < 0.06
-    assert 0.012 < more.mean() < 0.028
+    assert 0.006 < more.mean() < 0.022
     shown = StillClips(embedded_pictures(), scale=2, patch=32, augment=False, noise=SensorNoise(dead=0.04))
     assert (shown[0]["spikes"].amax(dim=0) == 0).double().mean() > 0.035
 
@@ -280,7 +280,8 @@ def test_training_clips_include_gain_and_noise():
     for n in range(3):
         light = clips.scene(n).light(scale=1, alpha=clips[n]["alpha"].item())
         assert abs(clips[n]["spikes"].float().mean() - light.clamp(max=1).mean()) < 0.05
-        assert 0 < clips[n]["noise"] <= 1
+    noise = torch.stack([torch.tensor(clips.draw(n)["noise"]) for n in range(60)])
+    assert 0.2 < (noise == 0).float().mean() < 0.5 < noise.max() <= 1
     fixed = StillClips(embedded_pictures()[:2], **options, augment=False)
     assert fixed[0]["alpha"] == torch.tensor(fixed.alpha)
     assert fixed[0]["noise"] == 1

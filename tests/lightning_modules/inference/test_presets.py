@@ -158,7 +158,7 @@ def test_invalid_speeds_and_budgets_are_rejected(table, arguments, message):
 def test_presets_survive_writing_and_reading():
     for given in ({}, WEIGHTS | {"motion": "Spike2Flow", "self_ensemble": 2, "tile": 0}):
         preset = Preset(**given)
-        assert Preset.read(preset.write()) == preset
+        assert Preset.read({name: "" if cell is None else str(cell) for name, cell in vars(preset).items()}) == preset
         assert preset.given(*vars(Preset())) == given
     with pytest.raises(ValueError, match="invalid literal"):
         Preset.read({"tile": "wide"})
