@@ -52,8 +52,8 @@ def find_changes(recent: Tensor, reference: Tensor, share: Tensor, noise: float 
 
     where the first term is the largest variance for any light that agrees with the rounded reference, and the second is
     the rounding of the reference, which is correlated with that of the next count. The gain g of flickering lamps is
-    the median ratio over all cells, weighted by their light. It is 1 unless it differs by five standard deviations, and
-    no cell has moved with it, or fewer than without.
+    the median ratio over all cells, weighted by their light. It counts only if it differs from 1 by five standard
+    deviations, and if fewer cells have moved with it than without it.
 
     A cell has moved if a pixel exceeds the bound, or if the sum of :math:`d^2 / \operatorname{var}` over its K blocks
     of 1, 2, 4 or 8 pixels exceeds :math:`K + 2 \sqrt{K x} + 2 x` with :math:`x = \ln(\text{tests} / \text{risk})`,

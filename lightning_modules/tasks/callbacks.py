@@ -99,7 +99,7 @@ class TestReport(Callback):
     def on_test_batch_end(  # noqa: D102
         self, trainer: Trainer, module: LightningModule, outputs: dict[str, Any], batch: dict[str, Tensor], *_: Any
     ) -> None:
-        self.truth = "white" not in batch
+        self.truth = "rgb" in batch
         for method, scores in outputs["scores"].items():
             self._scores[method] += zip(*(scores[column].tolist() for column, _, _ in self.columns()), strict=True)
         if len(self._rows) < self.clips:

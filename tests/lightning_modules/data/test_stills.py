@@ -273,14 +273,13 @@ def test_grey_clips_are_the_luminance_of_the_same_scenes():
 def test_training_clips_include_gain_and_noise():
     options = {"patch": 12, "scale": 1, "noise": SensorNoise(photons=1000), "gains": (0.03, 1.0)}
     clips = StillClips(embedded_pictures()[:2], **options, length=200)
-    gains = torch.stack([torch.tensor(clips.draw(n)["alpha"]) for n in range(40)])
+    gains, noise = (torch.tensor([clips.draw(n)[name].item() for n in range(60)]) for name in ("alpha", "noise"))
     assert gains.min() >= 0.03
     assert gains.max() <= 1
     assert 0.25 < ((gains < 0.17).float().mean()) < 0.75  # half of them below the geometric mean
     for n in range(3):
         light = clips.scene(n).light(scale=1, alpha=clips[n]["alpha"].item())
         assert abs(clips[n]["spikes"].float().mean() - light.clamp(max=1).mean()) < 0.05
-    noise = torch.stack([torch.tensor(clips.draw(n)["noise"]) for n in range(60)])
     assert 0.2 < (noise == 0).float().mean() < 0.5 < noise.max() <= 1
     fixed = StillClips(embedded_pictures()[:2], **options, augment=False)
     assert fixed[0]["alpha"] == torch.tensor(fixed.alpha)

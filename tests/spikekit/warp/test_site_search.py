@@ -59,6 +59,9 @@ def test_equals_upsampling_followed_by_flow_warp_idw_up_to_the_border(scale, pat
         torch.testing.assert_close(search_sites(features, flow, SHARES, table), expected, rtol=0, atol=1e-5)
         single = search_sites(features.float(), flow, SHARES, table)  # by compiled loops, where there are such
         torch.testing.assert_close(single.double(), expected, rtol=0, atol=2e-5)
+        half = features.bfloat16()  # the result is rounded to the nearest
+        exact = search_sites(half.float(), flow, SHARES, table)
+        torch.testing.assert_close(search_sites(half, flow, SHARES, table).float(), exact, rtol=2**-7.9, atol=1e-6)
 
 
 @pytest.mark.parametrize("pattern", ["RGGB", "grey"])
@@ -78,8 +81,7 @@ def test_flow_is_rounded_to_the_nearest_step():
     near = search_sites(features, flow + 0.4 / STEPS, SHARES, table_for(size))
     exact = search_sites(features, flow, SHARES, table_for(size))
     inside = ..., slice(4, -4), slice(4, -4)  # at the border steps are twice as long
-    last = slice(3 * 16, None)  # the last time point has the whole of the flow
-    assert torch.equal(near[:, last][inside], exact[:, last][inside])
+    assert torch.equal(near[:, 3 * 16 :][inside], exact[:, 3 * 16 :][inside])  # the last time point has all of the flow
 
 
 def test_infinite_or_huge_flow_ends_at_the_border():
@@ -90,7 +92,6 @@ def test_infinite_or_huge_flow_ends_at_the_border():
     beyond[0, :, 0, 5, 5], beyond[0, :, 0, 6, 6] = 4.0 * size[1], -4.0 * size[1]
     for dtype in (torch.float32, torch.float64):
         found = search_sites(features.to(dtype), flow, SHARES, table_for(size))
-        assert torch.isfinite(found).all()
         torch.testing.assert_close(found, search_sites(features.to(dtype), beyond, SHARES, table_for(size)))
 
 
