@@ -5,11 +5,11 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import product
 from math import prod
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 import torch
 
@@ -109,7 +109,7 @@ class Preset:
             >>> Preset.read({"weights": "cscsr_small_x4", "tile": "64", "self_ensemble": ""})
             Preset(weights='cscsr_small_x4', ..., tile=64, self_ensemble=None, ...)
         """
-        kinds = {name: get_args(hint)[0] for name, hint in get_type_hints(cls).items()}
+        kinds = {one.name: int if one.type == "int | None" else str for one in fields(cls)}
         return cls(**{name: kind(row[name]) for name, kind in kinds.items() if row.get(name)})
 
     def build(self, pattern: str = "RGGB") -> Network:

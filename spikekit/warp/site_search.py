@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import Any
 
 import torch
@@ -206,17 +206,15 @@ def _weights(
             tap = (i - base_y + around) * side + j - base_x + around
             # features of weight 0 may lie outside
             dense.scatter_add_(1, tap.where(amount != 0, 0).T, amount.float().T)
-    dense = dense.reshape(len(rows), len(moved), len(columns), len(moved), -1).transpose(1, 2).flatten(0, 1)
-    counts, offsets, weights = [], [], []
-    for pair in dense:
-        near = (pair > _LEAST).flatten(0, 1).any(dim=0).nonzero()[:, 0]
-        part = pair[..., near][which][:, :, which].transpose(1, 2).flatten(2, 3).flatten(0, 1)
-        used = (part > _LEAST).any(dim=1)
-        site, tap = used.nonzero(as_tuple=True)
-        counts.append(used.sum(dim=1))
-        offsets.append(torch.stack([near[tap] // side - around, near[tap] % side - around], dim=1))
-        weights.append(part[site, :, tap])
-    return torch.cat(counts), torch.cat(offsets), torch.cat(weights)
+    dense = dense.reshape(len(rows), len(moved), len(columns), len(moved), -1)
+    used = dense > _LEAST  # by one of the temporal pixels of the site
+    used = reduce(torch.logical_or, (used.index_select(1, part) for part in which.T))
+    used = reduce(torch.logical_or, (used.index_select(3, part) for part in which.T)).transpose(1, 2)
+    row, column, down, right, tap = used.nonzero(as_tuple=True)
+    first = ((row * len(moved) + which.T[:, down]) * len(columns) + column) * len(moved) * side**2 + tap
+    weight = dense.take(first.unsqueeze(1) + which.T[:, right] * side**2)
+    offset = torch.stack([tap // side - around, tap % side - around], dim=1)
+    return used.sum(dim=-1).flatten(), offset, weight.flatten(0, 1).T.contiguous()
 
 
 def _mixture(pixel: Tensor, scale: int, length: int) -> list[tuple[Tensor, Tensor]]:
