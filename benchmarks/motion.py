@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     clips = [data.val_set[index] for index in range(args.clips)]
     estimators = {
         "ClassicalFlow": ClassicalFlow(),
-        "3 warps": ClassicalFlow(warps=3),
+        "5 warps": ClassicalFlow(warps=5),
         "1 warp": ClassicalFlow(warps=1),
         "scikit-image's TV-L1": ScikitImage(),
         "no motion": ZeroFlow(),

@@ -33,7 +33,7 @@ _NOISE = 0.002  # standard deviation, in firing rates, that halves the weight of
 _RATES = 1024
 _NEAR = _gaussian(17, 2.0)  # window of the test for linear motion
 _PART = 1.25, 1.75  # error ratios at which the flows begin to differ, and at which they are independent
-_OWN = 3  # warping iterations that refine the velocity of a half, from a joint velocity that is nearly right
+_OWN = 2  # warping iterations that refine the velocity of a half, from a joint velocity that is nearly right
 _UNSEEN = 1e-6  # negligible squared difference of two pictures, in firing rates
 
 
@@ -56,7 +56,7 @@ class ClassicalFlow(MotionEstimator):
 
     Args:
         attachment: weight of the data term for pictures in firing rates; smaller values give smoother flow.
-        warps: warping iterations per pyramid level; fewer are faster and less accurate. At most three refine a half.
+        warps: warping iterations per pyramid level; fewer are faster and less accurate. At most two refine a half.
 
     Shape:
         As :class:`MotionEstimator`; no gradient.
@@ -70,7 +70,7 @@ class ClassicalFlow(MotionEstimator):
         Zach, Pock and Bischof, A duality based approach for realtime TV-L1 optical flow, DAGM 2007.
     """
 
-    def __init__(self, attachment: float = 120.0, warps: int = 5) -> None:
+    def __init__(self, attachment: float = 120.0, warps: int = 3) -> None:
         super().__init__()
         check_positive("attachment", attachment)
         self.attachment, self.warps = attachment, check_whole("warps", warps)

@@ -13,14 +13,14 @@ from torch.compiler import is_exporting
 
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks.cscsr_config import CSCSRConfig
-from lightning_modules.networks.layers import enlarge, enlarge_smoothly, fold, start_pixel_by_pixel
+from lightning_modules.networks.layers import channels_last, enlarge, enlarge_smoothly, fold, start_pixel_by_pixel
 from lightning_modules.networks.motion_fusion import assembled_motion, independent_motion, joint_motion
 from lightning_modules.networks.network import Network
 from lightning_modules.networks.reconstruction import ColorCorrelation, EarlyFusion, SeparateColors
 from lightning_modules.networks.refinement import FeatureRefinement, TimeFusion
 from lightning_modules.networks.representation import IntervalRepresentation, SpikeRepresentation, WindowMeans
 from lightning_modules.signatures import inherit_signature
-from spikekit import bayer_mask, demosaic, flow_warp_idw, linear_motion, split_colors, tfp_at
+from spikekit import bayer_mask, demosaic, flow_warp_idw, linear_motion, tfp_at
 from spikekit.color.cfa import count_colors
 from spikekit.kernels import compiler_kept_out
 from spikekit.warp.site_search import SMALLEST, apart, search_sites, site_table
@@ -174,7 +174,8 @@ class CSCSR(Network):
         spikes = spikes.to(self.reconstruction.rgb.weight.dtype)
         told = self._told(noise, spikes)
         rgb = self.reconstruction(self._colors(spikes, self.resolve_flow(spikes, flow, static), **told), **told)
-        return self._exposed(rgb + self._base(spikes) if self.config.skip else rgb, alpha)
+        rgb = rgb.add_(self._base(spikes)) if self.config.skip else rgb
+        return self._exposed(F.pixel_shuffle(rgb, self.fold), alpha)
 
     def _told(self, noise: float | Tensor | None, spikes: Tensor) -> dict[str, Tensor]:
         """Return the noise level of clips (B, N, H, W) as a keyword argument (B, 1, 1, 1), or no argument."""
@@ -192,7 +193,11 @@ class CSCSR(Network):
 
     def _colors(self, spikes: Tensor, flow: Tensor | None, **told: Tensor) -> list[Tensor]:
         """Return the refined features of each colour, (B, width, H, W), at the resolution of the reconstruction."""
-        planes = split_colors(spikes, self.pattern)
+        if torch.is_autocast_enabled(spikes.device.type):  # before they are copied
+            spikes = spikes.to(torch.get_autocast_dtype(spikes.device.type))
+        masks = bayer_mask(*spikes.shape[-2:], self.pattern, device=spikes.device, dtype=spikes.dtype)
+        spikes = channels_last(spikes)
+        planes = (spikes * mask for mask in masks)
         # one colour at a time, to save memory
         features = (encode(plane, **told) for encode, plane in zip(self.representation, planes, strict=True))
         if not self.config.search or (flow is None and self.colors == 1):  # a grey sensor at rest knows all pixels
@@ -284,17 +289,20 @@ class CSCSR(Network):
         return pixels / known.where(mask, 1)
 
     def _base(self, spikes: Tensor) -> Tensor:
-        """Return the enlarged TFP picture: demosaiced and smoothed, or third-order TFP for a grey sensor.
+        """Return the enlarged TFP picture, as ``reconstruction`` does; not in bfloat16, which has too few levels.
 
-        Not in bfloat16, which has hardly more levels than the picture.
+        It is demosaiced and smoothed, or third-order TFP for a grey sensor.
         """
         with torch.autocast(spikes.device.type, enabled=False):
             if self.colors == 1:
-                smooth = tfp_at(spikes, self.frames // 2, (self.frames - 1) // 6 * 2 + 1, order=3).unsqueeze(1)
-                return enlarge_smoothly(smooth / self.config.alpha, self.scale)
-            from kornia.filters import filter2d_separable
+                raw = tfp_at(spikes, self.frames // 2, (self.frames - 1) // 6 * 2 + 1, order=3)
+                smooth = raw.unsqueeze(1) / self.config.alpha
+            else:
+                from kornia.filters import filter2d_separable
 
-            raw = tfp_at(spikes, self.frames // 2, self.frames) / self.config.alpha
-            # zero at the Nyquist frequency, to remove the zipper artefacts of demosaicing
-            binomial = torch.cat([raw.new_full((1, 1), weight) for weight in (0.25, 0.5, 0.25)], dim=1)
-            return enlarge_smoothly(filter2d_separable(demosaic(raw, self.pattern), binomial, binomial), self.scale)
+                raw = tfp_at(spikes, self.frames // 2, self.frames) / self.config.alpha
+                # zero at the Nyquist frequency, to remove the zipper artefacts of demosaicing
+                binomial = torch.cat([raw.new_full((1, 1), weight) for weight in (0.25, 0.5, 0.25)], dim=1)
+                smooth = filter2d_separable(demosaic(raw, self.pattern), binomial, binomial)
+            large = enlarge_smoothly(smooth, self.scale)
+            return large if self.fold == self.scale else F.pixel_shuffle(large, self.scale)

@@ -41,12 +41,12 @@ def _cubic(scale: int, dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def enlarge_smoothly(planes: Tensor, scale: int) -> Tensor:
-    """Enlarge bicubically, (B, C, H, W) to (B, C, s H, s W), by a convolution: half the time of ``interpolate``."""
+    """Enlarge bicubically, (B, C, H, W) to the pixels of (B, C, s H, s W) as channels, (B, C s^2, H, W)."""
     if scale == 1:
         return planes
-    around = F.pad(planes.flatten(0, 1).unsqueeze(1), (2, 2, 2, 2), "replicate")
-    large = F.conv2d(around, _cubic(scale, planes.dtype, planes.device))
-    return F.pixel_shuffle(large, scale).squeeze(1).unflatten(0, planes.shape[:2])
+    around = channels_last(F.pad(planes, (2, 2, 2, 2), "replicate"))
+    weight = _cubic(scale, planes.dtype, planes.device)
+    return F.conv2d(around, weight.repeat(planes.shape[1], 1, 1, 1), groups=planes.shape[1])
 
 
 def fold(planes: Tensor, size: int) -> Tensor:

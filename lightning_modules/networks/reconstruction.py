@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lightning_modules.networks.layers import NoiseLevel, conv, res_blocks
 
 
 class ToRgb(nn.Conv2d):
-    """Sub-pixel convolution to the colours; it disables autocast, as half precision would round the picture."""
+    """Convolution to the colours of all sub-pixels; half precision would round the picture, so it disables autocast."""
 
     def __init__(self, inputs: int, enlarge: int = 1, groups: int = 1, colors: int = 3) -> None:
         super().__init__(inputs, colors * enlarge**2, 3, padding=1, groups=groups)
-        self.enlarge = enlarge
 
     def forward(self, x: Tensor) -> Tensor:  # noqa: D102
         with torch.autocast(x.device.type, enabled=False):
-            return F.pixel_shuffle(super().forward(x.to(self.weight.dtype)), self.enlarge)
+            return super().forward(x.to(self.weight.dtype))
 
 
 class ColorFusion(nn.Sequential):
@@ -45,7 +43,7 @@ class ColorCorrelation(nn.Module):
 
     Shape:
         - Input: features of each colour, :math:`(B, width, H, W)`; optionally the noise level, :math:`(B, 1, 1, 1)`
-        - Output: rgb :math:`(B, colors, enlarge H, enlarge W)`
+        - Output: rgb with its sub-pixels as channels, :math:`(B, colors \text{ enlarge}^2, H, W)`
     """
 
     def __init__(

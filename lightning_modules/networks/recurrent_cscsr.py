@@ -229,10 +229,9 @@ class RecurrentCSCSR(CSCSR):
             Picture and memory as channels, (B, 3 s^2 + memory, H, W), or (B, s^2 + memory, H, W) for a grey sensor.
         """
         features = channels_last(features)
-        rgb = self.reconstruction.rgb(features)
+        picture = self.reconstruction.rgb(features)
         if self.config.skip:
-            rgb = rgb + self._base(spikes.to(rgb.dtype))
-        picture = F.pixel_unshuffle(rgb, self.scale)
+            picture = picture.add_(self._base(spikes.to(picture.dtype)))
         if neighbors:
             return self.fusion(features, picture, neighbors)
         nothing = picture.new_zeros(len(picture), self.config.memory, *picture.shape[-2:])

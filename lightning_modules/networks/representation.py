@@ -59,13 +59,11 @@ class SpikeRepresentation(nn.Module):
         last.weight[1:] *= 0.1
 
     def forward(self, spikes: Tensor, noise: Tensor | None = None) -> Tensor:  # noqa: D102
-        if torch.is_autocast_enabled(spikes.device.type):  # before they are copied into windows
-            spikes = spikes.to(torch.get_autocast_dtype(spikes.device.type))
         windows = spikes.unfold(1, self.window, self.stride).movedim(-1, 2)
         everywhere = None
         if self.whole is not None:
             # features of the whole clip are the same for all time points, so they are convolved once
-            seen = self.whole(channels_last(spikes))
+            seen = self.whole(spikes)
             everywhere = F.conv2d(seen, self.fuse[0][0].weight[:, -seen.shape[1] :], padding=1).unsqueeze(1)
         if spikes.device.type != "cpu" or torch.is_grad_enabled() or torch.jit.is_tracing() or is_exporting():
             return self._features(windows, everywhere, noise)
