@@ -43,7 +43,7 @@ class ColorCorrelation(nn.Module):
 
     Shape:
         - Input: features of each colour, :math:`(B, width, H, W)`; optionally the noise level, :math:`(B, 1, 1, 1)`
-        - Output: rgb with its sub-pixels as channels, :math:`(B, colors \text{ enlarge}^2, H, W)`
+        - Output: rgb with its sub-pixels as channels, :math:`(B, colors enlarge^2, H, W)`
     """
 
     def __init__(
