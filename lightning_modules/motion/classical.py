@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import lru_cache
 
 import torch
@@ -13,6 +12,7 @@ from lightning_modules.motion.estimator import MotionEstimator, split_any_size
 from spikekit import flow_warp, tfp_at
 from spikekit.check import check_planes, check_positive, check_whole
 from spikekit.color.cfa import cfa_pattern
+from spikekit.filters import separable_filter
 from spikekit.flow.tvl1 import tvl1_flow
 from spikekit.kernels import compiler_kept_out
 from spikekit.sensor.quantization_noise import flicker
@@ -112,7 +112,8 @@ class ClassicalFlow(MotionEstimator):
         if by_site:
             raw, variance = (split_any_size(part, pattern).flatten(0, 1) for part in (raw, variance))
         pictures, variance = (
-            _filtered(part, weights, border) for part, weights in ((raw, kernel), (variance, [w**2 for w in kernel]))
+            separable_filter(part, weights, border)
+            for part, weights in ((raw, kernel), (variance, [w**2 for w in kernel]))
         )
         attachment = self.attachment / (1 + variance[:, 0] / _NOISE**2)
         velocities = self._velocities(pictures, clock, attachment)
@@ -132,13 +133,6 @@ class ClassicalFlow(MotionEstimator):
         unlike, less = (_unlike(pictures, velocities * away) for velocities in (one, own))
         bent = ((unlike / (less + _UNSEEN) - _PART[0]) / (_PART[1] - _PART[0])).clamp(0, 1)
         return torch.lerp(one, own, bent.unsqueeze(1))
-
-
-def _filtered(planes: Tensor, weights: Sequence[float], border: str) -> Tensor:
-    from kornia.filters import filter2d_separable
-
-    kernel = torch.cat([planes.new_full((1, 1), weight) for weight in weights], dim=1)
-    return filter2d_separable(planes, kernel, kernel, border)
 
 
 def _times(pictures: Tensor, first: float, second: float) -> Tensor:
@@ -183,4 +177,4 @@ def noise_by_rate(window: int, device: torch.device | str = "cpu") -> Tensor:
 def _unlike(pictures: Tensor, flows: Tensor) -> Tensor:
     """Return the squared error (B, 1, h, w) between the middle picture and both others, warped by their flows."""
     error = flow_warp(pictures[:, ::2].unsqueeze(2), flows).squeeze(2) - pictures[:, 1:2]
-    return _filtered(error.square().sum(dim=1, keepdim=True), _NEAR, "replicate")
+    return separable_filter(error.square().sum(dim=1, keepdim=True), _NEAR, "replicate")

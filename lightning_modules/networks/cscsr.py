@@ -22,6 +22,7 @@ from lightning_modules.networks.representation import IntervalRepresentation, Sp
 from lightning_modules.signatures import inherit_signature
 from spikekit import bayer_mask, demosaic, flow_warp_idw, linear_motion, tfp_at
 from spikekit.color.cfa import count_colors
+from spikekit.filters import separable_filter
 from spikekit.kernels import compiler_kept_out
 from spikekit.warp.site_search import SMALLEST, apart, search_sites, site_table
 
@@ -298,11 +299,8 @@ class CSCSR(Network):
                 raw = tfp_at(spikes, self.frames // 2, (self.frames - 1) // 6 * 2 + 1, order=3)
                 smooth = raw.unsqueeze(1) / self.config.alpha
             else:
-                from kornia.filters import filter2d_separable
-
                 raw = tfp_at(spikes, self.frames // 2, self.frames) / self.config.alpha
                 # zero at the Nyquist frequency, to remove the zipper artefacts of demosaicing
-                binomial = torch.cat([raw.new_full((1, 1), weight) for weight in (0.25, 0.5, 0.25)], dim=1)
-                smooth = filter2d_separable(demosaic(raw, self.pattern), binomial, binomial)
+                smooth = separable_filter(demosaic(raw, self.pattern), (0.25, 0.5, 0.25))
             large = enlarge_smoothly(smooth, self.scale)
             return large if self.fold == self.scale else F.pixel_shuffle(large, self.scale)

@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from kornia.filters import filter2d_separable
 from torch import Tensor
 
 from spikekit.calibration.calibration import Calibration, colors
 from spikekit.calibration.measure import Measured
 from spikekit.color.cfa import bayer_mask
 from spikekit.color.demosaic import demosaic
+from spikekit.filters import separable_filter
 from spikekit.flow.fields import ends_inside
 from spikekit.flow.tvl1 import tvl1_flow
 from spikekit.progress import progress
@@ -37,7 +37,7 @@ _AROUND = 15  # side of a neighbourhood, in pixels
 _LEAST_GAIN = 0.1  # pixels below this are dead
 _ROUNDS = 2
 _ATTACHMENT = 120.0  # data weight of TV-L1 for pictures in spikes per frame
-_GREY = torch.tensor([[0.25, 0.5, 0.25]])  # mean over the Bayer cells that contain a pixel
+_GREY = 0.25, 0.5, 0.25  # mean over the Bayer cells that contain a pixel
 
 
 class Segments(NamedTuple):
@@ -147,7 +147,7 @@ def _places(light: Callable[[int], Tensor], count: int, color: bool) -> Tensor:
 
     def grey(number: int) -> Tensor:
         plane = light(number)
-        return filter2d_separable(plane[None, None], _GREY, _GREY, "reflect")[0, 0] if color else plane
+        return separable_filter(plane[None, None], _GREY)[0, 0] if color else plane
 
     place, before = torch.zeros(count, 2, *light(0).shape), 0
     for number in progress(range(count), "motion"):
