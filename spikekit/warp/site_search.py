@@ -277,7 +277,8 @@ def _search_in_graph(features: Tensor, flow: Tensor, shares: Tensor, table: Site
     for part, first, row in zip(pixels.unbind(0), base, found, strict=True):
         index = first + step.index_select(0, row)
         near = part.index_select(0, index.flatten()).unflatten(0, index.shape)
-        result.append((near.mT @ weight.index_select(0, row).to(part.dtype)).flatten(1))
+        near = near.mT if channels > 1 else near.flatten(1).unsqueeze(1)  # engines multiply rows faster than columns
+        result.append((near @ weight.index_select(0, row).to(part.dtype)).flatten(1))
     return torch.cat(result, dim=1).reshape(batch, height, width, -1).movedim(-1, 1)
 
 

@@ -15,7 +15,7 @@ from spikekit import write_spikes
 
 TINY = {"width": 4, "representation_width": 4, "features": 1, "stages": 1, "blocks": 1, "end_blocks": 1}
 
-FILM = {**TINY, "fusion_width": 4, "fusion_blocks": 1, "memory": 2}
+FILM = {**TINY, "features": 2, "fusion_width": 4, "fusion_blocks": 1, "memory": 2}
 #: of every kind of part one: an export of any network is compared with it before it is written
 MADE = [
     (CSCSR, {**TINY, "motion_fusion": "assembled", "resolution": "sensor"}),
