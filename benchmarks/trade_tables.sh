@@ -2,7 +2,7 @@
 # Measure the tables that --speed and --budget read, lightning_modules/weights/x*.csv: sh benchmarks/trade_tables.sh [TABLE ...]
 set -e
 cd "$(dirname "$0")/.."
-all="x1 x1_film x1_grey x1_grey_film x2 x2_film x2_dim x2_dim_film x3 x3_film x3_dim x3_dim_film x4 x4_film x4_dim x4_dim_film"
+all="x1 x1_film x1_grey x1_grey_film x2 x2_film x3 x3_film x4 x4_film"
 for name in ${*:-$all}; do
     set -- -c "configs/${name%%_*}.yaml"
     case $name in *_grey*) set -- "$@" -c configs/grey.yaml ;; esac
@@ -11,7 +11,6 @@ for name in ${*:-$all}; do
         *) set -- "$@" --data.motion 7.5 --data.rotation 2.5 --data.zoom 0.025 \
             -c '{model: {network: {init_args: {frames: 101}}}}' ;; # also for clips of 101 frames
     esac
-    case $name in *_dim*) set -- "$@" --model.network.alpha 0.1 ;; esac
     case $name in *_film) set -- "$@" --film 20 ;; esac
     lightning trade "$@" --data.val_clips 6 --rounds 3 -o "runs/tables/$name"
     cp "runs/tables/$name/trade.csv" "lightning_modules/weights/$name.csv"

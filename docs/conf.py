@@ -93,7 +93,7 @@ def _spikekit(arguments):
 
 
 class ShippedTrade(SphinxDirective):
-    """``.. shipped-trade:: 4`` shows the table of a scale in the package, ``4_dim`` that for low light."""
+    """``.. shipped-trade:: 4`` shows the table of a scale in the package."""
 
     required_arguments = 1
 

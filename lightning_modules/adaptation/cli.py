@@ -71,7 +71,7 @@ def adapt(args: Sequence[str]) -> None:
             print(warning, flush=True)
         level = 0.0 if asked.calibration == "none" else RecordingClips(recording).noise_level
         clips, name, teacher = clips_and_teacher(recording, student, asked.teacher, level > NOISY)
-        student.noise_level = teacher.noise_level = level
+        student.noise_level = teacher.noise_level = level * clips.joined**0.5
         with locked_folder(asked.output, "adaptation"):
             examples = make_distillation_set(student, teacher.to(device).eval(), clips)
             precision = precision_of(torch.device(device)) if device == "cuda" else "32-true"
@@ -98,7 +98,8 @@ def clips_and_teacher(
     frames = max(student.frames, network.frames)
     if recording.frames < ROOM * frames:
         raise ValueError(_too_short(recording, frames))
-    return RecordingClips(recording, frames, crop_to=student.pattern), name, network
+    clips = RecordingClips(recording, frames, crop_to=student.pattern).in_light(room=recording.frames // ROOM)
+    return clips, name, network
 
 
 def _largest(recording: Recording, student: Network, noisy: bool) -> str:

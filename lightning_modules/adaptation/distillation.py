@@ -86,7 +86,7 @@ def make_distillation_set(student: Network, teacher: Network, clips: RecordingCl
         if student.takes_flow and not student.motion.static:
             with torch.no_grad():
                 flows.append(student.estimate_flow(seen).cpu())
-    white = clips.white / student.settings["alpha"]
+    white = clips.joined * clips.white / student.settings["alpha"]
     return DistillationSet(torch.cat(spikes), torch.cat(pictures), torch.cat(flows) if flows else None, white)
 
 

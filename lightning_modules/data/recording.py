@@ -35,11 +35,11 @@ class RecordingScenes(LightningDataModule):
         if stage not in (None, "test"):
             raise ValueError(f"data: {stage} needs clips with ground truth, got the recording {self.path}")
         recording = open_recording(self.path, **self.known)
-        self.clips = RecordingClips(recording, self.frames, self.frame)
+        self.clips = RecordingClips(recording, self.frames, self.frame).in_light()
         self.options = {"pattern": GREY if recording.pattern == GREY else "RGGB"}
         self.test_names = self.clips.chosen
 
     def test_dataloader(self) -> Iterator[dict[str, Tensor]]:  # noqa: D102
         level = 0.0 if str(self.known.get("calibration")) == "none" else self.clips.noise_level
-        known = {"white": torch.tensor([self.clips.white]), "noise": torch.tensor([level])}
+        known = {"white": torch.tensor([self.clips.joined * self.clips.white]), "noise": torch.tensor([level])}
         return ({"spikes": clip[None], **known} for _, clip in self.clips.in_order())

@@ -29,6 +29,9 @@ FRAMES, EVERY = 41, 20
 # parts of a recording that white and noise are measured on, and least frames of a part of several
 _PARTS, _LEAST_PART = 4, 200
 
+# white level in spikes per frame below which frames are joined
+_BRIGHT = 0.6
+
 # spread of the gains at noise level 1, see configs/cameras.yaml, and the largest level that networks extrapolate to
 _SPREAD, _MOST = 0.06, 1.5
 
@@ -45,6 +48,7 @@ class RecordingClips:
 
     Attributes:
         size: (H, W) of a clip.
+        joined: number of consecutive spike frames that are joined into one, see :meth:`in_light`.
         chosen: key frames, in order.
 
     Raises:
@@ -58,7 +62,7 @@ class RecordingClips:
         path, total, (rows, columns) = recording.path, recording.frames, recording.size
         if total < frames:
             raise ValueError(f"{path}: expected at least {frames} frames for a clip, got {total}")
-        self.recording, self.frames = recording, frames
+        self.recording, self.frames, self.joined, self._asked = recording, frames, 1, (frame, crop_to)
         self.top = self.left = 0
         if recording.pattern != GREY and crop_to != GREY:  # the site of red identifies the phase
             phase = recording.pattern or "RGGB"
@@ -77,8 +81,32 @@ class RecordingClips:
     def __len__(self) -> int:
         return len(self.chosen)
 
+    @property
+    def room(self) -> int:
+        """Spike frames of the longest clip around the given first and last key frame; by default half the recording."""
+        given, whole = (self._asked[0] or ":").split(":")[:2], self.recording.frames
+        before = self.chosen[0] if given[0] else whole // 4
+        after = whole - 1 - self.chosen[-1] if given[-1] else whole // 4
+        return max(2 * min(before, after) + 1, self.frames)
+
+    def in_light(self, white: float | None = None, room: int | None = None) -> RecordingClips:
+        """Return these clips with as many spike frames joined into one as the light requires.
+
+        A joined frame has a spike where one of its frames has, as of a camera with a slower clock. Clips grow with the
+        square root of the light that is missing, because motion grows as well.
+
+        Args:
+            white: white level in spikes per frame; default: :attr:`white`.
+            room: longest clip in spike frames; default: :attr:`room`.
+        """
+        best, most = FRAMES * (_BRIGHT / (white or self.white)) ** 0.5 / self.frames, (room or self.room) // self.frames
+        joined = max(min(round(best), most), 1)
+        clips = RecordingClips(self.recording, joined * self.frames, *self._asked)
+        clips.joined = joined
+        return clips
+
     def in_order(self, chosen: Iterable[int] | None = None) -> Iterator[tuple[int, Tensor]]:
-        """Yield number and clip (N, H, W) of the given key frames, in increasing order; by default of all."""
+        """Yield number and clip (N / joined, H, W) of the given key frames, in increasing order; by default of all."""
         middles = self.chosen if chosen is None else list(chosen)
 
         def jump(start: int) -> Iterator[Tensor]:
@@ -88,7 +116,8 @@ class RecordingClips:
         packed = self.recording.path.suffix.lower() == ".npz"
         start = middles[0] - self.frames // 2 if middles else 0
         for middle, clip in clips_around(middles, self.frames, jump(start), start, None if packed else jump):
-            yield middle, self.recording.correct_spikes(clip)[..., self.top :, self.left :]
+            clip = self.recording.correct_spikes(clip)[..., self.top :, self.left :]
+            yield middle, clip if self.joined == 1 else clip.unflatten(0, (-1, self.joined)).amax(1)
 
     @cached_property
     def _looks(self) -> tuple[Tensor, int, int]:
@@ -112,7 +141,7 @@ class RecordingClips:
         if self.recording.alpha is not None or (measured is not None and measured.dark.any()):
             return 0.0
         spread = gain_spread(*self._looks, self.recording.pattern or "RGGB")
-        return 1.0 if spread is None else min(spread / _SPREAD, _MOST)
+        return self.joined**0.5 * (1.0 if spread is None else min(spread / _SPREAD, _MOST))
 
 
 def clips_around(

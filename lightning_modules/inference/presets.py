@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from lightning_modules import motion as estimators
+from lightning_modules.inference.clips import FRAMES
 from lightning_modules.inference.predict import precision_of, predict
 from lightning_modules.inference.tiles import FAR, TILE
 from lightning_modules.networks import CSCSR, ClassicalDecoder, Network
@@ -25,14 +26,8 @@ _FOLDER = Path(__file__).parents[1] / "weights"
 
 _DECODER = "ClassicalDecoder"
 
-#: default spike frames of a clip
-_FRAMES = 41
-
 #: largest loss against the best preset, in dB
 SPEEDS = {"fastest": float("inf"), "fast": 2.0, "balanced": 0.3, "best": 0.005}
-
-#: white level, in spikes per frame, below which the table for dim scenes is used
-_LITTLE_LIGHT = 0.2
 
 #: presets whose times differ by less than this factor count as equally fast
 _AS_FAST = 1.2
@@ -96,7 +91,7 @@ class Preset:
     def clip(self) -> int:
         """Spike frames of a clip; 41 is assumed for weights from outside the package."""
         model = find_model(self.weights or "")
-        return (model and model.frames) or self.frames or _FRAMES
+        return (model and model.frames) or self.frames or FRAMES
 
     @classmethod
     def read(cls, row: Mapping[str, str]) -> Preset:
@@ -144,8 +139,6 @@ class Conditions:
         film: use the table of films (``lightning trade --film``), if the package has one for the scale.
         frames: spike frames available for a clip; presets that need more are left out. From 101 on, presets with longer
             clips take part.
-        white: white level in spikes per frame; below 0.2 the table of dim scenes (0.1) is used, if the package has
-            one for the scale. Longer clips gain more there.
         noisy: of the networks keep only those with weights trained for noisy sensors, and use these weights; no effect
             if the package has none for the scale.
         grey: use the table of grey cameras, if the package has one for the scale.
@@ -154,8 +147,7 @@ class Conditions:
     scale: int
     size: tuple[int, int] = (250, 400)
     film: bool = False
-    frames: int = _FRAMES
-    white: float = 0.4
+    frames: int = FRAMES
     noisy: bool = False
     grey: bool = False
 
@@ -231,8 +223,7 @@ def choices(conditions: Conditions) -> list[Choice]:
 
 
 def _table(conditions: Conditions) -> list[dict[str, str]]:
-    scale, dim = conditions.scale, conditions.white < _LITTLE_LIGHT
-    asked = ("_grey", conditions.grey), ("_dim", dim), ("_film", conditions.film)
+    scale, asked = conditions.scale, (("_grey", conditions.grey), ("_film", conditions.film))
     kinds = product(*([name, ""] if holds else [""] for name, holds in asked))  # the best match first
     paths = (_FOLDER / f"x{scale}{''.join(kind)}.csv" for kind in kinds)
     path = next((path for path in paths if path.is_file()), None)

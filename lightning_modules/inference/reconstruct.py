@@ -17,7 +17,7 @@ from lightning_modules.inference.clips import FRAMES, NOISY, RecordingClips, fil
 from lightning_modules.inference.film import FilmFrame, FilmMaker
 from lightning_modules.inference.output import file_identity
 from lightning_modules.inference.predict import precision_of
-from lightning_modules.inference.presets import SPEEDS, Choice, Conditions, Preset, choose
+from lightning_modules.inference.presets import SPEEDS, Conditions, Preset, choose
 from lightning_modules.networks import ClassicalDecoder, Network
 from lightning_modules.registry import find_model
 from spikekit import __version__
@@ -25,10 +25,6 @@ from spikekit.color.cfa import GREY, PATTERNS
 from spikekit.io.image_bytes import to_bytes
 from spikekit.recording import Recording, open_recording
 
-# a recording is at least this many times as long as its clips, as clips cost pictures at both ends
-_MANY = 10
-# smallest gain in dB for which a hint recommends longer clips
-_WORTH_ROOM = 0.3
 # largest distance, in clocks, of two pictures of the network between which pictures are interpolated: without
 # loss in fast scenes, and in slower ones
 _APART, _FARTHER_APART = 6, 12
@@ -62,7 +58,8 @@ def reconstruct(
     Convention:
         Without a ``network``, ``speed`` or ``budget`` chooses weights of the package whose clips fit the recording.
         Unless the sensor was calibrated in the dark or the recording is simulated, its noise is measured; if it is
-        strong, the weights are those trained for noisy sensors. ``calibration="none"`` declares the pixels ideal.
+        strong, the weights are those trained for noisy sensors. ``calibration="none"`` declares the pixels ideal. In
+        dim light, frames are joined, see :meth:`lightning_modules.inference.clips.RecordingClips.in_light`.
 
         Films of ``"fast"`` and ``"balanced"`` run the network only where something moves, unless pictures are
         interpolated; ``psnr_tolerance=0`` runs it everywhere.
@@ -124,14 +121,15 @@ def reconstruct(
         scale = scale or (1 if recording.pattern == GREY else 4)
         speed = "balanced" if budget is None and speed is None else speed
         resting = bool(how.get("psnr_tolerance"))
-        preset, notes = _chosen(recording, speed, budget, scale, frame, white, level, resting)
+        preset, notes = _chosen(recording, speed, budget, scale, frame, level, resting)
         how = {**preset.given("tile", "self_ensemble", "interpolated"), **how}
         if speed in _ONLY_WHAT_MOVES and not (how.get("future") or how.get("interpolated")):
             how = {"psnr_tolerance": 0.1, **how}
         network = preset.build(GREY if recording.pattern == GREY else "RGGB")
-    network.noise_level = level
-    clips = RecordingClips(recording, network.frames, frame, network.pattern)
-    notes = [line for line in (recording.note, other_sensor(recording, network.pattern), *notes) if line]
+    clips = RecordingClips(recording, network.frames, frame, network.pattern).in_light(white)
+    network.noise_level = level * clips.joined**0.5
+    light = f"dim light: {clips.joined} spike frames are joined into one" if clips.joined > 1 else ""
+    notes = [line for line in (recording.note, other_sensor(recording, network.pattern), *notes, light) if line]
     return Reconstruction(network, clips, white, device, precision, notes, **how)
 
 
@@ -199,14 +197,15 @@ class Reconstruction:
             done: called with the finished fraction of the current picture.
         """
         maker = self._maker(done)
-        exposure = self.network.settings["alpha"] / self.white
+        joined = self.clips.joined
+        exposure = self.network.settings["alpha"] / (joined * self.white)
         groups = self._groups(maker, set(made), *part)
         clips = self.clips.in_order(frame for group, _ in groups for frame in group)
         mixed = torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bf16-mixed")
         for group, wanted in groups:
             spikes = torch.stack([clip for _, clip in islice(clips, len(group))]).to(self.device)
             with torch.inference_mode(), mixed:
-                rgb = maker(spikes, group, exposure=exposure).float()
+                rgb = maker(spikes, [frame / joined for frame in group], exposure=exposure).float()
             for frame, clip, picture in zip(group, spikes, rgb, strict=True):
                 if wanted and frame not in made:
                     shown = self._shown(picture.cpu().clone())
@@ -234,7 +233,7 @@ class Reconstruction:
         if method is None:
             return []
         settings = self.network.settings
-        decoder = ClassicalDecoder(method, settings["scale"], settings["pattern"], self.white)
+        decoder = ClassicalDecoder(method, settings["scale"], settings["pattern"], self.white * self.clips.joined)
         rgb = self._shown(decoder(clip[None].cpu())[0].clamp(0, 1))
         return [rgb, rgb.new_ones(3, rgb.shape[1], _GAP)]
 
@@ -249,6 +248,7 @@ class Reconstruction:
         return {
             "recording": file_identity(recording.path),
             "read": [recording.stored, recording.flip, recording.pattern, clips.top, clips.left, recording.camera],
+            "joined": clips.joined,
             "calibration": measured and _digest((name, value) for name, value in measured),
             "white": self.white,
             "network": [type(self.network).__name__, self.network.settings, _digest(self.network.state_dict().items())],
@@ -287,7 +287,6 @@ def _chosen(
     budget: str | None,
     scale: int,
     frame: str | None,
-    white: float,
     level: float,
     resting: bool,
 ) -> tuple[Preset, list[str]]:
@@ -295,10 +294,8 @@ def _chosen(
     clips = RecordingClips(recording, frame=frame)
     every = min((later - clock for clock, later in pairwise(clips.chosen)), default=clips.frames + 1)
     film = every <= clips.frames  # neighbouring clips overlap
-    around = 2 * min(clips.chosen[0], recording.frames - 1 - clips.chosen[-1]) + 1
-    room = max(FRAMES, recording.frames // _MANY if frame is None else around)
     noisy, grey = level > NOISY, recording.pattern == GREY
-    conditions = Conditions(scale, clips.size, film, room, white, noisy, grey)
+    conditions = Conditions(scale, clips.size, film, clips.room, noisy, grey)
     choice = choose(conditions, speed, budget)
     interpolated = 0 if resting else _interpolated(choice.preset, every, speed)
     said = [str(choice)]
@@ -311,8 +308,6 @@ def _chosen(
             f"{interpolated} of {interpolated + 1} pictures are interpolated, as they are {every} frames apart; "
             "--interpolated 0 computes all with the network"
         )
-    if speed:
-        said += _longer(choose(replace(conditions, frames=recording.frames), speed), choice, recording)
     if noisy and choice.preset.weights:
         said.append(_unmeasured(choice.preset, recording, scale, level))
     return replace(choice.preset, interpolated=interpolated or None), said
@@ -324,15 +319,6 @@ def _interpolated(preset: Preset, every: int, speed: str | None) -> int:
         return 0
     apart = _APART if speed in (None, "best") else _FARTHER_APART
     return max(apart // every - 1, 0)
-
-
-def _longer(ideal: Choice, choice: Choice, recording: Recording) -> list[str]:
-    """Return a hint if only the ends of the recording exclude longer, better clips."""
-    gain, half = ideal.psnr - choice.psnr, ideal.preset.clip // 2
-    if ideal.preset.clip <= choice.preset.clip or gain < _WORTH_ROOM:
-        return []
-    leaves = f"--frame {half}:{recording.frames - half} leaves room for them"
-    return [f"clips of {ideal.preset.clip} frames would be about {gain:.1f} dB better: {leaves}"]
 
 
 def _unmeasured(preset: Preset, recording: Recording, scale: int, level: float) -> str:

@@ -131,16 +131,9 @@ def usual_settings(
         for name, changes in [_NO_MOTION, *([] if film else more)]:
             if not changes.startswith(lacking):
                 typed[f"{weights}, {name}"] = f"{text} {changes}"
-    decoders = {
-        name: {"method": name[:3].lower(), "scale": scale, **({"frames": 41} if frames > 41 else {}), **options}
-        for name, options in _DECODERS.items()
-    }
-    if frames > 41:  # in dim light decoders gain from longer clips, too
-        window = 2 * ((frames - 1) // 6) + 1
-        longer = {"method": "tfp", "scale": scale, "window": window, "order": 3, "frames": frames}
-        decoders[f"TFP {window}, order 3"] = longer
     without = " ".join(f"{option} null" for option in own)  # decoders take no weights
-    for name, options in decoders.items():
+    for name, options in _DECODERS.items():
+        options = {"method": name[:3].lower(), "scale": scale, "frames": min(frames, 41), **options}
         given = " ".join(f"--model.network.{option} {value}" for option, value in options.items())
         typed[name] = f"--model.network ClassicalDecoder {given} {without}"
     return [Setting(name, text.split()) for name, text in typed.items()]

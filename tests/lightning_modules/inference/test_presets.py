@@ -90,36 +90,6 @@ def test_same_network_for_films_and_single_clips():
         assert isinstance(film.build(), RecurrentCSCSR) == find_model(film.weights).film
 
 
-def test_dim_light_has_its_own_tables(table, monkeypatch):
-    """The table of films comes first; without any for dim light, the one for bright light."""
-    assert choose(Conditions(3, white=0.1), "best").name == choose(Conditions(3), "best").name == "all"
-    lines = (table / "x3.csv").read_text().splitlines()
-    reference = next(line for line in lines if line.startswith("all,")).replace(",30.0,", ",20.0,")
-    for name, best in (("x3_dim", "tfp"), ("x3_film", "tfi"), ("x3_dim_film", "no motion")):
-        row = next(line for line in lines if line.startswith(f"{best},"))
-        (table / f"{name}.csv").write_text("\n".join([lines[0], reference, row]))
-    whites, films = (0.19, 0.2), (False, True)
-    found = [choose(Conditions(3, film=film, white=white), "best").name for white in whites for film in films]
-    assert found == ["tfp", "no motion", "all", "tfi"]
-    monkeypatch.setattr(speed, "pace", lambda asked: asked.film + asked.white)
-    film = Conditions(3, (40, 50), film=True, white=0.1)
-    assert choose(film, budget="2s").where.split(",")[1].split()[2] == "1.1"
-    (table / "x3_dim_film.csv").unlink()
-    assert choose(film, "best").name == "tfp"
-
-
-def test_longer_clips_are_chosen_in_dim_light():
-    """At x4, which has weights for long clips, if the recording is long enough."""
-    weights = "cscsr_huge_long_x4"
-    for film in (False, True):
-        dim = Conditions(4, film=film, frames=101, white=0.07)
-        assert choose(dim, "best").preset.weights == weights
-        assert choose(replace(dim, frames=100), "best").preset.clip == 41
-        assert choose(replace(dim, white=0.4), "best").preset.weights != weights
-        # hardly slower than the other decoders, and 4 dB better
-        assert choose(dim, "fastest").name == "TFP 33, order 3"
-
-
 def test_time_budget_is_for_this_machine(table, monkeypatch):
     monkeypatch.setattr(speed, "pace", lambda *_: 2.0)
     choice = choose(Conditions(3, (40, 50)), budget="400ms")
@@ -187,13 +157,12 @@ def test_tables_of_the_package_are_valid():
 
 def test_noisy_sensors_get_weights_for_noise_at_the_same_cost():
     for film in (False, True):
-        for white in (0.4, 0.1):
-            conditions = Conditions(4, film=film, frames=101, white=white)
-            noisy = choices(replace(conditions, noisy=True))
-            ideal = {choice.name: choice for choice in choices(conditions)}
-            assert noisy[0].preset.network == "ClassicalDecoder"  # nothing to train
-            for choice in noisy:
-                assert choice.preset.weights is None or find_model(choice.preset.weights).noise
-                assert any(choice.ms == other.ms and choice.psnr == other.psnr for other in ideal.values())
-            assert min(choice.below for choice in noisy) == 0
+        conditions = Conditions(4, film=film, frames=101)
+        noisy = choices(replace(conditions, noisy=True))
+        ideal = {choice.name: choice for choice in choices(conditions)}
+        assert noisy[0].preset.network == "ClassicalDecoder"  # nothing to train
+        for choice in noisy:
+            assert choice.preset.weights is None or find_model(choice.preset.weights).noise
+            assert any(choice.ms == other.ms and choice.psnr == other.psnr for other in ideal.values())
+        assert min(choice.below for choice in noisy) == 0
     assert choices(Conditions(2, noisy=True)) == choices(Conditions(2))  # there are no such weights

@@ -92,19 +92,15 @@ def test_ideal_sensors_get_weights_for_ideal_sensors(flat, tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize(
-    ("white", "frame", "frames", "hint"),
-    [(0.05, None, 41, True), (0.05, "50:150", 101, False), (0.05, "50:151", 41, True), (0.4, None, 41, False)],
+    ("white", "frame", "joined"), [(0.05, "100", 3), (0.05, None, 2), (0.05, "::30", 2), (0.05, "30:", 1), (0.4, "100", 1)]
 )
-def test_longer_clips_are_chosen_or_hinted_at_in_dim_light(flat, white, frame, frames, hint):
-    pictures = reconstruct(flat(white), "best", frame=frame)
-    assert pictures.network.frames == frames
-    assert any("--frame 50:150 leaves room for them" in line for line in pictures.notes) == hint
-
-
-def test_given_white_level_determines_dim_light(flat):
-    path = flat(0.4)
-    assert reconstruct(path, "best", frame="100").network.frames == 41
-    assert reconstruct(path, "best", frame="100", white=0.05).network.frames == 101
+def test_dim_light_joins_frames_if_there_is_room(flat, white, frame, joined):
+    """The brightness of the pictures stays the same."""
+    pictures = reconstruct(flat(0.05), "fastest", pattern="grey", frame=frame, white=white)
+    assert pictures.clips.joined == joined
+    assert any("spike frames are joined" in line for line in pictures.notes) == (joined > 1)
+    for _, rgb in pictures:
+        assert rgb.mean().item() == pytest.approx(0.05 / white, abs=0.06)
 
 
 @pytest.mark.parametrize(

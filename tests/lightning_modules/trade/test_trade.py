@@ -216,7 +216,7 @@ def test_default_settings_are_the_networks_of_the_package_and_the_decoders():
     assert [*settings][: len(networks)] == networks
     two = ["--model.weights", "cscsr_tiny_x4", "--self_ensemble", "2"]
     assert settings["cscsr_tiny_x4, self-ensemble of 2"].args == two
-    assert settings["TFI"].preset == Preset(network="ClassicalDecoder", method="tfi", scale=4)
+    assert settings["TFI"].preset == Preset(network="ClassicalDecoder", method="tfi", scale=4, frames=41)
     assert all(setting.preset is not None for setting in settings.values())
     own = {setting.name: setting for setting in usual_settings(4, ["--ckpt_path"])}
     assert not networks_of(own.values())
