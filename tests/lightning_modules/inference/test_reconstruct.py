@@ -92,7 +92,8 @@ def test_ideal_sensors_get_weights_for_ideal_sensors(flat, tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize(
-    ("white", "frame", "joined"), [(0.05, "100", 3), (0.05, None, 2), (0.05, "::30", 2), (0.05, "30:", 1), (0.4, "100", 1)]
+    ("white", "frame", "joined"),
+    [(0.05, "100", 3), (0.05, None, 2), (0.05, "::30", 2), (0.05, "30:", 1), (0.4, "100", 1)],
 )
 def test_dim_light_joins_frames_if_there_is_room(flat, white, frame, joined):
     """The brightness of the pictures stays the same."""
