@@ -21,6 +21,7 @@ from lightning_modules.inference.presets import SPEEDS, Conditions, Preset, choo
 from lightning_modules.networks import ClassicalDecoder, Network
 from lightning_modules.registry import find_model
 from spikekit import __version__
+from spikekit.check import check_positive
 from spikekit.color.cfa import GREY, PATTERNS
 from spikekit.io.image_bytes import to_bytes
 from spikekit.recording import Recording, open_recording
@@ -117,6 +118,7 @@ def reconstruct(
     looks = RecordingClips(recording, FRAMES if network is None else network.frames)
     level = 0.0 if str(calibration) == "none" else looks.noise_level
     white = looks.white if white is None else white
+    check_positive("white", white)
     if network is None:
         scale = scale or (1 if recording.pattern == GREY else 4)
         speed = "balanced" if budget is None and speed is None else speed
@@ -161,8 +163,6 @@ class Reconstruction:
         notes: list[str] | None = None,
         **how: Any,
     ) -> None:
-        if white is not None and not 0 < white < float("inf"):
-            raise ValueError(f"white: expected a finite number above 0, got {white}")
         if precision not in (None, "32-true", "bf16-mixed"):
             raise ValueError(f"precision: expected 32-true or bf16-mixed, got {precision!r}")
         self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))

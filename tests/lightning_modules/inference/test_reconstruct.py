@@ -104,6 +104,12 @@ def test_dim_light_joins_frames_if_there_is_room(flat, white, frame, joined):
         assert rgb.mean().item() == pytest.approx(0.05 / white, abs=0.06)
 
 
+@pytest.mark.parametrize("white", [0, -0.1, float("nan")])
+def test_invalid_white_levels_are_rejected(flat, white):
+    with pytest.raises(ValueError, match=f"white: expected a finite number above 0, got {white}"):
+        reconstruct(flat(0.4), "fastest", white=white)
+
+
 @pytest.mark.parametrize(
     ("every", "speed", "interpolated"),
     [(1, "balanced", 11), (3, "best", 1), (4, "best", 0), (20, "balanced", 0), (3, "fastest", 0)],
