@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from itertools import count
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -153,23 +152,15 @@ def _check_output(output: Path, pictures: Reconstruction) -> None:
 def _make(
     pictures: Reconstruction, there: Output, made: set[int], beside: str | None, part: tuple[int, int] = (0, 1)
 ) -> None:
-    """Make the missing pictures, with progress bars on a terminal and one line per picture elsewhere."""
-    left, number = len(pictures) - len(made), count(1)
-    watched = sys.stderr.isatty()
-    bar = progress(what="pictures", total=left, unit="picture", delay=0)
-    shown = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}, {remaining} left"
-    present = progress(what="this picture", total=1.0, position=1, bar_format=shown, delay=0)
-
-    def done(share: float) -> None:
-        present.update(share - present.n)
-
-    with bar, present:
-        for frame, rgb in pictures.pictures(made, part, beside, done if watched else None):
+    """Make the missing pictures, with a progress bar on a terminal and one line per picture elsewhere."""
+    left = len(pictures) - len(made)
+    with progress(what="pictures", total=left, unit="picture", delay=0) as bar:
+        new = pictures.pictures(made, part, beside, Path(f"{there.state}.{part[0]}"))
+        for number, (frame, rgb) in enumerate(new, 1):
             path = there.write(frame, rgb)
             bar.update()
-            present.reset()
-            if not watched:
-                print(f"{path}, {next(number)} of {left}", flush=True)
+            if not sys.stderr.isatty():
+                print(f"{path}, {number} of {left}", flush=True)
 
 
 def _on_ray(asked: argparse.Namespace, arguments: dict[str, Any], output: Path) -> None:

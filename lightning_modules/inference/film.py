@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from functools import partial
+from io import BytesIO
 from itertools import count, islice, pairwise
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -19,6 +22,7 @@ from lightning_modules.networks import Network, RecurrentCSCSR
 from lightning_modules.networks.recurrent_cscsr import read_forward, read_from_end
 from spikekit import flow_warp, linear_motion, upsample_flow
 from spikekit.check import check_planes, check_positive, check_whole
+from spikekit.io.whole_file import whole_file
 from spikekit.recording import white_rate
 
 
@@ -155,8 +159,8 @@ class FilmMaker:
         tile: largest side of a tile in sensor pixels, 0 for no tiles; default: 256, or 512 on a GPU.
         psnr_tolerance: PSNR in dB that a picture may lose to save work. Above 0, the network runs only where the spikes
             show motion, see :class:`lightning_modules.inference.rest.Rest`; the first picture is always complete.
-        how: ``self_ensemble`` and ``done`` of :func:`lightning_modules.inference.predict.predict`. With a
-            self-ensemble, every clip is reconstructed alone, without a state.
+        how: ``self_ensemble`` of :func:`lightning_modules.inference.predict.predict`, with which every clip is
+            reconstructed alone, without a state.
 
     Raises:
         ValueError: ``future`` for a network without a state; ``interpolated`` for a network without a motion estimate;
@@ -203,15 +207,28 @@ class FilmMaker:
         self._known: _Known | None = None
         self.rest: Rest | None = None
         if psnr_tolerance:
-            settings = network.settings
-            self.rest = Rest(network.scale, settings["pattern"], settings["alpha"], network.noise_level > 0)
+            self.rest = Rest(network.scale, network.pattern, network.settings["alpha"], network.noise_level > 0)
 
     @property
     def warm_up(self) -> int:
-        """Number of pictures before a group that visibly affect it."""
-        known = self.network.warm_up if self.carries_on else 0
-        pictures = max(known, min(self.interpolated, 1), Rest.warm_up if self.rest else 0)
-        return pictures * (self.interpolated + 1)
+        """Number of groups before another that visibly affect it."""
+        known = -(-self.network.warm_up // (self.future + 1)) if self.carries_on else 0
+        return max(known, min(self.interpolated, 1), Rest.warm_up if self.rest else 0)
+
+    def save(self, path: Path, clock: int) -> None:
+        """Write the state after a picture, from which a film continues as if it had not stopped."""
+        torch.save((clock, self._last, self._known, self.rest), state := BytesIO())
+        with whole_file(path) as file:
+            file.write(state.getbuffer())
+
+    def load(self, path: Path, before: int, device: torch.device) -> int:
+        """Read a state of an earlier clock and return that; without one, nothing changes, and -1 is returned."""
+        with suppress(Exception), torch.serialization.safe_globals([_Made, _Known, Rest]):
+            clock, *state = torch.load(path, device, weights_only=True)
+            if clock < before:
+                self._last, self._known, self.rest = state
+                return clock
+        return -1
 
     @torch.no_grad()
     def __call__(

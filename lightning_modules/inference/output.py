@@ -51,6 +51,7 @@ class Output:
 
     Attributes:
         folder: folder of the pictures.
+        state: path of the state of a film, see :meth:`Reconstruction.pictures`; a part adds its number.
 
     Raises:
         PictureError: the path of a picture is taken by a link, a pipe, a folder, or a file that is not ours.
@@ -62,6 +63,7 @@ class Output:
         self.folder = Path(f"{output}.frames") if self.is_file else self.output
         self._paths = {frame: self.folder / f"frame_{frame:06d}.png" for frame in frames}
         self._record = hashlib.sha256(json.dumps(made_of, sort_keys=True, default=str).encode()).hexdigest()
+        self.state = self.folder / f".predict.state.{self._record[:16]}"
         if self.is_file and self.folder.is_symlink():  # in another user's folder it may lead anywhere
             raise PictureError(f"{self.folder}: expected a folder of pictures, got a link; choose another -o")
         if self.is_file:
@@ -102,7 +104,10 @@ class Output:
             path.replace(self.output)
 
     def clear(self) -> None:
-        """Remove the folder beside a film or a picture, unless it holds other files."""
+        """Remove states, and the folder beside a film or a picture unless it holds other files."""
+        for state in self.folder.glob("*.predict.state.*"):
+            with suppress(OSError):
+                state.unlink()
         if not self.is_file:
             return
         for path in self._paths.values():

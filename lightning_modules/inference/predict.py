@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from itertools import count
 
 import torch
 from torch import Tensor
@@ -24,7 +22,6 @@ def predict(
     tile: int = TILE,
     self_ensemble: int = 1,
     exposure: float | Tensor = 1.0,
-    done: Callable[[float], object] | None = None,
 ) -> Tensor:
     r"""Return the picture at the middle of a clip.
 
@@ -39,7 +36,6 @@ def predict(
         self_ensemble: number of views to average, 1, 2, 4 or 8, see
             :func:`lightning_modules.inference.self_ensemble.self_ensemble`.
         exposure: factor of the picture before it is clamped, a number or (B, 1, 1, 1).
-        done: called after every tile and every view with the finished fraction of the picture.
 
     Returns:
         rgb :math:`(B, 3, s H, s W)`, clamped to [0, 1].
@@ -54,15 +50,9 @@ def predict(
         torch.Size([1, 3, 32, 32])
     """
     check_views(self_ensemble)
-    views = count()
 
     def run(spikes: Tensor, flow: Tensor | None) -> Tensor:
-        before = next(views)
-        told = done and (lambda share: done((before + share) / self_ensemble))
-        rgb = forward_in_tiles(network, spikes, tile, flow, static, told)
-        if told:
-            told(1)  # small views have no tiles
-        return rgb
+        return forward_in_tiles(network, spikes, tile, flow, static)
 
     rgb = mean_of_views(run, spikes, flow, network.pattern, network.scale, self_ensemble)
     return (rgb * exposure).clamp_(0, 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from itertools import islice, pairwise
 from pathlib import Path
@@ -29,8 +29,6 @@ from spikekit.recording import Recording, open_recording
 # largest distance, in clocks, of two pictures of the network between which pictures are interpolated: without
 # loss in fast scenes, and in slower ones
 _APART, _FARTHER_APART = 6, 12
-# speeds whose films run the network only where something moves
-_ONLY_WHAT_MOVES = "fast", "balanced"
 # width of the white gap between two pictures side by side, in pixels
 _GAP = 4
 
@@ -122,10 +120,9 @@ def reconstruct(
     if network is None:
         scale = scale or (1 if recording.pattern == GREY else 4)
         speed = "balanced" if budget is None and speed is None else speed
-        resting = bool(how.get("psnr_tolerance"))
-        preset, notes = _chosen(recording, speed, budget, scale, frame, level, resting)
+        preset, notes = _chosen(recording, speed, budget, scale, frame, level, bool(how.get("psnr_tolerance")))
         how = {**preset.given("tile", "self_ensemble", "interpolated"), **how}
-        if speed in _ONLY_WHAT_MOVES and not (how.get("future") or how.get("interpolated")):
+        if speed in ("fast", "balanced") and not (how.get("future") or how.get("interpolated")):
             how = {"psnr_tolerance": 0.1, **how}
         network = preset.build(GREY if recording.pattern == GREY else "RGGB")
     clips = RecordingClips(recording, network.frames, frame, network.pattern).in_light(white)
@@ -169,7 +166,7 @@ class Reconstruction:
         self.precision = precision or precision_of(self.device)
         self.network = network.to(self.device).eval()
         self.clips, self.notes, self.how = clips, notes or [], how
-        self._maker()  # reports wrong arguments at once
+        FilmMaker(network, **how)  # reports wrong arguments at once
         self.white = clips.white if white is None else white
 
     def __len__(self) -> int:
@@ -178,15 +175,12 @@ class Reconstruction:
     def __iter__(self) -> Iterator[FilmFrame]:
         return self.pictures()
 
-    def _maker(self, done: Callable[[float], object] | None = None) -> FilmMaker:
-        return FilmMaker(self.network, **self.how, **({"done": done} if done else {}))
-
     def pictures(
         self,
         made: Collection[int] = (),
         part: tuple[int, int] = (0, 1),
         beside: str | None = None,
-        done: Callable[[float], object] | None = None,
+        state: Path | None = None,
     ) -> Iterator[FilmFrame]:
         """Yield the pictures that do not exist yet.
 
@@ -194,15 +188,19 @@ class Reconstruction:
             made: spike frames whose pictures exist.
             part: index of the part of the recording, from 0, and number of parts.
             beside: decoder, ``"tfi"`` or ``"tfp"``, whose picture of the same clip is put to the left of every picture.
-            done: called with the finished fraction of the current picture.
+            state: file for what later pictures of a film depend on, from which a stopped run continues.
         """
-        maker = self._maker(done)
+        maker = FilmMaker(self.network, **self.how)
         joined = self.clips.joined
         exposure = self.network.settings["alpha"] / (joined * self.white)
         groups = self._groups(maker, set(made), *part)
+        if state is not None:
+            first = next((group[0] for group, wanted in groups if wanted), 0)
+            last = maker.load(state, first, self.device)
+            groups = [one for one in groups if one[0][0] > last]
         clips = self.clips.in_order(frame for group, _ in groups for frame in group)
         mixed = torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bf16-mixed")
-        for group, wanted in groups:
+        for n, (group, wanted) in enumerate(groups, 1):
             spikes = torch.stack([clip for _, clip in islice(clips, len(group))]).to(self.device)
             with torch.inference_mode(), mixed:
                 rgb = maker(spikes, [frame / joined for frame in group], exposure=exposure).float()
@@ -210,14 +208,15 @@ class Reconstruction:
                 if wanted and frame not in made:
                     shown = self._shown(picture.cpu().clone())
                     yield FilmFrame(frame, torch.cat([*self._decoded(clip, beside), shown], dim=-1))
+            if state is not None and maker.warm_up and n % maker.warm_up == 0:
+                maker.save(state, group[-1])
 
     def _groups(self, maker: FilmMaker, made: set[int], part: int, parts: int) -> list[tuple[list[int], bool]]:
         """Groups of frames made together, and whether their pictures are wanted or they only warm up the network."""
         groups = list(film_groups(self.clips.chosen, maker.future, maker.interpolated))
         mine = range(*(len(groups) * n // parts for n in (part, part + 1)))
         wanted = {n for n in mine if not made.issuperset(groups[n])}
-        before = -(-maker.warm_up // ((maker.future + 1) * (maker.interpolated + 1)))
-        seen = sorted({n for last in wanted for n in range(max(last - before, 0), last + 1)})
+        seen = sorted({n for last in wanted for n in range(max(last - maker.warm_up, 0), last + 1)})
         return [(groups[n], n in wanted) for n in seen]
 
     def _shown(self, rgb: Tensor) -> Tensor:

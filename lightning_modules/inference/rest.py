@@ -162,7 +162,8 @@ class Rest:
     Convention:
         The spikes since the last key frame are compared with earlier ones twice: alone, which detects sudden motion,
         and together with their predecessors, up to the length of the reference, which detects drift. The reference
-        grows while nothing moves, and starts anew where something does.
+        grows while nothing moves, and starts anew where something does. Until all cells rest, the halves of the new
+        spikes are also compared, as an object that turns in step with the key frames gives them equal sums.
 
         A cell is still if nothing changed during its clip, and rests if nothing changed in the 80 clocks before it
         either, as a single test may miss slow motion. A resting cell shows the mean of the network's first eight
@@ -184,7 +185,7 @@ class Rest:
         computed: cells (h, w) of the last picture that the network computed.
     """
 
-    #: pictures to repeat when a film is resumed, so that parts at rest are found again
+    #: earlier pictures that a part of a film begins with, so that what rests is found again
     warm_up = _PICTURES + 3
 
     def __init__(self, scale: int, pattern: str, white: float, noisy: bool = False) -> None:
@@ -268,6 +269,9 @@ class Rest:
         joint = find_changes(self._later, self._earlier, self._since / self._before, noise)
         self._since *= joint.gain
         changed = (alone.moved | joint.moved) & (self._before > 0)
+        if (self._count < _PICTURES).any():
+            first, second = spikes[len(spikes) % 2 :].unflatten(0, (2, -1)).sum(1, dtype=torch.float32)
+            changed |= find_changes(second, first, torch.ones_like(self._calm), noise).moved
         if _grown(changed).float().mean() > _BUSY:
             self._untested = _UNTESTED
         self._calm += len(spikes)

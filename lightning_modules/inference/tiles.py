@@ -27,7 +27,6 @@ def forward_in_tiles(
     tile: int,
     flow: Tensor | None = None,
     static: bool = False,
-    done: Callable[[float], object] | None = None,
 ) -> Tensor:
     r"""Run a network on overlapping tiles and join the results.
 
@@ -40,7 +39,6 @@ def forward_in_tiles(
         tile: largest side of a tile in sensor pixels; 0 for no tiles.
         flow: flow in the network's shape; default: the network's own estimate.
         static: nothing moves; replaces a flow.
-        done: called after every tile with the finished fraction.
 
     Returns:
         rgb :math:`(B, 3, s H, s W)`.
@@ -54,7 +52,7 @@ def forward_in_tiles(
         part = None if flow is None else outer.of(flow)
         return call(network, outer.of(spikes), part, part is None)
 
-    return tiled(run, whole, tile, lambda box: reach(flow, box, whole, network.halo), network.scale, done)
+    return tiled(run, whole, tile, lambda box: reach(flow, box, whole, network.halo), network.scale)
 
 
 def call(network: Network, spikes: Tensor, flow: Tensor | None = None, static: bool = False) -> Tensor:
@@ -76,7 +74,6 @@ def tiled(
     tile: int,
     around: Callable[[Box], int],
     scale: int = 1,
-    done: Callable[[float], object] | None = None,
 ) -> Tensor:
     """Compute planes in tiles of about the same size, even to keep the Bayer phase.
 
@@ -86,7 +83,6 @@ def tiled(
         tile: largest side of a tile in sensor pixels, 0 for a single tile.
         around: function that returns the margin needed around a box, in sensor pixels.
         scale: pixels of the planes per sensor pixel, s.
-        done: called after every tile with the finished fraction.
 
     Returns:
         Planes (..., s H, s W).
@@ -97,15 +93,13 @@ def tiled(
     planes = None
     rows, columns = (2 * -(-length // -(-length // tile) // 2) for length in (height, width))
     corners = [(top, left) for top in range(0, height, rows) for left in range(0, width, columns)]
-    for count, (top, left) in enumerate(corners, 1):
+    for top, left in corners:
         box = Box(top, left, top + rows, left + columns).grown(0, whole)
         outer = box.grown(around(box), whole)
         part = run(outer)
         if planes is None:
             planes = part.new_empty(*part.shape[:-2], scale * height, scale * width)
         box.of(planes, scale=scale).copy_(box.of(part, outer[:2], scale))
-        if done is not None:
-            done(count / len(corners))
     return planes
 
 

@@ -110,10 +110,12 @@ def test_stopped_run_resumes_after_its_last_picture(words, tmp_path, monkeypatch
         assert len(capsys.readouterr().err.splitlines()) == 1
         before = pictures(folder)
         assert len(before) == 2
+        (folder / ".predict.state.of_a_film").touch()
         with monkeypatch.context() as patch:
             stop_after(patch, 4)  # the others, and no more
             main([*words, str(tmp_path / name)])
         if name == "out":
+            assert [path.name for path in folder.iterdir() if path.suffix != ".png"] == [".predict.lock"]
             assert before.items() <= pictures(folder).items()
             assert pictures(folder) == pictures(tmp_path / "unbroken")
     assert len(read_video(tmp_path / "film.mp4")) == 6
@@ -196,11 +198,10 @@ def test_progress_on_a_terminal_and_elsewhere(words, tmp_path, monkeypatch, caps
     ]
     assert said.err == ""
     monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    main([*words, str(tmp_path / "again"), "--tile", "8"])
+    main([*words, str(tmp_path / "again")])
     said = capsys.readouterr()
     assert "frame_0000" not in said.out
     assert "pictures:" in said.err
-    assert "this picture:" in said.err
 
 
 TINY = {"scale": 2, "width": 8, "representation_width": 8, "features": 1, "stages": 1, "end_blocks": 1}

@@ -122,6 +122,12 @@ def test_a_camera_that_stops_lets_the_scene_rest():
     assert not computed[-1].any()
 
 
+def test_motion_in_step_with_the_pictures_is_seen():
+    clocks, columns = torch.arange(321.0)[:, None, None], torch.arange(SIDE)
+    light = (0.2 + 0.1 * torch.sin((clocks + columns) * 2 * math.pi / EVERY)).expand(-1, SIDE, -1)
+    assert all(cells.all() for _, cells in film(light, psnr_tolerance=0.1))
+
+
 def test_a_small_object_leaves_most_of_the_scene_at_rest():
     light = still(441).clone()
     for clock in range(441):

@@ -1,7 +1,6 @@
 import pytest
 import torch
 
-from lightning_modules.inference.predict import predict
 from lightning_modules.inference.tiles import forward_in_tiles
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks import CSCSR, ClassicalDecoder
@@ -120,16 +119,6 @@ def test_network_without_halo_is_not_tiled():
     calls.clear()
     assert forward_in_tiles(network, spikes, 64).equal(expected)
     assert calls == [(64, 192)]
-
-
-def test_progress_is_reported_per_tile_and_view():
-    shares = []
-    how = {"done": shares.append, "tile": 32}
-    predict(ClassicalDecoder(scale=2), clip([Layer(coarse(32, 64))], 32, 64), self_ensemble=2, **how)
-    assert list(dict.fromkeys(shares)) == [0.25, 0.5, 0.75, 1.0]
-    shares.clear()
-    predict(ClassicalDecoder(scale=2), clip([Layer(coarse(8, 8))], 8, 8), self_ensemble=4, **how)
-    assert list(dict.fromkeys(shares)) == [0.25, 0.5, 0.75, 1.0]
 
 
 @pytest.mark.parametrize("tile", [0, 64])
