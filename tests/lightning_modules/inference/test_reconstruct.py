@@ -99,11 +99,11 @@ def test_ideal_sensors_get_weights_for_ideal_sensors(flat, tmp_path, monkeypatch
 )
 def test_dim_light_joins_frames_if_there_is_room(flat, white, frame, joined):
     """The brightness of the pictures stays the same."""
-    pictures = reconstruct(flat(0.05), "fastest", pattern="grey", frame=frame, white=white)
+    pictures = reconstruct(flat(white / 2), "fastest", pattern="grey", frame=frame, white=white)
     assert pictures.clips.joined == joined
     assert any("spike frames are joined" in line for line in pictures.notes) == (joined > 1)
     for _, rgb in pictures:
-        assert rgb.mean().item() == pytest.approx(0.05 / white, abs=0.06)
+        assert rgb.mean().item() == pytest.approx(0.5, abs=0.1)
 
 
 @pytest.mark.parametrize("white", [0, -0.1, float("nan")])
