@@ -199,10 +199,9 @@ def exported(data: bytes, kind: str, threads: int | None = None) -> Callable[...
     options.log_severity_level = 3  # hide warnings on constants that are not folded
     options.intra_op_num_threads = threads or 0
     session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-    names = [one.name for one in session.get_inputs()]
 
     def run(*inputs: Tensor) -> Any:
-        given = {name: value.numpy() for name, value in zip(names, inputs, strict=True)}
+        given = {one.name: value.numpy() for one, value in zip(session.get_inputs(), inputs, strict=True)}
         found = [torch.from_numpy(value) for value in session.run(None, given)]
         return found[0] if len(found) == 1 else found
 
@@ -219,8 +218,10 @@ def _onnx(program: torch.export.ExportedProgram, inputs: list[str], outputs: lis
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # hide the hint to install torchvision, not needed
     # the optimiser takes minutes, and onnxruntime has its own
     options = {"dynamo": True, "optimize": False, "verbose": False, "opset_version": OPSET}
-    made = torch.onnx.export(program, input_names=inputs, output_names=outputs, **options)
-    return made.model_proto.SerializeToString()
+    model = torch.onnx.export(program, input_names=inputs, output_names=outputs, **options).model_proto
+    for node in model.graph.node:
+        node.ClearField("metadata_props")  # a tenth of the file, and it tells the paths of the source
+    return model.SerializeToString()
 
 
 def _check_onnx() -> None:

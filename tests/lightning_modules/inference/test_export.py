@@ -30,9 +30,8 @@ model, recording, out = sys.argv[1:]
 packed = np.fromfile(recording, np.uint8).reshape(41, -1)
 spikes = np.unpackbits(packed, axis=1, bitorder="little")[:, : 16 * 24].reshape(1, 41, 16, 24).astype(np.float32)
 session = onnxruntime.InferenceSession(model)
-names = [value.name for value in session.get_inputs()]
 given = {"spikes": spikes, "flow": np.full((1, 2, 2, 16, 24), 0.5, np.float32)}
-np.save(out, session.run(["rgb"], {name: given[name] for name in names})[0])
+np.save(out, session.run(["rgb"], {one.name: given[one.name] for one in session.get_inputs()})[0])
 assert "torch" not in sys.modules
 """
 
@@ -87,6 +86,7 @@ def test_onnx_gives_the_picture_of_the_network(kind, settings, tmp_path, program
     path = tmp_path / "a.onnx"
     export_network(network, path, "onnx")
     assert sizes_differ(program(path), network) < 1e-4
+    assert b".py" not in path.read_bytes()  # no paths of the source
     kinds = {node.op_type for node in pytest.importorskip("onnx").load(path).graph.node}
     refused = {"SplitToSequence", "SequenceAt", "Loop", "If", "GatherElements", "ScatterElements"}  # by some engines
     assert not isinstance(network, CSCSR) or not kinds & refused
