@@ -7,6 +7,7 @@ import platform
 import re
 import sys
 import time
+import timeit
 from collections.abc import Callable
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
@@ -36,14 +37,7 @@ def duration(seconds: float) -> str:
 
 def cpu_timer(now: Callable[[], float]) -> Timer:
     """Return a timer that reads ``now``, such as :func:`time.process_time` or :func:`time.perf_counter`."""
-
-    def timer(run: Run, number: int) -> float:
-        begin = now()
-        for _ in range(number):
-            run()
-        return (now() - begin) / number
-
-    return timer
+    return lambda run, number: timeit.timeit(run, timer=now, number=number) / number
 
 
 def cuda_timer(run: Run, number: int) -> float:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
-
 import numpy as np
 import torch
 import torch.nn.functional as F
+from lightning_fabric.utilities import move_data_to_device
 from torch import Tensor
+from torch.utils.data import default_collate
 
 from lightning_modules.adaptation.distillation import HELD_OUT, DistillationSet
 from lightning_modules.inference.tiles import TILE, forward_in_tiles
@@ -70,19 +70,14 @@ def fine_tune(
     before = likeness(student, held_out)
     device = next(student.parameters()).device
     optimizer = torch.optim.Adam(student.parameters(), lr=_RATE)
-    mixed = torch.autocast(device.type, torch.bfloat16) if precision == "bf16-mixed" else nullcontext()
     student.train()
     for step in progress(range(steps), "steps", steps):
-        batch = [patch_of(taught, student.pattern, student.scale, _BATCH * step + n) for n in range(_BATCH)]
-        clips, truth, flow = (_stacked(batch, name, device) for name in ("spikes", "rgb", "flow"))
+        patches = [patch_of(taught, student.pattern, student.scale, _BATCH * step + n) for n in range(_BATCH)]
+        batch = move_data_to_device(default_collate(patches), device)
         optimizer.param_groups[0]["lr"] = _RATE * min(1, (step + 1) / _RISING) * (1 - step / (steps + 1))
         optimizer.zero_grad()
-        with mixed:
-            loss = F.l1_loss(student(clips, flow), truth)
+        with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16-mixed"):
+            loss = F.l1_loss(student(batch["spikes"], batch.get("flow")), batch["rgb"])
         loss.backward()
         optimizer.step()
     return before, likeness(student.eval(), held_out)
-
-
-def _stacked(batch: list[dict[str, Tensor]], name: str, device: torch.device) -> Tensor | None:
-    return torch.stack([one[name] for one in batch]).to(device) if name in batch[0] else None

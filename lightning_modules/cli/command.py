@@ -282,7 +282,7 @@ def _check_continuation(path: str, model: BaseTask) -> None:
             name, expected = key.replace(".init_args", ""), f"{there.get(key)}, as {path} was trained with"
             anew = "to start anew with other settings, use --model.weights"
             raise UsageError(f"model.{name}: expected {expected}, got {here.get(key)}; {anew}")
-    check_resume(path, model)
+    check_resume(checkpoint, path, model)
 
 
 def without_chatter() -> None:

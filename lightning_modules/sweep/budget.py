@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from argparse import ArgumentTypeError
 from copy import deepcopy
 from typing import Any
 
@@ -14,12 +15,12 @@ _PACE = {"class_path": "lightning_modules.tasks.pace.Pace", "init_args": {}}
 
 
 def seconds(text: str) -> float:
-    """Parse a time above 0, ``HH:MM:SS`` or ``DD:HH:MM:SS``; raise ``ValueError`` for anything else."""
+    """Parse a time above 0, ``HH:MM:SS`` or ``DD:HH:MM:SS``; raise ``ArgumentTypeError`` for anything else."""
     if not re.fullmatch(r"(\d+:)?\d+:[0-5]?\d:[0-5]?\d", text):
-        raise ValueError(f"expected HH:MM:SS or DD:HH:MM:SS, got {text}")
+        raise ArgumentTypeError(f"expected HH:MM:SS or DD:HH:MM:SS, got {text}")
     time = sum(int(part) * unit for part, unit in zip(text.split(":")[::-1], (1, 60, 3600, 86400), strict=False))
     if time == 0:
-        raise ValueError(f"expected a time above 0, got {text}")
+        raise ArgumentTypeError(f"expected a time above 0, got {text}")
     return time
 
 

@@ -25,13 +25,6 @@ _ENGINES = {"local": run_locally, "ray": run_on_ray}
 _A_WHILE = 60  # seconds between two progress lines of a trial
 
 
-def _time(text: str) -> float:
-    try:
-        return seconds(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-
-
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the verb."""
     made = VerbParser(
@@ -90,7 +83,7 @@ examples:
     budget.add_argument("--steps", type=whole(1), help="training steps; a schedule with an end (T_max) ends with them")
     budget.add_argument(
         "--time",
-        type=_time,
+        type=seconds,
         metavar="HH:MM:SS",
         help="wall time of training with validation; a schedule with an end becomes a cosine that ends with it",
     )

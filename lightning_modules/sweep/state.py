@@ -22,14 +22,9 @@ def write_json(path: Path, value: Any) -> None:
         file.write(json.dumps(value, indent=1))
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Return the content of a JSON file."""
-    return _read(path, json.loads)
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """Return the content of a YAML file."""
-    return _read(path, yaml.safe_load)
+def read_settings(path: Path) -> dict[str, Any]:
+    """Return the content of a JSON or YAML file."""
+    return _read(path, json.loads if path.suffix == ".json" else yaml.safe_load)
 
 
 def read_result(folder: Path) -> dict[str, Any] | None:

@@ -19,7 +19,7 @@ from lightning_modules.cli.errors import InputError, UsageError
 from lightning_modules.cli.reasons import reason
 from lightning_modules.cli.rehearsal import Rehearsal, resolved
 from lightning_modules.sweep.budget import with_budget
-from lightning_modules.sweep.state import read_json, read_yaml, write_json
+from lightning_modules.sweep.state import read_settings, write_json
 from spikekit.io.whole_file import whole_file
 from spikekit.progress import progress
 
@@ -53,7 +53,7 @@ class Trial:
         """Write configuration and budget to the folder, which must not hold another trial."""
         config, budget = self.folder / "trial.yaml", self.folder / "budget.json"
         if budget.is_file():  # written last
-            there = {**read_yaml(config), "budget": read_json(budget)}
+            there = {**read_settings(config), "budget": read_settings(budget)}
             asked = {**yaml.safe_load(yaml.safe_dump(self.config)), "budget": self.budget}
             if there != asked:
                 raise InputError(f"{self.folder}: {_difference(there, asked)}; choose another -o, or delete the folder")

@@ -21,7 +21,7 @@ from lightning_modules.cli.errors import as_one_line
 from lightning_modules.cli.processes import end_with_parent
 from lightning_modules.storage.checkpoint import DivergedError, read_checkpoint
 from lightning_modules.sweep.budget import with_budget
-from lightning_modules.sweep.state import RESULT, check_result, read_json, read_yaml, say_progress, write_json
+from lightning_modules.sweep.state import RESULT, check_result, read_settings, say_progress, write_json
 from lightning_modules.tasks.pace import share_done
 from spikekit.io.whole_file import whole_file
 
@@ -116,7 +116,7 @@ def plan(folder: Path) -> Path:
     elementwise operations such as the warp. A resumed trial keeps its first plan.
     """
     own, planned = folder / "trial.yaml", folder / "plan.yaml"
-    config, budget = read_yaml(own), read_json(folder / "budget.json")
+    config, budget = read_settings(own), read_settings(folder / "budget.json")
     if "flops" not in budget:
         return own
     if not planned.is_file():

@@ -8,27 +8,21 @@ from typing import Any
 
 import torch
 
-from lightning_modules.storage.checkpoint import read_checkpoint
 from lightning_modules.tasks.base import BaseTask
 from spikekit.arguments import one_line
 
 
-def check_resume(path: str | Path, module: BaseTask) -> None:
+def check_resume(checkpoint: Mapping[str, Any], path: str | Path, module: BaseTask) -> None:
     """Check a checkpoint by one step with a temporary optimiser and schedule.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file is no checkpoint, or the training cannot resume from it; the message is one line that
-            names the file.
+        ValueError: the training cannot resume from it; the message is one line that names the file.
     """
-    checkpoint = read_checkpoint(path)
     weights = [torch.nn.Parameter(weight.detach().clone()) for weight in module.network.parameters()]
     made = module.optimizers_of(weights)
     try:
-        for name, part in (
-            ("optimizer_states", made["optimizer"]),
-            ("lr_schedulers", made["lr_scheduler"]["scheduler"]),
-        ):
+        parts = {"optimizer_states": made["optimizer"], "lr_schedulers": made["lr_scheduler"]["scheduler"]}
+        for name, part in parts.items():
             [state] = checkpoint[name]
             part.load_state_dict(state)
         for weight in weights:

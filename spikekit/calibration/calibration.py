@@ -108,25 +108,18 @@ def _nearest_that_work(bad: np.ndarray, pattern: str | None) -> tuple[Tensor, Te
     """Return defective pixels, the nearest working pixels of their colour, and weights that add up to 1."""
     from scipy.spatial import cKDTree
 
-    places, near, weights = [], [], []
+    near, weight = np.zeros((bad.sum(), _NEIGHBORS), int), np.zeros((bad.sum(), _NEIGHBORS))
     for pixels in colors(bad.shape, pattern):
-        wrong, right = np.argwhere(pixels & bad), np.argwhere(pixels & ~bad)
-        if not len(wrong):
+        wrong, right = pixels & bad, pixels & ~bad
+        if not wrong.any():
             continue
-        if not len(right):
+        if not right.any():
             raise ValueError("defects: expected working pixels of every colour, got none of one")
-        count = min(_NEIGHBORS, len(right))
-        distance, index = cKDTree(right).query(wrong, list(range(1, count + 1)))
-        places.append(np.ravel_multi_index(wrong.T, bad.shape))
-        found = np.zeros((2, len(wrong), _NEIGHBORS))
-        found[0, :, :count] = np.ravel_multi_index(right[index].transpose(2, 0, 1), bad.shape)
-        found[1, :, :count] = 1 / distance
-        near.append(found[0])
-        weights.append(found[1] / found[1].sum(-1, keepdims=True))
-    if not places:
-        return torch.empty(0, dtype=torch.long), torch.empty(0, _NEIGHBORS, dtype=torch.long), torch.empty(0)
-    joined = [torch.from_numpy(np.concatenate(parts)) for parts in (places, near, weights)]
-    return joined[0], joined[1].long(), joined[2]
+        count = min(_NEIGHBORS, right.sum())
+        distance, index = cKDTree(np.argwhere(right)).query(np.argwhere(wrong), list(range(1, count + 1)))
+        near[wrong[bad], :count], weight[wrong[bad], :count] = np.flatnonzero(right)[index], 1 / distance
+    places, shares = np.flatnonzero(bad), weight / weight.sum(-1, keepdims=True)
+    return torch.from_numpy(places), torch.from_numpy(near), torch.from_numpy(shares)
 
 
 def colors(size: tuple[int, int], pattern: str | None) -> list[np.ndarray]:

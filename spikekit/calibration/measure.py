@@ -94,21 +94,15 @@ def find_defects(scene: PixelRates, pattern: str | None = None) -> Measured:
     """
     size = tuple(scene.count.shape)
     defects = torch.zeros(size, dtype=torch.uint8)
-    for place in _lattices(size, pattern):
+    step = 1 if pattern is None else 2
+    for row, column in np.ndindex(min(step, size[0]), min(step, size[1])):  # pixels of one colour
+        place = slice(row, None, step), slice(column, None, step)
         rate = scene.rate[place]
         around = _median_around(rate)
         dead = (around * scene.frames >= _LEAST_SPIKES) & (rate < _DEAD_GAIN * around)
         hot = (rate >= _ALWAYS) & (around < 0.5)
         defects[place] = dead.byte() * DEAD + hot.byte() * HOT
     return Measured(Calibration(torch.ones(size), torch.zeros(size), defects))
-
-
-def _lattices(size: tuple[int, int], pattern: str | None) -> list[tuple[slice, slice]]:
-    """Return the slices of the sub-lattices, each with pixels of one colour."""
-    if pattern is None:
-        return [(slice(None), slice(None))]
-    starts = [(row, column) for row in range(min(2, size[0])) for column in range(min(2, size[1]))]
-    return [(slice(row, None, 2), slice(column, None, 2)) for row, column in starts]
 
 
 def _median_around(plane: Tensor) -> Tensor:

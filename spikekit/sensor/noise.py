@@ -277,14 +277,10 @@ class NoisyPixels:
 
 def _poisson_error(means: np.ndarray) -> np.ndarray:
     """Return E|N - mean| of Poisson numbers N, in the normal approximation for large means."""
-
-    def error(mean: float) -> float:
-        if mean > 1e4:
-            return _MEAN_SIZE * math.sqrt(mean)
-        most = math.floor(mean)
-        return 2 * math.exp((most + 1) * math.log(mean) - mean - math.lgamma(most + 1)) if mean else 0.0
-
-    return np.array([error(mean) for mean in means.tolist()])
+    mean = torch.from_numpy(means).double()
+    most = mean.floor()
+    exact = 2 * torch.exp(torch.xlogy(most + 1, mean) - mean - torch.lgamma(most + 1))
+    return torch.where(mean > 1e4, _MEAN_SIZE * mean.sqrt(), exact).numpy()
 
 
 def _arrive(charge: Tensor, quantum: float, numbers: np.random.Generator) -> Tensor:

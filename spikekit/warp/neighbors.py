@@ -138,13 +138,11 @@ def _insert(best: list[tuple[Tensor, Tensor]], distance: Tensor, index: Tensor, 
 def search_and_weigh(
     products: list[Product], neighbors: int, width: int, cell: Tensor, part: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return indices and weights, (neighbors, n), of the known pixels nearest to cell + part, (2, n)."""
+    """Return indices of the known pixels nearest to cell + part, (2, n), and their weights; both (neighbors, n).
+
+    Weights are inverse to the distance, and add up to 1.
+    """
     index = _search(products, neighbors, width, cell, part)
-    return index, _weigh(index, width, cell, part)
-
-
-def _weigh(index: Tensor, width: int, cell: Tensor, part: Tensor) -> Tensor:
-    """Return inverse-distance weights, of sum 1, of pixels (neighbors, n) at cell + part, (2, n)."""
     row = index // width
     dx = (index - row * width - cell[0]).to(part.dtype) - part[0]
     dy = (row - cell[1]).to(part.dtype) - part[1]
@@ -152,7 +150,7 @@ def _weigh(index: Tensor, width: int, cell: Tensor, part: Tensor) -> Tensor:
     # 1 / d relative to the nearest: no overflow near a known pixel; on it the other weights are 0
     weight = torch.where(index[1:] == index[0], 0, distance[0] / distance[1:])
     weight = torch.cat([torch.ones_like(distance[:1]), weight])
-    return weight / weight.sum(dim=0)
+    return index, weight / weight.sum(dim=0)
 
 
 def _nearest_known(flow: Tensor, mask: Tensor, neighbors: int) -> tuple[Tensor, Tensor]:
@@ -219,11 +217,7 @@ class NearestKnown(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, _: Tensor, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: D102
-        return NearestKnown.of_flow(*ctx.saved_tensors, grad), None, None
-
-    @staticmethod
-    def of_flow(flow: Tensor, index: Tensor, weight: Tensor, grad: Tensor) -> Tensor:
-        """Return the gradient of the flow from that of the weights."""
+        flow, index, weight = ctx.saved_tensors
         _, _, height, width = flow.shape
         whole = flow.detach().round()
         part = (flow - whole).flatten(2)
@@ -238,7 +232,8 @@ class NearestKnown(torch.autograd.Function):
         near = first * (others * (grad[:, :1] - grad[:, 1:])).sum(dim=1, keepdim=True)
         far = others * (grad[:, 1:] - (weight * grad).sum(dim=1, keepdim=True))
         factor = torch.cat([near, far], dim=1) / torch.where(square < torch.finfo(flow.dtype).tiny, 1, square)
-        return torch.stack([(factor * dx).sum(dim=1), (factor * dy).sum(dim=1)], dim=1).reshape(flow.shape)
+        moved = torch.stack([(factor * dx).sum(dim=1), (factor * dy).sum(dim=1)], dim=1)
+        return moved.reshape(flow.shape), None, None
 
 
 def idw_neighbors(flow: Tensor, mask: Tensor, neighbors: int = 4) -> tuple[Tensor, Tensor]:

@@ -19,7 +19,7 @@ from lightning_modules.cli.arguments import with_network_of_weights
 from lightning_modules.cli.errors import InputError
 from lightning_modules.data.cache import ClipCache
 from lightning_modules.inference import presets
-from lightning_modules.sweep.state import RESULT, read_yaml
+from lightning_modules.sweep.state import RESULT, read_settings
 from lightning_modules.sweep.table import collect, markdown, write_csv
 from lightning_modules.sweep.trials import Trial
 
@@ -119,4 +119,4 @@ def test_pipe_is_rejected_without_waiting(tmp_path):
     with pytest.raises(ValueError, match=r"a.yaml: expected a file, got a pipe or a device$"):
         with_network_of_weights(["fit", "-c", str(tmp_path / "a.yaml")])
     with pytest.raises(InputError, match=r"a.yaml: .*a pipe"):
-        read_yaml(tmp_path / "a.yaml")
+        read_settings(tmp_path / "a.yaml")
