@@ -158,9 +158,10 @@ def _films(folders: Iterable[Path], only: str | None = None) -> tuple[SequenceFi
     films: dict[str, SequenceFiles] = {}
     for folder in folders:
         for name in [only] if only else _subfolders(folder):
-            frames = tuple(sorted(_pictures(folder / name), key=natural_order))
+            seen = (frame for frame in os.listdir(folder / name) if not frame.startswith("."))
+            frames = sorted((one for one in seen if Path(one).suffix.lower() in PICTURE_ENDINGS), key=natural_order)
             if frames:
-                films.setdefault(name, SequenceFiles(name, folder / name, frames))
+                films.setdefault(name, SequenceFiles(name, folder / name, tuple(frames)))
     return tuple(films[name] for name in sorted(films, key=natural_order))
 
 
@@ -169,9 +170,3 @@ def _subfolders(folder: Path) -> list[str]:
         return []
     with os.scandir(folder) as entries:
         return [entry.name for entry in entries if os.path.isdir(entry.path) and not entry.name.startswith(".")]
-
-
-def _pictures(folder: Path) -> list[str]:
-    with os.scandir(folder) as entries:
-        names = [entry.name for entry in entries if not entry.name.startswith(".")]
-    return [name for name in names if os.path.splitext(name)[1].lower() in PICTURE_ENDINGS]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import reprlib
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -34,17 +35,17 @@ def own_class(
     name = settings.get("class")
     kind = kinds.get(name) if isinstance(name, str) else None
     if kind is None:
-        raise ValueError(f"{source}: class: expected one of {', '.join(kinds)}, got {_short(name)}")
+        raise ValueError(f"{source}: class: expected one of {', '.join(kinds)}, got {reprlib.repr(name)}")
     arguments = {key: value for key, value in settings.items() if key != "class"}
     parameters = signature(kind, eval_str=True).parameters
     known = {key: parameter.annotation for key, parameter in parameters.items() if key not in _NOT_STORED}
     for key, value in arguments.items():
         if key not in known:
             hint = "written by another version of this package?"
-            raise ValueError(f"{source}: {name} accepts no argument {_short(key)} from a file ({hint})")
+            raise ValueError(f"{source}: {name} accepts no argument {reprlib.repr(key)} from a file ({hint})")
         if not _fits(value, known[key]):
             expected = f"{_said(known[key])}, at most {_LARGEST}"
-            raise ValueError(f"{source}: {key} of {name}: expected {expected}, got {_short(value)}")
+            raise ValueError(f"{source}: {key} of {name}: expected {expected}, got {reprlib.repr(value)}")
     return kind, arguments
 
 
@@ -127,13 +128,3 @@ def _fits(value: Any, hint: Any) -> bool:
 
 def _said(hint: Any) -> str:
     return hint.__name__ if isinstance(hint, type) and not get_args(hint) else str(hint).replace("typing.", "")
-
-
-def _short(value: Any) -> str:
-    """Return a short representation of a value, for one-line messages."""
-    if not isinstance(value, (str, int, float, bool, types.NoneType)):
-        return f"a {type(value).__name__}"
-    if isinstance(value, int) and value.bit_length() > 200:
-        return f"a number of {value.bit_length()} bits"
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."

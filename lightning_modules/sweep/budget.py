@@ -37,17 +37,12 @@ def with_budget(config: dict[str, Any], budget: dict[str, float]) -> dict[str, A
     config = deepcopy(config)
     steps, time = budget.get("steps"), budget.get("seconds")
     config["trainer"] |= {"max_epochs": -1, "max_steps": steps or -1, "max_time": time and {"seconds": time}}
-    for name in _ends(config):
+    schedule = config["model"].get("init_args", {}).get("lr_scheduler")
+    arguments = schedule.get("init_args", {}) if isinstance(schedule, dict) else {}
+    for name in [name for name in _ENDS if arguments.get(name) is not None]:
         if steps:
-            config["model"]["init_args"]["lr_scheduler"]["init_args"][name] = steps
+            arguments[name] = steps
         if time:
             config["model"]["init_args"]["lr_scheduler"] = _CONSTANT
             config["trainer"]["callbacks"] = [*(config["trainer"]["callbacks"] or []), _PACE]
     return config
-
-
-def _ends(config: dict[str, Any]) -> list[str]:
-    """Return the arguments of a configuration's schedule for its last step."""
-    schedule = config["model"].get("init_args", {}).get("lr_scheduler")
-    arguments = schedule.get("init_args", {}) if isinstance(schedule, dict) else {}
-    return [name for name in _ENDS if arguments.get(name) is not None]

@@ -117,8 +117,9 @@ class TestReport(Callback):
             writer = csv.writer(file)
             writer.writerow(["method", "clip", *(column for column, _, _ in self.columns())])
             for method, scores in self._scores.items():
-                writer.writerows([method, n, *map(_rounded, score)] for n, score in zip(names, scores, strict=True))
-                writer.writerow([method, "mean", *map(_rounded, means[method])])
+                for n, score in zip(names, scores, strict=True):
+                    writer.writerow([method, n, *map("{:.4f}".format, score)])
+                writer.writerow([method, "mean", *map("{:.4f}".format, means[method])])
         write_picture(self.output / "test.png", panel(self._rows))
         missing = why_no_lpips() if any(name == "psnr" for name, *_ in self.columns()) else None
         shown = [*self._scores, *(["truth"] if self.truth else [])]
@@ -127,7 +128,3 @@ class TestReport(Callback):
         lines = [[method, *map("{:.{}f}".format, values, places)] for method, values in means.items()]
         print(f"\n{table(head, lines)}\n\n{missing or ''}")  # noqa: T201
         print(f"{self.output / 'test.csv'}, {self.output / 'test.png'} (columns: {', '.join(shown)})")  # noqa: T201
-
-
-def _rounded(value: float) -> str:
-    return f"{value:.4f}"

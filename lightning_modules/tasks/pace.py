@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -62,11 +61,9 @@ class Pace(Callback):
             rate = self._clips / took
             steps = (trainer.global_step - self._step) / took
             if trainer.is_global_zero:
-                sys.stdout.write(
-                    f"step {trainer.global_step}, {share_done(trainer):.0%}: {steps:.2f} steps/s, {rate:.0f} clips/s, "
-                    f"loss {loss:.5f}, lr {trainer.optimizers[0].param_groups[0]['lr']:.2g}\n"
-                )
-                sys.stdout.flush()
+                said = f"step {trainer.global_step}, {share_done(trainer):.0%}: {steps:.2f} steps/s, {rate:.0f} clips/s"
+                said += f", loss {loss:.5f}, lr {trainer.optimizers[0].param_groups[0]['lr']:.2g}"
+                print(said, flush=True)  # noqa: T201
             self._said, self._step, self._clips = time.monotonic(), trainer.global_step, 0
         if now - self._written >= self.weights_every:
             self._write(trainer, module)

@@ -55,21 +55,21 @@ def search(plane: Callable[[int], np.ndarray], frame: int, clip: range) -> np.nd
     ``plane`` returns the frame of a given number, uint8, where any value but 0 is a spike. ``clip`` holds the numbers
     of all frames.
     """
-    size = plane(frame).shape
+    size, counter = plane(frame).shape, np.int16 if len(clip) < 32767 else np.int32
     onwards, backwards = range(frame, clip.stop), range(frame - 1, clip.start - 1, -1)
-    after, none_after = _silence(map(plane, onwards), size, len(clip))
-    before, none_before = _silence(map(plane, backwards), size, len(clip))
+    after, none_after = _silence(map(plane, onwards), size, counter)
+    before, none_before = _silence(map(plane, backwards), size, counter)
     interval = after + before + 1
     # if one of the two spikes is missing, the nearest complete interval lies on the other side
     for order, alone in ((onwards, none_before & ~none_after), (backwards, none_after & ~none_before)):
         if alone.any():
-            np.maximum(interval, _first_interval(map(plane, order), alone, len(clip)), out=interval)
+            np.maximum(interval, _first_interval(map(plane, order), alone, counter), out=interval)
     return interval
 
 
-def _silence(planes: Iterable[np.ndarray], size: tuple[int, ...], most: int) -> tuple[np.ndarray, np.ndarray]:
+def _silence(planes: Iterable[np.ndarray], size: tuple[int, ...], counter: type) -> tuple[np.ndarray, np.ndarray]:
     """Count the planes before the first spike of every pixel (all if there is none); also return which have none."""
-    silent, count = np.ones(size, bool), np.zeros(size, _counter(most))
+    silent, count = np.ones(size, bool), np.zeros(size, counter)
     for plane in planes:
         np.greater(silent.view(np.uint8), plane, out=silent)
         count += silent
@@ -78,9 +78,9 @@ def _silence(planes: Iterable[np.ndarray], size: tuple[int, ...], most: int) -> 
     return count, silent
 
 
-def _first_interval(planes: Iterable[np.ndarray], wanted: np.ndarray, most: int) -> np.ndarray:
+def _first_interval(planes: Iterable[np.ndarray], wanted: np.ndarray, counter: type) -> np.ndarray:
     """Count the planes from the first spike to the second at the ``wanted`` pixels; 0 if there is no second."""
-    waiting, once, count = wanted.copy(), np.zeros_like(wanted), np.zeros(wanted.shape, _counter(most))
+    waiting, once, count = wanted.copy(), np.zeros_like(wanted), np.zeros(wanted.shape, counter)
     for plane in planes:
         fired = plane != 0
         np.greater(waiting, once & fired, out=waiting)
@@ -89,10 +89,6 @@ def _first_interval(planes: Iterable[np.ndarray], wanted: np.ndarray, most: int)
         if not waiting.any():
             break
     return count * ~waiting
-
-
-def _counter(most: int) -> type[np.signedinteger]:
-    return np.int16 if most < 32767 else np.int32
 
 
 def spike_interval_at(spikes: Tensor, frame: int) -> Tensor:

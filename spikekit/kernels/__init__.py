@@ -32,7 +32,7 @@ def operator(fake: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
         if hasattr(cpu, name):
             register_kernel(op, "cpu")(getattr(cpu, name))
             register_on_gpu(op, lambda *args: gpu_kernel(name)(*args))
-        batch_first(op)
+        register_vmap(op)
         return op
 
     return make
@@ -77,16 +77,26 @@ def gpu_kernel(name: str) -> Callable[..., Any]:
     return getattr(import_module("spikekit.kernels.gpu"), name)
 
 
-def batch_first(op: Any) -> None:
-    """Register a ``torch.func.vmap`` rule that adds the mapped axis as a leading dimension of every tensor."""
+def register_vmap(op: Any, folded: int = 0) -> None:
+    """Register a ``torch.func.vmap`` rule that adds the mapped axis as a leading dimension of every tensor.
+
+    With ``folded``, the axis is folded into the first dimension of that many arguments; others cannot be mapped over.
+    """
 
     def rule(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Any, Any]:
+        count = folded or len(args)
+        if any(dim is not None for dim in in_dims[count:]):
+            raise ValueError(f"{op._name}: expected only the first {count} arguments to be mapped over")
+
         def with_axis(value: Any, dim: int | None) -> Any:
             if not isinstance(value, Tensor):
                 return value
-            return value.expand(info.batch_size, *value.shape) if dim is None else value.movedim(dim, 0)
+            value = value.expand(info.batch_size, *value.shape) if dim is None else value.movedim(dim, 0)
+            return value.flatten(0, 1) if folded else value
 
-        result = op(*map(with_axis, args, in_dims))
+        result = op(*map(with_axis, args[:count], in_dims), *args[count:])
+        if folded:
+            result = tree_map(lambda value: value.unflatten(0, (info.batch_size, -1)), result)
         return result, tree_map(lambda _: 0, result)
 
     op.register_vmap(rule)

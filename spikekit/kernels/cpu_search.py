@@ -81,16 +81,12 @@ def _search(flow, rows, columns, height, width, begin, end, index, weight):
             weight[k, n] = distances[k] / total if k < count else 0.0
 
 
-def _padded(tables: list[Tensor]) -> np.ndarray:
-    """Stack tables (k, 2 L) to (P, 2 L, k), padded by -1."""
-    return pad_sequence(tables, batch_first=True, padding_value=-1).transpose(1, 2).contiguous().numpy()
-
-
 def nearest_known(flow: Tensor, products: list[tuple[Tensor, Tensor]], neighbors: int) -> tuple[Tensor, Tensor]:
     """Return indices and weights, (N, K, H W), like the operator of this name; for ``products`` see `products_of`."""
     count, _, height, width = flow.shape
     plane = height * width
-    rows, columns = (_padded(list(tables)) for tables in zip(*products, strict=True))
+    stacked = (pad_sequence(list(axis), True, -1) for axis in zip(*products, strict=True))
+    rows, columns = (tables.transpose(1, 2).contiguous().numpy() for tables in stacked)
     index = np.empty((count, neighbors, plane), np.int64)
     weight = np.empty((count, neighbors, plane), np.float64 if flow.dtype is torch.float64 else np.float32)
     moved = flow.detach().contiguous().flatten(2).numpy()

@@ -60,19 +60,14 @@ def _used_rows(planes: Tensor, index: np.ndarray, dtype: torch.dtype) -> tuple[T
     return rows, place
 
 
-def _bags(index: np.ndarray, place: np.ndarray | None, piece: slice) -> np.ndarray:
-    """Return a piece of an index (K, Q) as bags (q, K)."""
-    bags = index[:, piece].T
-    return np.ascontiguousarray(bags) if place is None else place.take(bags)
-
-
 def weighted_gather(values: Tensor, index: Tensor, weight: Tensor) -> Tensor:
     """Gather from rows of the pixels that are read; sums of a piece are transposed while they are in the cache."""
     out, dtype = _new_like_layout(values, index.shape[2]), wide_dtype(values, weight)
     for planes, index_b, weight_b, out_b in zip(values.detach(), index.numpy(), weight.detach(), out, strict=True):
         rows, place = _used_rows(planes, index_b, dtype)
         for piece in _pieces(*out_b.t().shape):
-            bags, weights = torch.from_numpy(_bags(index_b, place, piece)), weight_b[:, piece].t().to(dtype)
+            bags, weights = index_b[:, piece].T, weight_b[:, piece].t().to(dtype)
+            bags = torch.from_numpy(np.ascontiguousarray(bags) if place is None else place.take(bags))
             sums = F.embedding_bag(bags, rows, mode="sum", per_sample_weights=weights.contiguous()).to(out.dtype).t()
             _array(out_b)[:, piece] = _array(sums if is_channels_last(out) else sums.contiguous())
     return out

@@ -131,11 +131,8 @@ def tvl1_level(
     """Return the flow (B, 2, H, W) of pictures (B, 2, H, W), float32, like :func:`spikekit.flow.tvl1.refine`."""
     clips, _, height, width = pictures.shape
     pictures, times, limit = pictures.contiguous(), times.to(pictures).contiguous(), limit.contiguous()
-    near, slope, rest = (
-        flow.clone(memory_format=torch.contiguous_format),
-        torch.empty_like(flow),
-        torch.empty_like(limit),
-    )
+    near = flow.clone(memory_format=torch.contiguous_format)
+    slope, rest = torch.empty_like(flow), torch.empty_like(limit)
     flow = near.clone()
     duals = [flow.new_zeros(clips, 2, 2, height, width) for _ in range(2)]
     blocks = triton.cdiv(height * width, _BLOCK) * clips

@@ -15,10 +15,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils._pytree import tree_map
 
 from spikekit.check import wide_dtype
-from spikekit.kernels import cpu_warp, custom_operator, gpu_kernel, register_kernel, register_on_gpu
+from spikekit.kernels import cpu_warp, custom_operator, gpu_kernel, register_kernel, register_on_gpu, register_vmap
 from spikekit.kernels.layout import empty_like_layout, is_channels_last
 
 _FEW = 8  # channels; with fewer, a CPU is faster plane by plane
@@ -51,23 +50,6 @@ def _dot(values: Tensor, grad: Tensor, index: Tensor) -> Tensor:
     return result
 
 
-def fold_into_batch(op: Any, count: int) -> None:
-    """Register a ``torch.func.vmap`` rule that folds the mapped axis of the first ``count`` arguments into a batch."""
-
-    def rule(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Any, Any]:
-        if any(dim is not None for dim in in_dims[count:]):
-            raise ValueError(f"{op._name}: expected only the first {count} arguments to be mapped over")
-
-        def folded(value: Tensor, dim: int | None) -> Tensor:
-            return (value.expand(info.batch_size, *value.shape) if dim is None else value.movedim(dim, 0)).flatten(0, 1)
-
-        result = op(*map(folded, args[:count], in_dims), *args[count:])
-        result = tree_map(lambda value: value.unflatten(0, (info.batch_size, -1)), result)
-        return result, tree_map(lambda _: 0, result)
-
-    op.register_vmap(rule)
-
-
 def _operator(plain: Callable[..., Tensor], fake: Callable[..., Tensor]) -> Any:
     name = f"weighted{plain.__name__}"
     op = custom_operator(name, plain, fake)
@@ -82,7 +64,7 @@ def _operator(plain: Callable[..., Tensor], fake: Callable[..., Tensor]) -> Any:
         return plain(*args) if result is NotImplemented else result
 
     register_on_gpu(op, on_gpu)
-    fold_into_batch(op, 3)
+    register_vmap(op, 3)
     return op
 
 

@@ -16,9 +16,8 @@ import torch
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
-from spikekit.kernels import custom_operator, gpu_kernel, register_kernel, register_on_gpu
+from spikekit.kernels import custom_operator, gpu_kernel, register_kernel, register_on_gpu, register_vmap
 from spikekit.kernels.loops import import_loops
-from spikekit.warp.gather import fold_into_batch
 
 _FARTHEST = 2.0**30  # flow is clamped to it, so that positions fit an integer
 _CHUNK = 1 << 15  # positions per search: fits in the cache of one thread
@@ -197,7 +196,7 @@ def _on_gpu(flow: Tensor, mask: Tensor, neighbors: int) -> tuple[Tensor, Tensor]
 
 
 register_on_gpu(nearest_known, _on_gpu)
-fold_into_batch(nearest_known, 1)
+register_vmap(nearest_known, 1)
 
 
 class NearestKnown(torch.autograd.Function):
