@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from lightning_modules.cli.errors import InputError, UsageError, VerbParser
+from lightning_modules.cli.errors import InputError, UsageError, VerbParser, input_errors
 from lightning_modules.cli.folder_lock import locked_folder
 from lightning_modules.trade.films import PICTURES, measure_films
 from lightning_modules.trade.measure import Measurement, measure, running, single_clips
@@ -97,12 +97,8 @@ def _measured(rows: Sequence[Measurement], base: Runner, asked: argparse.Namespa
     if asked.film is None:
         timed = measure(rows, single_clips(base.data.test_dataloader()), asked.rounds)
     else:
-        try:
+        with input_errors():
             timed = measure_films(rows, base.data, base.network.frames, asked.film, asked.rounds)
-        except UsageError:
-            raise
-        except ValueError as error:
-            raise InputError(f"trade: {error}") from error
     _check_any(rows)
     text = markdown(rows, command, timed)
     with whole_file(asked.output / "trade.md", "w") as file:

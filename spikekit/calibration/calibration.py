@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from spikekit.check import check_planes
-from spikekit.color.cfa import bayer_sites
+from spikekit.color.cfa import GREY, bayer_mask
 from spikekit.sensor.noise import HOT, WORKS
 
 _NEIGHBORS = 4
@@ -109,7 +109,7 @@ def _nearest_that_work(bad: np.ndarray, pattern: str | None) -> tuple[Tensor, Te
     from scipy.spatial import cKDTree
 
     near, weight = np.zeros((bad.sum(), _NEIGHBORS), int), np.zeros((bad.sum(), _NEIGHBORS))
-    for pixels in colors(bad.shape, pattern):
+    for pixels in bayer_mask(*bad.shape, pattern or GREY, device="cpu", dtype=torch.bool).numpy():
         wrong, right = pixels & bad, pixels & ~bad
         if not wrong.any():
             continue
@@ -120,13 +120,3 @@ def _nearest_that_work(bad: np.ndarray, pattern: str | None) -> tuple[Tensor, Te
         near[wrong[bad], :count], weight[wrong[bad], :count] = np.flatnonzero(right)[index], 1 / distance
     places, shares = np.flatnonzero(bad), weight / weight.sum(-1, keepdims=True)
     return torch.from_numpy(places), torch.from_numpy(near), torch.from_numpy(shares)
-
-
-def colors(size: tuple[int, int], pattern: str | None) -> list[np.ndarray]:
-    """Return a mask (H, W) of the pixels of each colour: R, G and B, or one mask for a grey sensor."""
-    if pattern is None:
-        return [np.ones(size, bool)]
-    masks = [np.zeros(size, bool) for _ in range(3)]
-    for colour, row, column in bayer_sites(pattern):
-        masks[colour][row::2, column::2] = True
-    return masks

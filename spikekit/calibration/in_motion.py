@@ -10,9 +10,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from spikekit.calibration.calibration import Calibration, colors
+from spikekit.calibration.calibration import Calibration
 from spikekit.calibration.measure import Measured
-from spikekit.color.cfa import bayer_mask
+from spikekit.color.cfa import GREY, bayer_mask
 from spikekit.color.demosaic import demosaic
 from spikekit.filters import separable_filter
 from spikekit.flow.fields import ends_inside
@@ -95,7 +95,7 @@ def calibrate_in_motion(segments: Segments, known: Calibration, pattern: str | N
     counts, works = segments.counts, known.defects == WORKS
     if min(known.size) < _LEAST_SIDE:
         return None
-    planes = [torch.from_numpy(plane) & works for plane in colors(known.size, pattern)]
+    planes = bayer_mask(*known.size, pattern or GREY, dtype=torch.bool) & works
     measured = Measured(known)
     for _ in range(_ROUNDS):
         # sums over both halves: number of comparisons, expected light, and excess of the rate over it
@@ -162,7 +162,7 @@ def _places(light: Callable[[int], Tensor], count: int, color: bool) -> Tensor:
     return place
 
 
-def _most_likely(halves: Tensor, works: Tensor, planes: list[Tensor], known: Calibration) -> Measured | None:
+def _most_likely(halves: Tensor, works: Tensor, planes: Tensor, known: Calibration) -> Measured | None:
     """Return the most likely gains, given the sums over both halves of a recording."""
     from scipy.optimize import nnls
 

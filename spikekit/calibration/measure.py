@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spikekit.calibration.calibration import Calibration, colors
+from spikekit.calibration.calibration import Calibration
 from spikekit.calibration.pixel_rates import PixelRates
+from spikekit.color.cfa import GREY, bayer_mask
 from spikekit.sensor.noise import DEAD, HOT
 
 _LEAST_SPIKES = 10  # spikes of the neighbours, below which a silent pixel is not called dead
@@ -66,7 +67,7 @@ def calibrate(
             raise ValueError(f"expected a flat recording brighter than the dark one, got {brightness:.3g} per clock")
         defects[whole.rate >= _ALWAYS] = HOT
         errors = []
-        for pixels in map(torch.from_numpy, colors(size, pattern)):
+        for pixels in bayer_mask(*size, pattern or GREY, dtype=torch.bool):
             works = pixels & (defects == 0)
             defects[works & (light < _DEAD_GAIN * light[works].median())] = DEAD
             works = pixels & (defects == 0)

@@ -18,11 +18,16 @@ def _check_flow(name: str, flow: Tensor) -> None:
         raise ValueError(f"{name}: expected (*, 2, H, W), got {tuple(flow.shape)}")
 
 
+def ends(flow: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the columns and the rows, (*, H, W), at which the flow (*, 2, H, W) of every pixel ends."""
+    rows, columns = (torch.arange(side, device=flow.device, dtype=flow.dtype) for side in flow.shape[-2:])
+    return flow[..., 0, :, :] + columns, flow[..., 1, :, :] + rows[:, None]
+
+
 def ends_inside(flow: Tensor, beyond: float = 0.0) -> Tensor:
     """Return a mask (*, H, W) of the pixels whose flow (*, 2, H, W) ends inside, or ``beyond`` pixels outside."""
     height, width = flow.shape[-2:]
-    rows, columns = (torch.arange(side, device=flow.device) for side in (height, width))
-    x, y = flow[..., 0, :, :] + columns, flow[..., 1, :, :] + rows[:, None]
+    x, y = ends(flow)
     return (x >= -beyond) & (x <= width - 1 + beyond) & (y >= -beyond) & (y <= height - 1 + beyond)
 
 

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from spikekit.check import check_picture, check_planes, check_whole
-from spikekit.flow.fields import ends_inside, upsample_flow
+from spikekit.flow.fields import ends, ends_inside, upsample_flow
 
 # Radius, in pixels, of the window in which frames are compared.
 _REACH = 2
@@ -266,16 +266,9 @@ def _estimates(luma: np.ndarray) -> Tensor:
 def _sample(planes: Tensor, flow: Tensor, mode: str = "bilinear") -> Tensor:
     """Warp planes (B, C, H, W) by flow (B, 2, H, W), with replicated borders."""
     height, width = planes.shape[-2:]
-    x, y = _positions(flow)
+    x, y = ends(flow)
     grid = torch.stack([(2 * x + 1) / width - 1, (2 * y + 1) / height - 1], dim=-1)
     return F.grid_sample(planes, grid, mode, "border", align_corners=False)
-
-
-def _positions(flow: Tensor) -> tuple[Tensor, Tensor]:
-    height, width = flow.shape[-2:]
-    x = flow[:, 0] + torch.arange(width, device=flow.device, dtype=flow.dtype)
-    y = flow[:, 1] + torch.arange(height, device=flow.device, dtype=flow.dtype)[:, None]
-    return x, y
 
 
 def _around(error: Tensor) -> Tensor:
@@ -297,7 +290,7 @@ def _best(candidates: Tensor, errors: Tensor) -> Tensor:
 def _splat(values: Tensor, flow: Tensor) -> Tensor:
     """Splat values (B, C, H, W) along flow (B, 2, H, W), bilinearly, and sum them."""
     height, width = values.shape[-2:]
-    x, y = _positions(flow)
+    x, y = ends(flow)
     left, top = x.floor(), y.floor()
     sums = torch.zeros_like(values).flatten(2)
     for i, j in ((left, top), (left + 1, top), (left, top + 1), (left + 1, top + 1)):
