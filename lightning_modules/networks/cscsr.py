@@ -138,8 +138,9 @@ class CSCSR(Network):
         self.colors = count_colors(config.pattern)
         self.representation = nn.ModuleList(_representation(config) for _ in range(self.colors))
         refine = FeatureRefinement if config.refinement else TimeFusion
+        self._side = self.fold if config.search else 1  # of the square of temporal pixels that a feature becomes
         self.refinement = nn.ModuleList(
-            refine(len(times), part.features * self.fold**2, config.width) for part in self.representation
+            refine(len(times), part.features * self._side**2, config.width) for part in self.representation
         )
         own = {} if config.end_width is None else {"end_width": config.end_width}
         own |= {"colors": 1} if self.colors == 1 else {}
@@ -159,7 +160,7 @@ class CSCSR(Network):
                 part.start_at_the_mean()
         for part in self.refinement:
             if isinstance(part, TimeFusion):
-                part.start_at_the_mean(self.fold**2)
+                part.start_at_the_mean(self._side**2)
         if self.config.skip:
             nn.init.zeros_(self.reconstruction.rgb.weight)
 
@@ -201,7 +202,9 @@ class CSCSR(Network):
         planes = (spikes * mask for mask in masks)
         # one colour at a time, to save memory
         features = (encode(plane, **told) for encode, plane in zip(self.representation, planes, strict=True))
-        if not self.config.search or (flow is None and self.colors == 1):  # a grey sensor at rest knows all pixels
+        if not self.config.search:
+            pixels = (enlarge(part, self.scale // self.fold) for part in features)
+        elif flow is None and self.colors == 1:  # a grey sensor at rest knows all pixels
             pixels = (enlarge(part, self.scale) for part in features)
         elif self._by_sites(spikes, flow):
             pixels = self._search_sites(features, flow, spikes)
@@ -211,7 +214,7 @@ class CSCSR(Network):
             raise ValueError(f"neighbors, H, W: expected at most 4 and at least {SMALLEST} for export, got {got}")
         else:
             pixels = map(self._search, features, self._offsets(flow, spikes), range(self.colors))
-        pixels = (fold(part.flatten(1, 2), self.fold) for part in pixels)
+        pixels = (fold(part.flatten(1, 2), self._side) for part in pixels)
         return [refine(part) for refine, part in zip(self.refinement, pixels, strict=True)]
 
     def _by_sites(self, spikes: Tensor, flow: Tensor | None) -> bool:
