@@ -24,6 +24,7 @@ class Model:
         size: name in :data:`lightning_modules.networks.sizes.SIZES`.
         frames: number of spike frames per clip.
         margin: radius of the receptive field in sensor pixels, measured with these weights.
+        search: the network searches along estimated motion.
         film: the network also uses the neighbouring key frames of a film.
         noise: the network was trained for noisy sensors without calibration.
         macs: multiplications per sensor pixel for the picture of a single clip or one motion estimate.
@@ -37,6 +38,7 @@ class Model:
     size: str | None
     frames: int | None
     margin: int | None
+    search: bool
     film: bool
     noise: bool
     macs: int
@@ -105,8 +107,7 @@ def _model(row: dict[str, str]) -> Model:
         row["name"],
         pattern=row["pattern"] or None,
         size=row["size"] or None,
-        film=row["film"] == "1",
-        noise=row["noise"] == "1",
+        **{name: row[name] == "1" for name in ("search", "film", "noise")},
         macs=int(row["macs"]),
         **{name: int(row[name]) if row[name] else None for name in ("scale", "frames", "margin")},
         **{name: float(row[name]) if row[name] else None for name in ("kodak", "vid4")},

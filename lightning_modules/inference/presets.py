@@ -93,6 +93,12 @@ class Preset:
         model = find_model(self.weights or "")
         return (model and model.frames) or self.frames or FRAMES
 
+    @property
+    def moves(self) -> bool:
+        """Whether motion is estimated; assumed for weights from outside the package."""
+        model = find_model(self.weights or "")
+        return self.weights is not None and self.motion != "ZeroFlow" and (model is None or model.search)
+
     @classmethod
     def read(cls, row: Mapping[str, str]) -> Preset:
         """Return the preset in a row of a table; an empty cell is ``None``.
@@ -209,8 +215,7 @@ def choices(conditions: Conditions) -> list[Choice]:
         margin = model.margin if model else CSCSR.halo
         in_tile = min(pixels, ((preset.tile or TILE) + 2 * (margin + FAR)) ** 2 / measured)
         psnr, ratio, mib = (float(row[name]) for name in ("psnr", "ratio", "mib"))
-        moves = preset.motion != "ZeroFlow" and preset.network != _DECODER
-        everywhere = frame + moves * _MOTION * measured
+        everywhere = frame + preset.moves * _MOTION * measured
         mib = everywhere * pixels + (mib - everywhere) * in_tile
         ms = ratio * float(_reference(rows)["ms"]) * pixels
         name = row["setting"].replace(row["weights"], preset.weights) if preset.weights else row["setting"]

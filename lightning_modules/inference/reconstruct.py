@@ -314,7 +314,7 @@ def _chosen(
 
 def _interpolated(preset: Preset, every: int, speed: str | None) -> int:
     """Return the number of pictures that may be interpolated between two of the network."""
-    if preset.weights is None or preset.motion == "ZeroFlow":
+    if not preset.moves:
         return 0
     apart = _APART if speed in (None, "best") else _FARTHER_APART
     return max(apart // every - 1, 0)

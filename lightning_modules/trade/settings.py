@@ -117,6 +117,7 @@ def usual_settings(
     models.sort(key=lambda model: model.macs)
     largest = models[-1].name if models else None
     reference = _reference(models) if models else None
+    still = {one.name for one in models if not one.search}
     networks = {one.name: f"--model.weights {one.name}" for one in sorted(models, key=lambda one: one is not reference)}
     if own:
         networks, largest = {"own weights": ""}, "own weights"
@@ -129,7 +130,7 @@ def usual_settings(
     for place, (weights, text) in enumerate(networks.items()):
         more = [_TWO_VIEWS, *(_MOST if weights == largest else []), *(_VARIANTS if place == 0 else [])]
         for name, changes in [_NO_MOTION, *([] if film else more)]:
-            if not changes.startswith(lacking):
+            if not changes.startswith(lacking) and (name != _NO_MOTION[0] or weights not in still):
                 typed[f"{weights}, {name}"] = f"{text} {changes}"
     without = " ".join(f"{option} null" for option in own)  # decoders take no weights
     for name, options in _DECODERS.items():
