@@ -208,8 +208,9 @@ def networks_of(settings):
 def test_default_settings_are_the_networks_of_the_package_and_the_decoders():
     settings = {setting.name: setting for setting in usual_settings(4)}
     networks = networks_of(settings.values())
-    assert networks == ["cscsr_small_x4", "cscsr_tiny_x4", "cscsr_large_x4", "cscsr_huge_x4"]  # the reference first
-    assert [*settings][: len(networks)] == networks
+    sizes = "small", "micro", "tiny", "large", "huge"  # the reference first
+    assert networks == [*settings][: len(networks)] == [f"cscsr_{size}_x4" for size in sizes]
+    assert "cscsr_tiny_x4, no motion" in settings and "cscsr_micro_x4, no motion" not in settings
     two = ["--model.weights", "cscsr_tiny_x4", "--self_ensemble", "2"]
     assert settings["cscsr_tiny_x4, self-ensemble of 2"].args == two
     assert settings["TFI"].preset == Preset(network="ClassicalDecoder", method="tfi", scale=4, frames=41)
