@@ -210,7 +210,8 @@ def test_default_settings_are_the_networks_of_the_package_and_the_decoders():
     networks = networks_of(settings.values())
     sizes = "small", "micro", "tiny", "large", "huge"  # the reference first
     assert networks == [*settings][: len(networks)] == [f"cscsr_{size}_x4" for size in sizes]
-    assert "cscsr_tiny_x4, no motion" in settings and "cscsr_micro_x4, no motion" not in settings
+    assert "cscsr_tiny_x4, no motion" in settings
+    assert "cscsr_micro_x4, no motion" not in settings
     two = ["--model.weights", "cscsr_tiny_x4", "--self_ensemble", "2"]
     assert settings["cscsr_tiny_x4, self-ensemble of 2"].args == two
     assert settings["TFI"].preset == Preset(network="ClassicalDecoder", method="tfi", scale=4, frames=41)
