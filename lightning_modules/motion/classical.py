@@ -56,7 +56,8 @@ class ClassicalFlow(MotionEstimator):
 
     Args:
         attachment: weight of the data term for pictures in firing rates; smaller values give smoother flow.
-        warps: warping iterations per pyramid level; fewer are faster and less accurate. At most two refine a half.
+        warps: warping iterations at the finest pyramid level; fewer are faster and less accurate. At most two refine a
+            half.
 
     Shape:
         As :class:`MotionEstimator`; no gradient.

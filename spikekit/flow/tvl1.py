@@ -17,6 +17,7 @@ COUPLING = 0.25  # theta, which couples the data term and the smooth flow
 STEP = 0.15  # step of the dual variable; must be below 1/4 to converge
 
 _SMALLEST = 16  # shorter side of the coarsest level, in pixels
+_COARSE = 2  # further linearizations on all levels but the finest, where they cost little
 
 
 @torch.no_grad()
@@ -39,7 +40,7 @@ def tvl1_flow(
         times: (B, 2), :math:`t_0` and :math:`t_1`, about 1 apart.
         attachment: (B, H, W), the weight :math:`\lambda` of the data term.
         start: initial flow (B, 2, H, W), refined at full size only; default: 0 at the coarsest size.
-        warps: number of linearizations per level.
+        warps: number of linearizations at full size; smaller sizes take two more.
 
     Returns:
         (B, 2, H, W), in pixels per unit of the times, order (x, y).
@@ -64,7 +65,8 @@ def _estimate(warps: int, pictures: Tensor, times: Tensor, attachment: Tensor, s
             (height, width), (old_height, old_width) = level.shape[-2:], flow.shape[-2:]
             flow = F.interpolate(flow, level.shape[-2:], mode="bilinear")
             flow = torch.stack([flow[:, 0] * (width / old_width), flow[:, 1] * (height / old_height)], dim=1)
-        flow = _improve(level[:, :2], times, level[:, 2] * COUPLING, flow, warps)
+        more = 0 if level is levels[0] else _COARSE
+        flow = _improve(level[:, :2], times, level[:, 2] * COUPLING, flow, warps + more)
     return flow
 
 
