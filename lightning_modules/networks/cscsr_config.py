@@ -49,7 +49,7 @@ class CSCSRConfig:
             ``"independent"`` (D) one per colour, from its own sub-stream, with the mean of two for green;
             ``"assembled"`` (E) interleaves the flows of the sub-streams as in the Bayer pattern.
         search: temporal pixel search along the motion. False ignores motion and only enlarges the features of each
-            time point; with ``refinement=False`` it is F, no MSR.
+            time point to the resolution of the reconstruction; with ``refinement=False`` it is F, no MSR.
         refinement: feature refinement FR; False is G, one convolution over all time points.
         reconstruction: ``"correlated"`` is CCR; ``"separate"`` (H) reconstructs each colour channel independently;
             ``"early"`` (I) fuses the colours once, at the beginning.
