@@ -19,9 +19,11 @@ import torch
 import torch.nn.functional as F
 from in_turn import interleave, ratio
 from kornia.color import CFA, raw_to_rgb, rgb_to_raw
+from kornia.filters import filter2d_separable
 from torch import Tensor
 
 import spikekit as sk
+from spikekit.filters import separable_filter
 from spikekit.timing import cpu_name, software, timer_of
 
 ROOT = Path(__file__).parents[1]
@@ -217,6 +219,9 @@ def colour(given: Inputs) -> Iterator[Case]:
     yield "split_colors", "uint8, 41 frames", lambda: sk.split_colors(clip), {"plain torch": lambda: colours(clip)}
     others = {"kornia, bilinear": lambda: raw_to_rgb(raw[:, None], CFA.BG)}
     yield "demosaic", "8 pictures", lambda: sk.demosaic(raw), others
+    binomial = torch.tensor([[0.25, 0.5, 0.25]], device=given.device)
+    others = {"kornia": lambda: filter2d_separable(rgb, binomial, binomial)}
+    yield "separable_filter", "8 pictures, 3 x 3", lambda: separable_filter(rgb, (0.25, 0.5, 0.25)), others
     yield "ssim", "1 picture", lambda: sk.ssim(rgb[0], rgb[1]), made(scikit_image, rgb[0], rgb[1])
 
 

@@ -31,7 +31,7 @@ def main(args: Sequence[str] | None = None) -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     with suppress(AttributeError, TypeError):  # where the C library is not glibc
         allocator = ctypes.CDLL(None)
-        # Freed memory of up to 32 MiB is kept; to return it and get it anew takes 5 % of the time of a picture.
+        # Freed memory is kept, as every picture would return and fault it in again; arrays above 32 MiB are returned.
         allocator.mallopt(_MMAP_THRESHOLD, 1 << 25)
         allocator.mallopt(_TRIM_THRESHOLD, 1 << 30)
     try:

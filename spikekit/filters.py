@@ -11,7 +11,7 @@ from torch import Tensor
 def separable_filter(planes: Tensor, weights: Sequence[float], border: str = "reflect") -> Tensor:
     """Filter planes along both axes by the same short kernel.
 
-    As :func:`kornia.filters.filter2d_separable`, whose convolutions take 3 to 19 times as long on a CPU.
+    As :func:`kornia.filters.filter2d_separable`, whose convolutions take about ten times as long on a CPU.
 
     Args:
         planes: (B, C, H, W), floating.

@@ -7,6 +7,7 @@ import torch
 
 from lightning_modules import reconstruct
 from lightning_modules.inference.film import film
+from lightning_modules.inference.presets import Choice, Preset
 from lightning_modules.networks import CSCSR, ClassicalDecoder, RecurrentCSCSR
 from lightning_modules.registry import find_model
 from spikekit import SensorNoise, SpikeSensor, mosaic, read_spikes, simulate_spikes, write_picture, write_spikes
@@ -123,6 +124,14 @@ def test_close_pictures_are_interpolated(flat, every, speed, interpolated):
     assert without.how["interpolated"] == 0
     resting = reconstruct(flat(0.3), speed, frame=f"60:120:{every}", calibration="none", psnr_tolerance=0.2)
     assert not resting.how.get("interpolated")
+
+
+def test_networks_without_motion_do_not_interpolate(flat, monkeypatch):
+    for weights, interpolated in (("cscsr_micro_x4", None), ("cscsr_tiny_x4", 1)):
+        choice = Choice(weights, Preset(weights), 27.0, 0.0, 1.0, 1.0)
+        monkeypatch.setattr("lightning_modules.inference.reconstruct.choose", lambda *of, choice=choice: choice)
+        pictures = reconstruct(flat(0.3), "best", frame="60:120:3", calibration="none")
+        assert pictures.how.get("interpolated") == interpolated
 
 
 @pytest.mark.parametrize(
