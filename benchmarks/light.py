@@ -1,8 +1,8 @@
-"""Measure pictures of dim recordings, with and without joined frames.
+"""Measure pictures of dim recordings, with and without joined frames, or longer clips of a decoder.
 
 ``python benchmarks/light.py PICTURES`` prints PSNR in dB and writes ``results/light.csv``: eight pictures of the folder
 move by up to 0.6 and by up to 3 sensor pixels in 20 spike frames; the recordings have 205. A clip without joined frames
-has the length that the network was trained with; ``reconstruct`` joins frames.
+has the length that the network was trained with; ``reconstruct`` joins frames, or gives a decoder more of them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from lightning_modules import reconstruct
 from lightning_modules.data.pictures import folder_pictures
 from lightning_modules.data.stills import StillClips
 from lightning_modules.inference.predict import predict
-from lightning_modules.networks import Network
+from lightning_modules.networks import ClassicalDecoder, Network
 from spikekit import psnr, write_spikes
 from spikekit.tables import table
 
@@ -28,7 +28,7 @@ ALPHAS, MOTIONS, FRAMES, CLIPS = (0.03, 0.05, 0.1, 0.2, 0.4), (3.0, 15.0), 205, 
 
 @torch.inference_mode()
 def measure(network: Network, pictures: list[Path], alpha: float, motion: float, patch: int) -> tuple[float, float]:
-    """Return mean PSNR of pictures without and with joined frames."""
+    """Return mean PSNR of pictures without and with joined frames, or longer clips."""
     clips = StillClips(
         pictures,
         scale=network.scale,
@@ -68,8 +68,11 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("results/light.csv"), help="default: %(default)s")
     args = parser.parse_args()
     pictures = folder_pictures(args.pictures)
-    networks = {name: Network.from_pretrained(name).eval() for name in WEIGHTS}
-    head = ["alpha", "pixels in 20 frames", *(f"{name}, {how}" for name in WEIGHTS for how in ("alone", "joined"))]
+    networks = {"TFP 13, order 3, grey": ClassicalDecoder("tfp", 1, "grey", window=13, order=3)}
+    networks |= {name: Network.from_pretrained(name).eval() for name in WEIGHTS}
+    head = ["alpha", "pixels in 20 frames"]
+    for name, network in networks.items():
+        head += [f"{name}, alone", f"{name}, {'joined' if network.joins else 'longer'}"]
     rows = []
     for alpha in ALPHAS:
         for motion in MOTIONS:

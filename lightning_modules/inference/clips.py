@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property
@@ -89,19 +90,20 @@ class RecordingClips:
         after = whole - 1 - self.chosen[-1] if given[-1] else whole // 4
         return max(2 * min(before, after) + 1, self.frames)
 
-    def in_light(self, white: float | None = None, room: int | None = None) -> RecordingClips:
+    def in_light(self, white: float | None = None, room: int | None = None, join: bool = True) -> RecordingClips:
         """Return these clips with as many spike frames joined into one as the light requires.
 
         A joined frame has a spike where one of its frames has, as of a camera with a slower clock. Clips grow with the
-        square root of the light that is missing, because motion grows as well.
+        square root of the light that is missing, because motion grows as well. Decoders take all frames of clips that
+        grow with the light that is missing, up to tenfold, as they need two spikes of a dark pixel.
 
         Args:
             white: white level in spikes per frame; default: :attr:`white`.
             room: longest clip in spike frames; default: :attr:`room`.
+            join: join frames; False for decoders.
         """
-        best, most = FRAMES * (_BRIGHT / (white or self.white)) ** 0.5 / self.frames, (room or self.room) // self.frames
-        joined = max(min(round(best), most), 1)
-        clips = RecordingClips(self.recording, joined * self.frames, *self._asked)
+        length, joined = clip_in_light(self.frames, white or self.white, room or self.room, join)
+        clips = RecordingClips(self.recording, length, *self._asked)
         clips.joined = joined
         return clips
 
@@ -117,7 +119,7 @@ class RecordingClips:
         start = middles[0] - self.frames // 2 if middles else 0
         for middle, clip in clips_around(middles, self.frames, jump(start), start, None if packed else jump):
             clip = self.recording.correct_spikes(clip)[..., self.top :, self.left :]
-            yield middle, clip if self.joined == 1 else clip.unflatten(0, (-1, self.joined)).amax(1)
+            yield middle, join_frames(clip, self.joined)
 
     @cached_property
     def _looks(self) -> tuple[Tensor, int, int]:
@@ -142,6 +144,19 @@ class RecordingClips:
             return 0.0
         spread = gain_spread(*self._looks, self.recording.pattern or "RGGB")
         return self.joined**0.5 * (1.0 if spread is None else min(spread / _SPREAD, _MOST))
+
+
+def clip_in_light(frames: int, white: float, room: float = math.inf, join: bool = True) -> tuple[int, int]:
+    """Return the spike frames of a clip and how many of them are joined, see :meth:`RecordingClips.in_light`."""
+    missing = _BRIGHT / white
+    best = round(missing**0.5 * min(FRAMES / frames, 1)) if join else round(min(missing, 10))
+    times = int(max(min(best, room // frames), 1))
+    return times * frames, times if join else 1
+
+
+def join_frames(clip: Tensor, joined: int) -> Tensor:
+    """Join consecutive spike frames of a clip (N, H, W)."""
+    return clip if joined == 1 else clip.unflatten(0, (-1, joined)).amax(1)
 
 
 def clips_around(

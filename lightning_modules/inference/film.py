@@ -7,14 +7,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from io import BytesIO
-from itertools import count, islice, pairwise
+from itertools import chain, count, islice, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from lightning_modules.inference.clips import clips_around, film_groups
+from lightning_modules.inference.clips import clip_in_light, clips_around, film_groups, join_frames
 from lightning_modules.inference.predict import check_views, predict
 from lightning_modules.inference.rest import AROUND, SEEN, Rest
 from lightning_modules.inference.tiles import TILE, TILE_ON_GPU, Box, reach, tiled
@@ -54,7 +54,8 @@ def film(
         The picture of clock n needs the clocks n - N // 2 to n + (N - 1) // 2, for a network with clips of N frames. It
         is made as soon as the last of them has arrived, (N - 1) // 2 clocks later: 20 clocks for N = 41, a millisecond
         at 20 kHz. Chunks of c clocks add up to c - 1 clocks, and the network its computing time. The first picture
-        shows clock N // 2. Only N frames and the current chunk are kept in memory.
+        shows clock N // 2. Only N frames and the current chunk are kept in memory. In dim light, N is larger, see
+        :meth:`lightning_modules.inference.clips.RecordingClips.in_light`; ``noise_level`` is that of joined frames.
 
         With ``future`` or ``interpolated``, pictures come in groups, see :class:`FilmMaker`. A picture is then delayed
         by up to ``(future + 1) * (interpolated + 1) - 1`` pictures, and the group is kept in memory.
@@ -91,20 +92,34 @@ def film(
         check_positive("white", white)
     static = how.pop("static", False)
     maker = FilmMaker(network, future, interpolated, **how)
-    clips = clips_around(count(network.frames // 2, every), network.frames, _frames(chunks))
-    return _pictures(maker, film_groups(clips, future, interpolated), white, static)
+    return _pictures(maker, _frames(chunks), every, white, static)
 
 
 def _pictures(
-    maker: FilmMaker, groups: Iterable[list[tuple[int, Tensor]]], white: float | None, static: bool
+    maker: FilmMaker, frames: Iterator[Tensor], every: int, white: float | None, static: bool
 ) -> Iterator[FilmFrame]:
-    for group in groups:
-        clocks, clips = [clock for clock, _ in group], torch.stack([clip for _, clip in group])
-        if white is None:
-            white = white_rate(clips[0].float().mean(0).cpu())
-        pictures = maker(clips, clocks, static, maker.network.settings["alpha"] / white)
+    network = maker.network
+    if white is None:
+        white, frames = _white_of_first_clip(network, frames)
+    length, joined = clip_in_light(network.frames, white, join=network.joins)
+    exposure = network.settings["alpha"] / (joined * white)
+    clips = clips_around(count(length // 2, every), length, frames)
+    joint = ((clock, join_frames(clip, joined)) for clock, clip in clips)
+    for group in film_groups(joint, maker.future, maker.interpolated):
+        clocks, spikes = [clock for clock, _ in group], torch.stack([clip for _, clip in group])
+        pictures = maker(spikes, [clock / joined for clock in clocks], static, exposure)
         for clock, rgb in zip(clocks, pictures, strict=True):
             yield FilmFrame(clock, rgb.clone() if len(group) > 1 else rgb)  # a kept picture does not keep the group
+
+
+def _white_of_first_clip(network: Network, frames: Iterator[Tensor]) -> tuple[float, Iterator[Tensor]]:
+    """Return the white level of the first clip, which is longer in dim light, and the frames from the first on."""
+    first: list[Tensor] = []
+    white = 1.0
+    for _ in range(2):
+        first += islice(frames, clip_in_light(network.frames, white, join=network.joins)[0] - len(first))
+        white = white_rate(torch.stack(first).float().mean(0).cpu()) if first else white
+    return white, chain(iter(first), frames)  # unlike a list, a finished iterator does not keep the frames
 
 
 def _frames(chunks: Iterable[Tensor]) -> Iterator[Tensor]:

@@ -58,7 +58,7 @@ def reconstruct(
         Without a ``network``, ``speed`` or ``budget`` chooses weights of the package whose clips fit the recording.
         Unless the sensor was calibrated in the dark or the recording is simulated, its noise is measured; if it is
         strong, the weights are those trained for noisy sensors. ``calibration="none"`` declares the pixels ideal. In
-        dim light, frames are joined, see :meth:`lightning_modules.inference.clips.RecordingClips.in_light`.
+        dim light, clips are longer, see :meth:`lightning_modules.inference.clips.RecordingClips.in_light`.
 
         Films of ``"fast"`` and ``"balanced"`` run the network only where something moves, unless pictures are
         interpolated; ``psnr_tolerance=0`` runs it everywhere.
@@ -125,7 +125,7 @@ def reconstruct(
         if speed in ("fast", "balanced") and not (how.get("future") or how.get("interpolated")):
             how = {"psnr_tolerance": 0.1, **how}
         network = preset.build(GREY if recording.pattern == GREY else "RGGB")
-    clips = RecordingClips(recording, network.frames, frame, network.pattern).in_light(white)
+    clips = RecordingClips(recording, network.frames, frame, network.pattern).in_light(white, join=network.joins)
     network.noise_level = level * clips.joined**0.5
     light = f"dim light: {clips.joined} spike frames are joined into one" if clips.joined > 1 else ""
     notes = [line for line in (recording.note, other_sensor(recording, network.pattern), *notes, light) if line]
@@ -247,7 +247,7 @@ class Reconstruction:
         return {
             "recording": file_identity(recording.path),
             "read": [recording.stored, recording.flip, recording.pattern, clips.top, clips.left, recording.camera],
-            "joined": clips.joined,
+            "clip": [clips.frames, clips.joined],
             "calibration": measured and _digest((name, value) for name, value in measured),
             "white": self.white,
             "network": [type(self.network).__name__, self.network.settings, _digest(self.network.state_dict().items())],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor
 
@@ -17,6 +18,8 @@ METHODS = ("tfi", "tfp")
 
 class ClassicalDecoder(Network):
     r"""Classical decoder: TFI or TFP of the middle frame, demosaicing and bicubic enlargement.
+
+    TFI replaces TFP where the interval between spikes is longer than the window, which then holds a spike or none.
 
     Args:
         method: decoder, ``"tfi"`` or ``"tfp"``.
@@ -39,6 +42,7 @@ class ClassicalDecoder(Network):
 
     halo = 4  # two pixels for demosaicing and two for bicubic enlargement
     takes_flow = False
+    joins = False
 
     def __init__(
         self,
@@ -72,7 +76,9 @@ class ClassicalDecoder(Network):
         """Return rgb; the flow is ignored."""
         check_planes("spikes", spikes, 4, "(B, N, H, W)")
         n = spikes.shape[1] // 2
-        raw = tfi_at(spikes, n) if self.method == "tfi" else tfp_at(spikes, n, self.window, order=self.order)
+        raw = tfi_at(spikes, n)
+        if self.method == "tfp":
+            raw = torch.where(raw < 1 / self.window, raw, tfp_at(spikes, n, self.window, order=self.order))
         rgb = demosaic(raw / self.alpha, self.pattern)
         if self.scale > 1:
             rgb = F.interpolate(rgb, scale_factor=self.scale, mode="bicubic", align_corners=False)

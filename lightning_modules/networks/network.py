@@ -43,6 +43,7 @@ class Network(nn.Module):
             phase. None if it covers the whole picture or is unknown: such a network does not run in tiles. Shipped
             weights define their own.
         takes_flow: whether the flow affects the result.
+        joins: whether spike frames are joined in dim light; if not, clips only become longer.
         noise_level: default noise level, 0 for an ideal sensor and 1 for the sensor used in training. Networks
             trained without noise levels ignore it.
         warm_up: number of earlier key frames that visibly affect a picture of a film; 0 for independent clips.
@@ -60,6 +61,7 @@ class Network(nn.Module):
     alpha: float = 0.4
     halo: int | None = None
     takes_flow: bool = True
+    joins: bool = True
     noise_level: float = 0.0
     warm_up: int = 0
     flow_groups: tuple[tuple[int, ...], ...] = ((),)

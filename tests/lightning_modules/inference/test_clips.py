@@ -44,7 +44,7 @@ def test_clips_equal_the_frames_of_the_file(opened, spikes, name):
 
 @pytest.mark.parametrize(("name", "frame"), [("clip.dat", None), ("clip.npz", "31:39:3")])
 def test_joined_frames_have_the_spikes_of_their_frames(opened, spikes, name, frame):
-    clips = RecordingClips(opened(spikes, name), 5, frame).in_light(0.2)
+    clips = RecordingClips(opened(spikes, name), 5, frame).in_light(0.002)
     assert (clips.joined, clips.chosen[0]) == ((7, 17) if frame is None else (12, 31))
     for middle, clip in clips.in_order():
         start = middle - 5 * clips.joined // 2

@@ -8,7 +8,7 @@ from lightning_modules.networks import CSCSR, ClassicalDecoder
 from lightning_modules.networks.layers import ConvBlock, res_blocks
 from lightning_modules.networks.refinement import FeatureRefinement
 from lightning_modules.networks.representation import SpikeRepresentation
-from spikekit import demosaic, mosaic, psnr, spike_integrate_fire, tfi, tfp
+from spikekit import demosaic, mosaic, psnr, spike_integrate_fire, spike_interval, tfi, tfp
 
 TINY = {"width": 4, "representation_width": 4, "features": 2, "stages": 2, "blocks": 1, "end_blocks": 1}
 
@@ -146,12 +146,13 @@ def test_tiles_give_the_picture_of_the_whole(motion):
     torch.testing.assert_close(forward_in_tiles(network, spikes, 32), network(spikes, flow), rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize(("method", "pattern"), [("tfi", "RGGB"), ("tfp", "GBRG")])
-def test_classical_decoder_recovers_the_colour_of_a_flat_scene(method, pattern):
+@pytest.mark.parametrize(("method", "pattern", "alpha"), [("tfi", "RGGB", 0.5), ("tfp", "GBRG", 0.02)])
+def test_classical_decoder_recovers_the_colour_of_a_flat_scene(method, pattern, alpha):
+    """Also of a dark one, in which the interval between spikes exceeds the window of TFP."""
     rgb = torch.tensor([1.0, 0.5, 0.25]).reshape(1, 3, 1, 1)
-    light = 0.5 * mosaic(rgb.expand(1, 3, 12, 12), pattern).expand(41, 1, 12, 12).movedim(0, 1)
+    light = alpha * mosaic(rgb.expand(1, 3, 12, 12), pattern).expand(411, 1, 12, 12).movedim(0, 1)
     spikes, _ = spike_integrate_fire(light)
-    decoded = ClassicalDecoder(method, 2, pattern, alpha=0.5)(spikes)
+    decoded = ClassicalDecoder(method, 2, pattern, alpha)(spikes)
     assert psnr(decoded, rgb.expand_as(decoded)).item() > 30
 
 
@@ -160,7 +161,8 @@ def test_classical_decoder_recovers_the_colour_of_a_flat_scene(method, pattern):
 )
 def test_classical_decoder_decodes_the_middle_frame(method, settings):
     spikes, _ = clip(2)
-    raw = {"tfi": tfi, "tfp": tfp}[method](spikes, **settings)[:, 20]
+    raw, interval = {"tfi": tfi, "tfp": tfp}[method](spikes, **settings)[:, 20], spike_interval(spikes)[:, 20]
+    raw = torch.where(interval > settings.get("window", 41), 1 / interval, raw)
     torch.testing.assert_close(ClassicalDecoder(method, 1, **settings)(spikes), demosaic(raw / 0.4))
 
 
