@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from lightning_modules.inference.tiles import Box
-from spikekit import bin_to_sensor, demosaic
+from spikekit import bin_to_sensor, demosaic, tfi
 from spikekit.color.cfa import GREY
 
 #: side of a cell, the smallest part that can rest, in sensor pixels
@@ -20,47 +19,38 @@ CELL = 8
 SEEN, AROUND = 4, 16
 
 _RISK = 1e-5  # probability that a cell at rest counts as moved
-_TESTS = 6  # tests per cell: blocks of 1, 2 and 4 pixels, all of them, the cell, and 5 x 5 cells
+_TESTS = 8  # tests per cell: single blocks of 1, 2 and 4 pixels, all of them, the cell, and many key frames
 _PICTURES = 8  # pictures of the network that a cell at rest shows the mean of
 _SURE = 80  # clocks without a change before the clip of a resting cell
 _BUSY, _UNTESTED = 0.9, 4  # share of cells that makes a picture busy, and pictures after it that are not tested
+_FADE = 0.96  # weight of the sums of squares of the previous key frame
 _LEAST = 1 / 12  # smallest variance of a count, as light is not known exactly
-_NOISY = 0.01  # additional variance per spike of a noisy sensor: photon noise for 100 electrons per threshold
+_NOISE = 0.001, 0.01  # variance per spike of a calibrated and a noisy sensor: 1000 and 100 electrons per threshold
 
 
-class Changes(NamedTuple):
-    """Changes of a scene.
-
-    Args:
-        moved: cells (h, w) where the scene has changed.
-        gain: factor by which all light has changed.
-    """
-
-    moved: Tensor
-    gain: float
-
-
-def find_changes(recent: Tensor, reference: Tensor, share: Tensor, noise: float = 0.0) -> Changes:
+def find_changes(
+    recent: Tensor, reference: Tensor, share: Tensor, noise: float = 0.0, step: Tensor | float = 1.0
+) -> tuple[Tensor, Tensor, Tensor]:
     r"""Find where a scene has changed between two counts of spikes, and by how much its light has.
 
     A pixel that integrates light l counts :math:`n l` spikes in n clocks, rounded up or down. With the fractional part
     f of :math:`n l`, the variance is :math:`f (1 - f)`, at most a quarter for any number of spikes. A reference of m
     clocks, with :math:`q = n / m`, predicts the count of an ideal sensor with
 
-    .. math:: d = c - g q r, \quad |d| \le 1 + g q, \quad
-        \operatorname{var} d \approx \max_{|\epsilon| \le q} f_\epsilon (1 - f_\epsilon) + \frac{q^2 + q}{4}
+    .. math:: d = c - g q r, \quad \operatorname{var} d \approx f (1 - f) + \frac{q^2}{6} + \frac{q^2 + q}{4}
 
-    where the first term is the largest variance for any light that agrees with the rounded reference, and the second is
-    the rounding of the reference, which is correlated with that of the next count. The gain g of flickering lamps is
-    the median ratio over all cells, weighted by their light. It counts only if it differs from 1 by five standard
-    deviations, and if fewer cells have moved with it than without it.
+    where the second term is the error of f, and the last is the rounding of the reference, which is correlated with
+    that of the next count. Sums of :func:`spikekit.tfi` also count parts of intervals. They are rounded to the light of
+    a clock, l, and their variance is at most :math:`l^2 (1 + q + q^2) / 4`, which is much smaller.
 
-    A cell has moved if a pixel exceeds the bound, or if the sum of :math:`d^2 / \operatorname{var}` over its K blocks
-    of 1, 2, 4 or 8 pixels exceeds :math:`K + 2 \sqrt{K x} + 2 x` with :math:`x = \ln(\text{tests} / \text{risk})`,
-    which K normal numbers exceed with the probability of the risk, or if a single block does. Large blocks detect faint
-    motion, whose changes have the same sign at neighbouring pixels; single blocks detect objects smaller than a cell.
-    The sum over the 5 x 5 cells around, without those that have moved, detects soft light that is too faint for one.
-    The risk is 0.00001 per cell.
+    The gain g of flickering lamps is the median ratio over all cells, weighted by their light. If a tenth of the cells
+    has another, as a lamp lights only a part, cells have that of the two gains that suits their neighbourhood. A gain
+    counts only if it differs from 1 by five standard deviations, and if fewer cells have moved with it than without it.
+
+    A cell has moved if the sum of :math:`d^2 / \operatorname{var}` over its K blocks of 1, 2, 4 or 8 pixels exceeds
+    :math:`K + 2 \sqrt{K x} + 2 x` with :math:`x = \ln(\text{tests} / \text{risk})`, which K normal numbers exceed with
+    the probability of the risk, or if a single block does. Large blocks detect faint motion, whose changes have the
+    same sign at neighbouring pixels; single blocks detect objects smaller than a cell. The risk is 0.00001 per cell.
 
     Args:
         recent: counts (H, W).
@@ -68,64 +58,87 @@ def find_changes(recent: Tensor, reference: Tensor, share: Tensor, noise: float 
         share: (h, w) ratio of the clocks of the recent counts to those of the reference, for every cell; infinity for
             cells without a reference, which count as moved.
         noise: variance of the sensor per spike, besides rounding; 0 for an ideal sensor.
+        step: what counts are rounded to, (H, W): 1 for numbers of spikes, less for sums of :func:`spikekit.tfi`.
+
+    Returns:
+        The cells (h, w) that have moved; their gains (h, w); and (2, h, w): by how much the sum over blocks of 2 pixels
+        exceeds K, and K, both 0 without a reference.
 
     Example:
         >>> at_rest, lamp = torch.full((16, 16), 8.0), torch.full((16, 16), 12.0)
-        >>> moved, gain = find_changes(lamp, at_rest, torch.ones(2, 2))
-        >>> moved.any().item(), gain
+        >>> moved, gain, _ = find_changes(lamp, at_rest, torch.ones(2, 2))
+        >>> moved.any().item(), gain.unique().item()
         (False, 1.5)
     """
-    known = share.isfinite()
+    known, step = share.isfinite(), torch.as_tensor(step, device=recent.device)
     share = share.where(known, 0.0)
-    gain = _gain(_sum(recent, CELL)[known], (share * _sum(reference, CELL))[known])
-    moved = _moved(recent, reference, gain * share, noise)
-    if gain != 1 and moved[known].any():
-        without = _moved(recent, reference, share, noise)
-        if without.sum() <= moved.sum():
-            moved, gain = without, 1.0
-    return Changes(moved | ~known, gain)
-
-
-def _moved(recent: Tensor, reference: Tensor, share: Tensor, noise: float) -> Tensor:
-    """Return the cells whose light has changed."""
     each = _pixels(share, Box(0, 0, *recent.shape))
     expected = each * reference
-    off = recent - expected
-    part = (expected - expected.floor() - 0.5).abs_()
-    extra = noise * expected * (1 + each)
-    variance = (0.25 - (part - each).clamp_(min=0).square_()).clamp_(min=_LEAST) + each * (each + 1) / 4 + extra
-    size = each + 1.1 + 6 * extra.sqrt()
-    moved = F.max_pool2d((off.abs() - size)[None], CELL, ceil_mode=True)[0] > 0
+    variance = _variance(expected, each, noise, step)
+    gain = _gains(_sum(recent, CELL), _sum(expected, CELL), _sum(variance, CELL).sqrt(), known)
+    moved, excess = _moved(recent, expected, variance)
+    if (gain != 1).any():
+        lit = _pixels(gain, Box(0, 0, *recent.shape))
+        with_gain = _moved(recent, lit * expected, _variance(lit * expected, lit * each, noise, step))
+        if with_gain[0].sum() < moved.sum() or not moved[known].any():
+            moved, excess = with_gain
+        else:
+            gain = torch.ones_like(gain)
+    return moved | ~known, gain, excess * known
+
+
+def _moved(recent: Tensor, expected: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the cells whose light has changed, and the excess of :func:`find_changes`."""
+    off, moved = recent - expected, _sum(recent, CELL) < 0
     for block in (1, 2, 4, CELL):
         if block > 1:
             off, variance = _sum(off, 2), _sum(variance, 2)
         squares, side = off.square() / variance, CELL // block
-        moved |= _sum(squares, side) > _limit(_sum(torch.ones_like(squares), side))
-        if block in (2, 4):
+        total, blocks = _sum(squares, side), _sum(torch.ones_like(squares), side)
+        moved |= total > _limit(blocks)
+        if block == 2:
+            excess = torch.stack([total - blocks, blocks])
+        if block < CELL:
             most = F.max_pool2d(squares[None], side, ceil_mode=True)[0]
-            moved |= most > _limit(torch.ones(()), side**2)
-    around = ((part * ~moved)[None] for part in (off, variance))
-    off, variance = (F.avg_pool2d(part, 5, 1, 2, divisor_override=1)[0] for part in around)
-    moved |= off.square() > variance * _limit(torch.ones(()))
-    return moved
+            moved |= most > _limit(1, side**2)
+    return moved, excess
 
 
-def _limit(count: Tensor, tests: int = 1) -> Tensor:
+def _variance(expected: Tensor, each: Tensor, noise: float, step: Tensor) -> Tensor:
+    """Return the variance of the difference of a count from the expected one."""
+    part = (expected - expected.floor()).sub_(0.5).square_()
+    counted = (0.25 - part).clamp_(min=_LEAST).add_(each * (5 * each + 3) / 12)
+    timed = step**2 * (1 + each + each.square()) / 4
+    return torch.where(step < 1, timed, counted) + noise * expected * (1 + each)
+
+
+def _limit(count: Tensor | int, tests: int = 1) -> Tensor | float:
     """Return what the sum of squares of normal numbers exceeds with the probability of the risk."""
     x = math.log(_TESTS * tests / _RISK)
-    return count + 2 * (count * x).sqrt() + 2 * x
+    return count + 2 * (count * x) ** 0.5 + 2 * x
 
 
-def _gain(recent: Tensor, expected: Tensor) -> float:
+def _gains(recent: Tensor, expected: Tensor, spread: Tensor, cells: Tensor) -> Tensor:
+    """Return the gain of every cell: that of most cells, or that of most others, if these are a tenth or more."""
+    gain = _gain(recent[cells], expected[cells], spread[cells])
+    others = cells & ((recent - gain * expected).abs() > 5 * spread)
+    if others.sum() > 0.1 * cells.sum():
+        other = _gain(recent[others], expected[others], spread[others])
+        worse = ((recent - other * expected) / spread).square() - ((recent - gain * expected) / spread).square()
+        others = cells & (F.avg_pool2d((worse * cells).clamp(-25, 25)[None], 3, 1, 1)[0] < 0)
+        same = cells & ~others
+        gain = torch.where(others, other, _gain(recent[same], expected[same], spread[same]))
+    return torch.ones_like(recent).where(~cells, gain)
+
+
+def _gain(recent: Tensor, expected: Tensor, spread: Tensor) -> float:
     """Return the weighted median of ratios, or 1 if it does not differ significantly."""
-    recent, expected = recent[expected > 0], expected[expected > 0]
-    if not len(expected):
+    if not expected.any():
         return 1.0
-    ratio, order = (recent / expected).sort()
+    ratio, order = (recent / expected).nan_to_num().sort()
     weight = expected[order].cumsum(0)
     gain = ratio[int(torch.searchsorted(weight, weight[-1] / 2))].item()
-    spread = 0.6 * CELL * math.sqrt(len(expected)) / weight[-1].item()
-    return gain if abs(gain - 1) > 5 * spread else 1.0
+    return gain if abs(gain - 1) * weight[-1] > 5 * spread.norm() else 1.0
 
 
 def _sum(plane: Tensor, side: int) -> Tensor:
@@ -145,8 +158,10 @@ def _cells(cells: Tensor, box: Box) -> Tensor:
 
 def _pixels(cells: Tensor, box: Box, scale: int = 1) -> Tensor:
     """Return the value of its cell for every pixel of a box."""
-    pixels = _cells(cells, box).repeat_interleave(CELL * scale, -2).repeat_interleave(CELL * scale, -1)
-    return box.of(pixels, box[:2], scale)
+    cells = _cells(cells, box)
+    if (cells == cells[0, 0]).all():
+        return cells[:1, :1].expand(scale * (box.bottom - box.top), scale * (box.right - box.left))
+    return box.of(cells.repeat_interleave(CELL * scale, -2).repeat_interleave(CELL * scale, -1), box[:2], scale)
 
 
 def _blend(cells: Tensor, box: Box, scale: int) -> Tensor:
@@ -160,10 +175,13 @@ class Rest:
     r"""Make the pictures of consecutive key frames, with the network running only where something moves.
 
     Convention:
-        The spikes since the last key frame are compared with earlier ones twice: alone, which detects sudden motion,
-        and together with their predecessors, up to the length of the reference, which detects drift. The reference
-        grows while nothing moves, and starts anew where something does. Until all cells rest, the halves of the new
-        spikes are also compared, as an object that turns in step with the key frames gives them equal sums.
+        What the pixels integrated in the middle of a clip, of the length of a key frame distance, is compared with what
+        they did before: alone, which detects sudden motion, and together with its predecessors, up to the length of the
+        reference, which detects drift. The reference grows while nothing moves, and starts anew where something does.
+        It is the sum of :func:`spikekit.tfi` where intervals are short enough, and the number of spikes elsewhere. Sums
+        of squares over 3 x 3 cells and about 25 key frames detect what turns or sways with little contrast. Until all
+        cells rest, the halves of the middle are also compared, as an object that turns in step with the key frames
+        gives them equal sums.
 
         A cell is still if nothing changed during its clip, and rests if nothing changed in the 80 clocks before it
         either, as a single test may miss slow motion. A resting cell shows the mean of the network's first eight
@@ -171,8 +189,9 @@ class Rest:
         computed and blended. The gain of a lamp is removed from the mean, and applied to the picture. When 90 % of the
         cells have changed, or have a neighbour that did, the next four pictures are computed without a test.
 
-        The mean over all clocks of an ideal or calibrated sensor converges to the exact light. At the resolution of the
-        sensor, the picture is corrected towards it, by the share of their difference that is not noise of the mean.
+        The mean over all clocks of an ideal sensor converges to the exact light. At the resolution of the sensor, the
+        picture is corrected towards it, by the share of their difference that is not noise of the mean, but not at
+        single pixels that differ by more than five times the root mean square of their cell, which may be defective.
 
     Args:
         scale: pixels of the picture per sensor pixel.
@@ -195,10 +214,11 @@ class Rest:
     def _start(self, spikes: Tensor) -> None:
         planes = spikes.new_zeros(2, *spikes.shape[-2:], dtype=torch.float32)
         self._earlier, self._later = planes
+        self._timed = planes[0] == 0
         # clocks of both counts, scaled to the first light; clocks without a change; pictures in the mean
         self._before, self._since, self._calm, self._count = _sum(torch.zeros_like(planes[:1]), CELL).repeat(4, 1, 1)
+        self._light, self._excess = torch.ones_like(self._calm), self._calm.repeat(2, 1, 1)
         self._mean: Tensor | None = None
-        self._light = 1.0
 
     def __call__(self, spikes: Tensor, clock: int, make: Callable[[Box, bool], Tensor], exposure: float) -> Tensor:
         """Return a picture.
@@ -220,7 +240,7 @@ class Rest:
         if came > frames or self._earlier.shape != spikes.shape[-2:]:
             self._start(spikes)
         else:
-            self._compare(spikes[frames - came :])
+            self._compare(spikes, came)
         self._clock = clock
         still = self._calm >= frames - 1
         unsure = self._calm < frames - 1 + _SURE
@@ -233,10 +253,6 @@ class Rest:
             return make(whole, False)
         boxes = _boxes(self.computed, near, whole)
         parts = [(box, make(box, static).float()) for box, static in boxes]
-        middle = spikes[frames // 2 - came // 2 :][:came]
-        clocks = self._before + self._since
-        expected = _sum(self._earlier + self._later, CELL) * (came / clocks)
-        gain = _gain(_sum(middle.sum(0, dtype=torch.float32), CELL)[still], expected[still])
         if self._mean is None:
             self._mean = torch.zeros_like(parts[0][1])  # the first pictures are whole
             self._seen = self._mean.new_zeros(spikes.shape[1:])
@@ -244,11 +260,11 @@ class Rest:
             weight = _pixels(new / self._count.clamp(min=1), box, scale)
             if weight.any():
                 mean = box.of(self._mean, scale=scale)
-                mean.lerp_(part if gain == 1 else part / gain, weight)
+                mean.lerp_(part / _pixels(self._light, box, scale), weight)
                 box.of(self._seen).copy_(self._mosaic(mean))
         if boxes[:1] == [(whole, False)]:  # blending the few cells at rest would cost more than it gains
             return parts[0][1]
-        shown = (self._mean.clone() if self.noisy else self._drawn(exposure)).mul_(gain)
+        shown = (self._mean.clone() if self.noisy else self._drawn(exposure)).mul_(_pixels(self._light, whole, scale))
         for box, part in parts:
             box.of(shown, scale=scale).lerp_(part, _blend(unsure, box, scale))
         return shown.clamp_(0, 1)
@@ -259,32 +275,41 @@ class Rest:
             return F.avg_pool2d(picture, self.scale)[0]
         return bin_to_sensor(picture, self.pattern, scale=self.scale)
 
-    def _compare(self, spikes: Tensor) -> None:
-        """Add new spikes to the counts, which start anew where the scene has changed."""
-        recent, noise = spikes.sum(0, dtype=torch.float32), _NOISY * self.noisy
-        alone = find_changes(recent, self._earlier, len(spikes) * self._light / self._before, noise)
-        self._light *= alone.gain
+    def _compare(self, spikes: Tensor, clocks: int) -> None:
+        """Add the middle of a clip to the counts, which start anew where the scene has changed."""
+        noise, whole, frames = _NOISE[self.noisy], Box(0, 0, *spikes.shape[1:]), len(spikes)
+        middle = slice(frames // 2 - clocks // 2, frames // 2 - clocks // 2 + clocks)
+        recent = spikes[middle].sum(0, dtype=torch.float32)
+        # intervals are shorter than what a clip has before and after its middle
+        self._timed &= (recent - 1) * (frames - clocks) >= 2 * clocks
+        recent = torch.where(self._timed, tfi(spikes)[middle].sum(0), recent)
+        step = torch.where(self._timed, recent / clocks, 1)
+        sudden, gain, excess = find_changes(recent, self._earlier, clocks * self._light / self._before, noise, step)
+        self._light *= gain
         self._later += recent
-        self._since += len(spikes) * self._light
-        joint = find_changes(self._later, self._earlier, self._since / self._before, noise)
-        self._since *= joint.gain
-        changed = (alone.moved | joint.moved) & (self._before > 0)
-        if (self._count < _PICTURES).any():
-            first, second = spikes[len(spikes) % 2 :].unflatten(0, (2, -1)).sum(1, dtype=torch.float32)
-            changed |= find_changes(second, first, torch.ones_like(self._calm), noise).moved
+        self._since += clocks * self._light
+        slow, slow_gain, _ = find_changes(self._later, self._earlier, self._since / self._before, noise, step)
+        self._since *= slow_gain
+        changed = (sudden | slow) & (self._before > 0)
+        if (self._count < _PICTURES).any() and (gain == 1).all():
+            first, second = spikes[middle][clocks % 2 :].unflatten(0, (2, -1)).sum(1, dtype=torch.float32)
+            changed |= find_changes(second, first, torch.ones_like(self._calm), noise)[0]
         if _grown(changed).float().mean() > _BUSY:
             self._untested = _UNTESTED
-        self._calm += len(spikes)
+        self._calm += clocks
         self._calm[changed] = self._before[changed] = self._since[changed] = 0
+        self._light[changed] = 1
+        fade = self._light.new_tensor([_FADE, _FADE**2])[:, None, None]
+        self._excess = (fade * self._excess + excess) * ~changed
+        total, tests = F.avg_pool2d(self._excess, 3, 1, 1, divisor_override=1)
+        self._calm[total > _limit(tests) - tests] = 0
         full = self._since >= self._before
-        whole = Box(0, 0, *recent.shape)
         kept, grown = (_pixels(cells.float(), whole) for cells in (~changed, full & ~changed))
+        self._timed |= kept == 0
         self._earlier = self._earlier * kept + self._later * grown
         self._later *= kept * (1 - grown)
         self._before += self._since * full
         self._since *= ~full
-        if not self._before.any():
-            self._light = 1.0
 
     def _drawn(self, exposure: float) -> Tensor:
         """Return the mean of pictures, corrected towards that of all spikes."""
@@ -293,6 +318,7 @@ class Rest:
         whole = Box(0, 0, *self._seen.shape)
         off = (self._earlier + self._later) * _pixels(share, whole) - self._seen
         power = F.avg_pool2d(off.square()[None], CELL, ceil_mode=True)[0]
+        off = off.where(off.square() < 25 * _pixels(power, whole), 0)
         trust = (1 - share.square() / 6 / power).nan_to_num(0).clamp(min=0) * (self._count > 0)
         off = off * _pixels(trust, whole)
         colors = off[None] if self.pattern == GREY else demosaic(off, self.pattern)

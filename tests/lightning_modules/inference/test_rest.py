@@ -34,32 +34,25 @@ def counts(light, before, after, seed=0):
 def test_cells_at_rest_are_rarely_taken_for_moved(clocks, bright):
     light = bright * torch.rand(256, 256, generator=generator())
     share = torch.full((32, 32), 20 / clocks)
-    wrong = [find_changes(*counts(light, clocks, 20, seed), share).moved.sum() for seed in range(4)]
+    wrong = [find_changes(*counts(light, clocks, 20, seed), share)[0].sum() for seed in range(4)]
     assert sum(wrong) <= 1
 
 
-@pytest.mark.parametrize("columns", [1, 4])
-def test_light_too_faint_for_a_cell_is_seen_with_its_neighbours(columns):
-    recent, reference = torch.full((SIDE, SIDE), 2.0), torch.full((SIDE, SIDE), 16.0)
-    recent[16:48, 16 : 16 + CELL * columns] += 0.2
-    assert find_changes(recent, reference, torch.full((8, 8), 1 / 8)).moved.any() == (columns > 1)
-
-
 @pytest.mark.parametrize(("recent", "reference"), [(20, 200), (160, 160)])
-def test_a_shift_of_half_a_pixel_is_seen_in_every_textured_cell(recent, reference):
+def test_a_shift_of_half_a_pixel_is_seen_in_nearly_every_textured_cell(recent, reference):
     picture = texture(2 * SIDE + 8)[0]
     first, second = (0.4 * picture[: 2 * SIDE : 2, at : at + 2 * SIDE : 2] for at in (0, 1))
     share = torch.full((SIDE // CELL, SIDE // CELL), recent / reference)
     for seed in range(8):
         found = find_changes(counts(second, 20, recent, seed)[0], counts(first, reference, 1, seed + 9)[1], share)
-        assert found.moved.all()
+        assert found[0].float().mean() > 0.95
 
 
 def test_something_smaller_than_a_cell_is_seen_and_only_where_it_is():
     light = torch.full((SIDE, SIDE), 0.2)
     reference = counts(light, 60, 20)[1]
     light[21:23, 34:36] = 0.35
-    moved = find_changes(counts(light, 60, 20, 1)[0], reference, torch.full((8, 8), 20 / 60)).moved
+    moved = find_changes(counts(light, 60, 20, 1)[0], reference, torch.full((8, 8), 20 / 60))[0]
     assert moved.nonzero().tolist() == [[2, 4]]
 
 
@@ -67,19 +60,20 @@ def test_something_smaller_than_a_cell_is_seen_and_only_where_it_is():
 def test_a_faint_change_of_any_fineness_is_seen(side, spikes):
     sign = 1 - 2 * (torch.arange(4 * CELL) // side % 2)  # next to each other they cancel
     recent = 8 + spikes * sign * sign[:, None]
-    moved = find_changes(recent, torch.full_like(recent, 160), torch.full((4, 4), 20 / 400)).moved
+    moved = find_changes(recent, torch.full_like(recent, 160), torch.full((4, 4), 20 / 400))[0]
     assert moved.all()
 
 
 @pytest.mark.parametrize(("lit", "gain"), [(3, 1.5), (5, 1.5), (8, 0.5), (8, 0.9), (8, 1.4)])
-def test_a_lamp_that_changes_is_a_gain_and_moves_only_the_smaller_part(lit, gain):
+def test_a_lamp_that_changes_is_a_gain_of_the_part_that_it_lights(lit, gain):
     light = 0.1 + 0.2 * torch.rand(SIDE, SIDE, generator=generator())
     light[: CELL * lit] *= 2  # most of the light
     reference, share = counts(light, 60, 20)[1], torch.full((8, 8), 20 / 60)
     light[: CELL * lit] *= gain
-    moved, found = find_changes(counts(light, 60, 20, 1)[0], reference, share)
-    assert moved.any(1).tolist() == [lit < 4] * lit + [lit > 4] * (8 - lit)
-    assert found == pytest.approx(gain if lit > 4 else 1.0, rel=0.02)
+    moved, found, _ = find_changes(counts(light, 60, 20, 1)[0], reference, share)
+    assert not moved.any()
+    assert found[:lit].allclose(torch.tensor(gain), rtol=0.03)
+    assert found[lit:].allclose(torch.ones(()), rtol=0.01)
 
 
 def film(light, network=None, **how):
@@ -128,6 +122,14 @@ def test_motion_in_step_with_the_pictures_is_seen():
     assert all(cells.all() for _, cells in film(light, psnr_tolerance=0.1))
 
 
+@pytest.mark.parametrize(("contrast", "speed"), [(0.05, 0.02), (0.1, 0.02), (0.05, 0.005)])
+def test_a_wheel_of_low_contrast_does_not_rest(contrast, speed):
+    y, x = torch.meshgrid(*2 * [torch.arange(SIDE) - SIDE / 2], indexing="ij")
+    angle = torch.atan2(y, x) - speed * torch.arange(421)[:, None, None]
+    wheel = 0.25 * (1 + contrast * torch.sin(6 * angle) * (x.square() + y.square() < 100))
+    assert all(cells[3:5, 3:5].all() for _, cells in list(film(wheel, psnr_tolerance=0.1))[13:])
+
+
 def test_a_small_object_leaves_most_of_the_scene_at_rest():
     light = still(441).clone()
     for clock in range(441):
@@ -159,7 +161,18 @@ def test_a_picture_at_rest_becomes_the_mean_of_all_its_clocks():
     assert psnr(pictures[-1], truth) > psnr(pictures[0], truth) + 15
 
 
-@pytest.mark.parametrize(("more", "pixels", "within"), [(0.08, 3, 1), (0.003, 1, 14)])
+def test_a_hot_pixel_that_the_network_removes_does_not_return():
+    class Clean(Sensor):
+        def forward(self, *clip):
+            return super().forward(*clip).clamp(max=0.6)
+
+    light = torch.full((441, 16, 16), 0.2)
+    light[:, 5, 5] = 1
+    *_, (last, _) = film(light, Clean(**{**TINY, "scale": 1, "pattern": "grey"}), psnr_tolerance=0.1)
+    assert last.max() < 0.65
+
+
+@pytest.mark.parametrize(("more", "pixels", "within"), [(0.08, 3, 2), (0.003, 1, 14)])
 def test_what_appears_is_seen_at_once_and_what_is_faint_in_time(more, pixels, within):
     before, network = 30, Sensor(**{**TINY, "scale": 1, "pattern": "grey"})
     light = torch.full((20 * (before + within) + 41, 32, 32), 0.4)
