@@ -22,7 +22,7 @@ _RISK = 1e-5  # probability that a cell at rest counts as moved
 _TESTS = 8  # tests per cell: single blocks of 1, 2 and 4 pixels, all of them, the cell, and many key frames
 _PICTURES = 8  # pictures of the network that a cell at rest shows the mean of
 _SURE = 80  # clocks without a change before the clip of a resting cell
-_BUSY, _UNTESTED = 0.9, 4  # share of cells that makes a picture busy, and pictures after it that are not tested
+_BUSY, _UNTESTED = 0.9, 6  # share of cells that makes a picture busy, and pictures after it that are not tested
 _FADE = 0.96  # weight of the sums of squares of the previous key frame
 _LEAST = 1 / 12  # smallest variance of a count, as light is not known exactly
 _NOISE = 0.001, 0.01  # variance per spike of a calibrated and a noisy sensor: 1000 and 100 electrons per threshold
@@ -187,7 +187,7 @@ class Rest:
         either, as a single test may miss slow motion. A resting cell shows the mean of the network's first eight
         pictures of the still cell; after these the network does not run. Neighbours of cells that do not rest are
         computed and blended. The gain of a lamp is removed from the mean, and applied to the picture. When 90 % of the
-        cells have changed, or have a neighbour that did, the next four pictures are computed without a test.
+        cells have changed, or have a neighbour that did, the next six pictures are computed without a test.
 
         The mean over all clocks of an ideal sensor converges to the exact light. At the resolution of the sensor, the
         picture is corrected towards it, by the share of their difference that is not noise of the mean, but not at
