@@ -45,7 +45,7 @@ def find_changes(
 
     The gain g of flickering lamps is the median ratio over all cells, weighted by their light. If a tenth of the cells
     has another, as a lamp lights only a part, cells have that of the two gains that suits their neighbourhood. A gain
-    counts only if it differs from 1 by five standard deviations, and if fewer cells have moved with it than without it.
+    counts only if it differs from 1 by five standard deviations, and if no more cells have moved with it than without.
 
     A cell has moved if the sum of :math:`d^2 / \operatorname{var}` over its K blocks of 1, 2, 4 or 8 pixels exceeds
     :math:`K + 2 \sqrt{K x} + 2 x` with :math:`x = \ln(\text{tests} / \text{risk})`, which K normal numbers exceed with
@@ -80,7 +80,7 @@ def find_changes(
     if (gain != 1).any():
         lit = _pixels(gain, Box(0, 0, *recent.shape))
         with_gain = _moved(recent, lit * expected, _variance(lit * expected, lit * each, noise, step))
-        if with_gain[0].sum() < moved.sum() or not moved[known].any():
+        if with_gain[0].sum() <= moved.sum():
             moved, excess = with_gain
         else:
             gain = torch.ones_like(gain)
