@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 import torch
 
+gc.disable()  # until all is imported and collected, of which nothing is garbage
+
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ["OMP_NUM_THREADS"] = "1"
     torch.set_num_threads(1)
@@ -42,6 +44,7 @@ def pytest_collection_finish():
     gc.collect()
     gc.freeze()
     gc.set_threshold(10_000, 20, 100)
+    gc.enable()
 
 
 def pytest_sessionfinish():

@@ -71,13 +71,15 @@ sys.meta_path.insert(0, Missing())
 """
 
 
-def without_the_extra(code):
-    program = WITHOUT.format(missing=LEARN) + code
+def without_the_extra(code, before=""):
+    program = before + WITHOUT.format(missing=LEARN) + code
     return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=False)
 
 
-def test_operators_need_no_extra():
-    done = without_the_extra("import torch, spikekit\nprint(spikekit.tfi(torch.ones(9, 4, 4)).sum().item())")
+def test_operators_need_no_extra_and_import_none():
+    heavy = {"pytorch_lightning", "lightning", "lightning_modules", "skimage", "matplotlib", "torchmetrics"}
+    light = f"import spikekit, sys\nassert not {heavy} & {{name.partition('.')[0] for name in sys.modules}}\n"
+    done = without_the_extra("import torch\nprint(spikekit.tfi(torch.ones(9, 4, 4)).sum().item())", light)
     assert done.stdout == "144.0\n", done.stderr
 
 

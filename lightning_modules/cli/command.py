@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import sys
@@ -130,6 +131,10 @@ class Command(LightningCLI):
                 raise
             raise UsageError(f"{error.code} (see lightning {self.typed[0]} --help)") from error
 
+    def _dump_config(self) -> None:
+        """Take the configuration as it is, as to check and write it once more would take as long as to build all."""
+        self.config_dump = json.loads(json.dumps(self.config[self.subcommand].as_dict(), default=str))
+
     def _parse_ckpt_path(self) -> None:
         """Read no hyper-parameters from a checkpoint: jsonargparse would build any class that they name."""
 
@@ -204,9 +209,8 @@ class Command(LightningCLI):
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """Write everything to one folder, and use bfloat16 on a GPU that supports it."""
-        output = Path(self._get(self.config_init, "output"))
+        kwargs["default_root_dir"] = output = Path(self._get(self.config_init, "output"))
         config = self._get(self.config_init, "trainer")
-        kwargs["default_root_dir"] = output
         if config.get("logger") is None:
             # the other verbs write their tables and pictures to files
             kwargs["logger"] = TensorBoardLogger(output, name="", version="") if self.subcommand == "fit" else False

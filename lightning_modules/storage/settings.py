@@ -7,7 +7,7 @@ import reprlib
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from inspect import Parameter, signature
+from inspect import Parameter, formatannotation, signature
 from pathlib import Path
 from threading import get_ident
 from typing import Any, Literal, Union, get_args, get_origin
@@ -44,7 +44,7 @@ def own_class(
             hint = "written by another version of this package?"
             raise ValueError(f"{source}: {name} accepts no argument {reprlib.repr(key)} from a file ({hint})")
         if not _fits(value, known[key]):
-            expected = f"{_said(known[key])}, at most {_LARGEST}"
+            expected = f"{formatannotation(known[key])}, at most {_LARGEST}"
             raise ValueError(f"{source}: {key} of {name}: expected {expected}, got {reprlib.repr(value)}")
     return kind, arguments
 
@@ -124,7 +124,3 @@ def _fits(value: Any, hint: Any) -> bool:
     if hint is str:
         return isinstance(value, str) and len(value) <= _LONGEST
     return hint in (bool, types.NoneType) and type(value) is hint
-
-
-def _said(hint: Any) -> str:
-    return hint.__name__ if isinstance(hint, type) and not get_args(hint) else str(hint).replace("typing.", "")

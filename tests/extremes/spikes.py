@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import cache, partial
 from itertools import product
 from typing import Any
 
@@ -38,6 +38,7 @@ def _every(frames: int) -> Tensor:
     return torch.tensor(list(product([0.0, 1.0], repeat=frames))).T
 
 
+@cache
 def _random(frames: int) -> Tensor:
     """Pixels that fire never to always."""
     density = torch.linspace(0, 1, 12)
@@ -66,6 +67,7 @@ def _decode(name: str, stream: Tensor, on: On, weight: Tensor | None = None, /, 
     return result[:, 0].detach().cpu(), grad[:, 0].cpu()
 
 
+@cache  # the same for every dtype
 def _by_pixel(function: Callable[..., Any], *streams: Tensor, **options: Any) -> Tensor:
     """Apply a function of one pixel's streams to (T, P)."""
     pixels = zip(*(stream.double().T.tolist() for stream in streams), strict=True)

@@ -24,7 +24,7 @@ def test_the_device_does_not_mix():
 
 
 @EVERY
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])  # of half precision, all are computed in float32
 def test_operators_give_the_results_of_the_cpu(op, options, tensors, dtype):
     moved = [tensor.requires_grad_() for tensor in there(*(tensor.to(dtype) for tensor in tensors))]
     kept = [tensor.detach().to(dtype).requires_grad_() for tensor in tensors]

@@ -4,7 +4,6 @@ import io
 import os
 import subprocess
 import sys
-from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
@@ -148,24 +147,20 @@ def test_full_disk_ends_with_status_1():
     with pytest.raises(SystemExit) as ended, as_one_line():
         raise OSError(28, "No space left on device", "a.png")
     assert ended.value.code == "lightning: a.png: No space left on device"  # Python prints it and ends with 1
-    with pytest.raises(SystemExit, match=r"^lightning: No room$"), as_one_line():
+    with pytest.raises(SystemExit, match=r"^lightning: No room$"), as_one_line():  # on standard output
         raise OSError(28, "No room")
     with pytest.raises(OSError, match="no errno"), as_one_line():  # a fault of the program
         raise OSError("no errno")
 
 
-def test_closed_or_full_standard_output():
-    """As with ``| head -1``, but without a race; then on a full disk."""
+def test_closed_standard_output():
+    """As with ``| head -1``, but without a race."""
     reader, writer = os.pipe()
     os.close(reader)
     command = [sys.executable, "-m", "lightning_modules", "models"]
     done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, timeout=120)
     os.close(writer)
     assert (done.returncode, done.stderr) == (141, "")
-    if Path("/dev/full").exists():
-        with open("/dev/full", "w") as full:
-            done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120)
-        assert (done.returncode, done.stderr) == (1, "lightning: No space left on device\n")
 
 
 def test_ctrl_c_while_torch_is_imported(monkeypatch, capsys):

@@ -72,15 +72,19 @@ def same(weights, others):
     return all(value.equal(others[name]) for name, value in weights.items())
 
 
-@pytest.mark.parametrize(("step", "where"), [(6, "step"), (8, "validation")])
-def test_training_resumes_exactly_after_sigterm(fit, unbroken, tmp_path, step, where, capfd):
+@pytest.mark.parametrize(("step", "where", "requeued"), [(6, "step", True), (8, "validation", False)])
+def test_training_resumes_exactly_after_sigterm(fit, unbroken, tmp_path, step, where, requeued, capfd, monkeypatch):
+    """By ``--ckpt_path last``, or where Slurm starts a job again, without being asked."""
     with pytest.raises(SystemExit) as ended:
         fit("broken", *stop(step, where))
     assert ended.value.code == 143
     assert "SIGTERM; --ckpt_path last resumes" in capfd.readouterr().err
-    last = torch.load(tmp_path / "broken" / "checkpoints" / "last.ckpt", weights_only=True)
-    assert last["global_step"] == step
-    resumed = fit("broken", "--ckpt_path", "last")
+    last = tmp_path / "broken" / "checkpoints" / "last.ckpt"
+    assert torch.load(last, weights_only=True)["global_step"] == step
+    if requeued:
+        monkeypatch.setenv("SLURM_JOB_ID", "1")
+        os.rename(last, tmp_path / "broken" / "hpc_ckpt_1.ckpt")
+    resumed = fit("broken", *(() if requeued else ("--ckpt_path", "last")))
     assert same(unbroken["weights"], resumed["state_dict"])
     assert logged("broken") == unbroken["losses"]  # at the same steps, too
     assert best("broken") == unbroken["best"]
@@ -91,17 +95,6 @@ def test_ctrl_c_gives_one_line_and_status_130(fit, capfd):
         fit("broken", *stop(2, number=2))
     assert ended.value.code == 130
     assert len(re.findall("lightning: .*", capfd.readouterr().err)) == 1
-
-
-def test_requeued_slurm_job_resumes(fit, unbroken, monkeypatch, tmp_path):
-    with pytest.raises(SystemExit):
-        fit("job", *stop(6))
-    with pytest.raises(SystemExit, match="holds a run already"):
-        fit("job")
-    monkeypatch.setenv("SLURM_JOB_ID", "1")
-    os.rename(tmp_path / "job" / "checkpoints" / "last.ckpt", tmp_path / "job" / "hpc_ckpt_1.ckpt")
-    resumed = fit("job")
-    assert same(unbroken["weights"], resumed["state_dict"])
 
 
 def test_plateau_schedule_monitors_the_best_metric(fit):
