@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lightning_modules.inference.tiles import Box
-from spikekit import bin_to_sensor, demosaic, tfi
+from spikekit import bin_to_sensor, demosaic
 from spikekit.color.cfa import GREY
 
 #: side of a cell, the smallest part that can rest, in sensor pixels
@@ -139,6 +139,14 @@ def _gain(recent: Tensor, expected: Tensor, spread: Tensor) -> float:
     weight = expected[order].cumsum(0)
     gain = ratio[int(torch.searchsorted(weight, weight[-1] / 2))].item()
     return gain if abs(gain - 1) * weight[-1] > 5 * spread.norm() else 1.0
+
+
+def _charge(spikes: Tensor, clock: int, near: int) -> Tensor:
+    """Return the charge (H, W) at the beginning of a clock, the past share of the interval between two spikes."""
+    order = torch.arange(1, near + 1, dtype=torch.uint8, device=spikes.device)[:, None, None]
+    past = near - ((spikes[clock - near : clock] != 0) * order).amax(0).float()
+    coming = near + 1 - ((spikes[clock : clock + near] != 0) * order.flip(0)).amax(0)
+    return past / (past + coming)
 
 
 def _sum(plane: Tensor, side: int) -> Tensor:
@@ -278,11 +286,13 @@ class Rest:
     def _compare(self, spikes: Tensor, clocks: int) -> None:
         """Add the middle of a clip to the counts, which start anew where the scene has changed."""
         noise, whole, frames = _NOISE[self.noisy], Box(0, 0, *spikes.shape[1:]), len(spikes)
+        near = (frames - clocks) // 2
         middle = slice(frames // 2 - clocks // 2, frames // 2 - clocks // 2 + clocks)
         recent = spikes[middle].sum(0, dtype=torch.float32)
         # intervals are shorter than what a clip has before and after its middle
         self._timed &= (recent - 1) * (frames - clocks) >= 2 * clocks
-        recent = torch.where(self._timed, tfi(spikes)[middle].sum(0), recent)
+        if near:
+            recent += self._timed * (_charge(spikes, middle.stop, near) - _charge(spikes, middle.start, near))
         step = torch.where(self._timed, recent / clocks, 1)
         sudden, gain, excess = find_changes(recent, self._earlier, clocks * self._light / self._before, noise, step)
         self._light *= gain
