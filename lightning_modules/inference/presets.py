@@ -35,14 +35,8 @@ _AS_FAST = 1.2
 #: MiB per sensor pixel for the estimate of motion, which covers the whole frame (measured with ClassicalFlow)
 _MOTION = 240 / 2**20
 
-_UNITS = {
-    "ms": ("ms", 1.0),
-    "s": ("ms", 1e3),
-    "MB": ("mib", 1e6 / 2**20),
-    "GB": ("mib", 1e9 / 2**20),
-    "MiB": ("mib", 1.0),
-    "GiB": ("mib", 1024.0),
-}
+_UNITS = {"ms": ("ms", 1.0), "s": ("ms", 1e3), "MiB": ("mib", 1.0), "GiB": ("mib", 1024.0)}
+_UNITS |= {"MB": ("mib", 1e6 / 2**20), "GB": ("mib", 1e9 / 2**20)}
 
 
 @dataclass(frozen=True)

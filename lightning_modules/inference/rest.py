@@ -51,6 +51,7 @@ def find_changes(
     :math:`K + 2 \sqrt{K x} + 2 x` with :math:`x = \ln(\text{tests} / \text{risk})`, which K normal numbers exceed with
     the probability of the risk, or if a single block does. Large blocks detect faint motion, whose changes have the
     same sign at neighbouring pixels; single blocks detect objects smaller than a cell. The risk is 0.00001 per cell.
+    In little light, it has also moved if a pixel of an ideal sensor cannot differ as much, :math:`|d| > 1 + g q`.
 
     Args:
         recent: counts (H, W).
@@ -74,12 +75,12 @@ def find_changes(
     share = share.where(known, 0.0)
     each = _pixels(share, Box(0, 0, *recent.shape))
     expected = each * reference
-    variance = _variance(expected, each, noise, step)
-    gain = _gains(_sum(recent, CELL), _sum(expected, CELL), _sum(variance, CELL).sqrt(), known)
-    moved, excess = _moved(recent, expected, variance)
+    spread = _spread(expected, each, noise, step)
+    gain = _gains(_sum(recent, CELL), _sum(expected, CELL), _sum(spread[0], CELL).sqrt(), known)
+    moved, excess = _moved(recent, expected, *spread)
     if (gain != 1).any():
         lit = _pixels(gain, Box(0, 0, *recent.shape))
-        with_gain = _moved(recent, lit * expected, _variance(lit * expected, lit * each, noise, step))
+        with_gain = _moved(recent, lit * expected, *_spread(lit * expected, lit * each, noise, step))
         if with_gain[0].sum() <= moved.sum():
             moved, excess = with_gain
         else:
@@ -87,9 +88,10 @@ def find_changes(
     return moved | ~known, gain, excess * known
 
 
-def _moved(recent: Tensor, expected: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+def _moved(recent: Tensor, expected: Tensor, variance: Tensor, bound: Tensor) -> tuple[Tensor, Tensor]:
     """Return the cells whose light has changed, and the excess of :func:`find_changes`."""
-    off, moved = recent - expected, _sum(recent, CELL) < 0
+    off = recent - expected
+    moved = F.max_pool2d((off.abs() - bound)[None], CELL, ceil_mode=True)[0] > 0
     for block in (1, 2, 4, CELL):
         if block > 1:
             off, variance = _sum(off, 2), _sum(variance, 2)
@@ -104,12 +106,14 @@ def _moved(recent: Tensor, expected: Tensor, variance: Tensor) -> tuple[Tensor, 
     return moved, excess
 
 
-def _variance(expected: Tensor, each: Tensor, noise: float, step: Tensor) -> Tensor:
-    """Return the variance of the difference of a count from the expected one."""
+def _spread(expected: Tensor, each: Tensor, noise: float, step: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the variance of the difference of a count from the expected one, and its bound."""
     part = (expected - expected.floor()).sub_(0.5).square_()
     counted = (0.25 - part).clamp_(min=_LEAST).add_(each * (5 * each + 3) / 12)
     timed = step**2 * (1 + each + each.square()) / 4
-    return torch.where(step < 1, timed, counted) + noise * expected * (1 + each)
+    extra = noise * expected * (1 + each)
+    bound = torch.where(step < 1, math.inf, each + 1.1 + 6 * extra.sqrt())
+    return torch.where(step < 1, timed, counted) + extra, bound
 
 
 def _limit(count: Tensor | int, tests: int = 1) -> Tensor | float:

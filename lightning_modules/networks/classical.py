@@ -19,7 +19,8 @@ METHODS = ("tfi", "tfp")
 class ClassicalDecoder(Network):
     r"""Classical decoder: TFI or TFP of the middle frame, demosaicing and bicubic enlargement.
 
-    TFI replaces TFP where the interval between spikes is longer than the window, which then holds a spike or none.
+    In clips longer than ``frames``, as in dim light, TFI replaces TFP where the interval between spikes is longer than
+    the window, which then holds a spike or none.
 
     Args:
         method: decoder, ``"tfi"`` or ``"tfp"``.
@@ -76,9 +77,9 @@ class ClassicalDecoder(Network):
         """Return rgb; the flow is ignored."""
         check_planes("spikes", spikes, 4, "(B, N, H, W)")
         n = spikes.shape[1] // 2
-        raw = tfi_at(spikes, n)
-        if self.method == "tfp":
-            raw = torch.where(raw < 1 / self.window, raw, tfp_at(spikes, n, self.window, order=self.order))
+        raw = tfi_at(spikes, n) if self.method == "tfi" else tfp_at(spikes, n, self.window, order=self.order)
+        if self.method == "tfp" and spikes.shape[1] > self.frames:
+            raw = torch.where((sparse := tfi_at(spikes, n)) < 1 / self.window, sparse, raw)
         rgb = demosaic(raw / self.alpha, self.pattern)
         if self.scale > 1:
             rgb = F.interpolate(rgb, scale_factor=self.scale, mode="bicubic", align_corners=False)
