@@ -42,14 +42,16 @@ def test_clips_equal_the_frames_of_the_file(opened, spikes, name):
         assert clip.equal(spikes[frame - 20 : frame + 21])
 
 
-@pytest.mark.parametrize(("name", "frame"), [("clip.dat", None), ("clip.npz", "31:39:3")])
-def test_joined_frames_have_the_spikes_of_their_frames(opened, spikes, name, frame):
-    clips = RecordingClips(opened(spikes, name), 5, frame).in_light(0.002)
-    assert (clips.joined, clips.chosen[0]) == ((7, 17) if frame is None else (12, 31))
+@pytest.mark.parametrize(
+    ("name", "frame", "white", "joined", "first"),
+    [("clip.dat", None, 0.002, 7, 17), ("clip.npz", "31:39:3", 0.002, 12, 31), ("clip.npz", None, 0.02, 5, 12)],
+)
+def test_joined_frames_have_the_spikes_of_their_frames(opened, spikes, name, frame, white, joined, first):
+    clips = RecordingClips(opened(spikes, name), 5, frame).in_light(white)
+    assert (clips.joined, clips.chosen[0]) == (joined, first)
     for middle, clip in clips.in_order():
-        start = middle - 5 * clips.joined // 2
-        expected = [spikes[start + n * clips.joined :][: clips.joined].amax(0) for n in range(5)]
-        assert clip.equal(torch.stack(expected))
+        start = middle - 5 * joined // 2
+        assert clip.equal(torch.stack([spikes[start + n * joined :][:joined].amax(0) for n in range(5)]))
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
