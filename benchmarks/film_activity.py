@@ -24,7 +24,16 @@ from lightning_modules.data.pictures import embedded_pictures
 from lightning_modules.inference.film import FilmMaker
 from lightning_modules.inference.rest import CELL, Rest
 from lightning_modules.networks import Network
-from spikekit import SensorNoise, bin_to_sensor, demosaic, psnr, read_picture, simulate_spikes, write_picture
+from spikekit import (
+    Calibration,
+    SensorNoise,
+    bin_to_sensor,
+    demosaic,
+    psnr,
+    read_picture,
+    simulate_spikes,
+    write_picture,
+)
 from spikekit.arguments import whole
 from spikekit.scenes.analytic import Layer, Motion, Scene
 
@@ -48,11 +57,12 @@ def scenes(size: tuple[int, int], clocks: int, scale: int) -> Iterator[tuple[str
     yield "object of 5 %", Scene([Layer(ground), moving], *view, clocks), lambda _: 1.0
     yield "flicker of 100 Hz", still, lambda clock: 1 + 0.25 * math.sin(2 * math.pi * clock / 200)
     yield "noisy sensor", still, lambda _: 1.0
+    yield "calibrated sensor", still, lambda _: 1.0
     yield "dark", still, lambda _: 0.05
     yield "panning", Scene([Layer(ground, Motion(velocity=(0.1 * scale, 0.0)))], *view, clocks), lambda _: 1.0
 
 
-def film_of(name: str, scene: Scene, bright: Callable[[int], float], network: Network) -> Tensor:
+def film_of(scene: Scene, bright: Callable[[int], float], network: Network, noise: SensorNoise | None = None) -> Tensor:
     """Simulate the spikes of a scene, (clocks, H, W)."""
     scale, pattern = network.scale, network.pattern
     if all(layer.motion == Motion() for layer in scene.layers):
@@ -60,8 +70,15 @@ def film_of(name: str, scene: Scene, bright: Callable[[int], float], network: Ne
     else:
         light = scene.light(pattern, scale=scale, alpha=ALPHA)
     light = light * torch.tensor([bright(clock) for clock in range(scene.frames)])[:, None, None]
-    noise = NOISE if name == "noisy sensor" else None
-    return simulate_spikes(light, generator=torch.Generator().manual_seed(0), noise=noise)
+    return simulate_spikes(light, generator=torch.Generator().manual_seed(0), noise=noise).byte()
+
+
+def known_sensor(size: tuple[int, int]) -> Calibration:
+    """Return a sensor with the spreads of ``NOISE`` and two dead pixels in a thousand."""
+    generator = torch.Generator().manual_seed(0)
+    gain, dark = (torch.randn(size, generator=generator) for _ in range(2))
+    dead = torch.rand(size, generator=generator) < 0.002
+    return Calibration((NOISE.gain_spread * gain).exp(), NOISE.dark_current * (0.39 * dark).exp(), dead.byte())
 
 
 def main() -> None:
@@ -86,8 +103,11 @@ def main() -> None:
         if args.scene and not name.startswith(tuple(args.scene)):
             continue
         network.noise_level = float(name == "noisy sensor")
-        spikes = film_of(name, scene, bright, network)
+        known = known_sensor(tuple(args.size)) if name == "calibrated sensor" else None
+        noise = SensorNoise(NOISE.photons, calibration=known) if known else NOISE if name == "noisy sensor" else None
+        spikes = film_of(scene, bright, network, noise)
         plain, resting = FilmMaker(network), FilmMaker(network, psnr_tolerance=0.1)
+        plain.calibration = resting.calibration = known
         times, cells, found, moving = [], [], [], []
         for clock in range(network.frames // 2, clocks - network.frames // 2, EVERY):
             clip = spikes[None, clock - network.frames // 2 :][:, : network.frames]
@@ -95,7 +115,8 @@ def main() -> None:
             made = []
             for maker in (plain, resting):
                 start = time.process_time()
-                made.append(maker(clip, [clock], exposure=network.settings["alpha"] / ALPHA)[0])
+                exposure = network.settings["alpha"] / ALPHA
+                made.append(maker(clip, [clock], exposure=exposure)[0])
                 times.append(time.process_time() - start)
             cells.append(resting.rest.computed.float().mean().item())
             found.append([psnr(picture, truth).item() for picture in made])
@@ -145,7 +166,7 @@ def false_rests(size: tuple[int, int], pictures: int) -> None:
         rest = Rest(1, "RGGB", ALPHA, noise is not None)
         changes, resting = [], []
         for clock in range(20, clocks - 20, EVERY):
-            rest(spikes[clock - 20 : clock + 21], clock, lambda box, static: box.of(nothing), 1.0)
+            rest(spikes[clock - 20 : clock + 21], clock, lambda box, static: box.of(nothing), 1.0, None)
             change = (light[clock] - light[clock - EVERY]) / ALPHA
             changes.append(F.avg_pool2d(change.square()[None], CELL, ceil_mode=True)[0].sqrt())
             resting.append(~rest.moving)

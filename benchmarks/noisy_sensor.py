@@ -77,7 +77,7 @@ def _halves(spikes: Tensor) -> tuple[PixelRates, PixelRates]:
 def _scores(spikes: Tensor, truth: dict[int, Tensor], network: CSCSR, known: Calibration | None) -> list[float]:
     decoders: list[Callable[[Tensor, int], Tensor]] = [tfi_at, lambda clip, middle: tfp_at(clip, middle, 13, order=3)]
     sums = [0.0] * 3
-    corrected = spikes if known is None else correct_spikes(spikes, known, PATTERN)
+    corrected = correct_spikes(spikes, known, PATTERN)
     network.noise_level = (gain_spread(corrected.float().mean(0), len(spikes), 1, PATTERN) or 0) / NOISE.gain_spread
     for middle, rgb in truth.items():
         near = spikes[middle - 60 : middle + 61].float()

@@ -13,7 +13,6 @@ from torch import Tensor
 from spikekit.arguments import UsageError, home_path
 from spikekit.calibration.calibration import Calibration
 from spikekit.calibration.files import ENDING, read_calibration
-from spikekit.calibration.spikes import correct_spikes
 from spikekit.color.cfa import GREY, cfa_pattern
 from spikekit.io.cameras import Camera, usual_sizes
 from spikekit.io.cameras import camera as load_camera
@@ -71,10 +70,6 @@ class Recording:
     def correct(self, raw: Tensor) -> Tensor:
         """Return the rates (*, H, W), in spikes per clock, that an ideal sensor would give."""
         return raw if self.calibration is None else self.calibration.correct(raw, self.bayer)
-
-    def correct_spikes(self, spikes: Tensor) -> Tensor:
-        """Return the spikes (*, T, H, W) that an ideal sensor would have fired."""
-        return spikes if self.calibration is None else correct_spikes(spikes, self.calibration, self.bayer)
 
     @property
     def said(self) -> str:
@@ -175,7 +170,7 @@ def _described(
         raise UsageError(_without_size(path))
     frames, *size = spikes_shape(path, height, width)
     note = "" if flip else _upside_down(*size)
-    if height is width is None and _long(*size) > 3 and _long(frames, size[0]) < 2:
+    if height is width is None and max(size) > 3 * min(size) and max(frames, size[0]) < 2 * min(frames, size[0]):
         note = f"read as {frames} frames of {size[0]} x {size[1]}; if the array is (H, W, T), transpose it to (T, H, W)"
     return Recording(path, frames, tuple(size), flip, pattern, note=note)
 
@@ -191,11 +186,6 @@ def _of_camera(path: Path, known: Camera, pattern: str | None) -> Recording:
             continue
         return Recording(path, frames, tuple(size), known.flip, known.prepared_pattern or GREY, camera=known)
     raise wrong
-
-
-def _long(height: int, width: int) -> float:
-    """Return the ratio of the longer side to the shorter."""
-    return max(height, width) / min(height, width)
 
 
 def _upside_down(height: int, width: int) -> str:

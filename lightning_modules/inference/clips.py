@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spikekit import bayer_sites
+from spikekit import Calibration, bayer_sites, correct_spikes
 from spikekit.arguments import frames_of
 from spikekit.calibration.gain_spread import gain_spread
 from spikekit.color.cfa import GREY
@@ -107,19 +107,25 @@ class RecordingClips:
         clips.joined = joined
         return clips
 
-    def in_order(self, chosen: Iterable[int] | None = None) -> Iterator[tuple[int, Tensor]]:
-        """Yield number and clip (N / joined, H, W) of the given key frames, in increasing order; by default of all."""
+    def in_order(self, chosen: Iterable[int] | None = None, raw: bool = False) -> Iterator[tuple[int, Tensor]]:
+        """Yield number and clip (N / joined, H, W), corrected unless ``raw``, of key frames in order; default: all."""
         middles = self.chosen if chosen is None else list(chosen)
-
-        def jump(start: int) -> Iterator[Tensor]:
-            return self.recording.frames_from(start)
-
+        jump, phase = self.recording.frames_from, self.recording.bayer and self._asked[1]
         # .npz files are decompressed from their beginning, wherever reading begins
         packed = self.recording.path.suffix.lower() == ".npz"
         start = middles[0] - self.frames // 2 if middles else 0
         for middle, clip in clips_around(middles, self.frames, jump(start), start, None if packed else jump):
-            clip = self.recording.correct_spikes(clip)[..., self.top :, self.left :]
-            yield middle, join_frames(clip, self.joined)
+            clip = join_frames(clip[..., self.top :, self.left :], self.joined)
+            yield middle, correct_spikes(clip, None if raw else self.calibration, phase)
+
+    @cached_property
+    def calibration(self) -> Calibration | None:
+        """Calibration of the pixels of a clip, whose dark rate is that of a joined frame."""
+        known = self.recording.calibration
+        if known is None or (self.top, self.left, self.joined) == (0, 0, 1):
+            return known
+        dark = (self.joined * known.dark).clamp(max=1)
+        return Calibration(*(plane[self.top :, self.left :] for plane in (known.gain, dark, known.defects)))
 
     @cached_property
     def _looks(self) -> tuple[Tensor, int, int]:

@@ -45,12 +45,8 @@ class _Moving(_Still):
         return self.network(spikes, flow)
 
 
-class _StillFilm(nn.Module):
+class _StillFilm(_Still):
     """A network for films; its second input is the state of the previous key frame, zeros for the first."""
-
-    def __init__(self, network: RecurrentCSCSR) -> None:
-        super().__init__()
-        self.network = network
 
     def forward(self, spikes: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         return self._meet(spikes, None, state, None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from functools import partial
+from functools import cache, partial
 from io import BytesIO
 from itertools import chain, count, islice, pairwise
 from pathlib import Path
@@ -20,7 +20,7 @@ from lightning_modules.inference.rest import AROUND, SEEN, Rest
 from lightning_modules.inference.tiles import TILE, TILE_ON_GPU, Box, reach, tiled
 from lightning_modules.networks import Network, RecurrentCSCSR
 from lightning_modules.networks.recurrent_cscsr import read_forward, read_from_end
-from spikekit import flow_warp, linear_motion, upsample_flow
+from spikekit import Calibration, correct_spikes, flow_warp, linear_motion, upsample_flow
 from spikekit.check import check_planes, check_positive, check_whole
 from spikekit.io.whole_file import whole_file
 from spikekit.recording import white_rate
@@ -177,6 +177,9 @@ class FilmMaker:
         how: ``self_ensemble`` of :func:`lightning_modules.inference.predict.predict`, with which every clip is
             reconstructed alone, without a state.
 
+    Attributes:
+        calibration: of the sensor; if set, the spikes are those that it fired, and are corrected for the network.
+
     Raises:
         ValueError: ``future`` for a network without a state; ``interpolated`` for a network without a motion estimate;
             a negative number; an option that the network does not support; or a tolerance that is negative, is combined
@@ -218,6 +221,7 @@ class FilmMaker:
         self.network, self.future, self.interpolated, self._how = network, future, interpolated, how
         on_gpu = any(part.is_cuda for part in network.parameters())
         self.tile = (TILE_ON_GPU if on_gpu else TILE) if tile is None else tile
+        self.calibration: Calibration | None = None
         self._last: _Made | None = None
         self._known: _Known | None = None
         self.rest: Rest | None = None
@@ -269,6 +273,7 @@ class FilmMaker:
             light = torch.as_tensor(exposure).flatten().expand(len(spikes)).tolist()
             pictures = [*map(self._where_it_moves, spikes.split(1), clocks, light)]
             return torch.cat(pictures) if len(pictures) > 1 else pictures[0]
+        spikes = correct_spikes(spikes, self.calibration, self.network.pattern)
         if not self.interpolated:
             return self._made(spikes, list(clocks), None, static, exposure)
         every, total = self.interpolated + 1, len(clocks)
@@ -290,15 +295,16 @@ class FilmMaker:
         whole, before, state = Box(0, 0, *spikes.shape[-2:]), self._known, None
         if before is not None and clock - before.clock <= self.network.frames:
             state = before.state
+        corrected = cache(partial(correct_spikes, spikes, self.calibration, self.network.pattern))
 
         def make(box: Box, static: bool) -> Tensor:
             nonlocal state
             outer, near = box.grown(SEEN, whole), box.grown(AROUND, whole)
-            flow = self.network.resolve_flow(near.of(spikes), None, static)
+            flow = self.network.resolve_flow(near.of(corrected()), None, static)
             flow = None if flow is None else outer.of(flow, near[:2])
             if self.carries_on:
                 self._known = None if state is None else _Known(before.clock, outer.of(before.state))
-            rgb = self._made(outer.of(spikes), [clock], flow, flow is None, exposure)[0]
+            rgb = self._made(outer.of(corrected()), [clock], flow, flow is None, exposure)[0]
             if self.carries_on:
                 part = self._known.state
                 if box == whole:
@@ -308,7 +314,7 @@ class FilmMaker:
                     box.of(state).copy_(box.of(part, outer[:2]))
             return box.of(rgb, outer[:2], self.network.scale)
 
-        rgb = self.rest(spikes[0], clock, make, exposure)
+        rgb = self.rest(spikes[0], clock, make, exposure, self.calibration)
         self._known = None if state is None else _Known(clock, state)
         return rgb[None]
 

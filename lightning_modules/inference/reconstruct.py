@@ -20,7 +20,7 @@ from lightning_modules.inference.predict import precision_of
 from lightning_modules.inference.presets import SPEEDS, Conditions, Preset, choose
 from lightning_modules.networks import ClassicalDecoder, Network
 from lightning_modules.registry import find_model
-from spikekit import __version__
+from spikekit import __version__, correct_spikes
 from spikekit.check import check_positive
 from spikekit.color.cfa import GREY, PATTERNS
 from spikekit.io.image_bytes import to_bytes
@@ -191,6 +191,7 @@ class Reconstruction:
             state: file for what later pictures of a film depend on, from which a stopped run continues.
         """
         maker = FilmMaker(self.network, **self.how)
+        maker.calibration = self.clips.calibration
         joined = self.clips.joined
         exposure = self.network.settings["alpha"] / (joined * self.white)
         groups = self._groups(maker, set(made), *part)
@@ -198,7 +199,7 @@ class Reconstruction:
             first = next((group[0] for group, wanted in groups if wanted), 0)
             last = maker.load(state, first, self.device)
             groups = [one for one in groups if one[0][0] > last]
-        clips = self.clips.in_order(frame for group, _ in groups for frame in group)
+        clips = self.clips.in_order((frame for group, _ in groups for frame in group), raw=True)
         mixed = torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bf16-mixed")
         for n, (group, wanted) in enumerate(groups, 1):
             spikes = torch.stack([clip for _, clip in islice(clips, len(group))]).to(self.device)
@@ -224,8 +225,7 @@ class Reconstruction:
         recording = self.clips.recording
         if recording.pattern == GREY and len(rgb) == 3:
             rgb = (rgb * rgb.new_tensor([0.25, 0.5, 0.25])[:, None, None]).sum(0, keepdim=True)
-        rgb = rgb.expand(3, -1, -1)
-        return rgb if recording.camera is None else replace(recording.camera, gain=1.0).display(rgb)
+        return recording.show(rgb.expand(3, -1, -1), known=False)
 
     def _decoded(self, clip: Tensor, method: str | None) -> list[Tensor]:
         """Return a decoder's picture of a clip (N, H, W), and a white gap."""
@@ -233,7 +233,8 @@ class Reconstruction:
             return []
         settings = self.network.settings
         decoder = ClassicalDecoder(method, settings["scale"], settings["pattern"], self.white * self.clips.joined)
-        rgb = self._shown(decoder(clip[None].cpu())[0].clamp(0, 1))
+        clip = correct_spikes(clip.cpu(), self.clips.calibration, self.network.pattern)
+        rgb = self._shown(decoder(clip[None])[0].clamp(0, 1))
         return [rgb, rgb.new_ones(3, rgb.shape[1], _GAP)]
 
     def array(self) -> np.ndarray:

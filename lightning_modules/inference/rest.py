@@ -10,8 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lightning_modules.inference.tiles import Box
-from spikekit import bin_to_sensor, demosaic
-from spikekit.color.cfa import GREY
+from spikekit import Calibration, bin_to_sensor, demosaic
 
 #: side of a cell, the smallest part that can rest, in sensor pixels
 CELL = 8
@@ -22,6 +21,7 @@ _RISK = 1e-5  # probability that a cell at rest counts as moved
 _TESTS = 8  # tests per cell: single blocks of 1, 2 and 4 pixels, all of them, the cell, and many key frames
 _PICTURES = 8  # pictures of the network that a cell at rest shows the mean of
 _SURE = 80  # clocks without a change before the clip of a resting cell
+_MORE = 1.125  # clocks, relative to those that a resting cell was drawn with, after which it is drawn again
 _BUSY, _UNTESTED = 0.9, 6  # share of cells that makes a picture busy, and pictures after it that are not tested
 _FADE = 0.96  # weight of the sums of squares of the previous key frame
 _LEAST = 1 / 12  # smallest variance of a count, as light is not known exactly
@@ -112,8 +112,8 @@ def _spread(expected: Tensor, each: Tensor, noise: float, step: Tensor) -> tuple
     counted = (0.25 - part).clamp_(min=_LEAST).add_(each * (5 * each + 3) / 12)
     timed = step**2 * (1 + each + each.square()) / 4
     extra = noise * expected * (1 + each)
-    bound = torch.where(step < 1, math.inf, each + 1.1 + 6 * extra.sqrt())
-    return torch.where(step < 1, timed, counted) + extra, bound
+    are_timed = (step < 1).float()
+    return torch.lerp(counted, timed, are_timed) + extra, each + 1.1 + 6 * extra.sqrt() + are_timed / (1 - are_timed)
 
 
 def _limit(count: Tensor | int, tests: int = 1) -> Tensor | float:
@@ -147,10 +147,12 @@ def _gain(recent: Tensor, expected: Tensor, spread: Tensor) -> float:
 
 def _charge(spikes: Tensor, clock: int, near: int) -> Tensor:
     """Return the charge (H, W) at the beginning of a clock, the past share of the interval between two spikes."""
-    order = torch.arange(1, near + 1, dtype=torch.uint8, device=spikes.device)[:, None, None]
-    past = near - ((spikes[clock - near : clock] != 0) * order).amax(0).float()
-    coming = near + 1 - ((spikes[clock : clock + near] != 0) * order.flip(0)).amax(0)
-    return past / (past + coming)
+    empty = 1 - spikes[clock - near : clock + near].to(torch.uint8)
+    past, coming = torch.zeros_like(empty[0]), torch.ones_like(empty[0])
+    for before, after in zip(empty[:near], empty[near:].flip(0), strict=True):
+        past.add_(1).mul_(before)
+        coming.mul_(after).add_(1)
+    return past / (past + coming).float()
 
 
 def _sum(plane: Tensor, side: int) -> Tensor:
@@ -203,7 +205,9 @@ class Rest:
 
         The mean over all clocks of an ideal sensor converges to the exact light. At the resolution of the sensor, the
         picture is corrected towards it, by the share of their difference that is not noise of the mean, but not at
-        single pixels that differ by more than five times the root mean square of their cell, which may be defective.
+        single pixels that differ by more than five times the root mean square of their cell, which may be defective. It
+        is corrected again when the cell has an eighth more clocks. Of a calibrated sensor, changes are found in the
+        spikes that it fired; the mean is corrected by the calibration.
 
     Args:
         scale: pixels of the picture per sensor pixel.
@@ -227,20 +231,24 @@ class Rest:
         planes = spikes.new_zeros(2, *spikes.shape[-2:], dtype=torch.float32)
         self._earlier, self._later = planes
         self._timed = planes[0] == 0
-        # clocks of both counts, scaled to the first light; clocks without a change; pictures in the mean
-        self._before, self._since, self._calm, self._count = _sum(torch.zeros_like(planes[:1]), CELL).repeat(4, 1, 1)
+        # clocks of both counts, scaled to the first light; clocks without a change; pictures in the mean; clocks drawn
+        cells = _sum(torch.zeros_like(planes[:1]), CELL).repeat(5, 1, 1)
+        self._before, self._since, self._calm, self._count, self._drawn = cells
         self._light, self._excess = torch.ones_like(self._calm), self._calm.repeat(2, 1, 1)
         self._mean: Tensor | None = None
 
-    def __call__(self, spikes: Tensor, clock: int, make: Callable[[Box, bool], Tensor], exposure: float) -> Tensor:
+    def __call__(
+        self, spikes: Tensor, clock: int, make: Callable[..., Tensor], exposure: float, known: Calibration | None
+    ) -> Tensor:
         """Return a picture.
 
         Args:
-            spikes: clip (N, H, W).
+            spikes: clip (N, H, W), as the sensor fired it.
             clock: clock of the picture, larger than that of the previous one.
             make: function that returns the network's picture (3, s h, s w) of a box; its second argument tells that
                 nothing moves there.
             exposure: factor of the network's pictures.
+            known: calibration of the sensor; None for an ideal or an unknown one.
         """
         frames, whole, scale = len(spikes), Box(0, 0, *spikes.shape[-2:]), self.scale
         if self._untested:
@@ -252,7 +260,7 @@ class Rest:
         if came > frames or self._earlier.shape != spikes.shape[-2:]:
             self._start(spikes)
         else:
-            self._compare(spikes, came)
+            self._compare(spikes, came, known)
         self._clock = clock
         still = self._calm >= frames - 1
         unsure = self._calm < frames - 1 + _SURE
@@ -260,34 +268,32 @@ class Rest:
         new = still & (self._count < _PICTURES)
         self.computed = near | new
         self._count = (self._count + new) * still
+        self._drawn *= still
         if not still.any():
             self._mean = None
             return make(whole, False)
-        boxes = _boxes(self.computed, near, whole)
+        boxes = _boxes(self.computed, near, whole) if self.computed.any() else []
         parts = [(box, make(box, static).float()) for box, static in boxes]
         if self._mean is None:
-            self._mean = torch.zeros_like(parts[0][1])  # the first pictures are whole
+            self._mean, self._shown = torch.zeros_like(parts[0][1]).repeat(2, 1, 1, 1)  # the first pictures are whole
             self._seen = self._mean.new_zeros(spikes.shape[1:])
         for box, part in parts:
             weight = _pixels(new / self._count.clamp(min=1), box, scale)
             if weight.any():
                 mean = box.of(self._mean, scale=scale)
                 mean.lerp_(part / _pixels(self._light, box, scale), weight)
-                box.of(self._seen).copy_(self._mosaic(mean))
+                box.of(self._seen).copy_(bin_to_sensor(mean, self.pattern, scale=scale))
         if boxes[:1] == [(whole, False)]:  # blending the few cells at rest would cost more than it gains
             return parts[0][1]
-        shown = (self._mean.clone() if self.noisy else self._drawn(exposure)).mul_(_pixels(self._light, whole, scale))
+        due = ~unsure & (new | (self._before + self._since > _MORE * self._drawn))
+        if due.any() and not self.noisy:
+            self._draw(due, exposure, known)
+        shown = (self._mean if self.noisy else self._shown) * _pixels(self._light, whole, scale)
         for box, part in parts:
             box.of(shown, scale=scale).lerp_(part, _blend(unsure, box, scale))
         return shown.clamp_(0, 1)
 
-    def _mosaic(self, picture: Tensor) -> Tensor:
-        """Return what the sensor sees of a picture."""
-        if len(picture) == 1:
-            return F.avg_pool2d(picture, self.scale)[0]
-        return bin_to_sensor(picture, self.pattern, scale=self.scale)
-
-    def _compare(self, spikes: Tensor, clocks: int) -> None:
+    def _compare(self, spikes: Tensor, clocks: int, known: Calibration | None) -> None:
         """Add the middle of a clip to the counts, which start anew where the scene has changed."""
         noise, whole, frames = _NOISE[self.noisy], Box(0, 0, *spikes.shape[1:]), len(spikes)
         near = (frames - clocks) // 2
@@ -297,6 +303,8 @@ class Rest:
         self._timed &= (recent - 1) * (frames - clocks) >= 2 * clocks
         if near:
             recent += self._timed * (_charge(spikes, middle.stop, near) - _charge(spikes, middle.start, near))
+        if known is not None:
+            recent *= (known.defects == 0).to(recent.device)
         step = torch.where(self._timed, recent / clocks, 1)
         sudden, gain, excess = find_changes(recent, self._earlier, clocks * self._light / self._before, noise, step)
         self._light *= gain
@@ -325,21 +333,27 @@ class Rest:
         self._before += self._since * full
         self._since *= ~full
 
-    def _drawn(self, exposure: float) -> Tensor:
-        """Return the mean of pictures, corrected towards that of all spikes."""
+    def _draw(self, due: Tensor, exposure: float, known: Calibration | None) -> None:
+        """Correct the mean of pictures towards that of all spikes, in boxes around some cells."""
         clocks = self._before + self._since
-        share = (exposure / self.white / clocks).nan_to_num(posinf=0)
-        whole = Box(0, 0, *self._seen.shape)
-        off = (self._earlier + self._later) * _pixels(share, whole) - self._seen
+        self._drawn = clocks.where(due, self._drawn)
+        each, whole, scale = (1 / clocks).nan_to_num(posinf=0), Box(0, 0, *self._seen.shape), self.scale
+        rate = (self._earlier + self._later) * _pixels(each, whole)
+        if known is not None:
+            rate = known.correct(rate, self.pattern)
+        white = exposure / self.white
+        off = white * rate - self._seen
         power = F.avg_pool2d(off.square()[None], CELL, ceil_mode=True)[0]
-        off = off.where(off.square() < 25 * _pixels(power, whole), 0)
-        trust = (1 - share.square() / 6 / power).nan_to_num(0).clamp(min=0) * (self._count > 0)
+        off = off * (off.square() < 25 * _pixels(power, whole))
+        trust = (1 - (white * each).square() / 6 / power).nan_to_num(0).clamp(min=0) * (self._count > 0)
         off = off * _pixels(trust, whole)
-        colors = off[None] if self.pattern == GREY else demosaic(off, self.pattern)
-        if self.scale > 1:
+        colors = demosaic(off, self.pattern)
+        for box, _ in _boxes(due, due, whole):
+            near = box.grown(CELL, whole)
             # antialias does not change the result of enlarging, but is three times faster
-            colors = F.interpolate(colors[None], scale_factor=self.scale, mode="bilinear", antialias=True)[0]
-        return colors.add_(self._mean)
+            part = F.interpolate(near.of(colors)[None], scale_factor=scale, mode="bilinear", antialias=True)
+            mean, shown = (box.of(planes, scale=scale) for planes in (self._mean, self._shown))
+            torch.add(mean, box.of(part[0], near[:2], scale), out=shown)
 
 
 def _boxes(computed: Tensor, near: Tensor, whole: Box) -> list[tuple[Box, bool]]:

@@ -16,7 +16,7 @@ _GOLDEN = (math.sqrt(5) - 1) / 2
 _ROUNDING = 1e-4  # tolerance for rounding errors in sums of light, in thresholds
 
 
-def correct_spikes(spikes: Tensor, calibration: Calibration, pattern: str | None = None) -> Tensor:
+def correct_spikes(spikes: Tensor, calibration: Calibration | None, pattern: str | None = None) -> Tensor:
     r"""Return the spikes that an ideal sensor would have fired, for networks, which take spikes rather than light.
 
     .. math:: \hat I_n = \text{corrected } 1 / \Psi_n, \quad \hat S = \text{spikes of } \hat I
@@ -29,7 +29,7 @@ def correct_spikes(spikes: Tensor, calibration: Calibration, pattern: str | None
 
     Args:
         spikes: zeros and ones, :math:`(*, T, H, W)`.
-        calibration: the calibration of the sensor.
+        calibration: the calibration of the sensor; ``None`` for an ideal one, whose spikes are returned.
         pattern: Bayer phase; ``None`` for a grey sensor.
 
     Returns:
@@ -46,6 +46,8 @@ def correct_spikes(spikes: Tensor, calibration: Calibration, pattern: str | None
         [1, 1, 0, 1, 1, 0, 1, 1, 0, 1]
     """
     check_planes("spikes", spikes, 3, "(*, T, H, W)")
+    if calibration is None:
+        return spikes
     fired = spikes != 0
     light = calibration.correct(tfi(fired, dtype=torch.promote_types(default_float(spikes), torch.float32)), pattern)
     first = fired.byte().argmax(-3, keepdim=True)

@@ -95,10 +95,8 @@ class _Tfi(torch.autograd.Function):
         return _SumOnIntervals.apply(grad, *ctx.saved_tensors), None, None
 
 
-class _SumOnIntervals(torch.autograd.Function):
-    """Gradient of TFI, which is linear in the incoming gradient and self-adjoint."""
-
-    generate_vmap_rule = True
+class _SumOnIntervals(_Tfi):
+    """Gradient of TFI, which is linear in the incoming gradient and self-adjoint, and therefore its own gradient."""
 
     @staticmethod
     def forward(grad: Tensor, spikes: Tensor, rate: Tensor) -> Tensor:
@@ -107,10 +105,6 @@ class _SumOnIntervals(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: Any, output: Tensor) -> None:
         ctx.save_for_backward(*inputs[1:])
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        return _SumOnIntervals.apply(grad, *ctx.saved_tensors), None, None
 
 
 @operator(lambda spikes, window, max_range, dtype: torch.empty_like(spikes, dtype=dtype))

@@ -25,7 +25,7 @@ _DIFFERS = 0.04
 
 
 class Between:
-    """Base class of interpolations between two frames; subclasses implement ``between``.
+    """Interpolation between two frames: the nearest of them, unless a subclass implements ``between``.
 
     Args:
         first: ``rgb`` (3, H, W), floating.
@@ -75,11 +75,6 @@ class Between:
 
     def between(self, tau: float) -> Tensor:
         """Return the picture at a time strictly between 0 and 1."""
-        raise NotImplementedError
-
-
-class _Still(Between):
-    def between(self, tau: float) -> Tensor:
         return self.first if tau < 0.5 else self.second
 
 
@@ -99,7 +94,7 @@ class Still:
 
     def __call__(self, first: Tensor, second: Tensor) -> Between:
         """Return the interpolation between two frames."""
-        return _Still(first, second)
+        return Between(first, second)
 
 
 class Blend:
@@ -173,7 +168,7 @@ class FlowInterpolation:
     @torch.no_grad()
     def __call__(self, first: Tensor, second: Tensor) -> Between:
         """Estimate the motion between two frames."""
-        still = _Still(first, second)
+        still = Between(first, second)
         first, second = first.detach(), second.detach()
         if first.equal(second):
             still.forward = still.backward = torch.zeros_like(first[:2])

@@ -32,10 +32,6 @@ class MeasuredPixels(Protocol):
     dark: Tensor
     defects: Tensor
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """(H, W)."""
-
 
 class SpikeChange(NamedTuple):
     """Effect of one source of noise, see :meth:`SensorNoise.spike_changes`.
@@ -224,8 +220,8 @@ class NoisyPixels:
     """Pixels (*, H, W) of a sensor, with fixed-pattern and temporal noise."""
 
     def __init__(self, noise: SensorNoise, size: tuple[int, ...], seed: int) -> None:
-        if noise.calibration is not None and noise.calibration.size != tuple(size[-2:]):
-            expected, got = noise.calibration.size, tuple(size[-2:])
+        if noise.calibration is not None and noise.calibration.gain.shape != tuple(size[-2:]):
+            expected, got = noise.calibration.gain.shape, tuple(size[-2:])
             raise ValueError(
                 f"light: expected {expected[0]} x {expected[1]} as the calibration, got {got[0]} x {got[1]}"
             )

@@ -11,6 +11,7 @@ from lightning_modules.inference.presets import Choice, Preset
 from lightning_modules.networks import CSCSR, ClassicalDecoder, RecurrentCSCSR
 from lightning_modules.registry import find_model
 from spikekit import SensorNoise, SpikeSensor, mosaic, read_spikes, simulate_spikes, write_picture, write_spikes
+from spikekit.calibration import Calibration, write_calibration
 from spikekit.cli.command import main as spikekit_main
 
 EXACT = {"precision": "32-true"}  # whatever the processor would do
@@ -49,13 +50,18 @@ def test_pictures_as_iterator_and_array(recording):
 
 
 @pytest.mark.parametrize("trained", ["RGGB", "GBRG"])
-def test_colours_are_correct_for_every_bayer_phase(tmp_path, trained):
-    colour = torch.tensor([0.9, 0.3, 0.1])
+def test_colours_of_calibrated_sensors_are_correct_for_every_bayer_phase(tmp_path, trained):
+    colour = torch.tensor([0.9, 0.5, 0.3])
     light = 0.4 * mosaic(colour[:, None, None].expand(41, 3, 16, 20), "BGGR")
-    write_spikes(tmp_path / "flat.npz", simulate_spikes(light, generator=torch.Generator().manual_seed(0)))
+    gain, dead = torch.linspace(0.6, 0.8, 20).repeat(16, 1), torch.zeros(16, 20, dtype=torch.uint8)
+    dead[::5, ::3] = 1
+    noise = SensorNoise(calibration=Calibration(gain, 0 * gain, dead))
+    write_calibration(tmp_path / "flat.calibration.safetensors", noise.calibration)
+    write_spikes(tmp_path / "flat.npz", simulate_spikes(light, generator=torch.Generator().manual_seed(0), noise=noise))
     network = ClassicalDecoder(scale=2, pattern=trained)
-    ((_, rgb),) = reconstruct(tmp_path / "flat.npz", network=network, pattern="BGGR", white=0.4)
-    torch.testing.assert_close(rgb.mean(dim=(1, 2)), colour, rtol=0, atol=0.04)
+    ((_, rgb),) = reconstruct(tmp_path / "flat.npz", network=network, pattern="BGGR", white=0.4).pictures(beside="tfi")
+    for half in (rgb[..., :36], rgb[..., -36:]):
+        torch.testing.assert_close(half.mean(dim=(1, 2)), colour, rtol=0, atol=0.04)
 
 
 def test_dim_recordings_give_bright_pictures(tmp_path):
