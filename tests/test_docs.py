@@ -178,7 +178,8 @@ def test_docs_build_offline_without_warnings(tmp_path):
     shutil.copytree(DOCS, tmp_path / "docs", ignore=shutil.ignore_patterns(*MADE))
     shutil.copytree(DOCS.parent / "results", tmp_path / "results")
     with (tmp_path / "docs" / "conf.py").open("a") as file:
-        file.write('plot_formats = [("png", 40)]\n')  # small figures
+        file.write('plot_formats = [("png", 40)]\n')  # small figures, and no pages of source
+        file.write('extensions.remove("sphinx.ext.viewcode")\n')
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", "docs", "pages"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(DOCS.parent), os.environ.get("PYTHONPATH", "")])}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)

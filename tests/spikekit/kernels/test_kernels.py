@@ -48,10 +48,11 @@ def _run(request, monkeypatch):
 
 def check(run, name, *args, rtol=0.0, atol=0.0):
     """Compare with the torch path, bit for bit by default; the interpreter truncates bfloat16 instead of rounding."""
-    plain = OPERATORS[name]._init_fn(*args)
-    for got, expected in zip(run(name, *args), plain if isinstance(plain, tuple) else (plain,), strict=True):
+    results, plain = run(name, *args), OPERATORS[name]._init_fn(*args)
+    for got, expected in zip(results, plain if isinstance(plain, tuple) else (plain,), strict=True):
         least = 2**-7 if INTERPRETED and got.dtype is torch.bfloat16 else 0
         torch.testing.assert_close(got, expected, rtol=max(rtol, least), atol=atol, equal_nan=True)
+    return results
 
 
 of_the_cpu = pytest.mark.skipif(INTERPRETED, reason="the interpreter has nothing to do with it")
@@ -113,7 +114,7 @@ def test_sensor_equals_the_torch_path_for_any_light(run, dtype):
 def sizes(dtype):
     """Small sizes for the slow interpreter; 23 * 29 pixels exceed a block."""
     if INTERPRETED:
-        return [(2, 5, 2, 3), (3, 23, 29)] if dtype in (torch.uint8, torch.float64) else [(2, 5, 2, 3)]
+        return [(2, 5, 2, 3), (3, 23, 29)] if dtype is torch.float64 else [(2, 5, 2, 3)]
     return [(1, 1, 1), (40, 23, 29), (2, 3, 9, 2, 3)]
 
 
@@ -172,10 +173,9 @@ def test_long_streams_have_intervals_of_32_bits(run, monkeypatch):
 def test_any_memory_layout_gives_the_same_result(run, name, args):
     """Any layout of the input; GPU results keep it."""
     x = torch.rand(2, 9, 5, 4)
-    views = [x[:, :1].expand(2, 9, 5, 4), torch.rand(2, 9, 5, 8)[..., 1::2], x[0], x[:0]]
-    for order in ([3, 2, 1, 0], [0, 1, 3, 2], [1, 2, 3, 0], [2, 3, 0, 1]):
-        views.append(x.permute(order).contiguous().permute([order.index(i) for i in range(4)]))
-        if run.on_gpu:
-            assert run(name, *args(views[-1]))[0].stride() == torch.empty_like(views[-1]).stride()
-    for view in views:
+    for view in (x[:, :1].expand(2, 9, 5, 4), torch.rand(2, 9, 5, 8)[..., 1::2], x[0], x[:0]):
         check(run, name, *args(view), rtol=1e-6, atol=1e-6)
+    for order in ([3, 2, 1, 0], [0, 1, 3, 2], [1, 2, 3, 0], [2, 3, 0, 1]):
+        view = x.permute(order).contiguous().permute([order.index(i) for i in range(4)])
+        result, *_ = check(run, name, *args(view), rtol=1e-6, atol=1e-6)
+        assert not run.on_gpu or result.stride() == torch.empty_like(view).stride()
