@@ -19,8 +19,8 @@ METHODS = ("tfi", "tfp")
 class ClassicalDecoder(Network):
     r"""Classical decoder: TFI or TFP of the middle frame, demosaicing and bicubic enlargement.
 
-    In clips longer than ``frames``, as in dim light, TFI replaces TFP where the interval between spikes is longer than
-    the window, which then holds a spike or none.
+    In clips longer than ``frames``, as in dim light, the window of TFP grows with the cube root of the length, and TFI
+    replaces TFP where fewer than two spikes are averaged; TFP of order k averages about sqrt(k) windows.
 
     Args:
         method: decoder, ``"tfi"`` or ``"tfp"``.
@@ -77,9 +77,10 @@ class ClassicalDecoder(Network):
         """Return rgb; the flow is ignored."""
         check_planes("spikes", spikes, 4, "(B, N, H, W)")
         n = spikes.shape[1] // 2
-        raw = tfi_at(spikes, n) if self.method == "tfi" else tfp_at(spikes, n, self.window, order=self.order)
-        if self.method == "tfp" and spikes.shape[1] > self.frames:
-            raw = torch.where((sparse := tfi_at(spikes, n)) < 1 / self.window, sparse, raw)
+        window = round(self.window * (longer := max(spikes.shape[1] / self.frames, 1)) ** (1 / 3)) // 2 * 2 + 1
+        raw = tfi_at(spikes, n) if self.method == "tfi" else tfp_at(spikes, n, window, order=self.order)
+        if self.method == "tfp" and longer > 1:
+            raw = torch.where((sparse := tfi_at(spikes, n)) < 2 / (window * self.order**0.5), sparse, raw)
         rgb = demosaic(raw / self.alpha, self.pattern)
         if self.scale > 1:
             rgb = F.interpolate(rgb, scale_factor=self.scale, mode="bicubic", align_corners=False)

@@ -165,6 +165,12 @@ def test_classical_decoder_decodes_the_middle_frame(method, settings):
     torch.testing.assert_close(ClassicalDecoder(method, 1, **settings)(spikes), demosaic(raw / 0.4))
 
 
+def test_classical_decoder_averages_longer_in_longer_clips():
+    spikes = torch.rand(2, 41, 8, 8, generator=torch.Generator().manual_seed(0)) < 0.9
+    rgb = ClassicalDecoder("tfp", 1, window=5, frames=5)(spikes)  # 5 (41 / 5)^(1/3) is 10.1
+    torch.testing.assert_close(rgb, demosaic(tfp(spikes, window=11)[:, 20] / 0.4))
+
+
 def test_invalid_shapes_are_rejected():
     spikes, flow = clip()
     network = CSCSR(2, **TINY)
