@@ -55,7 +55,7 @@ def _representation(config: CSCSRConfig) -> nn.Module:
         config.representation_width,
         config.features,
         config.global_perception,
-        config.noise,
+        config.noise and not config.noise_blocks,
     )
 
 
@@ -144,7 +144,7 @@ class CSCSR(Network):
         )
         own = {} if config.end_width is None else {"end_width": config.end_width}
         own |= {"colors": 1} if self.colors == 1 else {}
-        own |= {"noise": True} if config.noise else {}
+        own |= {"noise_blocks": config.noise_blocks} if config.noise_blocks else {"noise": True} if config.noise else {}
         reconstruct = _RECONSTRUCTIONS[config.reconstruction]
         self.reconstruction = reconstruct(
             config.width, config.stages, config.blocks, config.end_blocks, self.fold, **own
@@ -161,6 +161,9 @@ class CSCSR(Network):
         for part in self.refinement:
             if isinstance(part, TimeFusion):
                 part.start_at_the_mean(self._side**2)
+        if self.config.noise_blocks:  # no correction before training
+            for block in self.reconstruction.correction:
+                nn.init.zeros_(block.body[-1].weight)
         if self.config.skip:
             nn.init.zeros_(self.reconstruction.rgb.weight)
 

@@ -40,6 +40,8 @@ class CSCSRConfig:
         alpha: default gain of the camera: light of a white pixel per clock, in thresholds. The picture is light divided
             by alpha. Weights trained with another alpha are adapted when they are loaded.
         noise: condition the network on the noise level of the sensor.
+        noise_blocks: residual blocks that correct the features after the last fusion by the noise level. They run only
+            for a noisy sensor, and can be trained alone. Default: the level changes gain and shift of features.
         neighbors: number of known pixels in the weighted mean of the temporal pixel search.
         representation: features of a time point. ``"bssr"`` learns them; ``"spikes"`` (A, without BSSR) averages the
             spikes of the window; ``"interval"`` (C) inverts the spike interval. A and C have one feature and no
@@ -60,8 +62,8 @@ class CSCSRConfig:
     Raises:
         ValueError: values are inconsistent or unknown, or options have no effect together:
             ``global_perception=False`` without BSSR, ``motion_fusion`` without search, ``end_width`` with separate
-            colours, ``noise`` without BSSR and correlated colours, ``motion_fusion`` or ``reconstruction`` with a grey
-            sensor.
+            colours, ``noise`` without BSSR and correlated colours, ``noise_blocks`` without ``noise``,
+            ``motion_fusion`` or ``reconstruction`` with a grey sensor.
 
     Example:
         >>> CSCSRConfig(scale=2).times
@@ -84,6 +86,7 @@ class CSCSRConfig:
     skip: bool = False
     alpha: float = 0.4
     noise: bool = False
+    noise_blocks: int | None = None
     neighbors: int = 4
     representation: Literal["bssr", "spikes", "interval"] = "bssr"
     global_perception: bool = True
@@ -117,6 +120,8 @@ class CSCSRConfig:
         if self.noise and (self.representation, self.reconstruction) != ("bssr", "correlated"):
             got = f"{self.representation} and {self.reconstruction}"
             raise ValueError(f"noise: expected representation bssr and reconstruction correlated, got {got}")
+        if self.noise_blocks and not self.noise:
+            raise ValueError(f"noise_blocks: expected None without noise, got {self.noise_blocks}")
         if self.pattern == GREY and (self.motion_fusion, self.reconstruction) != ("joint", "correlated"):
             got = f"{self.motion_fusion} and {self.reconstruction}"
             raise ValueError(

@@ -39,7 +39,8 @@ class ColorCorrelation(nn.Module):
         enlarge: size of the picture relative to the features.
         end_width: channels after the last fusion. Default: ``width``.
         colors: number of colours, 3, or 1 for a grey sensor.
-        noise: condition the network on the noise level of the sensor.
+        noise: the noise level of the sensor changes gain and shift of the fused features.
+        noise_blocks: residual blocks that correct the features in proportion to the noise level.
 
     Shape:
         - Input: features of each colour, :math:`(B, width, H, W)`; optionally the noise level, :math:`(B, 1, 1, 1)`
@@ -56,6 +57,7 @@ class ColorCorrelation(nn.Module):
         end_width: int | None = None,
         colors: int = 3,
         noise: bool = False,
+        noise_blocks: int | None = None,
     ) -> None:
         super().__init__()
         end_width = end_width or width
@@ -68,6 +70,7 @@ class ColorCorrelation(nn.Module):
         outputs = [width] * (stages - 1) + [end_width]
         self.fuse = nn.ModuleList(map(ColorFusion, inputs, outputs))
         self.noise = NoiseLevel(end_width) if noise else None
+        self.correction = res_blocks(end_width, noise_blocks) if noise_blocks else None
         self.end = res_blocks(end_width, end_blocks)
         self.rgb = ToRgb(end_width, enlarge, colors=colors)
 
@@ -77,8 +80,10 @@ class ColorCorrelation(nn.Module):
         for refine, fuse in zip(self.refine, self.fuse, strict=True):
             colors = [branch(color) for branch, color in zip(refine, colors, strict=True)]
             fused = [fuse(torch.cat(colors + fused, dim=1))]
-        known = fused[0] if noise is None else self.noise(fused[0], noise)
-        return known + self.end(known)
+        known = fused[0] if self.noise is None else self.noise(fused[0], noise)
+        found = known + self.end(known)
+        corrected = noise is not None and self.correction is not None
+        return found + noise * (self.correction(known) - known) if corrected else found
 
     def forward(self, colors: list[Tensor], noise: Tensor | None = None) -> Tensor:  # noqa: D102
         return self.rgb(self.features(colors, noise))

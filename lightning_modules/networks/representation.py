@@ -79,7 +79,7 @@ class SpikeRepresentation(nn.Module):
         seen = F.conv2d(local, fuse.weight[:, : local.shape[1]], fuse.bias, padding=1)
         if everywhere is not None:
             seen.unflatten(0, (batch, times)).add_(everywhere)
-        if noise is not None:
+        if noise is not None and self.noise is not None:
             seen = self.noise(seen, noise.repeat_interleave(times, dim=0))
         return last(block(relu(seen))).unflatten(0, (batch, times))
 

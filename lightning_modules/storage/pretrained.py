@@ -214,10 +214,9 @@ def load_weights(network: nn.Module, weights: Weights, keep_motion: bool = False
     network = getattr(network, "_orig_mod", network)
     exchanged = {name: network.settings[name] for name in _ADAPTED if name in network.settings}
     ratio = weights.settings.get("alpha", exchanged["alpha"]) / exchanged["alpha"] if "alpha" in exchanged else 1
-    levels = {name: value for name, value in network.state_dict().items() if ".noise." in name}
-    if levels and not weights.settings.get("noise"):
-        exchanged["noise"] = True
-        weights = replace(weights, tensors={**levels, **weights.tensors})
+    if network.settings.get("noise") and not weights.settings.get("noise"):
+        exchanged |= {name: network.settings[name] for name in ("noise", "noise_blocks")}
+        weights = replace(weights, tensors={**network.state_dict(), **weights.tensors})
     check_settings(network, weights.settings and {**weights.settings, **exchanged}, weights.source)
     motion = getattr(network, "motion", None)
     tensors = weights.tensors if motion is None else with_own_motion(weights.tensors, motion, keep=keep_motion)

@@ -9,6 +9,7 @@ from lightning_modules.networks import CSCSR, RecurrentCSCSR
 from lightning_modules.storage.pretrained import Weights, load_weights, read_weights, settings_of, write_weights
 
 TINY = {"scale": 2, "width": 8, "representation_width": 8, "features": 1, "stages": 1, "end_blocks": 1}
+TOLD = pytest.mark.parametrize("told", [{"noise": True}, {"noise": True, "noise_blocks": 1}])
 KINDS = pytest.mark.parametrize("kind", [CSCSR, RecurrentCSCSR])
 
 
@@ -16,7 +17,7 @@ def _network(kind=CSCSR, **settings):
     torch.manual_seed(0)
     network = kind(**TINY, skip=True, **settings).eval()
     for name, parameter in network.named_parameters():  # initialised with 0
-        if "noise" in name or "rgb" in name:
+        if any(part in name for part in ("noise", "correction", "rgb")):
             parameter.data += 0.1 * torch.randn(parameter.shape)
     return network
 
@@ -36,9 +37,10 @@ def test_picture_is_divided_by_the_gain(kind):
 
 
 @KINDS
+@TOLD
 @pytest.mark.parametrize("pattern", ["RGGB", "grey"])
-def test_noise_level_is_set_per_clip(kind, pattern):
-    network, spikes = _network(kind, noise=True, pattern=pattern), _spikes(2, 41, 8, 10)
+def test_noise_level_is_set_per_clip(kind, told, pattern):
+    network, spikes = _network(kind, **told, pattern=pattern), _spikes(2, 41, 8, 10)
     quiet, loud = (network(spikes, static=True, noise=level) for level in (0.0, 1.0))
     torch.testing.assert_close(network(spikes, static=True), quiet)
     assert not torch.allclose(quiet, loud, atol=1e-3)
@@ -57,11 +59,12 @@ def test_gain_and_noise_are_set_per_film():
         torch.testing.assert_close(network(films[n : n + 1], static=True, future=2, **one)[0], both[n])
 
 
-def test_network_for_noisy_sensors_starts_from_weights_for_ideal_ones(tmp_path):
+@TOLD
+def test_network_for_noisy_sensors_starts_from_weights_for_ideal_ones(told, tmp_path):
     old = _network()
     file = tmp_path / "ideal.safetensors"
     write_weights(Weights(file, settings_of(old), {}, old.state_dict()), file)
-    new = CSCSR(**TINY, skip=True, noise=True)
+    new = CSCSR(**TINY, skip=True, **told)
     load_weights(new, read_weights(file))
     spikes = _spikes(1, 41, 8, 10)
     assert torch.equal(new(spikes, static=True, noise=1.0), old(spikes, static=True))
