@@ -24,7 +24,7 @@ from pytorch_lightning.utilities.exceptions import MisconfigurationException, SI
 
 from lightning_modules.cli.arguments import flatten, with_network_of_weights
 from lightning_modules.cli.configured import run_checkpoint
-from lightning_modules.cli.errors import Ended, InputError, UsageError, input_errors
+from lightning_modules.cli.errors import Ended, InputError, UsageError, causes, input_errors
 from lightning_modules.cli.folder_lock import check_folder, locked_folder
 from lightning_modules.cli.reasons import reason
 from lightning_modules.configurations import with_found_configs
@@ -260,15 +260,10 @@ def _locked(verb: str, config: Any) -> AbstractContextManager[None]:
     return locked_folder(config.output, f"lightning {verb}", f".{verb}.lock")
 
 
-def _is_of_file(error: BaseException | None, said: str) -> bool:
+def _is_of_file(error: BaseException, said: str) -> bool:
     """Whether an error is caused by a file rather than by the command line."""
-    if Path(said.partition(": ")[0]).exists():
-        return True
-    while error is not None:
-        if isinstance(error, (OSError, SpikeFileError, PictureError, VideoError)):
-            return True
-        error = error.__cause__ or error.__context__
-    return False
+    kinds = OSError, SpikeFileError, PictureError, VideoError
+    return Path(said.partition(": ")[0]).exists() or any(isinstance(cause, kinds) for cause in causes(error))
 
 
 def _listed(value: Any) -> list[Any]:

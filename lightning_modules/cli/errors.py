@@ -47,6 +47,13 @@ class VerbParser(argparse.ArgumentParser):
         raise UsageError(f"{self.prog.removeprefix('lightning ')}: {message}")
 
 
+def causes(error: BaseException | None) -> Iterator[BaseException]:
+    """Yield an error, what caused it, what caused that, and so on."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
 @contextmanager
 def input_errors() -> Iterator[None]:
     """Turn errors about files and values into errors of the user."""

@@ -139,8 +139,7 @@ class Conditions:
         film: use the table of films (``lightning trade --film``), if the package has one for the scale.
         frames: spike frames available for a clip; presets that need more are left out. From 101 on, presets with longer
             clips take part.
-        noisy: of the networks keep only those with weights trained for noisy sensors, and use these weights; no effect
-            if the package has none for the scale.
+        noisy: of the networks keep only those with weights trained for noisy sensors, and use these weights.
         grey: use the table of grey cameras, if the package has one for the scale.
     """
 
@@ -200,7 +199,7 @@ def choices(conditions: Conditions) -> list[Choice]:
         preset = Preset.read(row)
         if preset.precision is not None or preset.tile == 0 or not (preset.weights or preset.network):
             continue
-        if preset.clip > conditions.frames or (twins and preset.weights not in {*twins, None}):
+        if preset.clip > conditions.frames or (conditions.noisy and preset.weights not in {*twins, None}):
             continue
         preset = replace(preset, weights=twins.get(preset.weights, preset.weights))
         measured = int(row["height"]) * int(row["width"])

@@ -19,7 +19,6 @@ from lightning_modules.inference.output import file_identity
 from lightning_modules.inference.predict import precision_of
 from lightning_modules.inference.presets import SPEEDS, Conditions, Preset, choose
 from lightning_modules.networks import ClassicalDecoder, Network
-from lightning_modules.registry import find_model
 from spikekit import __version__, correct_spikes
 from spikekit.check import check_positive
 from spikekit.color.cfa import GREY, PATTERNS
@@ -297,7 +296,8 @@ def _chosen(
     noisy, grey = level > NOISY, recording.pattern == GREY
     conditions = Conditions(scale, clips.size, film, clips.room, noisy, grey)
     choice = choose(conditions, speed, budget)
-    interpolated = 0 if resting else _interpolated(choice.preset, every, speed)
+    apart = _APART if speed in (None, "best") else _FARTHER_APART
+    interpolated = max(apart // every - 1, 0) if choice.preset.moves and not resting else 0
     said = [str(choice)]
     if speed not in (None, "fastest"):
         sooner = list(SPEEDS)[list(SPEEDS).index(speed) - 1]
@@ -309,23 +309,13 @@ def _chosen(
             "--interpolated 0 computes all with the network"
         )
     if noisy and choice.preset.weights:
-        said.append(_unmeasured(choice.preset, recording, scale, level))
+        said.append(_unmeasured(recording, level))
     return replace(choice.preset, interpolated=interpolated or None), said
 
 
-def _interpolated(preset: Preset, every: int, speed: str | None) -> int:
-    """Return the number of pictures that may be interpolated between two of the network."""
-    if not preset.moves:
-        return 0
-    apart = _APART if speed in (None, "best") else _FARTHER_APART
-    return max(apart // every - 1, 0)
-
-
-def _unmeasured(preset: Preset, recording: Recording, scale: int, level: float) -> str:
+def _unmeasured(recording: Recording, level: float) -> str:
     """Return a line on the weights used for a noisy sensor without calibration."""
-    model = find_model(preset.weights or "")
     dark = ", with a recording in the dark," if recording.calibration is not None else ""
     measure = f"spikekit calibrate{dark} measures it, --calibration none takes it for ideal"
-    noisy = "using weights trained for noisy sensors"
-    said = noisy if model and model.noise else f"there are no weights for noisy sensors at scale {scale}"
-    return f"this sensor is not calibrated, noise level about {level:.1f}: {said}; {measure}"
+    said = f"this sensor is not calibrated, noise level about {level:.1f}: using weights trained for noisy sensors"
+    return f"{said}; {measure}"

@@ -12,7 +12,7 @@ from pytorch_lightning.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 
 from lightning_modules.cli.command import run
-from lightning_modules.cli.errors import InputError, UsageError, VerbParser
+from lightning_modules.cli.errors import InputError, UsageError, VerbParser, causes
 from lightning_modules.cli.reasons import reason
 from lightning_modules.cli.rehearsal import Rehearsal, resolved
 from lightning_modules.inference.film import FilmFrame, FilmMaker, film
@@ -137,12 +137,6 @@ def _built(args: Sequence[str]) -> _Test:
         raise CannotRunError(one_line(error)) from error
     except ValueError as error:
         wrong = UsageError if isinstance(error, UsageError) else InputError
-        kind = CannotRunError if any(isinstance(cause, OSError) for cause in _causes(error)) else wrong
+        kind = CannotRunError if any(isinstance(cause, OSError) for cause in causes(error)) else wrong
         raise kind(str(error)) from error
     return command
-
-
-def _causes(error: BaseException) -> Iterator[BaseException]:
-    while error.__cause__ is not None:
-        error = error.__cause__
-        yield error

@@ -2,7 +2,7 @@
 
 import csv
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 
 import pytest
 import torch
@@ -156,13 +156,12 @@ def test_tables_of_the_package_are_valid():
 
 
 def test_noisy_sensors_get_weights_for_noise_at_the_same_cost():
-    for film in (False, True):
-        conditions = Conditions(4, film=film, frames=101)
+    for scale, film, frames in product((1, 2, 3, 4), (False, True), (41, 101)):
+        conditions = Conditions(scale, film=film, frames=frames)
         noisy = choices(replace(conditions, noisy=True))
         ideal = {choice.name: choice for choice in choices(conditions)}
-        assert noisy[0].preset.network == "ClassicalDecoder"  # nothing to train
+        assert noisy[0].preset.network == "ClassicalDecoder" != noisy[-1].preset.network  # nothing to train
         for choice in noisy:
             assert choice.preset.weights is None or find_model(choice.preset.weights).noise
             assert any(choice.ms == other.ms and choice.psnr == other.psnr for other in ideal.values())
         assert min(choice.below for choice in noisy) == 0
-    assert choices(Conditions(2, noisy=True)) == choices(Conditions(2))  # there are no such weights
