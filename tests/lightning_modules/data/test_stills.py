@@ -8,11 +8,7 @@ import pytest
 import torch
 from skimage import io
 
-from lightning_modules.data.pictures import (
-    embedded_pictures,
-    folder_pictures,
-    split_pictures,
-)
+from lightning_modules.data.pictures import embedded_pictures, folder_pictures, split_pictures
 from lightning_modules.data.stills import StillClips, StillScenes
 from lightning_modules.data.textures import outline_mask, texture
 from spikekit import SensorNoise, bin_to_sensor

@@ -2,15 +2,7 @@ import pytest
 import torch
 
 from lightning_modules.inference.clips import RecordingClips
-from spikekit import (
-    Calibration,
-    SensorNoise,
-    SpikeSensor,
-    bayer_mask,
-    write_calibration,
-    write_picture,
-    write_spikes,
-)
+from spikekit import Calibration, SensorNoise, SpikeSensor, bayer_mask, write_calibration, write_picture, write_spikes
 from spikekit.cli.command import main as spikekit_main
 from spikekit.recording import open_recording
 
