@@ -23,6 +23,13 @@ train grey_large_x1 $seconds -c "$configs/x1.yaml" -c "$configs/grey.yaml" -c "$
     -c "$configs/gpu.yaml" --model.network.size large_x1 "$@"
 train grey_small_x1 $(( seconds / 2 )) -c "$configs/x1.yaml" -c "$configs/grey.yaml" -c "$configs/cameras.yaml" \
     -c "$configs/gpu.yaml" --model.network.size small_x1 "$@"
+# corrections for noisy sensors, trained alone, to replace the weights named "noisy"
+fixed='[representation,refinement,reconstruction.refine,reconstruction.fuse,reconstruction.end,reconstruction.rgb,fusion]'
+train noise_x4 $(( seconds / 2 )) -c "$configs/x4.yaml" -c "$configs/cameras.yaml" -c "$configs/gpu.yaml" \
+    --model.network.size huge --model.network.noise_blocks 8 --model.frozen "$fixed" --model.weights cscsr_huge_x4 "$@"
+train noise_long_x4 $(( seconds / 2 )) -c "$configs/x4.yaml" -c "$configs/cameras.yaml" -c "$configs/gpu.yaml" \
+    --model.network.size huge --model.network.frames 101 --model.network.noise_blocks 8 --model.frozen "$fixed" \
+    --model.weights cscsr_huge_long_x4 "$@"
 train large_x4 $seconds -c "$configs/x4.yaml" -c "$configs/cameras.yaml" -c "$configs/gpu.yaml" \
     --model.network.size huge "$@"
 train small_x4 $(( seconds / 2 )) -c "$configs/x4.yaml" -c "$configs/cameras.yaml" \
