@@ -109,8 +109,8 @@ def _largest(recording: Recording, student: Network, noisy: bool) -> str:
     fit = [one for one in models if one.frames and one.frames <= room]
     if not fit:
         raise ValueError(_too_short(recording, student.frames))
-    of_sensor = [one for one in fit if one.noise >= noisy] or fit
-    return max(of_sensor, key=lambda one: (one.macs, one.noise == noisy)).name
+    of_sensor = [one for one in fit if one.noise == noisy] or fit
+    return max(of_sensor, key=lambda one: one.macs).name
 
 
 def _too_short(recording: Recording, frames: int) -> str:
