@@ -115,8 +115,7 @@ def main() -> None:
             made = []
             for maker in (plain, resting):
                 start = time.process_time()
-                exposure = network.settings["alpha"] / ALPHA
-                made.append(maker(clip, [clock], exposure=exposure)[0])
+                made.append(maker(clip, [clock], exposure=network.settings["alpha"] / ALPHA)[0])
                 times.append(time.process_time() - start)
             cells.append(resting.rest.computed.float().mean().item())
             found.append([psnr(picture, truth).item() for picture in made])

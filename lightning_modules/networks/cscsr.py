@@ -144,7 +144,7 @@ class CSCSR(Network):
         )
         own = {} if config.end_width is None else {"end_width": config.end_width}
         own |= {"colors": 1} if self.colors == 1 else {}
-        own |= {"noise_blocks": config.noise_blocks} if config.noise_blocks else {"noise": True} if config.noise else {}
+        own |= {"noise": not config.noise_blocks, "noise_blocks": config.noise_blocks} if config.noise else {}
         reconstruct = _RECONSTRUCTIONS[config.reconstruction]
         self.reconstruction = reconstruct(
             config.width, config.stages, config.blocks, config.end_blocks, self.fold, **own
