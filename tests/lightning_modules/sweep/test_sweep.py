@@ -181,10 +181,11 @@ def test_finished_trials_are_kept_and_other_settings_rejected(swept, capsys, mon
 
 @pytest.mark.slow
 def test_killed_sweep_resumes_exactly(typed, overlays, tmp_path, monkeypatch, forked):
-    settings = ["data.train_clips=12", "data.val_clips=1", "model.network.features=1,2"]  # epochs of 6 steps
+    # epochs of 6 steps; two trials that train alike, of which the sweep is killed during the first
+    settings = ["data.train_clips=12", "data.val_clips=1", "trainer.log_every_n_steps=1,2"]
     sets = [word for setting in settings for word in ("--set", setting)]
     command = [*typed, "-c", str(overlays / "cosine.yaml"), *sets, "--steps", "10", "-o", str(tmp_path / "broken")]
-    first, second = (tmp_path / "broken" / f"features={features}" for features in (1, 2))
+    first, second = (tmp_path / "broken" / f"log_every_n_steps={steps}" for steps in (1, 2))
     with monkeypatch.context() as patch:
         patch.setitem(cli._ENGINES, "local", engines.run_locally)
         sweep = forked([*command, "--every", "0.01"])
@@ -203,14 +204,10 @@ def test_killed_sweep_resumes_exactly(typed, overlays, tmp_path, monkeypatch, fo
     assert not list(second.glob("checkpoints"))
 
     main(command)
-    configs = [typed[1], typed[3], overlays / "cosine.yaml"]
-    unbroken, _ = make_trials(configs, [], settings, [], {"steps": 10}, tmp_path / "unbroken")
-    unbroken.write()
-    worker.train_and_test(unbroken.folder, 60)
-    ours, theirs = weights(first), weights(unbroken.folder)
-    assert ours["global_step"] == theirs["global_step"] == weights(second)["global_step"] == 10
+    ours, theirs = weights(first), weights(second)
+    assert ours["global_step"] == theirs["global_step"] == 10
     assert all(ours["state_dict"][key].equal(value) for key, value in theirs["state_dict"].items())
-    assert (first / "test.csv").read_text() == (unbroken.folder / "test.csv").read_text()
+    assert (first / "test.csv").read_text() == (second / "test.csv").read_text()
     # it went on: the step after a start is not timed
     assert ours["callbacks"]["Report"]["steps"] == theirs["callbacks"]["Report"]["steps"] - 1
     # the schedule ended with the budget
