@@ -179,8 +179,7 @@ def test_docs_build_offline_without_warnings(tmp_path, typed_in, capfd):
     with (tmp_path / "docs" / "conf.py").open("a") as file:
         file.write('plot_formats = [("png", 40)]\n')  # small figures, and no pages of source
         file.write('extensions.remove("sphinx.ext.viewcode")\n')
-    words = ["-W", "--keep-going", "-q", "-b", "html", "docs", "pages"]
-    assert typed_in(tmp_path, sphinx, words) == 0, capfd.readouterr().err
+    assert typed_in(tmp_path, sphinx, ["-W", "--keep-going", "-q", "docs", "pages"]) == 0, capfd.readouterr().err
     built, formulas = tmp_path / "pages", 0
     for script in FIGURES:
         assert list((built / "_images").glob(f"{script.stem}*.png"))

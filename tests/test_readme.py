@@ -9,7 +9,7 @@ import torch
 
 from lightning_modules.__main__ import main as lightning
 from lightning_modules.sweep import cli as sweep
-from lightning_modules.sweep import worker
+from lightning_modules.sweep.worker import train_and_test
 from spikekit import simulate_spikes, write_picture, write_spikes
 from spikekit.cli.command import main as spikekit
 
@@ -66,16 +66,10 @@ IN_README = [*commands(README)]
 ELSEWHERE = [command for command in commands(QUICKSTART) if command not in IN_README]
 
 
-def trials_here(folders, jobs, every):
-    """An engine that runs trials in the process of the command; another would import everything anew."""
-    yield {folder: worker.train_and_test(folder, every) for folder in folders}
-
-
 @pytest.mark.parametrize("typed", [IN_README, ELSEWHERE], ids=["readme", "quickstart"])
 def test_commands_run_as_written(typed, folder, typed_in, monkeypatch):
-    import pytorch_lightning  # noqa: F401
-
-    monkeypatch.setitem(sweep._ENGINES, "local", trials_here)
+    # trials run in the process of the command; another would import everything anew
+    monkeypatch.setitem(sweep._ENGINES, "local", lambda trials, *_: [{one: train_and_test(one, 60) for one in trials}])
     outputs = 0
     for program, words in typed:
         words = [SMALL.get(word, word) for word in words] + ADDED.get(words[0], [])

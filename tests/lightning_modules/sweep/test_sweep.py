@@ -182,8 +182,7 @@ def test_finished_trials_are_kept_and_other_settings_rejected(swept, capsys, mon
 @pytest.mark.slow
 def test_killed_sweep_resumes_exactly(typed, overlays, tmp_path, monkeypatch, forked):
     # epochs of 6 steps; two trials that train alike, of which the sweep is killed during the first
-    settings = ["data.train_clips=12", "data.val_clips=1", "trainer.log_every_n_steps=1,2"]
-    sets = [word for setting in settings for word in ("--set", setting)]
+    sets = ["--set", "data.train_clips=12", "--set", "data.val_clips=1", "--set", "trainer.log_every_n_steps=1,2"]
     command = [*typed, "-c", str(overlays / "cosine.yaml"), *sets, "--steps", "10", "-o", str(tmp_path / "broken")]
     first, second = (tmp_path / "broken" / f"log_every_n_steps={steps}" for steps in (1, 2))
     with monkeypatch.context() as patch:
