@@ -190,7 +190,7 @@ def test_work_and_weights_are_counted(traded, convolutions):
 
 @pytest.mark.slow
 def test_default_settings_run_on_own_weights(shared, checkpoint, tmp_path, monkeypatch):
-    names = [*(f"own weights{name}" for name in ("", ", no motion", ", self-ensemble of 8")), "TFI", "TFP 13, order 3"]
+    names = [*(f"own weights{name}" for name in ("", ", no motion", ", self-ensemble of 2")), "TFI", "TFP 13, order 3"]
     monkeypatch.setattr(cli, "usual_settings", lambda *of: [one for one in usual_settings(*of) if one.name in names])
     own = ["--ckpt_path", str(checkpoint), "--data.val_clips", "1"]
     main(["trade", *shared, *own, "--rounds", "1", "-o", str(tmp_path)])
