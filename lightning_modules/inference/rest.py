@@ -15,14 +15,15 @@ from spikekit import Calibration, bin_to_sensor, demosaic
 #: side of a cell, the smallest part that can rest, in sensor pixels
 CELL = 8
 #: margins around a box, in sensor pixels, for the network and for the estimate of motion
-SEEN, AROUND = 4, 16
+SEEN, AROUND = 2, 16
 
 _RISK = 1e-5  # probability that a cell at rest counts as moved
-_TESTS = 8  # tests per cell: single blocks of 1, 2 and 4 pixels, all of them, the cell, and many key frames
+_TESTS = 16  # tests per cell: single blocks of 1, 2 and 4 pixels, all of each size, and two with its neighbours
+_DARK = 0.02  # spikes per clock and pixel of a cell that is dark
 _PICTURES = 8  # pictures of the network that a cell at rest shows the mean of
-_SURE = 80  # clocks without a change before the clip of a resting cell
-_MORE = 1.125  # clocks, relative to those that a resting cell was drawn with, after which it is drawn again
-_BUSY, _UNTESTED = 0.9, 6  # share of cells that makes a picture busy, and pictures after it that are not tested
+_SURE = 160  # clocks without a change before the clip of a resting cell
+_MORE = 1.25  # clocks, relative to those that a resting cell was drawn with, after which it is drawn again
+_BUSY, _UNTESTED = 0.75, 8  # share of cells that makes a picture busy, and pictures after it that are not tested
 _FADE = 0.96  # weight of the sums of squares of the previous key frame
 _LEAST = 1 / 12  # smallest variance of a count, as light is not known exactly
 _NOISE = 0.001, 0.01  # variance per spike of a calibrated and a noisy sensor: 1000 and 100 electrons per threshold
@@ -45,7 +46,8 @@ def find_changes(
 
     The gain g of flickering lamps is the median ratio over all cells, weighted by their light. If a tenth of the cells
     has another, as a lamp lights only a part, cells have that of the two gains that suits their neighbourhood. A gain
-    counts only if it differs from 1 by five standard deviations, and if no more cells have moved with it than without.
+    counts only if it reduces squares of cells by more than 25 in all, where parts of the picture with more than before
+    count twice, and if no more cells have moved with it than without.
 
     A cell has moved if the sum of :math:`d^2 / \operatorname{var}` over its K blocks of 1, 2, 4 or 8 pixels exceeds
     :math:`K + 2 \sqrt{K x} + 2 x` with :math:`x = \ln(\text{tests} / \text{risk})`, which K normal numbers exceed with
@@ -62,8 +64,8 @@ def find_changes(
         step: what counts are rounded to, (H, W): 1 for numbers of spikes, less for sums of :func:`spikekit.tfi`.
 
     Returns:
-        The cells (h, w) that have moved; their gains (h, w); and (2, h, w): by how much the sum over blocks of 2 pixels
-        exceeds K, and K, both 0 without a reference.
+        The cells (h, w) that have moved; their gains (h, w); and (2, 4, h, w): by how much the sums over blocks of 1,
+        2, 4 and 8 pixels exceed K, and K, all 0 without a reference.
 
     Example:
         >>> at_rest, lamp = torch.full((16, 16), 8.0), torch.full((16, 16), 12.0)
@@ -72,8 +74,7 @@ def find_changes(
         (False, 1.5)
     """
     known, step = share.isfinite(), torch.as_tensor(step, device=recent.device)
-    share = share.where(known, 0.0)
-    each = _pixels(share, Box(0, 0, *recent.shape))
+    each = _pixels(share.where(known, 0.0), Box(0, 0, *recent.shape))
     expected = each * reference
     spread = _spread(expected, each, noise, step)
     gain = _gains(_sum(recent, CELL), _sum(expected, CELL), _sum(spread[0], CELL).sqrt(), known)
@@ -82,28 +83,23 @@ def find_changes(
         lit = _pixels(gain, Box(0, 0, *recent.shape))
         with_gain = _moved(recent, lit * expected, *_spread(lit * expected, lit * each, noise, step))
         if with_gain[0].sum() <= moved.sum():
-            moved, excess = with_gain
-        else:
-            gain = torch.ones_like(gain)
-    return moved | ~known, gain, excess * known
+            return with_gain[0] | ~known, gain, with_gain[1] * known
+    return moved | ~known, torch.ones_like(gain), excess * known
 
 
 def _moved(recent: Tensor, expected: Tensor, variance: Tensor, bound: Tensor) -> tuple[Tensor, Tensor]:
     """Return the cells whose light has changed, and the excess of :func:`find_changes`."""
     off = recent - expected
-    moved = F.max_pool2d((off.abs() - bound)[None], CELL, ceil_mode=True)[0] > 0
+    moved, sums = F.max_pool2d((off.abs() - bound)[None], CELL, ceil_mode=True)[0] > 0, []
     for block in (1, 2, 4, CELL):
         if block > 1:
             off, variance = _sum(off, 2), _sum(variance, 2)
         squares, side = off.square() / variance, CELL // block
         total, blocks = _sum(squares, side), _sum(torch.ones_like(squares), side)
-        moved |= total > _limit(blocks)
-        if block == 2:
-            excess = torch.stack([total - blocks, blocks])
-        if block < CELL:
-            most = F.max_pool2d(squares[None], side, ceil_mode=True)[0]
-            moved |= most > _limit(1, side**2)
-    return moved, excess
+        sums.append(torch.stack([total - blocks, blocks]))
+        most = F.max_pool2d(squares[None], side, ceil_mode=True)[0]
+        moved |= (total > _limit(blocks)) | (most > _limit(1, side**2))
+    return moved, torch.stack(sums, 1)
 
 
 def _spread(expected: Tensor, each: Tensor, noise: float, step: Tensor) -> tuple[Tensor, Tensor]:
@@ -124,25 +120,27 @@ def _limit(count: Tensor | int, tests: int = 1) -> Tensor | float:
 
 def _gains(recent: Tensor, expected: Tensor, spread: Tensor, cells: Tensor) -> Tensor:
     """Return the gain of every cell: that of most cells, or that of most others, if these are a tenth or more."""
-    gain = _gain(recent[cells], expected[cells], spread[cells])
-    others = cells & ((recent - gain * expected).abs() > 5 * spread)
+    gain = _gain(recent[cells], expected[cells])
+    recent, expected = (cells * light / spread for light in (recent, expected))
+    off = (recent - gain * expected).square()
+    others = off > 25
     if others.sum() > 0.1 * cells.sum():
-        other = _gain(recent[others], expected[others], spread[others])
-        worse = ((recent - other * expected) / spread).square() - ((recent - gain * expected) / spread).square()
-        others = cells & (F.avg_pool2d((worse * cells).clamp(-25, 25)[None], 3, 1, 1)[0] < 0)
+        other = _gain(recent[others], expected[others])
+        better = off - (recent - other * expected).square()
+        others = F.avg_pool2d(better.clamp(-25, 25)[None], 3, 1, 1)[0] > 0
         same = cells & ~others
-        gain = torch.where(others, other, _gain(recent[same], expected[same], spread[same]))
-    return torch.ones_like(recent).where(~cells, gain)
+        gain = torch.where(others, other, _gain(recent[same], expected[same]))
+    better = _sum(((recent - expected).square() - (recent - gain * expected).square()).clamp(-25, 25), CELL)
+    return torch.where(cells & (better.minimum(2 * better).sum() > 25), gain, 1.0)
 
 
-def _gain(recent: Tensor, expected: Tensor, spread: Tensor) -> float:
-    """Return the weighted median of ratios, or 1 if it does not differ significantly."""
+def _gain(recent: Tensor, expected: Tensor) -> float:
+    """Return the weighted median of ratios."""
     if not expected.any():
         return 1.0
     ratio, order = (recent / expected).nan_to_num().sort()
     weight = expected[order].cumsum(0)
-    gain = ratio[int(torch.searchsorted(weight, weight[-1] / 2))].item()
-    return gain if abs(gain - 1) * weight[-1] > 5 * spread.norm() else 1.0
+    return ratio[int(torch.searchsorted(weight, weight[-1] / 2))].item()
 
 
 def _charge(spikes: Tensor, clock: int, near: int) -> Tensor:
@@ -193,20 +191,21 @@ class Rest:
         they did before: alone, which detects sudden motion, and together with its predecessors, up to the length of the
         reference, which detects drift. The reference grows while nothing moves, and starts anew where something does.
         It is the sum of :func:`spikekit.tfi` where intervals are short enough, and the number of spikes elsewhere. Sums
-        of squares over 3 x 3 cells and about 25 key frames detect what turns or sways with little contrast. Until all
-        cells rest, the halves of the middle are also compared, as an object that turns in step with the key frames
-        gives them equal sums.
+        of squares over 3 x 3 cells detect faint drift, and with those of about 25 key frames what turns or sways with
+        little contrast. Until all cells rest, the halves of the middle are also compared, as an object that turns in
+        step with the key frames gives them equal sums.
 
-        A cell is still if nothing changed during its clip, and rests if nothing changed in the 80 clocks before it
+        A cell is still if nothing changed during its clip, and rests if nothing changed in the 160 clocks before it
         either, as a single test may miss slow motion. A resting cell shows the mean of the network's first eight
         pictures of the still cell; after these the network does not run. Neighbours of cells that do not rest are
-        computed and blended. The gain of a lamp is removed from the mean, and applied to the picture. When 90 % of the
-        cells have changed, or have a neighbour that did, the next six pictures are computed without a test.
+        computed and blended; in the dark, where motion is seen late, they do not rest either. The gain of a lamp is
+        removed from the mean, and applied to the picture. When 75 % of the cells have changed, or have a neighbour that
+        did, the next eight pictures are computed without a test.
 
         The mean over all clocks of an ideal sensor converges to the exact light. At the resolution of the sensor, the
         picture is corrected towards it, by the share of their difference that is not noise of the mean, but not at
         single pixels that differ by more than five times the root mean square of their cell, which may be defective. It
-        is corrected again when the cell has an eighth more clocks. Of a calibrated sensor, changes are found in the
+        is corrected again when the cell has a quarter more clocks. Of a calibrated sensor, changes are found in the
         spikes that it fired; the mean is corrected by the calibration.
 
     Args:
@@ -228,13 +227,11 @@ class Rest:
         self._clock, self._untested = -math.inf, 0
 
     def _start(self, spikes: Tensor) -> None:
-        planes = spikes.new_zeros(2, *spikes.shape[-2:], dtype=torch.float32)
-        self._earlier, self._later = planes
-        self._timed = planes[0] == 0
+        self._earlier, self._later, self._seen = spikes.new_zeros(3, *spikes.shape[-2:], dtype=torch.float32)
+        self._timed = self._seen == 0
         # clocks of both counts, scaled to the first light; clocks without a change; pictures in the mean; clocks drawn
-        cells = _sum(torch.zeros_like(planes[:1]), CELL).repeat(5, 1, 1)
-        self._before, self._since, self._calm, self._count, self._drawn = cells
-        self._light, self._excess = torch.ones_like(self._calm), self._calm.repeat(2, 1, 1)
+        self._before, self._since, self._calm, self._count, self._drawn = _sum(self._seen, CELL).repeat(5, 1, 1)
+        self._light, self._excess = torch.ones_like(self._calm), self._calm.repeat(2, 4, 1, 1)
         self._mean: Tensor | None = None
 
     def __call__(
@@ -264,6 +261,8 @@ class Rest:
         self._clock = clock
         still = self._calm >= frames - 1
         unsure = self._calm < frames - 1 + _SURE
+        dark = _sum(self._earlier + self._later, CELL) < _DARK * CELL**2 * (self._before + self._since)
+        unsure |= _grown(unsure & dark) & dark
         self.moving = near = _grown(unsure)
         new = still & (self._count < _PICTURES)
         self.computed = near | new
@@ -276,7 +275,6 @@ class Rest:
         parts = [(box, make(box, static).float()) for box, static in boxes]
         if self._mean is None:
             self._mean, self._shown = torch.zeros_like(parts[0][1]).repeat(2, 1, 1, 1)  # the first pictures are whole
-            self._seen = self._mean.new_zeros(spikes.shape[1:])
         for box, part in parts:
             weight = _pixels(new / self._count.clamp(min=1), box, scale)
             if weight.any():
@@ -310,7 +308,7 @@ class Rest:
         self._light *= gain
         self._later += recent
         self._since += clocks * self._light
-        slow, slow_gain, _ = find_changes(self._later, self._earlier, self._since / self._before, noise, step)
+        slow, slow_gain, slow_excess = find_changes(self._later, self._earlier, self._since / self._before, noise, step)
         self._since *= slow_gain
         changed = (sudden | slow) & (self._before > 0)
         if (self._count < _PICTURES).any() and (gain == 1).all():
@@ -321,11 +319,12 @@ class Rest:
         self._calm += clocks
         self._calm[changed] = self._before[changed] = self._since[changed] = 0
         self._light[changed] = 1
-        fade = self._light.new_tensor([_FADE, _FADE**2])[:, None, None]
-        self._excess = (fade * self._excess + excess) * ~changed
-        total, tests = F.avg_pool2d(self._excess, 3, 1, 1, divisor_override=1)
-        self._calm[total > _limit(tests) - tests] = 0
         full = self._since >= self._before
+        fade = self._light.new_tensor([_FADE, _FADE**2])[:, None, None, None]
+        self._excess = (fade * self._excess + excess) * ~changed
+        for one in (self._excess, slow_excess * ~changed):
+            total, tests = F.avg_pool2d(one, 3, 1, 1, divisor_override=1)
+            self._calm[(total + tests > _limit(tests)).any(0)] = 0
         kept, grown = (_pixels(cells.float(), whole) for cells in (~changed, full & ~changed))
         self._timed |= kept == 0
         self._earlier = self._earlier * kept + self._later * grown
@@ -342,16 +341,16 @@ class Rest:
         if known is not None:
             rate = known.correct(rate, self.pattern)
         white = exposure / self.white
-        off = white * rate - self._seen
-        power = F.avg_pool2d(off.square()[None], CELL, ceil_mode=True)[0]
-        off = off * (off.square() < 25 * _pixels(power, whole))
-        trust = (1 - (white * each).square() / 6 / power).nan_to_num(0).clamp(min=0) * (self._count > 0)
-        off = off * _pixels(trust, whole)
-        colors = demosaic(off, self.pattern)
         for box, _ in _boxes(due, due, whole):
             near = box.grown(CELL, whole)
+            off = white * near.of(rate) - near.of(self._seen)
+            inside, power = Box(0, 0, *off.shape), F.avg_pool2d(off.square()[None], CELL, ceil_mode=True)[0]
+            trust = 1 - (white * _cells(each, near)).square() / 6 / power
+            trust = trust.nan_to_num(0).clamp(min=0) * (_cells(self._count, near) > 0)
+            off = off * (off.square() < 25 * _pixels(power, inside)) * _pixels(trust, inside)
+            colors = demosaic(off, self.pattern)
             # antialias does not change the result of enlarging, but is three times faster
-            part = F.interpolate(near.of(colors)[None], scale_factor=scale, mode="bilinear", antialias=True)
+            part = F.interpolate(colors[None], scale_factor=scale, mode="bilinear", antialias=True)
             mean, shown = (box.of(planes, scale=scale) for planes in (self._mean, self._shown))
             torch.add(mean, box.of(part[0], near[:2], scale), out=shown)
 
