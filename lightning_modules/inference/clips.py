@@ -15,6 +15,7 @@ from torch import Tensor
 
 from spikekit import Calibration, bayer_sites, correct_spikes
 from spikekit.arguments import frames_of
+from spikekit.calibration.defects import find_outliers, replace_pixels
 from spikekit.calibration.gain_spread import gain_spread
 from spikekit.color.cfa import GREY
 from spikekit.recording import Recording, white_rate
@@ -108,7 +109,10 @@ class RecordingClips:
         return clips
 
     def in_order(self, chosen: Iterable[int] | None = None, raw: bool = False) -> Iterator[tuple[int, Tensor]]:
-        """Yield number and clip (N / joined, H, W), corrected unless ``raw``, of key frames in order; default: all."""
+        """Yield number and clip (N / joined, H, W), calibrated unless ``raw``, of key frames in order; default: all.
+
+        The defects of a noisy sensor are filled, see :func:`spikekit.fill_defects`.
+        """
         middles = self.chosen if chosen is None else list(chosen)
         jump, phase = self.recording.frames_from, self.recording.bayer and self._asked[1]
         # .npz files are decompressed from their beginning, wherever reading begins
@@ -116,6 +120,7 @@ class RecordingClips:
         start = middles[0] - self.frames // 2 if middles else 0
         for middle, clip in clips_around(middles, self.frames, jump(start), start, None if packed else jump):
             clip = join_frames(clip[..., self.top :, self.left :], self.joined)
+            clip = replace_pixels(clip, *self._defects) if self.noise_level else clip
             yield middle, correct_spikes(clip, None if raw else self.calibration, phase)
 
     @cached_property
@@ -136,6 +141,14 @@ class RecordingClips:
         starts = np.linspace(0, whole - frames, parts).astype(int).tolist()
         counts = sum(self.recording.counts(start, frames) for start in starts)
         return self.recording.correct(counts / (parts * frames)), frames, parts
+
+    @cached_property
+    def _defects(self) -> tuple[Tensor, Tensor]:
+        """Dead and hot pixels of a clip, found in the whole recording, and the pixels that take their place, (H, W)."""
+        rate, frames, parts = self._looks
+        count = (rate * frames * parts)[self.top :, self.left :]
+        dead, hot, other = find_outliers(count, frames * parts, self.recording.bayer)
+        return dead | hot, other
 
     @cached_property
     def white(self) -> float:

@@ -9,16 +9,12 @@ import torch
 from torch import Tensor
 
 from spikekit.calibration.calibration import Calibration
+from spikekit.calibration.defects import ALWAYS, DEAD_GAIN, find_outliers
 from spikekit.calibration.pixel_rates import PixelRates
 from spikekit.color.cfa import GREY, bayer_mask
 from spikekit.sensor.noise import DEAD, HOT
 
-_LEAST_SPIKES = 10  # spikes of the neighbours, below which a silent pixel is not called dead
-_DEAD_GAIN = 0.1  # gain below which a pixel is dead, relative to others
 _HOT_RATE = 0.5  # dark rate from which on a pixel is hot, in spikes per clock
-_ALWAYS = 0.99  # rate of a saturated pixel, in spikes per clock
-
-_NEAR = 5  # side of the neighbourhood, in pixels of the same colour
 
 
 class Measured(NamedTuple):
@@ -60,16 +56,16 @@ def calibrate(
     if flat is not None:
         whole = flat[0] + flat[1]
         brightness = whole.rate.median().item()
-        if brightness >= _ALWAYS:
+        if brightness >= ALWAYS:
             raise ValueError(f"expected a flat recording without saturation, got {brightness:.3g} per clock")
         light = whole.rate - leak
         if light.median() <= 0:
             raise ValueError(f"expected a flat recording brighter than the dark one, got {brightness:.3g} per clock")
-        defects[whole.rate >= _ALWAYS] = HOT
+        defects[whole.rate >= ALWAYS] = HOT
         errors = []
         for pixels in bayer_mask(*size, pattern or GREY, dtype=torch.bool):
             works = pixels & (defects == 0)
-            defects[works & (light < _DEAD_GAIN * light[works].median())] = DEAD
+            defects[works & (light < DEAD_GAIN * light[works].median())] = DEAD
             works = pixels & (defects == 0)
             mean = light[works].mean()
             gain[works] = light[works] / mean
@@ -85,30 +81,11 @@ def _error(one: Tensor, other: Tensor, works: Tensor) -> float:
 
 
 def find_defects(scene: PixelRates, pattern: str | None = None) -> Measured:
-    """Find dead and hot pixels in a recording of any scene, by comparison with their neighbours.
+    """Find dead and hot pixels in a recording of any scene, see :func:`spikekit.calibration.defects.find_outliers`.
 
-    Convention:
-        A pixel is compared with the median of its neighbours of the same colour. It is dead if it fires less than a
-        tenth as often, provided that they fire at least ten times. It is hot if it fires at nearly every clock, and
-        they at less than half. Gains stay 1: in a still scene they cannot be separated from texture; for a moving one,
-        see :func:`spikekit.calibration.in_motion.calibrate_in_motion`.
+    Gains stay 1: in a still scene they cannot be separated from texture; for a moving one, see
+    :func:`spikekit.calibration.in_motion.calibrate_in_motion`.
     """
+    dead, hot, _ = find_outliers(scene.count, scene.frames, pattern)
     size = tuple(scene.count.shape)
-    defects = torch.zeros(size, dtype=torch.uint8)
-    step = 1 if pattern is None else 2
-    for row, column in np.ndindex(min(step, size[0]), min(step, size[1])):  # pixels of one colour
-        place = slice(row, None, step), slice(column, None, step)
-        rate = scene.rate[place]
-        around = _median_around(rate)
-        dead = (around * scene.frames >= _LEAST_SPIKES) & (rate < _DEAD_GAIN * around)
-        hot = (rate >= _ALWAYS) & (around < 0.5)
-        defects[place] = dead.byte() * DEAD + hot.byte() * HOT
-    return Measured(Calibration(torch.ones(size), torch.zeros(size), defects))
-
-
-def _median_around(plane: Tensor) -> Tensor:
-    """Return the median over a window without its centre."""
-    from scipy.ndimage import rank_filter
-
-    others = np.arange(_NEAR**2).reshape(_NEAR, _NEAR) != _NEAR**2 // 2
-    return torch.from_numpy(rank_filter(plane.numpy(), _NEAR**2 // 2 - 1, footprint=others, mode="nearest"))
+    return Measured(Calibration(torch.ones(size), torch.zeros(size), dead.byte() * DEAD + hot.byte() * HOT))
