@@ -37,6 +37,7 @@ class Recording:
     alpha: float | None = None  # light of a white pixel per clock, if known
     camera: Camera | None = None
     calibration: Calibration | None = None  # of the frames as read
+    ideal: bool = False  # declared free of noise
     note: str = ""  # a hint for the user, such as a likely wrong orientation
 
     @property
@@ -133,7 +134,9 @@ def open_recording(
     """
     recording = _described(home_path(path), height, width, flip, pattern, camera)
     file = own_calibration(recording.path) if calibration is None else home_path(calibration)
-    if str(calibration) == "none" or (calibration is None and not file.is_file()):
+    if str(calibration) == "none":
+        return replace(recording, ideal=True)
+    if calibration is None and not file.is_file():
         return recording
     known = read_calibration(file)
     if known.size != tuple(recording.size):

@@ -69,7 +69,7 @@ def adapt(args: Sequence[str]) -> None:
             raise UsageError(f"--weights: expected a network with one flow for all colours, got {weights}")
         if warning := other_sensor(recording, student.pattern):
             print(warning, flush=True)
-        level = 0.0 if asked.calibration == "none" else RecordingClips(recording).noise_level
+        level = RecordingClips(recording).noise_level
         clips, name, teacher = clips_and_teacher(recording, student, asked.teacher, level > NOISY)
         student.noise_level = teacher.noise_level = level * clips.joined**0.5
         with locked_folder(asked.output, "adaptation"):

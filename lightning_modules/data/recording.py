@@ -40,6 +40,6 @@ class RecordingScenes(LightningDataModule):
         self.test_names = self.clips.chosen
 
     def test_dataloader(self) -> Iterator[dict[str, Tensor]]:  # noqa: D102
-        level = 0.0 if str(self.known.get("calibration")) == "none" else self.clips.noise_level
-        known = {"white": torch.tensor([self.clips.joined * self.clips.white]), "noise": torch.tensor([level])}
+        white, level = self.clips.joined * self.clips.white, self.clips.noise_level
+        known = {"white": torch.tensor([white]), "noise": torch.tensor([level])}
         return ({"spikes": clip[None], **known} for _, clip in self.clips.in_order())

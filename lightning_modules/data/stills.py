@@ -22,6 +22,7 @@ from lightning_modules.data.pool import ScenePool
 from lightning_modules.data.rendering import Gallery, Pictures, draw_cut, render_scene, see
 from lightning_modules.data.textures import outline
 from lightning_modules.signatures import inherit_signature
+from spikekit import fill_defects
 from spikekit.check import check_positive, check_whole
 from spikekit.color.cfa import cfa_pattern
 from spikekit.scenes import analytic
@@ -59,7 +60,7 @@ class StillClips(Dataset):
         brightness: lowest and highest exposure; a random number in between multiplies ground truth and light of a clip.
         noise: noise of the sensor, such as ``{photons: 3000, gain_spread: 0.06}``. With ``augment``, as in training,
             every clip has a random share of it, given as its ``noise``, and a third have none, so that a network learns
-            ideal sensors and all levels of noise.
+            ideal sensors and all levels of noise. Dead and hot pixels are filled, see :func:`spikekit.fill_defects`.
         gains: lowest and highest alpha with ``augment``, drawn log-uniformly and given as the clip's ``alpha``. Null
             for a constant alpha.
         flow_times: spike frames to which the flow from the middle frame is given; for 41 frames and a window of 11, 5
@@ -160,7 +161,9 @@ class StillClips(Dataset):
         light = scene.light(self.pattern, scale=self.scale, alpha=1.0)
         middles = [self.frames // 2 + n * self.every for n in range(self.key_frames)]
         rgb = torch.stack([trim(scene.rgb(middle), self.scale * self.margin) for middle in middles], dim=1)
-        clips = {"spikes": see(light, drawn, self.noise), "rgb": rgb if self.key_frames > 1 else rgb[:, 0]}
+        spikes = see(light, drawn, self.noise)
+        spikes = fill_defects(spikes, self.pattern) if self.noise else spikes  # as is done with recordings
+        clips = {"spikes": spikes, "rgb": rgb if self.key_frames > 1 else rgb[:, 0]}
         if self.key_frames == 1:
             flow = torch.stack([scene.flow(clock, scale=self.scale) for clock in self.flow_times], dim=1)
             clips["flow"] = trim(flow, self.margin)

@@ -158,8 +158,8 @@ class RecordingClips:
     @cached_property
     def noise_level(self) -> float:
         """Noise level for networks: 0 for an ideal or calibrated sensor, and 1 for that of the training."""
-        measured = self.recording.calibration
-        if self.recording.alpha is not None or (measured is not None and measured.dark.any()):
+        recording, measured = self.recording, self.recording.calibration
+        if recording.ideal or recording.alpha is not None or (measured is not None and measured.dark.any()):
             return 0.0
         spread = gain_spread(*self._looks, self.recording.pattern or "RGGB")
         return self.joined**0.5 * (1.0 if spread is None else min(spread / _SPREAD, _MOST))

@@ -113,7 +113,7 @@ def reconstruct(
     if not (network is None or isinstance(network, Network)):
         network = Network.from_pretrained(network)
     looks = RecordingClips(recording, FRAMES if network is None else network.frames)
-    level = 0.0 if str(calibration) == "none" else looks.noise_level
+    level = looks.noise_level
     white = looks.white if white is None else white
     check_positive("white", white)
     if network is None:

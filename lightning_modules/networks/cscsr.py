@@ -106,7 +106,8 @@ class CSCSR(Network):
           ``flow`` from the middle to the first and last time points, in sensor pixels, :math:`(B, 2, 2, H, W)`, or one
           flow per colour, :math:`(B, 3, 2, 2, H, W)`; ``static=True`` for a scene without motion, which gives the
           result of zero flow faster; ``alpha``, the gain of the camera; ``noise``, the noise level, 0 for an ideal
-          sensor and 1 for the sensor used in training. ``alpha`` and ``noise`` are numbers or :math:`(B,)`
+          sensor and 1 for the sensor used in training, whose defects are filled, see :func:`spikekit.fill_defects`.
+          ``alpha`` and ``noise`` are numbers or :math:`(B,)`
         - Output: rgb :math:`(B, 3, s H, s W)`, or :math:`(B, 1, s H, s W)` for a grey sensor, not clamped
 
     Raises:

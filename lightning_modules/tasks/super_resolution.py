@@ -19,7 +19,7 @@ from lightning_modules.networks.classical import METHODS
 from lightning_modules.storage.pretrained import load_weights, read_weights, with_own_motion
 from lightning_modules.tasks.base import BaseTask, step_schedule
 from lightning_modules.tasks.callbacks import TestReport, ValidationPictures, middle_clip, middle_half
-from spikekit import fill_defects, psnr, ssim
+from spikekit import psnr, ssim
 
 
 # not a lambda, so that a module can be pickled
@@ -95,10 +95,6 @@ class SuperResolution(BaseTask):
         ``flow`` is (B, 2, 2, H, W); default: the estimate of the network.
         """
         return predict(self.network, spikes, flow)
-
-    def on_after_batch_transfer(self, batch: dict[str, Tensor], dataloader_idx: int) -> dict[str, Tensor]:
-        """Fill the defects of noisy sensors, as is done with recordings."""
-        return batch | {"spikes": fill_defects(batch["spikes"], self.network.pattern)} if "noise" in batch else batch
 
     def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:  # noqa: D102
         batch, flow = self._with_motion(batch)

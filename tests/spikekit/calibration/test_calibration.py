@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from spikekit import bayer_mask, correct_spikes, demosaic, psnr, tfi_at
+from spikekit import bayer_mask, correct_spikes, demosaic, fill_defects, psnr, tfi_at
 from spikekit.calibration.calibration import Calibration
 from spikekit.calibration.measure import calibrate, find_defects
 from spikekit.calibration.pixel_rates import PixelRates
@@ -124,6 +124,27 @@ def test_defects_are_filled_from_the_nearest_pixels_of_their_colour(truth, patte
         assert low - 1e-9 <= found[y, x] <= high + 1e-9
     works = truth.defects == WORKS
     assert found[works].equal(light[works])
+
+
+@pytest.mark.parametrize(("pattern", "step"), [(None, 1), ("GBRG", 2)])
+def test_defects_of_a_clip_take_the_spikes_of_the_median_neighbour(pattern, step):
+    whole = SpikeSensor().expose((0.1 + 0.3 * torch.rand(SIZE, generator=chance(9))).expand(2, 41, *SIZE))
+    whole[..., 20] = 0  # a thin line is no defect
+    clips = whole.clone()
+    bad = [(0, 0), (5, 7), (39, 30), (12, 46)]
+    for n, (y, x) in enumerate(bad):
+        clips[..., y, x] = n % 2
+    filled = fill_defects(clips, pattern)
+    for clip, made in zip(clips, filled, strict=True):
+        for y, x in bad:
+            near = [(abs(y + v), abs(x + u)) for v in (-step, 0, step) for u in (-step, 0, step) if (u, v) != (0, 0)]
+            streams = [clip[:, min(v, 78 - v), min(u, 94 - u)].tolist() for v, u in near]
+            median = sorted(map(sum, streams))[3]
+            assert made[:, y, x].tolist() in [stream for stream in streams if sum(stream) == median]
+            made[:, y, x] = clip[:, y, x]
+    assert filled.equal(clips)
+    for size in ((1, 1), (2, 2), (3, 1)):
+        assert fill_defects(clips[..., : size[0], : size[1]], pattern).shape == (2, 41, *size)
 
 
 def test_corrected_spikes_have_the_rate_of_an_ideal_sensor(truth):
