@@ -12,6 +12,7 @@ from torch import Tensor
 
 from spikekit.arguments import UsageError, home_path
 from spikekit.calibration.calibration import Calibration
+from spikekit.calibration.defects import find_outliers
 from spikekit.calibration.files import ENDING, read_calibration
 from spikekit.color.cfa import GREY, cfa_pattern
 from spikekit.io.cameras import Camera, usual_sizes
@@ -101,9 +102,10 @@ class Recording:
         return (self.camera if known else replace(self.camera, gain=1.0)).display(picture)
 
 
-def white_rate(rates: Tensor) -> float:
-    """Return the default white level: the 99.9th percentile of the rates."""
-    return float(np.quantile(rates.numpy(), 0.999)) or float(rates.max()) or 1.0
+def white_rate(rates: Tensor, pattern: str | None = None) -> float:
+    """Return the default white level: the 99.9th percentile of the rates (H, W), without those of hot pixels."""
+    _, hot, _ = find_outliers(rates, 1, pattern)
+    return float(np.quantile(rates[~hot].numpy(), 0.999)) or float(rates[~hot].max()) or 1.0
 
 
 def open_recording(

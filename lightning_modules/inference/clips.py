@@ -111,7 +111,7 @@ class RecordingClips:
     def in_order(self, chosen: Iterable[int] | None = None, raw: bool = False) -> Iterator[tuple[int, Tensor]]:
         """Yield number and clip (N / joined, H, W), calibrated unless ``raw``, of key frames in order; default: all.
 
-        The defects of a noisy sensor are filled, see :func:`spikekit.fill_defects`.
+        Defects of unknown sensors are filled, see :func:`spikekit.fill_defects`.
         """
         middles = self.chosen if chosen is None else list(chosen)
         jump, phase = self.recording.frames_from, self.recording.bayer and self._asked[1]
@@ -120,7 +120,7 @@ class RecordingClips:
         start = middles[0] - self.frames // 2 if middles else 0
         for middle, clip in clips_around(middles, self.frames, jump(start), start, None if packed else jump):
             clip = join_frames(clip[..., self.top :, self.left :], self.joined)
-            clip = replace_pixels(clip, *self._defects) if self.noise_level else clip
+            clip = replace_pixels(clip, *self._defects) if self._unknown else clip
             yield middle, correct_spikes(clip, None if raw else self.calibration, phase)
 
     @cached_property
@@ -142,6 +142,12 @@ class RecordingClips:
         counts = sum(self.recording.counts(start, frames) for start in starts)
         return self.recording.correct(counts / (parts * frames)), frames, parts
 
+    @property
+    def _unknown(self) -> bool:
+        """Whether the sensor may be noisy: it was neither simulated nor declared ideal nor calibrated in the dark."""
+        recording, measured = self.recording, self.recording.calibration
+        return not recording.ideal and recording.alpha is None and (measured is None or not measured.dark.any())
+
     @cached_property
     def _defects(self) -> tuple[Tensor, Tensor]:
         """Dead and hot pixels of a clip, found in the whole recording, and the pixels that take their place, (H, W)."""
@@ -153,13 +159,12 @@ class RecordingClips:
     @cached_property
     def white(self) -> float:
         """White level in spikes per frame: the side-car's, else the level that 99.9 % of the pixels do not exceed."""
-        return self.recording.alpha or white_rate(self._looks[0])
+        return self.recording.alpha or white_rate(self._looks[0], self.recording.bayer)
 
     @cached_property
     def noise_level(self) -> float:
         """Noise level for networks: 0 for an ideal or calibrated sensor, and 1 for that of the training."""
-        recording, measured = self.recording, self.recording.calibration
-        if recording.ideal or recording.alpha is not None or (measured is not None and measured.dark.any()):
+        if not self._unknown:
             return 0.0
         spread = gain_spread(*self._looks, self.recording.pattern or "RGGB")
         return self.joined**0.5 * (1.0 if spread is None else min(spread / _SPREAD, _MOST))

@@ -118,7 +118,7 @@ def _white_of_first_clip(network: Network, frames: Iterator[Tensor]) -> tuple[fl
     white = 1.0
     for _ in range(2):
         first += islice(frames, clip_in_light(network.frames, white, join=network.joins)[0] - len(first))
-        white = white_rate(torch.stack(first).float().mean(0).cpu()) if first else white
+        white = white_rate(torch.stack(first).float().mean(0).cpu(), network.pattern) if first else white
     return white, chain(iter(first), frames)  # unlike a list, a finished iterator does not keep the frames
 
 

@@ -81,7 +81,7 @@ def replace_pixels(spikes: Tensor, bad: Tensor, other: Tensor) -> Tensor:
 
 
 def _mirrored(size: int, step: int, device: torch.device) -> Tensor:
-    """Return the indices ``step`` before, at and after each of ``size``, mirrored at the ends, or its own; (3, size)."""
+    """Return the indices ``step`` before, at and after each, mirrored at the ends, or its own, (3, size)."""
     own = torch.arange(size, device=device)
     shifted = own + torch.tensor([[-step], [0], [step]], device=device)
     mirrored = (size - 1) - ((size - 1) - shifted.abs()).abs()

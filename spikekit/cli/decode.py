@@ -137,7 +137,8 @@ def _white(alpha: float | None, recording: Recording, key: int, reach: int) -> t
         return alpha, f"divided by alpha {alpha:g}"
     first, last = _span(key, reach, recording.frames)
     # The percentile of the rate, not of the picture: a bright pixel of TFI is 1 or 1/2, and so is its percentile.
-    white = white_rate(recording.correct(recording.counts(first, last - first + 1) / (last - first + 1)))
+    rates = recording.counts(first, last - first + 1) / (last - first + 1)
+    white = white_rate(recording.correct(rates), recording.bayer)
     scale = f"multiplied by {1 / white:.4g}"
     return white, f"{scale}, so that the 99.9th percentile of the spike rate around frame {key} is white"
 

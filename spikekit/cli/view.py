@@ -65,7 +65,7 @@ class Moment:
         self.averaged = range(first, min(first + window, near.stop))
         self._planes = list(recording.packed(near.start, len(near)))
         self.rates = self._rate(near)  # (H, W), spikes per frame
-        self.white = alpha or white_rate(recording.correct(self.rates))
+        self.white = alpha or white_rate(recording.correct(self.rates), recording.bayer)
 
     def _plane(self, n: int) -> np.ndarray:
         return self.recording.unpack(self._planes[n - self.near.start])

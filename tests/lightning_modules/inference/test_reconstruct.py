@@ -83,11 +83,17 @@ def test_uncalibrated_sensors_get_weights_for_noise(flat):
 @pytest.mark.parametrize(("spread", "level"), [(0.0, 0.0), (0.06, 1.0)])
 def test_noise_is_measured_if_nothing_is_known(tmp_path, spread, level):
     light = torch.linspace(0.1, 0.4, 64).expand(300, 48, 64)
-    write_spikes(tmp_path / "clip.npz", SpikeSensor(SensorNoise(gain_spread=spread), seed=0).expose(light))
+    noise = SensorNoise(gain_spread=spread, hot=0.005, dead=0.005)
+    write_spikes(tmp_path / "clip.npz", SpikeSensor(noise, seed=0).expose(light))
     made = reconstruct(tmp_path / "clip.npz", "fast", pattern="grey", frame="150")
     assert made.network.noise_level == pytest.approx(level, abs=0.2)
     assert any("not calibrated" in note for note in made.notes) == (level > 0)
-    assert reconstruct(tmp_path / "clip.npz", "fast", pattern="grey", calibration="none").network.noise_level == 0
+    ideal = reconstruct(tmp_path / "clip.npz", "fast", pattern="grey", calibration="none")
+    assert ideal.network.noise_level == 0
+    assert 0.4 < made.white == ideal.white < 0.5  # not that of hot pixels
+    rates = [next(one.clips.in_order())[1].float().mean(0) for one in (made, ideal)]
+    assert rates[1].aminmax() == (0, 1)
+    assert 0 < rates[0].min() < rates[0].max() < 0.6  # defects are filled, unless the sensor is declared ideal
 
 
 def test_ideal_sensors_get_weights_for_ideal_sensors(flat, tmp_path, monkeypatch):
