@@ -1,7 +1,8 @@
 """Measure the benefit of a calibration on a noisy sensor, for decoders and a network.
 
 ``python benchmarks/noisy_sensor.py PICTURES`` prints the table. Moving still pictures are recorded by a BGGR sensor
-with another gain than that of the training data. Networks with a noise level are told the measured one.
+with another gain than that of the training data. Networks get clips whose defects are filled, as without a calibration by ``lightning predict``, and the
+measured noise level.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from torch import Tensor
 from lightning_modules.data.pictures import folder_pictures
 from lightning_modules.data.stills import StillClips
 from lightning_modules.networks import CSCSR
-from spikekit import SensorNoise, SpikeSensor, correct_spikes, demosaic, psnr, tfi_at, tfp_at
+from spikekit import SensorNoise, SpikeSensor, correct_spikes, demosaic, fill_defects, psnr, tfi_at, tfp_at
 from spikekit.calibration.calibration import Calibration
 from spikekit.calibration.gain_spread import gain_spread
 from spikekit.calibration.in_motion import calibrate_in_motion, count_segments, segment_length
@@ -77,7 +78,7 @@ def _halves(spikes: Tensor) -> tuple[PixelRates, PixelRates]:
 def _scores(spikes: Tensor, truth: dict[int, Tensor], network: CSCSR, known: Calibration | None) -> list[float]:
     decoders: list[Callable[[Tensor, int], Tensor]] = [tfi_at, lambda clip, middle: tfp_at(clip, middle, 13, order=3)]
     sums = [0.0] * 3
-    corrected = correct_spikes(spikes, known, PATTERN)
+    corrected = fill_defects(spikes, PATTERN) if known is None else correct_spikes(spikes, known, PATTERN)
     network.noise_level = (gain_spread(corrected.float().mean(0), len(spikes), 1, PATTERN) or 0) / NOISE.gain_spread
     for middle, rgb in truth.items():
         near = spikes[middle - 60 : middle + 61].float()
