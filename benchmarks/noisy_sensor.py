@@ -1,8 +1,8 @@
 """Measure the benefit of a calibration on a noisy sensor, for decoders and a network.
 
 ``python benchmarks/noisy_sensor.py PICTURES`` prints the table. Moving still pictures are recorded by a BGGR sensor
-with another gain than that of the training data. Networks get clips whose defects are filled, as without a calibration by ``lightning predict``, and the
-measured noise level.
+with another gain than that of the training data. Without a calibration, networks get clips whose defects are filled, as
+from ``lightning predict``; those with a noise level are told the measured one.
 """
 
 from __future__ import annotations
