@@ -29,7 +29,7 @@ NOISY = 0.3
 FRAMES, EVERY = 41, 20
 
 # parts of a recording that white and noise are measured on, and least frames of a part of several
-_PARTS, _LEAST_PART = 4, 200
+_PARTS, _LEAST_PART = 4, 100
 
 # white level in spikes per frame below which frames are joined
 _BRIGHT = 0.6
@@ -133,14 +133,14 @@ class RecordingClips:
         return Calibration(*(plane[self.top :, self.left :] for plane in (known.gain, dark, known.defects)))
 
     @cached_property
-    def _looks(self) -> tuple[Tensor, int, int]:
-        """Mean rates (H, W) of parts evenly spread over the recording, frames of a part, and number of parts."""
+    def _looks(self) -> tuple[Tensor, int]:
+        """Rates (P, H, W) of parts evenly spread over the recording, and frames of a part."""
         whole = self.recording.frames
         parts = min(max(whole // _LEAST_PART, 1), _PARTS)
-        frames = min(whole // parts, 2 * _LEAST_PART)
+        frames = min(whole // parts - 10 * (parts > 1), 4 * _LEAST_PART)  # with gaps, so that rounding differs
         starts = np.linspace(0, whole - frames, parts).astype(int).tolist()
-        counts = sum(self.recording.counts(start, frames) for start in starts)
-        return self.recording.correct(counts / (parts * frames)), frames, parts
+        counts = torch.stack([self.recording.counts(start, frames) for start in starts])
+        return self.recording.correct(counts / frames), frames
 
     @property
     def _unknown(self) -> bool:
@@ -151,15 +151,15 @@ class RecordingClips:
     @cached_property
     def _defects(self) -> tuple[Tensor, Tensor]:
         """Dead and hot pixels of a clip, found in the whole recording, and the pixels that take their place, (H, W)."""
-        rate, frames, parts = self._looks
-        count = (rate * frames * parts)[self.top :, self.left :]
-        dead, hot, other = find_outliers(count, frames * parts, self.recording.bayer)
+        rates, frames = self._looks
+        count = (frames * rates).sum(0)[self.top :, self.left :]
+        dead, hot, other = find_outliers(count, frames * len(rates), self.recording.bayer)
         return dead | hot, other
 
     @cached_property
     def white(self) -> float:
         """White level in spikes per frame: the side-car's, else the level that 99.9 % of the pixels do not exceed."""
-        return self.recording.alpha or white_rate(self._looks[0], self.recording.bayer)
+        return self.recording.alpha or white_rate(self._looks[0].mean(0), self.recording.bayer)
 
     @cached_property
     def noise_level(self) -> float:

@@ -17,16 +17,16 @@ _LEAST_SPIKES = 8  # of a pixel, on average over a block
 SECOND_DIFFERENCE = torch.tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]]) / 6
 
 
-def gain_spread(rate: Tensor, frames: int, parts: int = 1, pattern: str = GREY) -> float | None:
+def gain_spread(rates: Tensor, frames: int, pattern: str = GREY) -> float | None:
     r"""Estimate the relative standard deviation of the gains from the mean rates of the pixels.
 
-    The noise is that of the flattest blocks, without the rounding of an ideal sensor, whose counts have a variance of
-    1/6 on average. Texture may hide in it: motion, or parts far apart, makes the estimate better.
+    The smaller of two estimates: the noise of the flattest blocks, without the rounding of an ideal sensor, whose
+    counts have a variance of 1/6 on average; and, if there are several parts, the noise that they have in common in the
+    median block. Texture is not taken for noise by the first if some of the picture is flat, by the second if it moves.
 
     Args:
-        rate: spikes per clock, :math:`(H, W)`.
+        rates: spikes per clock in parts of a recording, apart from each other, :math:`(P, H, W)`.
         frames: clocks per part that were counted.
-        parts: number of parts, apart from each other, of which ``rate`` is the mean.
         pattern: Bayer phase, or ``"grey"``.
 
     Returns:
@@ -36,20 +36,24 @@ def gain_spread(rate: Tensor, frames: int, parts: int = 1, pattern: str = GREY) 
         The filter is that of J. Immerkaer, "Fast noise variance estimation", CVIU 64(2), 1996.
 
     Example:
-        >>> gains = 1 + 0.06 * torch.randn(64, 64, generator=torch.Generator().manual_seed(0))
-        >>> round(gain_spread(0.3 * gains, frames=400), 2), gain_spread(torch.full((64, 64), 0.3), frames=400)
+        >>> gains = 1 + 0.06 * torch.randn(1, 64, 64, generator=torch.Generator().manual_seed(0))
+        >>> round(gain_spread(0.3 * gains, frames=400), 2), gain_spread(torch.full((1, 64, 64), 0.3), frames=400)
         (0.06, 0.0)
     """
-    step = 1 if pattern == GREY else 2
-    found = []
-    for plane in (rate[row::step, column::step].float() for row in range(step) for column in range(step)):
-        if min(plane.shape) < _SIDE + 2:
+    step, parts = 1 if pattern == GREY else 2, len(rates)
+    flattest, common = [], []
+    for planes in (rates[:, row::step, column::step].float() for row in range(step) for column in range(step)):
+        if min(planes.shape[1:]) < _SIDE + 2:
             return None
-        noise = F.conv2d(plane[None, None], SECOND_DIFFERENCE.to(plane)[None, None]).square()
-        noise = F.avg_pool2d(noise, _SIDE) - 1 / (6 * parts * frames**2)
-        mean = F.avg_pool2d(plane[None, None, 1:-1, 1:-1], _SIDE)
-        found.append((noise / mean.square())[mean * parts * frames >= _LEAST_SPIKES])
-    blocks = torch.cat(found)
+        noise = F.conv2d(planes[:, None], SECOND_DIFFERENCE.to(planes)[None, None])
+        square, squares = (F.avg_pool2d(part, _SIDE) for part in (noise.sum(0).square(), noise.square().sum(0)))
+        mean = F.avg_pool2d(planes.mean(0)[None, 1:-1, 1:-1], _SIDE)
+        lit = mean * parts * frames >= _LEAST_SPIKES
+        flattest.append(((square / parts**2 - 1 / (6 * parts * frames**2)) / mean.square())[lit])
+        common.append(((square - squares) / max(parts * (parts - 1), 1) / mean.square())[lit])
+    blocks = torch.cat(flattest)
     if not len(blocks):
         return None
-    return (torch.quantile(blocks, _QUANTILE) / _OF_NOISE).clamp(min=0).sqrt().item()
+    found = torch.quantile(blocks, _QUANTILE) / _OF_NOISE
+    found = torch.minimum(found, torch.cat(common).median()) if parts > 1 else found
+    return found.clamp(min=0).sqrt().item()

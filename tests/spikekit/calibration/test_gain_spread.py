@@ -7,30 +7,42 @@ from spikekit import SensorNoise, SpikeSensor, bayer_mask
 from spikekit.calibration.gain_spread import gain_spread
 
 
-def _rate(spread, pattern):
-    """Mean rate of a scene of edges, stripes and flat parts that moves by 12 pixels in 300 clocks."""
+def _spikes(spread, pattern):
+    """Spikes of a scene of edges, stripes and flat parts that moves by 12 pixels in 300 clocks."""
     y, x = torch.meshgrid(torch.arange(72.0), torch.arange(96.0), indexing="ij")
     along = x - torch.linspace(0, 12, 300).reshape(-1, 1, 1)
     light = 0.18 + 0.12 * (((along + y) % 40 < 12).float() - (along % 30 < 3).float())
     if pattern != "grey":
         light = light * (bayer_mask(72, 96, pattern) * torch.tensor([0.5, 1.0, 0.7])[:, None, None]).sum(0)
-    return SpikeSensor(SensorNoise(gain_spread=spread), seed=0).expose(light).float().mean(0)
+    return SpikeSensor(SensorNoise(gain_spread=spread), seed=0).expose(light).float()
 
 
 @pytest.mark.parametrize("pattern", ["grey", "GBRG"])
 @pytest.mark.parametrize("spread", [0.0, 0.03, 0.06, 0.12])
 def test_spread_is_found_in_spite_of_texture(pattern, spread):
-    found = gain_spread(_rate(spread, pattern), 300, 1, pattern)
-    assert found == pytest.approx(spread, rel=0.2, abs=0.01)
+    spikes = _spikes(spread, pattern)
+    for parts, gap in ((1, 0), (3, 10)):
+        rates = spikes.unflatten(0, (parts, -1))[:, gap:].mean(1)
+        assert gain_spread(rates, 300 // parts - gap, pattern) == pytest.approx(spread, rel=0.2, abs=0.01)
+
+
+@pytest.mark.parametrize(("spread", "at_rest"), [(0.0, 0.06), (0.06, 0.08)])
+def test_texture_everywhere_is_no_noise_if_it_moves(spread, at_rest):
+    still = 0.1 + 0.2 * torch.rand(48, 112, generator=torch.Generator().manual_seed(0))
+    for speed in (3, 0):
+        light = torch.cat([still[:, speed * n :][:, :64].expand(100, 48, 64) for n in range(16)])
+        spikes = SpikeSensor(SensorNoise(gain_spread=spread), seed=0).expose(light).float()
+        found = gain_spread(spikes.unflatten(0, (4, 400)).mean(1), 400)
+        assert found == pytest.approx(spread, rel=0.2, abs=0.02) if speed else found > at_rest
 
 
 def test_dark_or_small_pictures_tell_nothing():
-    assert gain_spread(torch.full((40, 40), 0.02), 300) is None  # six spikes a pixel
-    assert gain_spread(torch.full((19, 40), 0.3), 300, 1, "RGGB") is None
+    assert gain_spread(torch.full((1, 40, 40), 0.02), 300) is None  # six spikes a pixel
+    assert gain_spread(torch.full((1, 19, 40), 0.3), 300, "RGGB") is None
 
 
 def test_rounding_of_counts_is_no_noise():
     rate = torch.linspace(0.1, 0.4, 64).expand(64, 64)
     counts = torch.stack([(rate * 41 + torch.rand(64, 64)).floor() for _ in range(8)])
-    assert gain_spread(counts.mean(0) / 41, 41, 8) < 0.006
-    assert gain_spread(counts.mean(0) / 41, 41 * 8) > 0.006  # as if counted without a gap
+    assert gain_spread(counts / 41, 41) < 0.006
+    assert gain_spread(counts.mean(0, keepdim=True) / 41, 41 * 8) > 0.006  # as if counted without a gap
