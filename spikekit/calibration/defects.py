@@ -46,7 +46,8 @@ def find_outliers(count: Tensor, frames: int, pattern: str | None = None) -> tup
 def fill_defects(spikes: Tensor, pattern: str | None = None) -> Tensor:
     """Give dead and hot pixels the spikes of a neighbour of their colour: that with the median count of the eight.
 
-    A clip is enough: neither a calibration nor a still scene is needed. The defects are those of :func:`find_outliers`.
+    A clip is enough: neither a calibration nor a still scene is needed. The defects are those of
+    :func:`spikekit.calibration.defects.find_outliers`.
 
     Args:
         spikes: zeros and ones, :math:`(*, T, H, W)`.
