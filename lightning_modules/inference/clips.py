@@ -29,7 +29,7 @@ NOISY = 0.3
 FRAMES, EVERY = 41, 20
 
 # parts of a recording that white and noise are measured on, and least frames of a part of several
-_PARTS, _LEAST_PART = 4, 100
+_PARTS, _LEAST_PART = 4, 200
 
 # white level in spikes per frame below which frames are joined
 _BRIGHT = 0.6
@@ -137,7 +137,7 @@ class RecordingClips:
         """Rates (P, H, W) of parts evenly spread over the recording, and frames of a part."""
         whole = self.recording.frames
         parts = min(max(whole // _LEAST_PART, 1), _PARTS)
-        frames = min(whole // parts - 10 * (parts > 1), 4 * _LEAST_PART)  # with gaps, so that rounding differs
+        frames = min(whole // parts, 2 * _LEAST_PART)
         starts = np.linspace(0, whole - frames, parts).astype(int).tolist()
         counts = torch.stack([self.recording.counts(start, frames) for start in starts])
         return self.recording.correct(counts / frames), frames

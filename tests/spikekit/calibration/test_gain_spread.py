@@ -36,6 +36,15 @@ def test_texture_everywhere_is_no_noise_if_it_moves(spread, at_rest):
         assert found == pytest.approx(spread, rel=0.2, abs=0.02) if speed else found > at_rest
 
 
+@pytest.mark.parametrize(("dark", "bright", "spread"), [(0.1, 0.1, 0.1), (0.1, 0.5, 0.045), (0.5, 0.5, 0.0)])
+def test_noise_of_light_counts_if_most_is_dark(dark, bright, spread):
+    """The noise of 5 electrons per spike is that of gains of 1 / sqrt(5 n) for n spikes."""
+    light = torch.full((200, 40, 48), dark)
+    light[..., :16] = bright
+    spikes = SpikeSensor(SensorNoise(photons=5), seed=0).expose(light).float()
+    assert gain_spread(spikes.unflatten(0, (2, 100)).mean(1), 100) == pytest.approx(spread, rel=0.3, abs=0.01)
+
+
 def test_dark_or_small_pictures_tell_nothing():
     assert gain_spread(torch.full((1, 40, 40), 0.02), 300) is None  # six spikes a pixel
     assert gain_spread(torch.full((1, 19, 40), 0.3), 300, "RGGB") is None
