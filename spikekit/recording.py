@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,9 @@ from spikekit.progress import progress
 
 # Pixels per chunk.
 _BLOCK = 1 << 24
+
+# parts of a recording that white and noise are measured on, and least frames of a part of several
+_PARTS, _LEAST_PART = 4, 200
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,14 @@ class Recording:
         """Return the pixels (H, W) of a packed frame."""
         bits = np.unpackbits(plane, axis=-1, count=self.stored[1], bitorder="little")
         return self.prepare(torch.from_numpy(bits)).numpy()
+
+    @cached_property
+    def looks(self) -> tuple[Tensor, int]:
+        """Corrected rates (P, H, W) of parts evenly spread over the recording, and frames of a part."""
+        parts = min(max(self.frames // _LEAST_PART, 1), _PARTS)
+        frames = min(self.frames // parts, 2 * _LEAST_PART)
+        starts = np.linspace(0, self.frames - frames, parts).astype(int).tolist()
+        return self.correct(torch.stack([self.counts(start, frames) for start in starts]) / frames), frames
 
     def correct(self, raw: Tensor) -> Tensor:
         """Return the rates (*, H, W), in spikes per clock, that an ideal sensor would give."""

@@ -9,7 +9,6 @@ from functools import cached_property
 from itertools import islice
 from typing import TypeVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,9 +26,6 @@ NOISY = 0.3
 
 #: default spike frames of a clip, and default distance of two pictures in spike frames
 FRAMES, EVERY = 41, 20
-
-# parts of a recording that white and noise are measured on, and least frames of a part of several
-_PARTS, _LEAST_PART = 4, 200
 
 # white level in spikes per frame below which frames are joined
 _BRIGHT = 0.6
@@ -132,16 +128,6 @@ class RecordingClips:
         dark = (self.joined * known.dark).clamp(max=1)
         return Calibration(*(plane[self.top :, self.left :] for plane in (known.gain, dark, known.defects)))
 
-    @cached_property
-    def _looks(self) -> tuple[Tensor, int]:
-        """Rates (P, H, W) of parts evenly spread over the recording, and frames of a part."""
-        whole = self.recording.frames
-        parts = min(max(whole // _LEAST_PART, 1), _PARTS)
-        frames = min(whole // parts, 2 * _LEAST_PART)
-        starts = np.linspace(0, whole - frames, parts).astype(int).tolist()
-        counts = torch.stack([self.recording.counts(start, frames) for start in starts])
-        return self.recording.correct(counts / frames), frames
-
     @property
     def _unknown(self) -> bool:
         """Whether the sensor may be noisy: it was neither simulated nor declared ideal nor calibrated in the dark."""
@@ -151,7 +137,7 @@ class RecordingClips:
     @cached_property
     def _defects(self) -> tuple[Tensor, Tensor]:
         """Dead and hot pixels of a clip, found in the whole recording, and the pixels that take their place, (H, W)."""
-        rates, frames = self._looks
+        rates, frames = self.recording.looks
         count = (frames * rates).sum(0)[self.top :, self.left :]
         dead, hot, other = find_outliers(count, frames * len(rates), self.recording.bayer)
         return dead | hot, other
@@ -159,14 +145,14 @@ class RecordingClips:
     @cached_property
     def white(self) -> float:
         """White level in spikes per frame: the side-car's, else the level that 99.9 % of the pixels do not exceed."""
-        return self.recording.alpha or white_rate(self._looks[0].mean(0), self.recording.bayer)
+        return self.recording.alpha or white_rate(self.recording.looks[0].mean(0), self.recording.bayer)
 
     @cached_property
     def noise_level(self) -> float:
         """Noise level for networks: 0 for an ideal or calibrated sensor, and 1 for that of the training."""
         if not self._unknown:
             return 0.0
-        spread = gain_spread(*self._looks, self.recording.pattern or "RGGB")
+        spread = gain_spread(*self.recording.looks, self.recording.pattern or "RGGB")
         return self.joined**0.5 * (1.0 if spread is None else min(spread / _SPREAD, _MOST))
 
 
