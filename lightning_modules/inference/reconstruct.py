@@ -55,9 +55,10 @@ def reconstruct(
 
     Convention:
         Without a ``network``, ``speed`` or ``budget`` chooses weights of the package whose clips fit the recording.
-        Unless the sensor was calibrated in the dark or the recording is simulated, its noise is measured; if it is
-        strong, the weights are those trained for noisy sensors. ``calibration="none"`` declares the pixels ideal. In
-        dim light, clips are longer, see :meth:`lightning_modules.inference.clips.RecordingClips.in_light`.
+        Unless the sensor was calibrated in the dark or the recording is simulated, dead and hot pixels are filled from
+        a neighbour, and the noise is measured; if it is strong, the weights are those trained for noisy sensors.
+        ``calibration="none"`` declares the pixels ideal. In dim light, clips are longer, see
+        :meth:`lightning_modules.inference.clips.RecordingClips.in_light`.
 
         Films of ``"fast"`` and ``"balanced"`` run the network only where something moves, unless pictures are
         interpolated; ``psnr_tolerance=0`` runs it everywhere.
@@ -249,6 +250,7 @@ class Reconstruction:
             "read": [recording.stored, recording.flip, recording.pattern, clips.top, clips.left, recording.camera],
             "clip": [clips.frames, clips.joined],
             "calibration": measured and _digest((name, value) for name, value in measured),
+            "ideal": recording.ideal,
             "white": self.white,
             "network": [type(self.network).__name__, self.network.settings, _digest(self.network.state_dict().items())],
             "motion": str(getattr(self.network, "motion", None)),

@@ -90,6 +90,7 @@ def test_noise_is_measured_if_nothing_is_known(tmp_path, spread, level):
     assert any("not calibrated" in note for note in made.notes) == (level > 0)
     ideal = reconstruct(tmp_path / "clip.npz", "fast", pattern="grey", calibration="none")
     assert ideal.network.noise_level == 0
+    assert made.identity() != ideal.identity()  # a stopped run is not continued with the other
     assert 0.4 < made.white == ideal.white < 0.5  # not that of hot pixels
     rates = [next(one.clips.in_order())[1].float().mean(0) for one in (made, ideal)]
     assert rates[1].aminmax() == (0, 1)
