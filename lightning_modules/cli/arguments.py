@@ -82,11 +82,7 @@ def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def read_config(path: str | Path) -> dict[str, Any]:
-    """Return the content of a configuration file; nothing is built.
-
-    Raises:
-        ValueError: the file cannot be read, or is not YAML in UTF-8; the message is one line that names the file.
-    """
+    """Return the content of a configuration file; nothing is built."""
     import yaml
 
     path = Path(path).expanduser()

@@ -25,12 +25,7 @@ class UsageError(InputError, SpikekitUsageError):
 
 
 class Ended(SystemExit):
-    """End of the command with a line on stderr.
-
-    Args:
-        line: error message.
-        status: exit status: 2 for an invalid command line, 130 or 143 after a signal, 1 otherwise.
-    """
+    """End of the command with a line on stderr: status 2 for a wrong command line, 130 or 143 after a signal, or 1."""
 
     def __init__(self, line: str, status: int) -> None:
         line = "\n".join(map(printable, line.splitlines()))  # names of files can hold escape sequences

@@ -58,11 +58,7 @@ def folder_pictures(root: str | Path) -> list[Path]:
 
 
 def embedded_pictures(held_out: bool = False) -> list[Path]:
-    """List the photographs installed with scikit-image, for training or the four held out; nothing is downloaded.
-
-    Raises:
-        FileNotFoundError: this build of scikit-image has no photographs.
-    """
+    """List the photographs installed with scikit-image, for training or the four held out; nothing is downloaded."""
     import skimage.data
 
     here = Path(skimage.data.__file__).parent

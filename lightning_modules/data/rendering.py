@@ -164,10 +164,7 @@ def _cubic(x: Tensor) -> Tensor:
 def outline_masks(radius: Tensor, sides: Tensor, side: int) -> Tensor:
     """Return masks (B, side, side) of outlines, 1 inside, 0 outside, with an edge one pixel wide.
 
-    Args:
-        radius: (B, A) radii at A angles from -pi on, at most 1; all 0 for no object.
-        sides: (B,) sides of the squares that the outlines fill.
-        side: side of the masks.
+    Outlines are given by their radii (B, A) at A angles from -pi on, at most 1, and fill squares of ``sides`` (B,).
     """
     middle = ((sides - 1) / 2)[:, None]
     place = torch.arange(side, device=radius.device) - middle

@@ -111,10 +111,6 @@ class ClipRecipe:
             ``spikes`` uint8 (N, H, W), the ground truth ``rgb`` (3, s H, s W), and ``flow`` (times, 2, H, W) in sensor
             pixels, all of the whole view. The flow is 0 across a cut of the film. With K key frames, ``spikes`` holds
             all their spike frames and ``rgb`` is (K, 3, s H, s W).
-
-        Raises:
-            spikekit.io.video.VideoError: a file cannot be read; the message names it.
-            ValueError: the frames are too small for the sensor, or the ground truth has the wrong size.
         """
         clip, paths = self.view(sequence, middle), self.files(sequence, middle)
         # the seed of the sensor depends on the content of the frames, not on their paths
@@ -191,9 +187,6 @@ class SequenceClips(Dataset):
         cache: cache of the clips; ``None`` to simulate them every time.
         flow_patch: smallest side of the spikes, in sensor pixels, for the estimate of motion. Spikes reach beyond the
             patch accordingly, within the view; ground truth and flow cover the patch.
-
-    Raises:
-        ValueError: there are no sequences, one is too short for a clip, or ``clips`` or ``patch`` is below 1.
     """
 
     def __init__(

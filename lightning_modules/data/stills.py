@@ -151,12 +151,7 @@ class StillClips(Dataset):
         return drawn, Gallery.of([self.sources[n] for n in used])
 
     def render(self, drawn: dict[str, np.ndarray], gallery: Gallery) -> dict[str, Tensor]:
-        """Render clips from random numbers, before they are cut into key frames.
-
-        Args:
-            drawn: random numbers of :meth:`draw`, with a leading dimension B.
-            gallery: the pictures, on the device that renders.
-        """
+        """Render clips from random numbers of :meth:`draw`, with a leading dimension B, before :meth:`cut`."""
         scene = self._scene(drawn, gallery)
         light = scene.light(self.pattern, scale=self.scale, alpha=1.0)
         middles = [self.frames // 2 + n * self.every for n in range(self.key_frames)]

@@ -129,13 +129,7 @@ def _moves(network: Network, still: bool) -> bool:
 
 
 def example_inputs(network: Network, size: tuple[int, int], still: bool = False) -> dict[str, Tensor]:
-    """Return reproducible example inputs by name: random spikes, flow and state.
-
-    Args:
-        network: network to export.
-        size: size of the clip, (H, W) in sensor pixels.
-        still: nothing moves, see :func:`export_network`.
-    """
+    """Return reproducible example inputs for a sensor of ``size`` by name: random spikes, flow and state."""
     moves, films = _moves(network, still), isinstance(network, RecurrentCSCSR)
     generator = torch.Generator().manual_seed(0)
     found = {"spikes": (torch.rand(1, network.frames, *size, generator=generator) < 0.3).float()}

@@ -52,9 +52,6 @@ class Output:
     Attributes:
         folder: folder of the pictures.
         state: path of the state of a film, see :meth:`Reconstruction.pictures`; a part adds its number.
-
-    Raises:
-        PictureError: the path of a picture is taken by a link, a pipe, a folder, or a file that is not ours.
     """
 
     def __init__(self, output: str | Path, frames: Sequence[int], made_of: dict[str, Any]) -> None:
@@ -124,15 +121,7 @@ def _digest(pixels: Tensor) -> str:
 
 
 def check_place(path: Path, follow: bool = False) -> None:
-    """Check that a path is free or a file.
-
-    Args:
-        path: path of the file to write.
-        follow: allow a link to the file, for names that the user has given.
-
-    Raises:
-        PictureError: the path is a folder, a pipe, a device or a link.
-    """
+    """Check that a path is free or a file, or with ``follow``, for names that the user has given, a link to a file."""
     try:
         mode = os.stat(path, follow_symlinks=follow).st_mode
     except (OSError, ValueError):

@@ -97,9 +97,6 @@ class Preset:
     def read(cls, row: Mapping[str, str]) -> Preset:
         """Return the preset in a row of a table; an empty cell is ``None``.
 
-        Raises:
-            ValueError: a cell of a numeric column is not a number.
-
         Example:
             >>> Preset.read({"weights": "cscsr_small_x4", "tile": "64", "self_ensemble": ""})
             Preset(weights='cscsr_small_x4', ..., tile=64, self_ensemble=None, ...)
@@ -113,11 +110,6 @@ class Preset:
         ``pattern`` is the Bayer phase of a decoder, or ``"grey"``; weights have their own. ``tile``, ``self_ensemble``
         and ``precision`` have no effect here: pass them to :func:`lightning_modules.inference.predict.predict` and to
         the Trainer.
-
-        Raises:
-            FileNotFoundError: the weights do not exist.
-            ValueError: the preset has neither weights nor a decoder, the weights are of another kind of network, or
-                the estimator is unknown.
         """
         if self.network == _DECODER:
             options = self.given("method", "window", "order", "scale", "frames")
@@ -153,22 +145,12 @@ class Conditions:
 
 @dataclass(frozen=True)
 class Choice:
-    """A measured preset and its expected cost.
-
-    Args:
-        name: name of the row in the table.
-        preset: network and settings.
-        psnr: PSNR on the clips of the table, in dB.
-        below: difference to the best preset of the table, in dB.
-        ms: expected milliseconds per frame.
-        mib: expected memory per frame, in MiB.
-        where: machine of the expected time, in words.
-    """
+    """A measured preset and its expected cost: PSNR, difference to the best, time and memory of a frame."""
 
     name: str
     preset: Preset
-    psnr: float
-    below: float
+    psnr: float  # in dB, on the clips of the table
+    below: float  # in dB
     ms: float
     mib: float
     where: str = "on the reference machine"
@@ -187,9 +169,6 @@ def choices(conditions: Conditions) -> list[Choice]:
     row. The expected memory grows with the number of pixels until a tile and the reach of motion around it are full.
     Beyond that, only the part that covers the whole frame grows: the picture and the estimate of motion. Presets
     without tiles are left out, as their memory has no bound.
-
-    Raises:
-        ValueError: the package has no table for this scale.
     """
     rows = _table(conditions)
     twins = for_noise(conditions.scale) if conditions.noisy else {}
@@ -249,13 +228,7 @@ def _reference(rows: list[dict[str, str]]) -> dict[str, str]:
 
 
 def pace(conditions: Conditions) -> float:
-    """Measure the time of a frame on this machine, relative to the table.
-
-    Runs the reference preset on a quarter of the area of a clip.
-
-    Returns:
-        1 on the reference machine, 2 on one that takes twice as long.
-    """
+    """Measure the time of a frame, relative to the table, with the reference preset on a quarter of a clip's area."""
     row = _reference(_table(conditions))
     preset = Preset.read(row)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")

@@ -31,11 +31,7 @@ _RECONSTRUCTIONS = {"correlated": ColorCorrelation, "separate": SeparateColors, 
 
 
 def one_a_clip(name: str, value: float | Tensor, clips: Tensor) -> Tensor:
-    """Return a number, or one number per clip (B,), in a shape that broadcasts with the clips, (B, 1, ...).
-
-    Raises:
-        ValueError: the value is neither a number nor of shape (B,).
-    """
+    """Return a number, or one number per clip (B,), in a shape that broadcasts with the clips, (B, 1, ...)."""
     value = torch.as_tensor(value, dtype=clips.dtype, device=clips.device)
     if value.shape not in ((), (len(clips),)):
         raise ValueError(f"{name}: expected a number or shape ({len(clips)},), got {tuple(value.shape)}")

@@ -29,18 +29,9 @@ class DivergedError(ValueError):
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """Read a checkpoint without executing its code or building its classes.
+    """Read a checkpoint, without hyper-parameters, to the CPU; no code of it is executed, none of its classes is built.
 
-    Args:
-        path: file of the checkpoint.
-
-    Returns:
-        A dictionary on the CPU, without hyper-parameters. It holds ``state_dict``, and ``network``, ``motion`` and
-        ``recipe`` as plain values.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is damaged, no checkpoint, or its weights are not finite.
+    It holds finite weights as ``state_dict``, and ``network``, ``motion`` and ``recipe`` as plain values.
     """
     path = Path(path)
     if not path.is_file():
@@ -67,12 +58,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
 
 
 def check_tensors(tensors: Mapping[str, Tensor]) -> None:
-    """Check that weights are finite, as a network would otherwise return black pictures.
-
-    Raises:
-        TypeError: a value is not a dense tensor of an ordinary dtype.
-        ValueError: a tensor contains NaN or Inf.
-    """
+    """Check that weights are dense tensors and finite, as a network would otherwise return black pictures."""
     for name, value in tensors.items():
         if not isinstance(name, str) or not isinstance(value, Tensor):
             raise TypeError(

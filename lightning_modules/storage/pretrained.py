@@ -56,10 +56,6 @@ def read_weights(source: str | Path) -> Weights:
     Args:
         source: name of weights in the package, such as ``"cscsr_small_x4"``; path of a safetensors file; or checkpoint
             of ``lightning fit``.
-
-    Raises:
-        FileNotFoundError: ``source`` is neither a file nor a known name.
-        ValueError: the file is damaged or of another type, weights are not finite, or settings are invalid.
     """
     model = find_model(str(source))
     path = model.path if model else Path(source)
@@ -73,12 +69,7 @@ def read_weights(source: str | Path) -> Weights:
 def check_weights(weights: Weights, kinds: Mapping[str, type[nn.Module]]) -> None:
     """Check that weights fit the network and estimator that their file names, without allocating memory for them.
 
-    Args:
-        weights: contents of the file.
-        kinds: classes of this package by name; weights of other classes are checked when they are loaded.
-
-    Raises:
-        ValueError: settings or weights do not fit, see :func:`lightning_modules.storage.settings.check_shapes`.
+    ``kinds`` are the classes of this package by name; weights of other classes are checked when they are loaded.
     """
     inside = {name.removeprefix(_MOTION): value for name, value in weights.tensors.items() if name.startswith(_MOTION)}
     outside = {name: value for name, value in weights.tensors.items() if not name.startswith(_MOTION)}
@@ -124,11 +115,7 @@ def _named(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def write_weights(weights: Weights, path: str | Path) -> None:
-    """Write a safetensors file of weights and the settings of their network.
-
-    Raises:
-        ValueError: the name of the file does not end in .safetensors.
-    """
+    """Write a safetensors file of weights and the settings of their network."""
     path = Path(path)
     if path.suffix != ".safetensors":
         raise ValueError(f"{path}: expected a name that ends in .safetensors")
@@ -167,9 +154,6 @@ def check_settings(network: nn.Module, settings: dict[str, Any], source: str | P
     """Check that a network has the settings stored with weights, as parameters alone would not show another scale.
 
     Empty settings, of files that store none, are accepted.
-
-    Raises:
-        CheckpointMismatchError: settings differ; the message lists them.
     """
     here = settings_of(network)
     # arguments added after the weights were written have their default values
@@ -206,10 +190,6 @@ def load_weights(network: nn.Module, weights: Weights, keep_motion: bool = False
     The settings ``alpha`` and ``motion_fusion`` may differ. If alpha differs, the network's output is scaled by the
     ratio of the gains. A network with ``noise`` may start from weights without: it ignores the noise level until it is
     trained. With ``keep_motion``, the network keeps the weights of its own motion estimator.
-
-    Raises:
-        CheckpointMismatchError: the weights belong to another network.
-        ValueError: the weights do not fit their settings.
     """
     network = getattr(network, "_orig_mod", network)
     exchanged = {name: network.settings[name] for name in _ADAPTED if name in network.settings}

@@ -27,11 +27,7 @@ _NOT_STORED = ("weights",)  # a file must not make the package read another file
 def own_class(
     settings: Mapping[str, Any], source: str | Path, kinds: Mapping[str, type[nn.Module]]
 ) -> tuple[type[nn.Module], dict[str, Any]]:
-    """Return the class, one of ``kinds``, and the constructor arguments that settings of a file describe.
-
-    Raises:
-        ValueError: the class or an argument is unknown, or a value has the wrong type or is too large.
-    """
+    """Return the class, one of ``kinds``, and the constructor arguments that settings of a file describe, checked."""
     name = settings.get("class")
     kind = kinds.get(name) if isinstance(name, str) else None
     if kind is None:
@@ -55,11 +51,7 @@ def check_shapes(
     source: str | Path,
     kinds: Mapping[str, type[nn.Module]],
 ) -> None:
-    """Check that weights fit the network that their settings describe, without allocating memory for it.
-
-    Raises:
-        ValueError: settings are invalid, see :func:`own_class`, or inconsistent; or names, shapes or dtypes differ.
-    """
+    """Check that weights fit the network that their settings describe, without allocating memory for it."""
     kind, arguments = own_class(settings, source, kinds)
     try:
         with torch.device("meta"), _at_most(2 * len(tensors) + 1000):
@@ -97,11 +89,7 @@ def _at_most(parameters: int) -> Iterator[None]:
 
 
 def check_plain(name: str, value: Any) -> None:
-    """Check that a value consists of finite numbers, strings, and lists and dictionaries of them.
-
-    Raises:
-        ValueError: the value contains anything else.
-    """
+    """Check that a value consists of finite numbers, strings, and lists and dictionaries of them."""
     try:
         json.dumps(value, allow_nan=False)
     except (TypeError, ValueError, RecursionError) as error:

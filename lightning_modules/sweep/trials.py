@@ -73,16 +73,7 @@ def make_trials(
     budget: dict[str, float],
     output: Path,
 ) -> list[Trial]:
-    """Parse and build all combinations; nothing is written.
-
-    Args:
-        configs: configurations of all trials, in the order of ``lightning fit -c``.
-        over: groups of overlays; a trial takes one of each.
-        settings: ``KEY=VALUE,VALUE,...``; a trial takes one value of each.
-        seeds: seeds of the initial weights.
-        budget: training budget, see :func:`lightning_modules.sweep.budget.with_budget`.
-        output: folder of the sweep.
-    """
+    """Parse and build all combinations of overlays, one of each group, and values; nothing is written."""
     common = [word for config in configs for word in ("-c", str(config))]
     groups = [[(Path(path).stem, ["-c", str(path)]) for path in group] for group in over]
     for key, values in map(_key_and_values, settings):

@@ -45,11 +45,7 @@ class Checkpoints(TorchCheckpointIO):
         self._folder, self._saved = Path(os.path.abspath(folder)), set()
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
-        """Write a checkpoint atomically.
-
-        Raises:
-            DivergedError: the weights are not finite; training can resume from the previous checkpoint.
-        """
+        """Write a checkpoint atomically, if its weights are finite; training can resume from the previous one."""
         try:
             # files of forked or spawned processes are plain weights
             check_tensors(checkpoint.get("state_dict", checkpoint))

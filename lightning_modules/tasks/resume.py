@@ -13,11 +13,7 @@ from spikekit.arguments import one_line
 
 
 def check_resume(checkpoint: Mapping[str, Any], path: str | Path, module: BaseTask) -> None:
-    """Check a checkpoint by one step with a temporary optimiser and schedule.
-
-    Raises:
-        ValueError: the training cannot resume from it; the message is one line that names the file.
-    """
+    """Check a checkpoint by one step with a temporary optimiser and schedule."""
     weights = [torch.nn.Parameter(weight.detach().clone()) for weight in module.network.parameters()]
     made = module.optimizers_of(weights)
     try:
@@ -35,11 +31,7 @@ def check_resume(checkpoint: Mapping[str, Any], path: str | Path, module: BaseTa
 
 
 def load_weights_of(checkpoint: Mapping[str, Any], path: str | Path, module: BaseTask) -> None:
-    """Load the weights of a checkpoint into a module.
-
-    Raises:
-        ValueError: the weights are of another network; the message is one line that names the file.
-    """
+    """Load the weights of a checkpoint into a module."""
     try:
         module.on_load_checkpoint(dict(checkpoint))
         module.load_state_dict(checkpoint["state_dict"])

@@ -46,10 +46,6 @@ class Runner:
     Args:
         args: arguments of ``lightning test``, and these of ``lightning predict``: ``--tile``, ``--tolerance``,
             ``--self_ensemble``, ``--interpolated`` and ``--future``.
-
-    Raises:
-        InputError: the arguments are invalid.
-        CannotRunError: a file is missing, or the machine lacks a required device or precision.
     """
 
     def __init__(self, args: Sequence[str]) -> None:

@@ -51,9 +51,6 @@ class Setting(NamedTuple):
 def read_setting(text: str) -> Setting:
     """Parse a setting: ``ARGS`` or ``NAME: ARGS``.
 
-    Raises:
-        UsageError: the text has neither form.
-
     Example:
         >>> read_setting("my own: -c my.yaml").args
         ['-c', 'my.yaml']

@@ -76,11 +76,7 @@ def _check(sidecar: Sidecar) -> None:
 
 
 def find_sidecar(stream: Path) -> Sidecar | None:
-    """Return the side-car of a stream: the JSON file of the same name, if it describes this stream.
-
-    Raises:
-        ValueError: the file names this stream but is not a valid side-car.
-    """
+    """Return the side-car of a stream: the JSON file of the same name, if it describes this stream."""
     path, ours = stream.with_suffix(".json"), False
     with suppress(OSError, ValueError, TypeError, LookupError, RecursionError):
         ours = _data(path)["stream"]["file"] == stream.name

@@ -71,17 +71,7 @@ class SiteTable:
         return torch.where(base + self.high >= length, 3 - self.low + length - base, place)
 
     def classes(self, y: Tensor, x: Tensor, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return bases and classes of positions in steps.
-
-        Args:
-            y: rows, int32, from ``-STEPS`` to ``STEPS * height``.
-            x: columns, from ``-STEPS`` to ``STEPS * width``.
-            height: height of the sensor.
-            width: width of the sensor.
-
-        Returns:
-            Rows and columns of the bases, and the classes, in the shape of ``y``.
-        """
+        """Return rows and columns of the bases, and the classes, of int32 positions from -1 to ``length``, in steps."""
         rows, columns = y // STEPS, x // STEPS
         down, right = y - STEPS * rows, x - STEPS * columns
         i, j = self.place(rows, height), self.place(columns, width)
@@ -120,16 +110,10 @@ def site_table(
     neighbors: int = 4,
     sparse: bool = False,
 ) -> SiteTable:
-    """Return the table of one colour, cached.
+    """Return the table of one colour, cached, that weights at most 4 ``neighbors``, the known temporal pixels.
 
-    Args:
-        pattern: Bayer phase, or ``"grey"``.
-        color: 0, 1, 2 for R, G, B; 0 for grey.
-        scale: super-resolution factor s.
-        odd: whether height and width of the sensor are odd, which changes the phase at the far border.
-        device: device of the table.
-        neighbors: number of known temporal pixels that are weighted, at most 4.
-        sparse: features at pixels of other colours are zero, so the enlarged ones are renormalised.
+    It depends on whether height and width of the sensor are ``odd``, which changes the phase at the far border. If the
+    features are ``sparse``, zero at pixels of other colours, the enlarged ones are renormalised.
     """
     if device.type == "cpu":
         return apart(_make_table, pattern, color, scale, odd, neighbors, sparse)
@@ -170,19 +154,10 @@ def _make_table(
 def _weights(
     mask: Tensor, gain: Tensor, neighbors: int, scale: int, rows: list[int], columns: list[int], steps: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute the weights for all pairs of bases and all fractions.
+    """Compute the weights for bases in I rows and J columns, at S x S fractions ``steps``.
 
-    Args:
-        mask: known temporal pixels, (s H, s W).
-        gain: factor of every temporal pixel, (s H, s W).
-        neighbors: number of known pixels that are weighted.
-        scale: super-resolution factor s.
-        rows: rows of the I bases.
-        columns: columns of the J bases.
-        steps: fractions on both axes, (S,).
-
-    Returns:
-        For the I J S^2 classes: number of features, (classes,), their offsets, (n, 2), and weights, (n, s^2).
+    ``mask`` and ``gain`` are those of all temporal pixels, (s H, s W). Returned are, for the I J S^2 classes, the
+    number of features, (classes,), their offsets, (n, 2), and weights, (n, s^2).
     """
     height, width = (length // scale for length in mask.shape)
     # distinct targets of the temporal pixels of a site at all fractions, in steps of a temporal pixel
