@@ -146,7 +146,7 @@ def test_integer_limits_are_numbers_of_batches(configs, overlay, tmp_path):
 def test_verbs_that_need_no_trainer_do_not_import_lightning(tmp_path):
     write_spikes(tmp_path / "clip.npz", torch.rand(41, 8, 10) < 0.3)
     code = f"""
-import sys, lightning_modules
+import gc, sys, lightning_modules
 assert "CSCSR" in dir(lightning_modules) and "torch" not in sys.modules
 from lightning_modules.__main__ import main
 for words in (
@@ -155,6 +155,7 @@ for words in (
     ["export", "cscsr_tiny_x4", "-o", "{tmp_path}/tiny.safetensors"],
 ):
     main(words)
+assert gc.isenabled() and gc.get_freeze_count() > 100_000  # imports are not searched for garbage
 import lightning_modules.adaptation.cli
 assert "pytorch_lightning" not in sys.modules
 """
