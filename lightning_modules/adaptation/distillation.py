@@ -49,10 +49,6 @@ class DistillationSet:
 def chosen_frames(total: int, frames: int) -> list[int]:
     """Return the middle frames of the examples; clips of held-out examples do not overlap with the others.
 
-    Args:
-        total: number of spike frames of the recording, at least ``ROOM`` clips.
-        frames: number of spike frames of the longest clip.
-
     Example:
         >>> chosen_frames(1000, 101)[-5:]
         [669, 770, 830, 889, 949]

@@ -18,12 +18,7 @@ def configured_network(
     """Build the network of configurations, weights or a checkpoint, and load its weights.
 
     Weights of a network of this package describe it; configurations then only replace the motion estimator. A
-    checkpoint has to match the network of the configurations, if they have one.
-
-    Args:
-        configs: configuration files; later ones override earlier ones, and only ``model`` is read.
-        weights: name or path of weights; overrides the weights of the configurations.
-        checkpoint: path of a checkpoint, in place of weights.
+    checkpoint, in place of weights, has to match the network of the configurations, if they have one.
     """
     from jsonargparse import ArgumentError, ArgumentParser  # slow, and most predictions need no configuration
 

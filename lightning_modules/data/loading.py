@@ -100,19 +100,22 @@ def load_clips(clips: Dataset, batch_size: int, workers: int, **options: object)
     )
 
 
-class _ClipLoader(DataLoader):
+class Resumable:
+    """Mark a loader as resumable for Lightning; its position follows from the training step."""
+
+    def state_dict(self) -> dict[str, object]:  # noqa: D102
+        return {}
+
+    def load_state_dict(self, state: dict[str, object]) -> None:  # noqa: D102
+        pass
+
+
+class _ClipLoader(Resumable, DataLoader):
     """A loader whose workers send arrays through pipes, as tensors need more shared memory than containers have."""
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
         batches = made_on_cpu(super().__iter__)
         return ({name: torch.from_numpy(value) for name, value in batch.items()} for batch in batches)
-
-    # these two methods mark the loader as resumable for Lightning; its position follows from the training step
-    def state_dict(self) -> dict[str, object]:
-        return {}
-
-    def load_state_dict(self, state: dict[str, object]) -> None:
-        pass
 
 
 def made_on_cpu(batches: Callable[[], Iterator[T]]) -> Iterator[T]:

@@ -12,7 +12,7 @@ from pytorch_lightning import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from lightning_modules.data.loading import made_on_cpu, process, start_worker
+from lightning_modules.data.loading import Resumable, made_on_cpu, process, start_worker
 from lightning_modules.data.margin import trim
 from lightning_modules.data.rendering import Gallery
 
@@ -32,7 +32,7 @@ class _Drawn(Dataset):
         return {name: np.stack([one[name] for one in drawn]) for name in drawn[0]}
 
 
-class ScenePool:
+class ScenePool(Resumable):
     """Training batches of :class:`StillClips` that are rendered on the training device, in pools.
 
     Every kind of scene has a pool of ``reuse`` parts with ``size`` clips each. After one random pass over the pool, a
@@ -85,13 +85,6 @@ class ScenePool:
         for batch in islice(self._stream, self.length):
             self._next += 1
             yield batch
-
-    # these two methods mark the loader as resumable for Lightning; its position follows from the training step
-    def state_dict(self) -> dict[str, object]:  # noqa: D102
-        return {}
-
-    def load_state_dict(self, state: dict[str, object]) -> None:  # noqa: D102
-        pass
 
     def _turns(self, first: int) -> Iterator[tuple[int, int]]:
         """Yield the kind of every batch from ``first`` on and the number of earlier batches of it, evenly mixed."""

@@ -113,14 +113,8 @@ def cut_pictures(
 ) -> Tensor:
     """Crop squares from pictures, (B, 3, side, side) in [0, 1]: bicubic and antialiased, by two matrix products each.
 
-    Args:
-        gallery: the pictures.
-        which: (B,) indices of pictures.
-        cuts: (B, 2, 4), see :func:`draw_cut`.
-        sides: (B,) sides of the drawn squares; flips are about their middles.
-        side: side of all returned squares, at least the largest of ``sides``; they continue beyond the drawn ones.
-        taken: largest number of rows and of columns that a crop takes.
-        turn: (B, 3) bool: reverse rows, reverse columns, transpose.
+    ``cuts`` (B, 2, 4) are those of :func:`draw_cut`, ``taken`` the most rows and columns of a crop. Crops are reversed
+    in rows and columns about the middles of the drawn ``sides`` (B,), and transposed, as ``turn`` (B, 3) says.
     """
     # lines beyond a crop have no weight, but must lie inside the gallery
     rows, columns = (

@@ -178,17 +178,9 @@ def clips_around(
 ) -> Iterator[tuple[int, Tensor]]:
     """Yield number and clip of every key frame as soon as the last frame of the clip is read.
 
-    Memory: ``length`` frames and a clip.
-
-    Args:
-        middles: numbers of the key frames, increasing; the first is at least ``first + length // 2``.
-        length: frames of a clip.
-        frames: frames (H, W) of the stream, in order.
-        first: number of the first frame of the stream.
-        jump: returns the frames from a given number on; if given, frames between two clips are skipped.
-
-    Returns:
-        An iterator over numbers and clips (length, H, W); it ends with the key frames or with the stream.
+    Memory: ``length`` frames and a clip. The clips end with the key frames ``middles``, in order, or with the stream of
+    ``frames`` (H, W), whose number begins at ``first``. ``jump`` returns the frames from a given number on; if given,
+    frames between two clips are skipped.
 
     Example:
         >>> frames = iter(torch.arange(9.0).reshape(9, 1, 1))

@@ -75,17 +75,9 @@ def tiled(
     around: Callable[[Box], int],
     scale: int = 1,
 ) -> Tensor:
-    """Compute planes in tiles of about the same size, even to keep the Bayer phase.
+    """Compute planes (..., s H, s W) in tiles of about the same size, even to keep the Bayer phase; 0 for one tile.
 
-    Args:
-        run: function that returns planes (..., s h, s w) for a box of h x w sensor pixels.
-        whole: box of the whole planes.
-        tile: largest side of a tile in sensor pixels, 0 for a single tile.
-        around: function that returns the margin needed around a box, in sensor pixels.
-        scale: pixels of the planes per sensor pixel, s.
-
-    Returns:
-        Planes (..., s H, s W).
+    ``run`` returns the planes of a box, and ``around`` the margin needed around it, in sensor pixels.
     """
     height, width = whole.bottom - whole.top, whole.right - whole.left
     if not tile or max(height, width) <= tile:

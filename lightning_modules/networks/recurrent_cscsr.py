@@ -265,10 +265,7 @@ class RecurrentCSCSR(CSCSR):
 def read_from_end(group: Sequence[int], meet: Callable[[int, State | None, State | None], State]) -> Iterator[State]:
     """Yield the states of a backward pass, from the last key frame to the first; each uses the next key frame's state.
 
-    Args:
-        group: indices of the key frames.
-        meet: function of a key frame's index, the state before it and the state after it (None if absent), which
-            returns the state of the key frame.
+    ``meet`` returns the state of a key frame from its index, the state before it and the state after it, or None.
 
     Example:
         >>> list(read_from_end("abc", lambda n, before, after: f"({before or ''}{n}{after or ''})"))
@@ -288,12 +285,7 @@ def read_forward(
 ) -> Iterator[State]:
     """Yield the states of a forward pass; each uses the previous key frame's state and the next one's backward state.
 
-    Args:
-        group: indices of the key frames.
-        meet: see :func:`read_from_end`.
-        before: state of the key frame before the group, or None.
-        behind: states from :func:`read_from_end`, from the last to the second, or an empty list. They are popped in
-            use, to free memory.
+    The states ``behind``, from the last to the second, are popped from the list in use, to free memory.
 
     Example:
         >>> meet = lambda n, before, after: f"({before or ''}{n}{after or ''})"

@@ -28,18 +28,10 @@ _LONGEST = 240  # bytes of a folder's name
 
 @dataclass(frozen=True)
 class Trial:
-    """One training and its test.
+    """One training and its test."""
 
-    Args:
-        labels: overlay or value chosen from each group.
-        seed: seed of the initial weights; ``None`` for that of the configuration.
-        folder: output folder.
-        config: resolved configuration.
-        budget: training budget, see :func:`lightning_modules.sweep.budget.with_budget`.
-    """
-
-    labels: tuple[str, ...]
-    seed: int | None
+    labels: tuple[str, ...]  # overlay or value chosen from each group
+    seed: int | None  # of the initial weights; None for that of the configuration
     folder: Path
     config: dict[str, Any]
     budget: dict[str, float]

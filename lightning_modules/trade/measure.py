@@ -21,30 +21,19 @@ from spikekit.timing import Timer, peak_memory, timer_of
 
 @dataclass
 class Measurement:
-    """A setting and its measurements so far, or the ``reason`` why it cannot run.
-
-    Args:
-        psnr: PSNR of every clip, in dB.
-        ssim: SSIM of every clip.
-        lpips: LPIPS of every clip; empty if not available.
-        seconds: time of one picture, for every round.
-        memory: increase of the memory in use by a clip, in MiB; ``None`` if not available.
-        macs: multiplications of convolutions and matrix products per sensor pixel.
-        flicker: flicker of pairs of pictures in films, see :func:`lightning_modules.metrics.flicker.film_flicker`.
-        latency: latency of a film in clocks; ``None`` for single clips.
-    """
+    """A setting and its measurements so far, or the ``reason`` why it cannot run."""
 
     setting: Setting
     runner: Runner | None = None
     reason: str | None = None
-    psnr: list[float] = field(default_factory=list)
+    psnr: list[float] = field(default_factory=list)  # of every clip, in dB
     ssim: list[float] = field(default_factory=list)
-    lpips: list[float] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
-    memory: float | None = None
-    macs: float | None = None
-    flicker: list[float] = field(default_factory=list)
-    latency: int | None = None
+    lpips: list[float] = field(default_factory=list)  # empty if not available
+    seconds: list[float] = field(default_factory=list)  # of one picture, for every round
+    memory: float | None = None  # increase by a clip, in MiB; None if not available
+    macs: float | None = None  # of convolutions and matrix products per sensor pixel
+    flicker: list[float] = field(default_factory=list)  # of pairs of pictures in films
+    latency: int | None = None  # of a film in clocks
 
     @property
     def parameters(self) -> int:

@@ -98,16 +98,11 @@ def usual_settings(
 
     First the networks of the package: the reference, then the others by their multiplications. Then variants: every
     network without motion and as a self-ensemble, the reference also with other estimators, in float32 and with other
-    tiles, the largest network also with larger self-ensembles. Last the classical decoders.
+    tiles, the largest network also with larger self-ensembles. Last the classical decoders. For films: only the
+    networks, with and without motion.
 
-    Args:
-        scale: super-resolution factor.
-        own: options that give weights to the shared network, such as ``--ckpt_path``; this network then replaces those
-            of the package.
-        network: that network; variants that it has no options for are left out.
-        film: settings for films: only the networks, with and without motion.
-        frames: spike frames of the scenes; networks with longer clips are left out.
-        pattern: Bayer phase of the networks, or ``"grey"``.
+    If ``own`` options, such as ``--ckpt_path``, give weights to the shared ``network``, it replaces those of the
+    package, and variants that it has no options for are left out.
     """
     noisy = {name for ideal, name in for_noise(scale).items() if ideal != name}  # they would need other scenes
     models = [one for one in list_models(scale, pattern) if one.name not in noisy and one.frames <= frames]

@@ -155,37 +155,24 @@ def _my_tile(channels, points, tile_c: tl.constexpr, tile_q: tl.constexpr):
 def _gather_kernel(
     values, index, weight, result, channels, points, neighbors,
     values_b, values_c, values_p, result_b, result_c, result_q,
-    wide: tl.constexpr, tile_c: tl.constexpr, tile_q: tl.constexpr,
+    wide: tl.constexpr, tile_c: tl.constexpr, tile_q: tl.constexpr, back: tl.constexpr,
 ):  # fmt: skip
-    """Sum the weighted neighbours of a tile of channels and points."""
+    """Sum the weighted neighbours of a tile of results, or with ``back`` add the tile to its neighbours, atomically."""
     b, c, q = _my_tile(channels, points, tile_c, tile_q)
     inside = (c < channels) & (q < points)
     values += b * values_b + c * values_c
-    total = tl.zeros([tile_c, tile_q], wide)
+    result += b * result_b + c * result_c + q * result_q
+    total = tl.load(result, mask=inside, other=0).to(wide) if back else tl.zeros([tile_c, tile_q], wide)
     for k in range(neighbors):
         entry = (b * neighbors + k) * points + q
         pixel = tl.load(index + entry, mask=q < points, other=0)
         share = tl.load(weight + entry, mask=q < points, other=0).to(wide)
-        total += tl.load(values + pixel * values_p, mask=inside, other=0).to(wide) * share
-    store(result + b * result_b + c * result_c + q * result_q, total, inside)
-
-
-@triton.jit(do_not_specialize=["neighbors"])
-def _scatter_kernel(
-    grad, index, weight, result, channels, points, neighbors,
-    grad_b, grad_c, grad_q, result_b, result_c, result_p,
-    wide: tl.constexpr, tile_c: tl.constexpr, tile_q: tl.constexpr,
-):  # fmt: skip
-    """Add a weighted tile of channels and points to its neighbours, atomically."""
-    b, c, q = _my_tile(channels, points, tile_c, tile_q)
-    inside = (c < channels) & (q < points)
-    value = tl.load(grad + b * grad_b + c * grad_c + q * grad_q, mask=inside, other=0).to(wide)
-    result += b * result_b + c * result_c
-    for k in range(neighbors):
-        entry = (b * neighbors + k) * points + q
-        pixel = tl.load(index + entry, mask=q < points, other=0)
-        share = tl.load(weight + entry, mask=q < points, other=0).to(wide)
-        tl.atomic_add(result + pixel * result_p, value * share, mask=inside, sem="relaxed")
+        if back:
+            tl.atomic_add(values + pixel * values_p, total * share, mask=inside, sem="relaxed")
+        else:
+            total += tl.load(values + pixel * values_p, mask=inside, other=0).to(wide) * share
+    if not back:
+        store(result, total, inside)
 
 
 @triton.jit(do_not_specialize=["neighbors"])
@@ -223,26 +210,28 @@ def _tiles(batch: int, channels: int, points: int, tile: dict[str, int | tl.dtyp
 
 def weighted_gather(values: Tensor, index: Tensor, weight: Tensor) -> Tensor:
     """Read every neighbour of every point once, write the sums once."""
-    values, index, weight = values.detach(), index.contiguous(), weight.detach().contiguous()
-    (batch, channels, _), (_, neighbors, points) = values.shape, index.shape
-    result = empty_like_layout(values, points)
-    tile = _tile(values, wide_dtype(values, weight))
-    sizes = channels, points, neighbors, *values.stride(), *result.stride()
-    launch(_gather_kernel, _tiles(batch, channels, points, tile), values, index, weight, result, *sizes, **tile)
+    result = empty_like_layout(values, index.shape[2])
+    _gather(values, index, weight, result, _tile(values, wide_dtype(values, weight)), False)
     return result
+
+
+def _gather(
+    values: Tensor, index: Tensor, weight: Tensor, result: Tensor, tile: dict[str, int | tl.dtype], back: bool
+) -> None:
+    values, index, weight, result = values.detach(), index.contiguous(), weight.detach().contiguous(), result.detach()
+    (batch, channels, points), neighbors = result.shape, index.shape[1]
+    sizes = channels, points, neighbors, *values.stride(), *result.stride()
+    programs = _tiles(batch, channels, points, tile)
+    launch(_gather_kernel, programs, values, index, weight, result, *sizes, **tile, back=back)
 
 
 def weighted_scatter(grad: Tensor, index: Tensor, weight: Tensor, size: int) -> Tensor:
     """Read the gradient once and add it to every neighbour; not deterministic."""
     if torch.are_deterministic_algorithms_enabled():
         return NotImplemented
-    grad, index, weight = grad.detach(), index.contiguous(), weight.detach().contiguous()
-    (batch, channels, points), neighbors = grad.shape, index.shape[1]
     dtype = wide_dtype(grad, weight)
     result = empty_like_layout(grad, size).to(dtype).zero_()
-    tile = _tile(grad, dtype)
-    sizes = channels, points, neighbors, *grad.stride(), *result.stride()
-    launch(_scatter_kernel, _tiles(batch, channels, points, tile), grad, index, weight, result, *sizes, **tile)
+    _gather(result, index, weight, grad, _tile(grad, dtype), True)
     return result.to(grad.dtype)
 
 

@@ -236,16 +236,11 @@ class NearestKnown(torch.autograd.Function):
 
 
 def idw_neighbors(flow: Tensor, mask: Tensor, neighbors: int = 4) -> tuple[Tensor, Tensor]:
-    """Return the known pixels nearest to the positions of a flow, and their inverse-distance weights.
+    """Return the known pixels nearest to the positions of a flow (N, 2, H, W), and their inverse-distance weights.
 
-    Args:
-        flow: (N, 2, H, W), floating.
-        mask: (H, W); a pixel is known where it is not 0.
-        neighbors: number of neighbours, K.
-
-    Returns:
-        Flat indices, int64, and weights, in the dtype of ``flow`` but at least float32; both (N, K, H W). The weights
-        are differentiable in the flow. If fewer pixels are known, the nearest is repeated with weight 0.
+    A pixel is known where the mask (H, W) is not 0. Flat indices, int64, and weights, in the dtype of the flow but at
+    least float32, are both (N, K, H W). The weights are differentiable in the flow. If fewer pixels are known, the
+    nearest is repeated with weight 0.
     """
     flow = finite(flow.to(torch.promote_types(flow.dtype, torch.float32)))
     return NearestKnown.apply(flow, mask, neighbors)
