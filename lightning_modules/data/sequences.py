@@ -22,10 +22,11 @@ from lightning_modules.data.loading import ClipScenes, cut_key_frames
 from lightning_modules.data.margin import flow_margin, trim
 from lightning_modules.data.pictures import split_pictures
 from lightning_modules.signatures import inherit_signature
-from spikekit import bin_to_sensor
+from spikekit import VideoError, bin_to_sensor
 from spikekit.check import check_positive, check_whole
 from spikekit.color.cfa import GREY, cfa_pattern
 from spikekit.flow.interpolate import FlowInterpolation
+from spikekit.io.failures import reading
 from spikekit.io.video import read_video
 from spikekit.scenes.frame_sequence import SIMULATOR_VERSION, FrameSequence, SequenceClip
 from spikekit.sensor.noise import SensorNoise
@@ -133,14 +134,15 @@ class ClipRecipe:
     def view(self, sequence: SequenceFiles, middle: int) -> SequenceClip:
         """Return the view of the camera around a source frame; raises the errors of :meth:`clip`."""
         paths = self.files(sequence, middle)[: sum(self.reach) + 1]
-        seen = FrameSequence(
-            [_shrunk(read_video(path)[0], sequence.shrink) for path in paths],
-            scale=self.scale if sequence.truth is None else 1,
-            pattern=self.pattern,
-            alpha=self.alpha,
-            clocks=self.clocks,
-            interpolation=self.interpolation,
-        )
+        frames = [_shrunk(read_video(path)[0], sequence.shrink) for path in paths]
+        for path, rgb in zip(paths, frames, strict=True):
+            if rgb.shape != frames[0].shape:
+                (height, width), (h, w) = frames[0].shape[1:], rgb.shape[1:]
+                raise VideoError(f"{path}: expected {height} x {width} (H x W) as {paths[0]}, got {h} x {w}")
+        scale = self.scale if sequence.truth is None else 1
+        names = "pattern", "alpha", "clocks", "interpolation"
+        with reading(sequence.folder, VideoError):  # raised in a worker, any other error would be a traceback
+            seen = FrameSequence(frames, scale=scale, **{name: getattr(self, name) for name in names})
         return seen.clip(self.reach[0], self.frames + (self.key_frames - 1) * self.clocks)
 
     def _flow(self, clip: SequenceClip, time: int) -> Tensor:
@@ -167,7 +169,7 @@ def _truth(path: Path, scale: int, spikes: Tensor) -> Tensor:
     # the view is cropped to whole Bayer cells
     if not all(0 <= length - side < 2 * scale for length, side in zip(rgb.shape[1:], wanted, strict=True)):
         expected, got = (f"{height} x {width}" for height, width in (wanted, rgb.shape[1:]))
-        raise ValueError(f"{path}: expected {expected}, {scale} times the frames that the sensor sees, got {got}")
+        raise VideoError(f"{path}: expected {expected}, {scale} times the frames that the sensor sees, got {got}")
     return rgb[:, : wanted[0], : wanted[1]]
 
 
@@ -255,7 +257,7 @@ class SequenceClips(Dataset):
         part, margin = (0, 0, height, width), 0
         if rng is not None:
             if self.patch > min(height, width):
-                raise ValueError(
+                raise VideoError(
                     f"patch: expected at most {min(height, width)}, as {sequence.folder} gives {height} x {width} "
                     f"sensor pixels at scale {scale}, got {self.patch}"
                 )

@@ -7,7 +7,7 @@ import torch
 
 from lightning_modules.data.layouts import find_sequences
 from lightning_modules.data.sequences import ClipRecipe, FilmScenes, SequenceClips
-from spikekit import mosaic, read_picture
+from spikekit import VideoError, mosaic, read_picture
 
 SMALL = {"scale": 2, "patch": 8, "batch_size": 2, "workers": 0}
 
@@ -149,11 +149,16 @@ def test_bad_files_are_named(tmp_path, write_film):
     (tmp_path / "a" / "00000001.png").write_bytes(b"no picture")
     write_film(tmp_path / "b", 1, (32, 50), first=2)
     clips = scenes(tmp_path).test_set
-    with pytest.raises(ValueError, match=r"a/00000001\.png"):
+    # of our own class, which the command shows as one line
+    with pytest.raises(VideoError, match=r"a/00000001\.png"):
         clips[0]
-    with pytest.raises(ValueError, match="expected 32 x 48"):
+    with pytest.raises(
+        VideoError, match=r"b/00000002\.png: expected 32 x 48 \(H x W\) as .*b/00000000\.png, got 32 x 50"
+    ):
         clips[1]
     write_film(tmp_path / "b", 3)
     train = SequenceClips(found(tmp_path / "b").test, ClipRecipe(scale=2), patch=18)
-    with pytest.raises(ValueError, match=r"patch: expected at most 16, as .* gives 16 x 24 sensor pixels at scale 2"):
+    with pytest.raises(VideoError, match=r"patch: expected at most 16, as .* gives 16 x 24 sensor pixels at scale 2"):
         train[0]
+    with pytest.raises(VideoError, match="b: frames: expected 34 x 34 pixels or more, got 32 x 48"):
+        SequenceClips(train.places[0][:1], ClipRecipe(scale=17))[0]
