@@ -67,6 +67,24 @@ def options(args: Sequence[str]) -> Iterator[tuple[int, str, str]]:
         yield (n + 1, option, value) if equals else (n + 2, option, args[n + 1] if n + 1 < len(args) else "")
 
 
+def given_data(args: Sequence[str]) -> dict[str, Any]:
+    """Return the arguments of the data in configurations and options; of several values, the last.
+
+    Example:
+        >>> given_data(["--data.alpha", "0.5", "--data.init_args.scale=2", "--data.scale=3"])
+        {'alpha': 0.5, 'scale': 3}
+    """
+    import yaml
+
+    given: dict[str, Any] = {}
+    for _, option, value in options(args):
+        if option in ("-c", "--config") and os.path.exists(value):
+            given |= inner_arguments(read_config(value).get("data"))
+        elif named := re.fullmatch(r"--data\.(?:init_args\.)?(\w+)", option):
+            given[named[1]] = yaml.safe_load(value)
+    return given
+
+
 def flatten(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield dotted keys and the values that are not dictionaries.
 

@@ -22,7 +22,7 @@ from pytorch_lightning.loggers import TensorBoardLogger
 from pytorch_lightning.utilities import rank_zero_only
 from pytorch_lightning.utilities.exceptions import MisconfigurationException, SIGTERMException
 
-from lightning_modules.cli.arguments import flatten, with_network_of_weights
+from lightning_modules.cli.arguments import flatten, given_data, with_network_of_weights
 from lightning_modules.cli.configured import run_checkpoint
 from lightning_modules.cli.errors import Ended, InputError, UsageError, causes, input_errors
 from lightning_modules.cli.folder_lock import check_folder, locked_folder
@@ -55,6 +55,9 @@ _NOTHING_TO_DO = (
 # an int is a number of batches, a float a fraction
 _COUNTS = {f"trainer.limit_{stage}_batches" for stage in ("train", "val", "test", "predict")}
 _COUNTS |= {"trainer.overfit_batches", "trainer.val_check_interval"}
+
+# arguments of the network that its data follow
+_SHARED = "scale", "frames", "alpha"
 
 # environment variable: id of the process that starts the others of a distributed run
 _FIRST = "SPIKEKIT_FIRST_PROCESS"
@@ -116,7 +119,7 @@ class Command(LightningCLI):
                 action._typehint = int | float | None
         parser.set_defaults({"model": {"class_path": "SuperResolution"}})
         network = "model.init_args.network.init_args"
-        for name in ("scale", "frames", "alpha"):
+        for name in _SHARED:
             parser.link_arguments(f"{network}.{name}", f"data.init_args.{name}")
         parser.link_arguments("model.init_args.flow", "data.init_args.flow_patch", {"scene": 0, "estimated": 48}.get)
         parser.link_arguments("model", "data.init_args.flow_times", _ends, apply_on="instantiate")
@@ -126,6 +129,12 @@ class Command(LightningCLI):
             with input_errors():
                 args = with_network_of_weights(self.typed)
             self.config = parser.parse_args(args)
+            given = given_data(self.typed)
+            for name in [name for name in _SHARED if name in given]:  # a link replaces it without a word
+                expected = self.config.get(f"{self.typed[0]}.data.init_args.{name}", given[name])
+                if given[name] != expected:
+                    said = f"expected {expected}, the value of model.network.{name}, got {given[name]}"
+                    raise UsageError(f"data.{name}: {said}")
         except SystemExit as error:
             if not isinstance(error.code, str):
                 raise
