@@ -12,6 +12,7 @@ import argparse
 import math
 import time
 from collections.abc import Callable, Iterator
+from operator import truediv
 from pathlib import Path
 from statistics import mean
 
@@ -21,6 +22,7 @@ from scipy.stats import chi2
 from torch import Tensor
 
 from lightning_modules.data.pictures import embedded_pictures
+from lightning_modules.inference.clips import film_groups
 from lightning_modules.inference.film import FilmMaker
 from lightning_modules.inference.rest import CELL, Rest
 from lightning_modules.networks import Network
@@ -59,7 +61,8 @@ def scenes(size: tuple[int, int], clocks: int, scale: int) -> Iterator[tuple[str
     yield "noisy sensor", still, lambda _: 1.0
     yield "calibrated sensor", still, lambda _: 1.0
     yield "dark", still, lambda _: 0.05
-    yield "panning", Scene([Layer(ground, Motion(velocity=(0.1 * scale, 0.0)))], *view, clocks), lambda _: 1.0
+    for name, speed in (("panning", 0.1), ("slow panning", 0.02)):
+        yield name, Scene([Layer(ground, Motion(velocity=(speed * scale, 0.0)))], *view, clocks), lambda _: 1.0
 
 
 def film_of(scene: Scene, bright: Callable[[int], float], network: Network, noise: SensorNoise | None = None) -> Tensor:
@@ -109,23 +112,20 @@ def main() -> None:
         plain, resting = FilmMaker(network), FilmMaker(network, psnr_tolerance=0.1)
         plain.calibration = resting.calibration = known
         times, cells, found, moving = [], [], [], []
-        for clock in range(network.frames // 2, clocks - network.frames // 2, EVERY):
-            clip = spikes[None, clock - network.frames // 2 :][:, : network.frames]
+        shown = range(network.frames // 2, clocks - network.frames // 2, EVERY)
+        clips = {clock: spikes[None, clock - network.frames // 2 :][:, : network.frames] for clock in shown}
+        for clock, made, took, computed in in_turns(clips, (plain, resting), network.settings["alpha"] / ALPHA):
             truth = (bright(clock) * scene.rgb(clock)).clamp(0, 1)
-            made = []
-            for maker in (plain, resting):
-                start = time.process_time()
-                made.append(maker(clip, [clock], exposure=network.settings["alpha"] / ALPHA)[0])
-                times.append(time.process_time() - start)
-            cells.append(resting.rest.computed.float().mean().item())
+            times.append(took)
+            cells.append(computed.float().mean().item())
             found.append([psnr(picture, truth).item() for picture in made])
             if len(found) > 11 and any(layer.motion != Motion() for layer in scene.layers):
                 part = (scene.rgb(clock - EVERY) != scene.rgb(clock + EVERY)).any(0)
                 moving.append(-10 * math.log10(apart(made[1], truth, part) / apart(made[0], truth, part)))
             if args.overlay:
-                write_overlay(args.overlay, f"{name.split()[0]}_{clock:05}.png", made, truth, resting.rest.computed)
-        late = times[20::2], times[21::2]
-        ratio, share = sum(late[1]) / sum(late[0]), mean(cells[10:])
+                write_overlay(args.overlay, f"{name.split()[0]}_{clock:05}.png", made, truth, computed)
+        late = zip(*times[11:], strict=True)
+        ratio, share = 1 / truediv(*map(sum, late)), mean(cells[11:])
         figures = [mean(one for one, _ in found), *(found[n][1] - found[n][0] for n in (1, 10, -1))]
         written = [f"{figure:.2f}" for figure in figures] + [f"{mean(moving):.2f}" if moving else ""]
         size = " x ".join(map(str, args.size))
@@ -133,6 +133,23 @@ def main() -> None:
         if name == "still":
             gain = psnr(of_exact_light(network, scene.rgb(0)), scene.rgb(0)).item() - figures[0]
             print(f"{args.weights},{size},exact light,,,{figures[0]:.2f},,,{gain:.2f},", flush=True)
+
+
+def in_turns(
+    clips: dict[int, Tensor], makers: tuple[FilmMaker, FilmMaker], exposure: float
+) -> Iterator[tuple[int, list[Tensor], list[float], Tensor]]:
+    """Yield the clock, the pictures of both films, their seconds, and the cells that the second one computed."""
+    for group in film_groups(clips, 1, makers[1].together(EVERY)):
+        made = []
+        for clock in group:
+            start = time.process_time()
+            picture = makers[0](clips[clock], [clock], exposure=exposure)[0]
+            made.append((picture, time.process_time() - start))
+        start = time.process_time()
+        pictures = makers[1](torch.cat([clips[clock] for clock in group]), group, exposure=exposure)
+        seconds = (time.process_time() - start) / len(group)
+        for n, clock in enumerate(group):
+            yield clock, [made[n][0], pictures[n]], [made[n][1], seconds], makers[1].computed[n]
 
 
 def of_exact_light(network: Network, truth: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ from spikekit.io.video_output import check_film
 from spikekit.progress import progress
 from spikekit.timing import duration
 
-_HOW = "tile", "psnr_tolerance", "self_ensemble", "future", "interpolated"
+_HOW = "tile", "psnr_tolerance", "self_ensemble", "future"
 
 
 def parser() -> argparse.ArgumentParser:
@@ -76,11 +76,9 @@ def parser() -> argparse.ArgumentParser:
         dest="psnr_tolerance",
         metavar="DB",
         help="films: PSNR in dB that a picture may lose to save work; above 0, the network runs only where the spikes "
-        "show motion, and no picture is interpolated; default: 0.1 for --speed fast and balanced without interpolated "
-        "pictures, or else 0",
+        "show motion, and less often where it is slow; default: 0.1 for --speed fast and balanced, or else 0",
     )
     add("--self_ensemble", type=int, metavar="N", help="average 2, 4 or 8 views of a clip")
-    add("--interpolated", type=whole(0), metavar="N", help="pictures interpolated between two of the network")
     add("--future", type=whole(0), metavar="N", help="later pictures that a picture waits for; weights for films only")
     add("--device", help="such as cpu or cuda:1; default: a GPU if there is one")
     add("--precision", choices=["32-true", "bf16-mixed"], help="default: bf16-mixed if the device supports it")

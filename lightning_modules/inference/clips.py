@@ -202,20 +202,20 @@ def clips_around(
         yield middle, torch.stack(tuple(held))
 
 
-def film_groups(items: Iterable[Item], future: int = 0, interpolated: int = 0) -> Iterator[list[Item]]:
-    """Yield the items of a film in groups that are made together; each group ends with a picture of the network.
+def film_groups(items: Iterable[Item], first: int, size: int) -> Iterator[list[Item]]:
+    """Yield the items of a film in groups that are made together.
 
     Args:
         items: one item per picture, in order.
-        future: later key frames that a picture may wait for.
-        interpolated: pictures interpolated between two pictures of the network; none before the first.
+        first: pictures of the first group.
+        size: pictures of the others.
 
     Example:
-        >>> [*film_groups("abcdefg", interpolated=1)], [*film_groups("abcdefg", future=1, interpolated=1)]
-        ([['a'], ['b', 'c'], ['d', 'e'], ['f', 'g']], [['a', 'b', 'c'], ['d', 'e', 'f', 'g']])
+        >>> [*film_groups("abcdefg", 1, 2)], [*film_groups("abcdefg", 3, 3)]
+        ([['a'], ['b', 'c'], ['d', 'e'], ['f', 'g']], [['a', 'b', 'c'], ['d', 'e', 'f'], ['g']])
     """
-    items, size = iter(items), (future + 1) * (interpolated + 1)
-    group = list(islice(items, size - interpolated))
+    items = iter(items)
+    group = list(islice(items, first))
     while group:
         yield group
         group = list(islice(items, size))

@@ -3,27 +3,35 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from functools import cache, partial
+from functools import partial
 from io import BytesIO
 from itertools import chain, count, islice, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from lightning_modules.inference.clips import clip_in_light, clips_around, film_groups, join_frames
 from lightning_modules.inference.predict import check_views, predict
-from lightning_modules.inference.rest import AROUND, SEEN, Rest
+from lightning_modules.inference.rest import AROUND, CELL, SEEN, Rest, blend, boxes_around, find_misfits, grown
 from lightning_modules.inference.tiles import TILE, TILE_ON_GPU, Box, reach, tiled
 from lightning_modules.networks import Network, RecurrentCSCSR
 from lightning_modules.networks.recurrent_cscsr import read_forward, read_from_end
-from spikekit import Calibration, correct_spikes, flow_warp, linear_motion, upsample_flow
+from spikekit import Calibration, bin_to_sensor, correct_spikes, flow_warp, linear_motion, upsample_flow
 from spikekit.check import check_planes, check_positive, check_whole
 from spikekit.io.whole_file import whole_file
 from spikekit.recording import white_rate
+
+#: distance of two pictures of the network, in clocks, between which all pictures are made together
+_TOGETHER = 12
+#: largest motion between two pictures of the network, in sensor pixels, for single clips and with a state
+_SLOW = 2.0, 0.75
+#: largest share of cells that are computed in an interpolated picture
+_MOST = 0.5
 
 
 class FilmFrame(NamedTuple):
@@ -44,7 +52,6 @@ def film(
     every: int = 20,
     *,
     future: int = 0,
-    interpolated: int = 0,
     white: float | None = None,
     **how: Any,
 ) -> Iterator[FilmFrame]:
@@ -57,8 +64,8 @@ def film(
         shows clock N // 2. Only N frames and the current chunk are kept in memory. In dim light, N is larger, see
         :meth:`lightning_modules.inference.clips.RecordingClips.in_light`; ``noise_level`` is that of joined frames.
 
-        With ``future`` or ``interpolated``, pictures come in groups, see :class:`FilmMaker`. A picture is then delayed
-        by up to ``(future + 1) * (interpolated + 1) - 1`` pictures, and the group is kept in memory.
+        With ``future`` or ``psnr_tolerance``, pictures come in groups, see :class:`FilmMaker`. A picture is then
+        delayed by up to ``future`` pictures, or 11 clocks or a picture, and the group is kept in memory.
 
         The white level is the same in all pictures: ``white``, else the level that 99.9 % of the pixels of the first
         clip do not exceed.
@@ -69,7 +76,6 @@ def film(
             with the network's Bayer phase.
         every: clocks between two pictures.
         future: later key frames that a picture may wait for, see :class:`FilmMaker`.
-        interpolated: pictures interpolated between two pictures of the network, see :class:`FilmMaker`.
         white: white level in spikes per clock.
         how: ``static``, and further arguments of :class:`FilmMaker`.
 
@@ -91,7 +97,7 @@ def film(
     if white is not None:
         check_positive("white", white)
     static = how.pop("static", False)
-    maker = FilmMaker(network, future, interpolated, **how)
+    maker = FilmMaker(network, future, **how)
     return _pictures(maker, _frames(chunks), every, white, static)
 
 
@@ -105,7 +111,7 @@ def _pictures(
     exposure = network.settings["alpha"] / (joined * white)
     clips = clips_around(count(length // 2, every), length, frames)
     joint = ((clock, join_frames(clip, joined)) for clock, clip in clips)
-    for group in film_groups(joint, maker.future, maker.interpolated):
+    for group in film_groups(joint, maker.future + 1, maker.together(every / joined)):
         clocks, spikes = [clock for clock, _ in group], torch.stack([clip for _, clip in group])
         pictures = maker(spikes, [clock / joined for clock in clocks], static, exposure)
         for clock, rgb in zip(clocks, pictures, strict=True):
@@ -131,11 +137,12 @@ def _frames(chunks: Iterable[Tensor]) -> Iterator[Tensor]:
 
 
 class _Made(NamedTuple):
-    """A picture of the network and the motion of its clip."""
+    """A picture of the network, the motion of its clip, and the light (H, W) in the middle of the clip."""
 
     clock: int
     rgb: Tensor
     flow: Tensor | None
+    light: Tensor
 
 
 class _Known(NamedTuple):
@@ -143,6 +150,31 @@ class _Known(NamedTuple):
 
     clock: int
     state: Tensor
+
+
+class _Group:
+    """Clips whose pictures are made together, and one made before its turn, with the network's state after it."""
+
+    def __init__(
+        self, clocks: Sequence[int], clips: Sequence[Tensor], exposures: Sequence[float], alpha: float
+    ) -> None:
+        self.clocks, self.clips, self.exposures, self._alpha = clocks, clips, exposures, alpha
+        self.correct: Callable[[Tensor], Tensor]
+        self._corrected: dict[int, Tensor] = {}
+        self.ahead: tuple[int, _Made, _Known | None] | None = None
+
+    def corrected(self, n: int) -> Tensor:
+        """Return a clip as the network takes it."""
+        if n not in self._corrected:
+            self._corrected[n] = self.correct(self.clips[n])
+        return self._corrected[n]
+
+    def light(self, n: int) -> tuple[Tensor, float]:
+        """Return the light (H, W) in the middle of a clip, and that of a spike."""
+        frames = self.clips[n].shape[1]
+        middle = self.corrected(n)[0, frames // 4 : frames - frames // 4]
+        spike = self.exposures[n] / (self._alpha * len(middle))
+        return spike * middle.sum(0, dtype=torch.float32), spike
 
 
 class FilmMaker:
@@ -153,42 +185,45 @@ class FilmMaker:
     also use the next key frame. Neighbours further away than the length of a clip are not used, as their motion is
     unknown; groups from any other place of a film are therefore allowed.
 
-    An interpolated picture between those of the clocks l and r is
+    With a tolerance, groups have two or more pictures, see :meth:`together`. If most of the picture moves by less than
+    2 sensor pixels, or 0.75 for a network with a state, from the last whole picture of the network, of the clock l, to
+    a later one of the group, of the clock r, those between are interpolated:
 
     .. math:: I_n(x) = (1 - a) \, I_l(x + o_l(x)) + a \, I_r(x + o_r(x)), \quad a = \frac{n - l}{r - l}
 
     with offsets o along the motion of both clips, blended with the same weights. Where one of the two points lies
     outside the picture, only the other is used.
 
-    Convention:
-        The network makes the last picture of every ``interpolated + 1`` and the last of a group. If the previous
-        picture is further away than the length of a clip, it also makes the first.
+    Cells of 8 x 8 sensor pixels that move faster are computed, and those where the spikes contradict an interpolated
+    picture, see :func:`lightning_modules.inference.rest.find_misfits`.
 
+    Convention:
         For frames larger than a tile, states of key frames are stored in half precision: 0.27 GiB at x4 and
         1000 x 1000 sensor pixels. Pictures change by 0.03 of an 8-bit step (rms).
 
     Args:
         network: network of :mod:`lightning_modules.networks`.
         future: later key frames that a picture may wait for; only for networks with a state.
-        interpolated: pictures interpolated between two pictures of the network.
         tile: largest side of a tile in sensor pixels, 0 for no tiles; default: 256, or 512 on a GPU.
         psnr_tolerance: PSNR in dB that a picture may lose to save work. Above 0, the network runs only where the spikes
-            show motion, see :class:`lightning_modules.inference.rest.Rest`; the first picture is always complete.
+            show motion, see :class:`lightning_modules.inference.rest.Rest`, and less often where it is slow; the first
+            picture is always complete.
         how: ``self_ensemble`` of :func:`lightning_modules.inference.predict.predict`, with which every clip is
             reconstructed alone, without a state.
 
     Attributes:
         calibration: of the sensor; if set, the spikes are those that it fired, and are corrected for the network.
+        computed: cells (h, w) that the network computed of every picture of the last group, with a tolerance.
 
     Raises:
-        ValueError: ``future`` for a network without a state; ``interpolated`` for a network without a motion estimate;
-            a negative number; an option that the network does not support; or a tolerance that is negative, is combined
-            with ``future`` or ``interpolated``, or is for a network without a ``halo``.
+        ValueError: ``future`` is negative, or for a network without a state; an option that the network does not
+            support; or a tolerance that is negative, is combined with ``future``, or is for a network without a
+            ``halo``.
 
     Example:
         >>> from lightning_modules.networks import CSCSR
         >>> network = CSCSR(scale=2, width=8, representation_width=8, features=1, stages=1, end_blocks=1)
-        >>> maker = FilmMaker(network, interpolated=1)
+        >>> maker = FilmMaker(network, psnr_tolerance=0.1)
         >>> maker(torch.zeros(2, 41, 12, 10), [20, 23]).shape
         torch.Size([2, 3, 24, 20])
     """
@@ -197,42 +232,44 @@ class FilmMaker:
         self,
         network: Network,
         future: int = 0,
-        interpolated: int = 0,
         tile: int | None = None,
         psnr_tolerance: float = 0.0,
         **how: Any,
     ) -> None:
         kind = type(network).__name__
         self.carries_on = isinstance(network, RecurrentCSCSR) and how.get("self_ensemble", 1) == 1
-        for name, number in (("future", future), ("interpolated", interpolated)):
-            if isinstance(number, bool) or not isinstance(number, int) or number < 0:
-                raise ValueError(f"{name}: expected a whole number >= 0, got {number!r}")
+        if isinstance(future, bool) or not isinstance(future, int) or future < 0:
+            raise ValueError(f"future: expected a whole number >= 0, got {future!r}")
         if future and not self.carries_on:
             raise ValueError(f"future: expected 0, as {kind} takes single clips, got {future}")
-        if interpolated and not network.takes_flow:
-            raise ValueError(f"interpolated: expected 0, as {kind} estimates no motion of a clip, got {interpolated}")
         check_views(how.get("self_ensemble", 1))
         if not 0 <= psnr_tolerance < math.inf:
             raise ValueError(f"psnr_tolerance: expected 0 dB or more, got {psnr_tolerance}")
-        if psnr_tolerance and (future or interpolated):
-            raise ValueError(f"psnr_tolerance: expected 0 with future or interpolated pictures, got {psnr_tolerance}")
+        if psnr_tolerance and future:
+            raise ValueError(f"psnr_tolerance: expected 0 with future, got {psnr_tolerance}")
         if psnr_tolerance and network.halo is None:
             raise ValueError(f"psnr_tolerance: expected 0 for {kind}, run on whole pictures only, got {psnr_tolerance}")
-        self.network, self.future, self.interpolated, self._how = network, future, interpolated, how
+        self.network, self.future, self._how = network, future, how
         on_gpu = any(part.is_cuda for part in network.parameters())
         self.tile = (TILE_ON_GPU if on_gpu else TILE) if tile is None else tile
         self.calibration: Calibration | None = None
         self._last: _Made | None = None
         self._known: _Known | None = None
         self.rest: Rest | None = None
+        self.computed: list[Tensor] = []
         if psnr_tolerance:
             self.rest = Rest(network.scale, network.pattern, network.settings["alpha"], network.noise_level > 0)
 
     @property
     def warm_up(self) -> int:
-        """Number of groups before another that visibly affect it."""
-        known = -(-self.network.warm_up // (self.future + 1)) if self.carries_on else 0
-        return max(known, min(self.interpolated, 1), Rest.warm_up if self.rest else 0)
+        """Number of pictures before another that visibly affect it."""
+        return max(self.network.warm_up if self.carries_on else 0, Rest.warm_up if self.rest else 0)
+
+    def together(self, every: float) -> int:
+        """Return how many pictures are made together if they are ``every`` clocks apart, after the first group."""
+        if self.rest is None or not self.network.takes_flow or 2 * every > self.network.frames:
+            return self.future + 1
+        return max(int(_TOGETHER / every), 2)
 
     def save(self, path: Path, clock: int) -> None:
         """Write the state after a picture, from which a film continues as if it had not stopped."""
@@ -271,52 +308,120 @@ class FilmMaker:
             raise ValueError(f"clocks: expected {len(spikes)} increasing ones, got {list(clocks)}")
         if self.rest is not None and not static:
             light = torch.as_tensor(exposure).flatten().expand(len(spikes)).tolist()
-            pictures = [*map(self._where_it_moves, spikes.split(1), clocks, light)]
-            return torch.cat(pictures) if len(pictures) > 1 else pictures[0]
+            group = _Group(clocks, spikes.split(1), light, self.network.settings["alpha"])
+            group.correct = partial(correct_spikes, calibration=self.calibration, pattern=self.network.pattern)
+            pictures, self.computed = [], []
+            for n in range(len(clocks)):
+                pictures.append(self._where_it_moves(group, n))
+                self.computed.append(self.rest.computed)
+            return torch.stack(pictures) if len(pictures) > 1 else pictures[0][None]
         spikes = correct_spikes(spikes, self.calibration, self.network.pattern)
-        if not self.interpolated:
-            return self._made(spikes, list(clocks), None, static, exposure)
-        every, total = self.interpolated + 1, len(clocks)
-        see = partial(self._see, spikes, clocks, static, exposure)
-        known = [self._last]
-        if self._last is None or clocks[0] - self._last.clock > self.network.frames:
-            known = see([0])
-        keys = {*range(every - 1, total, every), total - 1}
-        known += see(sorted(n for n in keys if clocks[n] > known[0].clock))
-        self._last = known[-1]
-        pictures = {made.clock: made.rgb for made in known}
-        for left, right in pairwise(known):
-            between = [clock for clock in clocks if left.clock < clock < right.clock]
-            pictures |= {clock: self._interpolate(left, right, clock) for clock in between}
-        return torch.cat([pictures[clock] for clock in clocks])
+        return self._made(spikes, list(clocks), None, static, exposure)
 
-    def _where_it_moves(self, spikes: Tensor, clock: int, exposure: float) -> Tensor:
+    def _where_it_moves(self, group: _Group, n: int) -> Tensor:
         """Return a picture of which only moving parts are computed; the state of the other parts is kept."""
-        whole, before, state = Box(0, 0, *spikes.shape[-2:]), self._known, None
-        if before is not None and clock - before.clock <= self.network.frames:
-            state = before.state
-        corrected = cache(partial(correct_spikes, spikes, self.calibration, self.network.pattern))
+        clips, clock, exposure = group.clips[n], group.clocks[n], group.exposures[n]
+        whole, before, scale = Box(0, 0, *clips.shape[-2:]), self._known, self.network.scale
+        if group.ahead is not None and group.ahead[0] == n:
+            _, self._last, self._known = group.ahead
+            group.ahead, before = None, self._known
+        if before is not None and clock - before.clock > self.network.frames:
+            before = None
+        state = None if before is None else before.state
+        interpolated = False
 
         def make(box: Box, static: bool) -> Tensor:
-            nonlocal state
-            outer, near = box.grown(SEEN, whole), box.grown(AROUND, whole)
-            flow = self.network.resolve_flow(near.of(corrected()), None, static)
-            flow = None if flow is None else outer.of(flow, near[:2])
-            if self.carries_on:
-                self._known = None if state is None else _Known(before.clock, outer.of(before.state))
-            rgb = self._made(outer.of(corrected()), [clock], flow, flow is None, exposure)[0]
-            if self.carries_on:
-                part = self._known.state
-                if box == whole:
-                    state = part
-                else:
-                    state = state.clone() if state is before.state else state
-                    box.of(state).copy_(box.of(part, outer[:2]))
-            return box.of(rgb, outer[:2], self.network.scale)
+            nonlocal state, interpolated
+            last = self._last
+            if (last is None or last.clock != clock) and box == whole and not static:
+                between = self._between(group, n)
+                if between is not None:
+                    interpolated = True
+                    return between
+                last = self._last = self._whole(group, n)
+                state = self._known.state if self.carries_on else None
+            if last is not None and last.clock == clock:
+                return box.of(last.rgb[0], scale=scale).clone()
+            rgb, part = self._part(group, n, box, static, before)
+            if part is not None and box == whole:
+                state = part
+            elif part is not None:
+                state = state.clone() if state is before.state else state
+                box.of(state).copy_(part)
+            return rgb
 
-        rgb = self.rest(spikes[0], clock, make, exposure, self.calibration)
-        self._known = None if state is None else _Known(clock, state)
-        return rgb[None]
+        rgb = self.rest(clips[0], clock, make, exposure, self.calibration)
+        if interpolated:
+            self._known = before
+        else:
+            self._known = None if state is None else _Known(clock, state)
+        return rgb
+
+    def _part(
+        self, group: _Group, n: int, box: Box, static: bool, before: _Known | None
+    ) -> tuple[Tensor, Tensor | None]:
+        """Return the network's picture of a box, and its state."""
+        clip = group.corrected(n)
+        whole = Box(0, 0, *clip.shape[-2:])
+        outer, near = box.grown(SEEN, whole), box.grown(AROUND, whole)
+        flow = self.network.resolve_flow(near.of(clip), None, static)
+        flow = None if flow is None else outer.of(flow, near[:2])
+        if self.carries_on:
+            self._known = None if before is None else _Known(before.clock, outer.of(before.state))
+        rgb = self._made(outer.of(clip), [group.clocks[n]], flow, flow is None, group.exposures[n])[0]
+        state = box.of(self._known.state, outer[:2]) if self.carries_on else None
+        return box.of(rgb, outer[:2], self.network.scale), state
+
+    def _whole(self, group: _Group, n: int) -> _Made:
+        """Return the network's picture of a clip, and what an interpolation needs."""
+        clip = group.corrected(n)
+        flow = self.network.resolve_flow(clip, None, False)
+        rgb = self._made(clip, [group.clocks[n]], flow, flow is None, group.exposures[n])
+        joint = flow.mean(dim=1) if flow is not None and flow.ndim == 6 else flow  # one motion for all colours
+        return _Made(group.clocks[n], rgb, joint, group.light(n)[0])
+
+    def _between(self, group: _Group, n: int) -> Tensor | None:
+        """Return a picture between the last one of the network and a later one, or None if motion is too fast."""
+        left, clocks, last = self._last, group.clocks, len(group.clocks) - 1
+        if left is None or left.flow is None or left.flow.shape[-2:] != group.clips[n].shape[-2:]:
+            return None
+        if group.ahead is None:
+            spans = {m: clocks[m] - left.clock for m in range(last, n, -1)}
+            near = (m for m, span in spans.items() if span <= self.network.frames)
+            m = next((m for m in near if self._fast(left, spans[m]).float().mean() <= _MOST), None)
+            if m is None:
+                return None
+            before = self._known
+            group.ahead = m, self._whole(group, m), self._known
+            self._known = before
+        right = group.ahead[1]
+        span = right.clock - left.clock
+        cells = self._fast(left, span) | self._fast(right, span)
+        if span > self.network.frames or cells.float().mean() > _MOST:
+            return None
+        rgb = self._interpolate(left, right, clocks[n]).float()
+        scale, (light, spike) = self.network.scale, group.light(n)
+        pairs = (light, rgb), (left.light, left.rgb), (right.light, right.rgb)
+        off = (seen - bin_to_sensor(shown[0].float(), self.network.pattern, scale=scale) for seen, shown in pairs)
+        cells = cells | find_misfits(*off, spike)
+        near, whole, before = grown(cells), Box(0, 0, *light.shape), self._known
+        if near.float().mean() > _MOST:
+            return None
+        for box, _ in boxes_around(near, near, whole):
+            part, _ = self._part(group, n, box, False, before)
+            box.of(rgb[0], scale=scale).lerp_(part.float(), blend(cells, box, scale))
+        self._known, self.rest.computed = before, near
+        return rgb[0]
+
+    def _fast(self, made: _Made, span: float) -> Tensor:
+        """Return the cells (h, w) that move too far in some clocks for a picture between."""
+        if made.flow is None:
+            return torch.zeros((), dtype=torch.bool)
+        first, middle, last = self.network.flow_times
+        clocks = made.flow.new_tensor([middle - first, last - middle])[:, None, None]
+        speed = (made.flow[0].square().sum(1).sqrt() / clocks).amax(0, keepdim=True)
+        parts = F.avg_pool2d(speed, CELL // 2, ceil_mode=True)
+        return span * F.max_pool2d(parts, 2, ceil_mode=True)[0] > _SLOW[self.carries_on]
 
     def _made(
         self, spikes: Tensor, clocks: list[int], flow: Tensor | None, static: bool, exposure: float | Tensor
@@ -325,21 +430,6 @@ class FilmMaker:
         if self.carries_on:
             return self._carried_on(spikes, clocks, flow, static).mul_(exposure).clamp_(0, 1)
         return predict(self.network, spikes, flow, static, exposure=exposure, tile=self.tile, **self._how)
-
-    def _see(
-        self, spikes: Tensor, clocks: Sequence[int], static: bool, exposure: float | Tensor, keys: list[int]
-    ) -> list[_Made]:
-        """Return the network's pictures of some clips of a group, and their motion."""
-        if not keys:
-            return []
-        flows = [self.network.resolve_flow(spikes[n : n + 1], None, static) for n in keys]
-        flow = None if flows[0] is None else torch.cat(flows)
-        light = exposure[keys] if isinstance(exposure, Tensor) and exposure.ndim else exposure
-        at = [clocks[n] for n in keys]
-        rgb = self._made(spikes[keys], at, flow, flow is None, light)
-        # one motion for all colours
-        joint = [one.mean(dim=1) if one is not None and one.ndim == 6 else one for one in flows]
-        return list(map(_Made, at, rgb.split(1), joint))
 
     def _interpolate(self, left: _Made, right: _Made, clock: int) -> Tensor:
         share = (clock - left.clock) / (right.clock - left.clock)

@@ -54,8 +54,6 @@ class Preset:
         motion: class name of a motion estimator, such as ``"ZeroFlow"``, that replaces the one used in training.
         tile: side of a tile in sensor pixels, see :func:`lightning_modules.inference.predict.predict`.
         self_ensemble: number of views, 1, 2, 4 or 8, see :func:`lightning_modules.inference.predict.predict`.
-        interpolated: pictures interpolated between two pictures of the network, see
-            :class:`lightning_modules.inference.film.FilmMaker`.
         precision: precision of the Trainer, such as ``"bf16-mixed"``.
 
     Example:
@@ -73,7 +71,6 @@ class Preset:
     motion: str | None = None
     tile: int | None = None
     self_ensemble: int | None = None
-    interpolated: int | None = None
     precision: str | None = None
 
     def given(self, *names: str) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection, Iterator
-from dataclasses import replace
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
@@ -25,9 +24,6 @@ from spikekit.color.cfa import GREY, PATTERNS
 from spikekit.io.image_bytes import to_bytes
 from spikekit.recording import Recording, open_recording
 
-# largest distance, in clocks, of two pictures of the network between which pictures are interpolated: without
-# loss in fast scenes, and in slower ones
-_APART, _FARTHER_APART = 6, 12
 # width of the white gap between two pictures side by side, in pixels
 _GAP = 4
 
@@ -60,8 +56,8 @@ def reconstruct(
         ``calibration="none"`` declares the pixels ideal. In dim light, clips are longer, see
         :meth:`lightning_modules.inference.clips.RecordingClips.in_light`.
 
-        Films of ``"fast"`` and ``"balanced"`` run the network only where something moves, unless pictures are
-        interpolated; ``psnr_tolerance=0`` runs it everywhere.
+        Films of ``"fast"`` and ``"balanced"`` run the network only where something moves, and less often where it is
+        slow; ``psnr_tolerance=0`` runs it everywhere.
 
     Args:
         path: a ``.dat`` or ``.npz`` file, see :func:`spikekit.read_spikes`.
@@ -84,7 +80,7 @@ def reconstruct(
             else the level that 99.9 % of the pixels do not exceed, the same in all pictures.
         device: device of the network; default: a GPU if there is one.
         precision: ``"32-true"`` or ``"bf16-mixed"``; default: the latter if the device computes in bfloat16.
-        how: ``tile``, ``psnr_tolerance``, ``self_ensemble``, ``future`` and ``interpolated`` of
+        how: ``tile``, ``psnr_tolerance``, ``self_ensemble`` and ``future`` of
             :class:`lightning_modules.inference.film.FilmMaker`; they override those of the chosen preset.
 
     Returns:
@@ -120,9 +116,9 @@ def reconstruct(
     if network is None:
         scale = scale or (1 if recording.pattern == GREY else 4)
         speed = "balanced" if budget is None and speed is None else speed
-        preset, notes = _chosen(recording, speed, budget, scale, frame, level, bool(how.get("psnr_tolerance")))
-        how = {**preset.given("tile", "self_ensemble", "interpolated"), **how}
-        if speed in ("fast", "balanced") and not (how.get("future") or how.get("interpolated")):
+        preset, notes = _chosen(recording, speed, budget, scale, frame, level)
+        how = {**preset.given("tile", "self_ensemble"), **how}
+        if speed in ("fast", "balanced") and not how.get("future"):
             how = {"psnr_tolerance": 0.1, **how}
         network = preset.build(GREY if recording.pattern == GREY else "RGGB")
     clips = RecordingClips(recording, network.frames, frame, network.pattern).in_light(white, join=network.joins)
@@ -209,15 +205,19 @@ class Reconstruction:
                 if wanted and frame not in made:
                     shown = self._shown(picture.cpu().clone())
                     yield FilmFrame(frame, torch.cat([*self._decoded(clip, beside), shown], dim=-1))
-            if state is not None and maker.warm_up and n % maker.warm_up == 0:
+            if state is not None and maker.warm_up and n % -(-maker.warm_up // len(group)) == 0:
                 maker.save(state, group[-1])
 
     def _groups(self, maker: FilmMaker, made: set[int], part: int, parts: int) -> list[tuple[list[int], bool]]:
         """Groups of frames made together, and whether their pictures are wanted or they only warm up the network."""
-        groups = list(film_groups(self.clips.chosen, maker.future, maker.interpolated))
+        chosen = self.clips.chosen
+        every = min((later - frame for frame, later in pairwise(chosen)), default=1)
+        size = maker.together(every / self.clips.joined)
+        groups = list(film_groups(chosen, maker.future + 1, size))
         mine = range(*(len(groups) * n // parts for n in (part, part + 1)))
         wanted = {n for n in mine if not made.issuperset(groups[n])}
-        seen = sorted({n for last in wanted for n in range(max(last - maker.warm_up, 0), last + 1)})
+        before = -(-maker.warm_up // size)
+        seen = sorted({n for last in wanted for n in range(max(last - before, 0), last + 1)})
         return [(groups[n], n in wanted) for n in seen]
 
     def _shown(self, rgb: Tensor) -> Tensor:
@@ -289,7 +289,6 @@ def _chosen(
     scale: int,
     frame: str | None,
     level: float,
-    resting: bool,
 ) -> tuple[Preset, list[str]]:
     """Return the preset for a speed or a budget, and lines that tell its name and cost."""
     clips = RecordingClips(recording, frame=frame)
@@ -298,21 +297,14 @@ def _chosen(
     noisy, grey = level > NOISY, recording.pattern == GREY
     conditions = Conditions(scale, clips.size, film, clips.room, noisy, grey)
     choice = choose(conditions, speed, budget)
-    apart = _APART if speed in (None, "best") else _FARTHER_APART
-    interpolated = max(apart // every - 1, 0) if choice.preset.moves and not resting else 0
     said = [str(choice)]
     if speed not in (None, "fastest"):
         sooner = list(SPEEDS)[list(SPEEDS).index(speed) - 1]
         other = choose(conditions, sooner)
         said += [f"faster, --speed {sooner}: {other}"] if other != choice else []
-    if interpolated:
-        said.append(
-            f"{interpolated} of {interpolated + 1} pictures are interpolated, as they are {every} frames apart; "
-            "--interpolated 0 computes all with the network"
-        )
     if noisy and choice.preset.weights:
         said.append(_unmeasured(recording, level))
-    return replace(choice.preset, interpolated=interpolated or None), said
+    return choice.preset, said
 
 
 def _unmeasured(recording: Recording, level: float) -> str:

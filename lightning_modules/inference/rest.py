@@ -118,6 +118,37 @@ def _limit(count: Tensor | int, tests: int = 1) -> Tensor | float:
     return count + 2 * (count * x) ** 0.5 + 2 * x
 
 
+def find_misfits(off: Tensor, before: Tensor, after: Tensor, spike: float) -> Tensor:
+    """Find where spikes contradict a picture more than those of two neighbours contradict theirs.
+
+    A cell contradicts if its sum of squares over blocks of 1, 2, 4 or 8 pixels exceeds twice that of its neighbours by
+    more than chance, or if the mean difference of a part of 4 x 4 cells or of all is not that of the neighbours, as
+    under a lamp.
+
+    Args:
+        off: light (H, W) by the spikes minus that of the picture.
+        before: the same of the picture before.
+        after: the same of the picture after.
+        spike: light of a spike.
+
+    Returns:
+        Cells (h, w).
+    """
+    planes, found = torch.stack([off, before, after]) / spike, False
+    each = _sum(torch.ones_like(off), CELL)
+    for block in (1, 2, 4, CELL):
+        planes = planes if block == 1 else F.avg_pool2d(planes, 2, ceil_mode=True, divisor_override=1)
+        squares = F.avg_pool2d(planes.square(), CELL // block, ceil_mode=True, divisor_override=1)
+        blocks = each / block**2
+        found = found | (squares[0] > 1.5 * squares[1:].amin(0) + block**2 / 6 * (_limit(blocks) - blocks))
+    lamp = planes[0] - planes[1:].mean(0)
+    for side in (4, max(lamp.shape)):
+        total, pixels = _sum(lamp, side), _sum(each, side)
+        lit = total.square() > 3 / 8 * pixels * _limit(1)
+        found |= lit.repeat_interleave(side, 0).repeat_interleave(side, 1)[: lamp.shape[0], : lamp.shape[1]]
+    return found
+
+
 def _gains(recent: Tensor, expected: Tensor, spread: Tensor, cells: Tensor) -> Tensor:
     """Return the gain of every cell: that of most cells, or that of most others, if these are a tenth or more."""
     gain = _gain(recent[cells], expected[cells])
@@ -158,7 +189,7 @@ def _sum(plane: Tensor, side: int) -> Tensor:
     return F.avg_pool2d(plane[None], side, ceil_mode=True, divisor_override=1)[0]
 
 
-def _grown(cells: Tensor) -> Tensor:
+def grown(cells: Tensor) -> Tensor:
     """Return cells and their neighbours."""
     return F.max_pool2d(cells[None].float(), 3, 1, 1)[0] > 0
 
@@ -176,9 +207,9 @@ def _pixels(cells: Tensor, box: Box, scale: int = 1) -> Tensor:
     return box.of(cells.repeat_interleave(CELL * scale, -2).repeat_interleave(CELL * scale, -1), box[:2], scale)
 
 
-def _blend(cells: Tensor, box: Box, scale: int) -> Tensor:
+def blend(cells: Tensor, box: Box, scale: int) -> Tensor:
     """Return weights of a box's picture: 1 in cells and up to a quarter of a cell around, 0 from three quarters on."""
-    halves = _grown(_cells(cells, box).repeat_interleave(2, 0).repeat_interleave(2, 1))
+    halves = grown(_cells(cells, box).repeat_interleave(2, 0).repeat_interleave(2, 1))
     weight = F.interpolate(halves[None, None].float(), scale_factor=CELL // 2 * scale, mode="bilinear")[0, 0]
     return box.of(weight, box[:2], scale)
 
@@ -262,8 +293,8 @@ class Rest:
         still = self._calm >= frames - 1
         unsure = self._calm < frames - 1 + _SURE
         dark = _sum(self._earlier + self._later, CELL) < _DARK * CELL**2 * (self._before + self._since)
-        unsure |= _grown(unsure & dark) & dark
-        self.moving = near = _grown(unsure)
+        unsure |= grown(unsure & dark) & dark
+        self.moving = near = grown(unsure)
         new = still & (self._count < _PICTURES)
         self.computed = near | new
         self._count = (self._count + new) * still
@@ -271,7 +302,7 @@ class Rest:
         if not still.any():
             self._mean = None
             return make(whole, False)
-        boxes = _boxes(self.computed, near, whole) if self.computed.any() else []
+        boxes = boxes_around(self.computed, near, whole) if self.computed.any() else []
         parts = [(box, make(box, static).float()) for box, static in boxes]
         if self._mean is None:
             self._mean, self._shown = torch.zeros_like(parts[0][1]).repeat(2, 1, 1, 1)  # the first pictures are whole
@@ -288,7 +319,7 @@ class Rest:
             self._draw(due, exposure, known)
         shown = (self._mean if self.noisy else self._shown) * _pixels(self._light, whole, scale)
         for box, part in parts:
-            box.of(shown, scale=scale).lerp_(part, _blend(unsure, box, scale))
+            box.of(shown, scale=scale).lerp_(part, blend(unsure, box, scale))
         return shown.clamp_(0, 1)
 
     def _compare(self, spikes: Tensor, clocks: int, known: Calibration | None) -> None:
@@ -314,7 +345,7 @@ class Rest:
         if (self._count < _PICTURES).any() and (gain == 1).all():
             first, second = spikes[middle][clocks % 2 :].unflatten(0, (2, -1)).sum(1, dtype=torch.float32)
             changed |= find_changes(second, first, torch.ones_like(self._calm), noise)[0]
-        if _grown(changed).float().mean() > _BUSY:
+        if grown(changed).float().mean() > _BUSY:
             self._untested = _UNTESTED
         self._calm += clocks
         self._calm[changed] = self._before[changed] = self._since[changed] = 0
@@ -325,10 +356,10 @@ class Rest:
         for one in (self._excess, slow_excess * ~changed):
             total, tests = F.avg_pool2d(one, 3, 1, 1, divisor_override=1)
             self._calm[(total + tests > _limit(tests)).any(0)] = 0
-        kept, grown = (_pixels(cells.float(), whole) for cells in (~changed, full & ~changed))
+        kept, renewed = (_pixels(cells.float(), whole) for cells in (~changed, full & ~changed))
         self._timed |= kept == 0
-        self._earlier = self._earlier * kept + self._later * grown
-        self._later *= kept * (1 - grown)
+        self._earlier = self._earlier * kept + self._later * renewed
+        self._later *= kept * (1 - renewed)
         self._before += self._since * full
         self._since *= ~full
 
@@ -341,7 +372,7 @@ class Rest:
         if known is not None:
             rate = known.correct(rate, self.pattern)
         white = exposure / self.white
-        for box, _ in _boxes(due, due, whole):
+        for box, _ in boxes_around(due, due, whole):
             near = box.grown(CELL, whole)
             off = white * near.of(rate) - near.of(self._seen)
             inside, power = Box(0, 0, *off.shape), F.avg_pool2d(off.square()[None], CELL, ceil_mode=True)[0]
@@ -355,12 +386,12 @@ class Rest:
             torch.add(mean, box.of(part[0], near[:2], scale), out=shown)
 
 
-def _boxes(computed: Tensor, near: Tensor, whole: Box) -> list[tuple[Box, bool]]:
+def boxes_around(computed: Tensor, near: Tensor, whole: Box) -> list[tuple[Box, bool]]:
     """Return boxes around computed cells, and whether nothing moves there; where boxes overlap, the last counts."""
     from scipy.ndimage import find_objects, label
 
     found, area = [], 0
-    groups = label(_grown(computed).cpu().numpy())[0] * computed.cpu().numpy()
+    groups = label(grown(computed).cpu().numpy())[0] * computed.cpu().numpy()
     for rows, columns in find_objects(groups):
         box = Box(*(CELL * end for end in (rows.start, columns.start, rows.stop, columns.stop)))
         found.append((box.grown(0, whole), not near[rows, columns].any().item()))

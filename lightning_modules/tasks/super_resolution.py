@@ -165,7 +165,8 @@ class SuperResolution(BaseTask):
 
     def _film(self, clips: Tensor, every: int) -> Tensor:
         """Return the pictures (K, 3, s H, s W) of clips (K, N, H, W) that are ``every`` clocks apart."""
-        maker, groups = FilmMaker(self.network, self.future), film_groups(range(len(clips)), self.future)
+        size = self.future + 1
+        maker, groups = FilmMaker(self.network, self.future), film_groups(range(len(clips)), size, size)
         return torch.cat([maker(clips[group], [every * n for n in group]) for group in groups])
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:  # noqa: D102

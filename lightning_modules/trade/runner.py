@@ -45,7 +45,7 @@ class Runner:
 
     Args:
         args: arguments of ``lightning test``, and these of ``lightning predict``: ``--tile``, ``--tolerance``,
-            ``--self_ensemble``, ``--interpolated`` and ``--future``.
+            ``--self_ensemble`` and ``--future``.
     """
 
     def __init__(self, args: Sequence[str]) -> None:
@@ -102,7 +102,7 @@ class Runner:
 def _how() -> VerbParser:
     """Return a parser of the options of a setting that ``lightning predict`` has as well."""
     parser = VerbParser(prog="lightning trade", add_help=False, allow_abbrev=False)
-    for name in ("tile", "self_ensemble", "interpolated", "future"):
+    for name in ("tile", "self_ensemble", "future"):
         parser.add_argument(f"--{name}", type=whole(0))
     parser.add_argument("--tolerance", type=float, dest="psnr_tolerance")
     return parser

@@ -15,7 +15,7 @@ from lightning_modules.registry import Model, for_noise, list_models
 
 #: columns of a table, by option
 _COLUMNS = {f"--model.network.{name}": name for name in ("method", "window", "order", "scale", "frames", "motion")}
-_COLUMNS |= {f"--{name}": name for name in ("tile", "self_ensemble", "interpolated")}
+_COLUMNS |= {f"--{name}": name for name in ("tile", "self_ensemble")}
 _COLUMNS |= {"--model.weights": "weights", "--model.network": "network", "--trainer.precision": "precision"}
 
 

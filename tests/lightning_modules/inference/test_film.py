@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from lightning_modules import reconstruct
-from lightning_modules.inference.film import FilmMaker, film
+from lightning_modules.inference.film import FilmMaker, _Made, film
 from lightning_modules.inference.predict import predict
 from lightning_modules.motion import ClassicalFlow
 from lightning_modules.networks import CSCSR, ClassicalDecoder, Network, RecurrentCSCSR
@@ -61,7 +61,7 @@ def test_white_level_of_the_first_clip_is_used_for_all_pictures(spikes):
 def test_dim_films_have_the_pictures_of_dim_recordings(tmp_path, network):
     spikes, path = torch.rand(200, 8, 8) < 0.1, tmp_path / "dim.npz"
     write_spikes(path, spikes)
-    how = {"white": 0.25, "interpolated": int(network.takes_flow)}
+    how = {"white": 0.25, "psnr_tolerance": 0.1}
     pictures = dict(reconstruct(path, network=network, frame="41:159", precision="32-true", **how))
     torch.testing.assert_close(dict(film(network, spikes.split(9), **how)), pictures)
 
@@ -143,57 +143,17 @@ def clips(clocks, side=SIDE):
     return torch.stack([torch.full((5, side, side), float(clock)) for clock in clocks])
 
 
+def between(network, clock, *ends, tile=None):
+    seen = (clips([end]) for end in ends)
+    made = [_Made(end, network(clip), network.estimate_flow(clip), None) for end, clip in zip(ends, seen, strict=True)]
+    return FilmMaker(network, tile=tile)._interpolate(*made, clock)
+
+
 @pytest.mark.parametrize("tile", [0, 8])
-@pytest.mark.parametrize("interpolated", [1, 3])
-def test_interpolated_pictures_match_the_scene_up_to_the_edges(interpolated, tile):
-    network = Truth()
-    maker = FilmMaker(network, 0, interpolated, tile=tile)
-    network.frames = 40  # only says how far a picture may be away
-    group, found = interpolated + 1, []
-    clocks = [10 + 4 * n for n in range(2 * group)]
-    for first in (0, group):
-        part = clocks[first : first + group]
-        found.append(maker(clips(part), part))
-    expected = torch.stack([waves(clock) for clock in clocks])
-    assert error(torch.cat(found), expected) < 0.01
-    assert error(waves(clocks[0]), waves(clocks[1])) > 0.05
-    if not tile:
-        assert network.asked == [clocks[n] for n in (0, group - 1, 2 * group - 1)]
-
-
-def test_tiles_do_not_change_interpolation():
-    torch.manual_seed(0)
-    network = CSCSR(**TINY).eval()
-    spikes = (torch.rand(4, 41, 40, 36) < 0.3).to(torch.uint8)
-    network.halo = 40
-    whole, tiled = (FilmMaker(network, 0, 3, tile=tile)(spikes, [20, 26, 32, 38]) for tile in (0, 16))
-    torch.testing.assert_close(tiled, whole, rtol=0, atol=2e-4)
-
-
-def test_static_pictures_are_blended():
-    network = CSCSR(**TINY).eval()
-    spikes = (torch.rand(4, 41, 12, 10) < 0.3).to(torch.uint8)
-    found = FilmMaker(network, 0, 2)(spikes, [20, 40, 50, 60], static=True)
-    first, last = network(spikes[[0, 2]], static=True).clamp(0, 1)
-    torch.testing.assert_close(found[[0, 2]], torch.stack([first, last]))
-    torch.testing.assert_close(found[1], first / 3 + last * 2 / 3)
-
-
-def test_network_runs_only_on_its_own_pictures():
-    network = Truth()
-    maker = FilmMaker(network, 0, 1)
-    maker(clips([0, 3]), [0, 3])
-    maker(clips([6, 9, 12]), [6, 9, 12])  # 6 lies between 3 and 9; a group ends with a picture of the network
-    assert network.asked == [0, 3, 9, 12]
-    maker(clips([40, 43]), [40, 43])  # too far away from 12
-    assert network.asked[4:] == [40, 43]
-
-
-def test_exposure_of_every_clip():
-    exposure = torch.tensor([0.5, 0.25, 1.0]).reshape(3, 1, 1, 1)
-    found = FilmMaker(Truth(), 0, 2)(clips([0, 1, 2]), [0, 1, 2], exposure=exposure)
-    torch.testing.assert_close(found[0], 0.5 * waves(0))
-    torch.testing.assert_close(found[2], waves(2))
+@pytest.mark.parametrize("clock", [14, 16, 22])
+def test_interpolated_pictures_match_the_scene_up_to_the_edges(clock, tile):
+    assert error(between(Truth(), clock, 10, 26, tile=tile)[0], waves(clock)) < 0.01
+    assert error(waves(10), waves(14)) > 0.05
 
 
 def test_interpolation_blends_light_and_motion(monkeypatch):
@@ -201,44 +161,15 @@ def test_interpolation_blends_light_and_motion(monkeypatch):
     monkeypatch.setattr(network, "forward", lambda spikes, *_: x * (1 + clock(spikes) / 4))
     ends = torch.tensor([-2.0, 2.0]).reshape(1, 2, 1, 1, 1).expand(1, 2, 2, SIDE, SIDE)
     monkeypatch.setattr(network, "estimate_flow", lambda spikes: clock(spikes)[None] / 8 * ends)
-    maker = FilmMaker(network, 0, 3)
-    maker(clips([0]), [0])
-    found = maker(clips([1, 2, 3, 4]), [1, 2, 3, 4])
     share, moved = 1 / 4, SCALE * (0.5 * 1 / 4) / 1000  # 0.5 sensor pixels a clock at 4, none at 0
     expected = (1 - share) * (x - moved) + share * 2 * (x + 3 * moved)
-    torch.testing.assert_close(found[:1, :, 8:-8, 8:-8], expected[:, :, 8:-8, 8:-8])
+    torch.testing.assert_close(between(network, 1, 0, 4)[..., 8:-8, 8:-8], expected[..., 8:-8, 8:-8])
 
 
-def test_state_advances_between_pictures_of_the_network():
-    torch.manual_seed(1)
-    network = RecurrentCSCSR(**TINY).eval()
-    torch.nn.init.normal_(network.fusion.share.weight, std=0.1)
-    spikes = (torch.rand(8, 41, 12, 10) < 0.3).to(torch.uint8)
-    clocks = [20 + 5 * n for n in range(8)]
-    maker, keys = FilmMaker(network, 0, 1), FilmMaker(network)
-    found = torch.cat([maker(spikes[n : n + 2], clocks[n : n + 2]) for n in range(0, 8, 2)])
-    seen = [0, 1, 3, 5, 7]
-    expected = torch.cat([keys(spikes[n : n + 1], clocks[n : n + 1]) for n in seen])
-    torch.testing.assert_close(found[seen], expected)
-    groups = FilmMaker(network, 0, 1)
-    both = torch.cat([groups(spikes[n : n + 4], clocks[n : n + 4]) for n in (0, 4)])
-    assert (both[1] - found[1]).abs().max() > 1e-3  # has seen 3
-    torch.testing.assert_close(both[0], found[0])
-
-
-def test_interpolated_pictures_wait_for_the_next_picture_of_the_network():
-    network, come = Truth(), []
-
-    def camera():
-        for clock in range(60):
-            come.append(clock)
-            yield torch.full((1, SIDE, SIDE), float(clock))
-
-    shown = []
-    for clock, rgb in film(network, camera(), 2, interpolated=1, white=1.0):
-        shown.append((clock, come[-1]))
-        assert error(rgb, waves(clock - 2)) < 0.01  # Truth reads the clock of a clip's first frame
-    assert shown[:4] == [(2, 4), (4, 8), (6, 8), (8, 12)]
+def test_exposure_of_every_clip():
+    exposure = torch.tensor([0.5, 0.25, 1.0]).reshape(3, 1, 1, 1)
+    found = FilmMaker(Truth())(clips([0, 1, 2]), [0, 1, 2], exposure=exposure)
+    torch.testing.assert_close(found, exposure * torch.stack([waves(0), waves(1), waves(2)]))
 
 
 def test_self_ensemble_carries_no_state():
@@ -251,10 +182,8 @@ def test_self_ensemble_carries_no_state():
 def test_unsupported_film_options_are_rejected():
     network = CSCSR(**TINY)
     for wrong in (-1, 0.5, True):
-        with pytest.raises((ValueError, TypeError), match="interpolated"):
-            FilmMaker(network, 0, wrong)
-    with pytest.raises(ValueError, match="interpolated: expected 0, as ClassicalDecoder estimates no motion"):
-        FilmMaker(ClassicalDecoder(), 0, 1)
+        with pytest.raises((ValueError, TypeError), match="future"):
+            FilmMaker(network, wrong)
     with pytest.raises(ValueError, match="future: expected 0, as CSCSR takes single clips, got 1"):
         FilmMaker(network, 1)
     with pytest.raises(ValueError, match=r"clocks: expected 2 increasing ones, got \[3, 3\]"):

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from lightning_modules import reconstruct
-from lightning_modules.inference.film import film
-from lightning_modules.inference.presets import Choice, Preset
+from lightning_modules.inference.film import FilmMaker, film
 from lightning_modules.networks import CSCSR, ClassicalDecoder, RecurrentCSCSR
 from lightning_modules.registry import find_model
 from spikekit import SensorNoise, SpikeSensor, mosaic, read_spikes, simulate_spikes, write_picture, write_spikes
@@ -128,25 +127,13 @@ def test_invalid_white_levels_are_rejected(flat, white):
         reconstruct(flat(0.4), "fastest", white=white)
 
 
-@pytest.mark.parametrize(
-    ("every", "speed", "interpolated"),
-    [(1, "balanced", 11), (3, "best", 1), (4, "best", 0), (20, "balanced", 0), (3, "fastest", 0)],
-)
-def test_close_pictures_are_interpolated(flat, every, speed, interpolated):
-    pictures = reconstruct(flat(0.3), speed, frame=f"60:120:{every}", calibration="none")
-    assert pictures.how.get("interpolated", 0) == interpolated
-    without = reconstruct(flat(0.3), speed, frame=f"60:120:{every}", calibration="none", interpolated=0)
-    assert without.how["interpolated"] == 0
-    resting = reconstruct(flat(0.3), speed, frame=f"60:120:{every}", calibration="none", psnr_tolerance=0.2)
-    assert not resting.how.get("interpolated")
-
-
-def test_networks_without_motion_do_not_interpolate(flat, monkeypatch):
-    for weights, interpolated in (("cscsr_micro_x4", None), ("cscsr_tiny_x4", 1)):
-        choice = Choice(weights, Preset(weights), 27.0, 0.0, 1.0, 1.0)
-        monkeypatch.setattr("lightning_modules.inference.reconstruct.choose", lambda *of, choice=choice: choice)
-        pictures = reconstruct(flat(0.3), "best", frame="60:120:3", calibration="none")
-        assert pictures.how.get("interpolated") == interpolated
+@pytest.mark.parametrize(("every", "size"), [(1, 12), (3, 4), (20, 2), (21, 1)])
+def test_close_pictures_are_made_together(flat, every, size):
+    pictures = reconstruct(flat(0.3), "fast", frame=f"60:120:{every}", calibration="none")
+    sizes = [len(group) for group, _ in pictures._groups(FilmMaker(pictures.network, **pictures.how), set(), 0, 1)]
+    assert sizes[:3] == [1, size, size][: len(sizes)]
+    assert FilmMaker(pictures.network).together(every) == 1
+    assert FilmMaker(ClassicalDecoder(), psnr_tolerance=0.1).together(every) == 1
 
 
 @pytest.mark.parametrize(
