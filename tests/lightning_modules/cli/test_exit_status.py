@@ -170,3 +170,11 @@ def test_ctrl_c_while_torch_is_imported(monkeypatch, capsys):
         with pytest.raises(SystemExit, match="130"):
             main(["export"])
     assert capsys.readouterr().err == "lightning: stopped by Ctrl-C\n"
+
+
+@pytest.mark.slow
+def test_a_process_says_nothing_after_its_error():
+    """Such as the leaks that Triton's bindings report at exit, of objects that were kept from garbage collection."""
+    command = [sys.executable, "-m", "lightning_modules", "fit", "-c", "nowhere"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert len(done.stderr.splitlines()) == 1, done.stderr
