@@ -1,5 +1,6 @@
 """The option of the device; one thread each where tests run side by side (pytest -n); what damages files."""
 
+import atexit
 import copy
 import gc
 import multiprocessing
@@ -25,6 +26,8 @@ def pytest_configure(config):
     """Programs that tests start hear Ctrl-C, also where the shell runs tests in the background and ignores it."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    if hasattr(config, "workerinput"):  # of pytest -n: what it leaves need not be collected
+        atexit.register(os._exit, 0)
     if config.getoption("--table") and config.getoption("numprocesses", None):
         raise pytest.UsageError("--table: expected a single process, got -n")
 
