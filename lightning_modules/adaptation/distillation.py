@@ -23,13 +23,9 @@ _SIDE = 160  # side of an example in sensor pixels
 
 @dataclass(frozen=True)
 class DistillationSet:
-    """Examples: clips of a recording, and the teacher's pictures of them.
+    """Clips of the student's length (L, N, H, W), uint8, with pictures and flow; both and ``white`` in its units.
 
-    Args:
-        spikes: clips of the student's length, (L, N, H, W), uint8.
-        rgb: pictures of the teacher, (L, 3, s H, s W), float16, in the student's units.
-        flow: flow by the student's motion estimator, or None if it needs none.
-        white: value of a white pixel in the student's pictures.
+    The pictures are the teacher's, (L, 3, s H, s W), float16; the flow is None if the student estimates none.
     """
 
     spikes: Tensor
@@ -60,13 +56,7 @@ def chosen_frames(total: int, frames: int) -> list[int]:
 
 
 def make_distillation_set(student: Network, teacher: Network, clips: RecordingClips) -> DistillationSet:
-    """Create examples from clips of a recording.
-
-    Args:
-        student: network to train.
-        teacher: network of the same scale and Bayer phase.
-        clips: clips of the recording, of the length of the network with the longer clips.
-    """
+    """Create examples from clips as long as the longer of both networks takes, which share scale and Bayer phase."""
     chosen = chosen_frames(clips.recording.frames, clips.frames)
     ratio = teacher.settings["alpha"] / student.settings["alpha"]
     device, rng = next(teacher.parameters()).device, np.random.default_rng(0)

@@ -22,12 +22,9 @@ def calls_on_ray(
 ) -> Iterator[dict[Any, str | None]]:
     """Call functions on the Ray cluster of ``RAY_ADDRESS``, else on a running one, else on a new one on this machine.
 
-    Repeatedly yields the names of finished calls, each with its return value or its error: the reason of a failure, or
-    ``None``.
-
-    Args:
-        calls: function that takes the number of calls at once and returns functions and their arguments by name.
-        jobs: calls at once; default: the number of GPUs, else of nodes.
+    ``calls`` takes the number of calls at once, by default that of GPUs, else of nodes, and returns functions and their
+    arguments by name. Repeatedly yields the names of finished calls, each with its return value or its error: the
+    reason of a failure, or ``None``.
     """
     try:
         import ray

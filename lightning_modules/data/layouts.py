@@ -29,15 +29,10 @@ _REDS = ("{0}/{0}_orig", "{0}_orig", "{0}_orig_part*/{0}/{0}_orig", "{0}_orig_pa
 
 @dataclass(frozen=True)
 class SequenceFiles:
-    """The files of a frame sequence.
+    """The files of a frame sequence, such as ``walk`` or ``00001/0266``.
 
-    Args:
-        name: name of the sequence, such as ``walk`` or ``00001/0266``.
-        folder: folder of the frames.
-        frames: file names of the frames.
-        truth: folder of ground-truth pictures with the same file names; ``None`` if the frames are the ground truth.
-        shrink: factor by which the frames are reduced before the sensor sees them.
-        middle: the only frame that may be the middle of a clip; ``None`` for any.
+    The ground truth, of the same file names, is in the folder ``truth``, by default that of the frames. The sensor sees
+    frames reduced by the factor ``shrink``. ``middle`` is the only frame that may be the middle of a clip.
     """
 
     name: str
@@ -50,12 +45,7 @@ class SequenceFiles:
 
 @dataclass(frozen=True)
 class Collection:
-    """Name and sequences of a data set in a folder.
-
-    Args:
-        clips: clips per sequence, as in the paper.
-        scale: the only super-resolution factor that the sequences support; ``None`` for any.
-    """
+    """Sequences of a data set; clips per sequence, as in the paper; and the only factor that they support, if any."""
 
     name: str
     train: tuple[SequenceFiles, ...] = ()
@@ -66,19 +56,10 @@ class Collection:
 
 
 def find_sequences(root: str | Path, hold_out: Callable[[list], tuple[list, list]]) -> Collection:
-    """Recognise the data set in a folder by its files.
+    """Recognise the data set in a folder by its files; frames are not opened.
 
-    Args:
-        root: folder into which the archives of a data set were unpacked, or one folder further down.
-        hold_out: splits sequences without an official split into training and validation.
-
-    Returns:
-        The sequences; frames are not opened.
-
-    Raises:
-        FileNotFoundError: the folder does not exist, no layout fits, or a listed sequence is missing; the message
-            shows the expected layouts.
-        NotADirectoryError: the path is a file.
+    The archives of a data set were unpacked into the folder, or into the one above. ``hold_out`` splits sequences
+    without an official split into training and validation. Error messages show the expected layouts.
     """
     root = existing_folder(root, "films")
     found = _reds(root) or _vimeo(root) or _vid4(root) or _others(root, hold_out)

@@ -39,17 +39,9 @@ class ScenePool(Resumable):
     new part replaces the oldest, so a clip is used ``reuse`` times at long intervals. Half of the batches are reversed
     in time, and half are transposed if the Bayer phase allows it. Batch n depends only on n and the seed.
 
-    If the network has a fixed motion estimator, motion is estimated once for a whole part.
-
-    Args:
-        data: data module; its trainer and model determine the step, the device and the motion estimator.
-        kinds: kinds of scenes, as :class:`StillClips`.
-        shares: fraction of the batches for every kind.
-        size: clips that are rendered at once.
-        reuse: number of uses of a clip.
-        batch_size: clips of a batch; every key frame of a film counts.
-        length: batches of an epoch.
-        workers: processes that draw the random numbers of scenes.
+    If the network has a fixed motion estimator, motion is estimated once for a whole part. Step, device and estimator
+    are those of the trainer and the model of ``data``. Every kind has a fraction of the batches, see ``shares``; every
+    key frame of a film counts as a clip; ``workers`` processes draw the random numbers of scenes.
     """
 
     def __init__(

@@ -54,14 +54,7 @@ def _texture(n: int) -> Tensor:
 
 @dataclass(frozen=True)
 class Gallery:
-    """Pictures of any sizes in one tensor.
-
-    Args:
-        shades: values of all pictures, uint8.
-        start: index of the first value of each picture, (P,).
-        size: rows and columns, (P, 2).
-        grey: whether the three channels are equal, (P,).
-    """
+    """Values of P pictures of any sizes, uint8; for each the index of its first, its size, and whether it is grey."""
 
     shades: Tensor
     start: Tensor

@@ -180,15 +180,10 @@ class SequenceClips(Dataset):
     middle of its part. Patches are around a frame of the part that the seed fixes, so that a cache can hold all clips.
     They are shuffled in every round, each time at another place with even offsets, which keep the Bayer phase. Seed and
     index determine a clip, in any process and order.
+    Short sequences give fewer clips, and those with a fixed middle frame one.
 
-    Args:
-        sequences: sequences of :func:`lightning_modules.data.layouts.find_sequences`.
-        recipe: settings of the simulation.
-        clips: clips per sequence; fewer for short sequences, and one for sequences with a fixed middle frame.
-        patch: side of a patch in sensor pixels; ``None`` for whole clips.
-        cache: cache of the clips; ``None`` to simulate them every time.
-        flow_patch: smallest side of the spikes, in sensor pixels, for the estimate of motion. Spikes reach beyond the
-            patch accordingly, within the view; ground truth and flow cover the patch.
+    Spikes have at least the side ``flow_patch``, for the estimate of motion: they reach beyond the patch accordingly,
+    within the view; ground truth and flow cover the patch. Sides are in sensor pixels.
     """
 
     def __init__(

@@ -48,10 +48,6 @@ class RecordingClips:
         size: (H, W) of a clip.
         joined: number of consecutive spike frames that are joined into one, see :meth:`in_light`.
         chosen: key frames, in order.
-
-    Raises:
-        ValueError: the recording is shorter than a clip, the crop is smaller than 3 x 3 pixels, or a key frame has no
-            whole clip around it.
     """
 
     def __init__(
@@ -203,12 +199,7 @@ def clips_around(
 
 
 def film_groups(items: Iterable[Item], first: int, size: int) -> Iterator[list[Item]]:
-    """Yield the items of a film in groups that are made together.
-
-    Args:
-        items: one item per picture, in order.
-        first: pictures of the first group.
-        size: pictures of the others.
+    """Yield the items of a film, one per picture, in groups that are made together; the first has its own size.
 
     Example:
         >>> [*film_groups("abcdefg", 1, 2)], [*film_groups("abcdefg", 3, 3)]

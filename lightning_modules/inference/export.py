@@ -171,15 +171,9 @@ def _reason(error: BaseException) -> str:
 
 
 def exported(data: bytes, kind: str, threads: int | None = None) -> Callable[..., Any]:
-    """Return a function that runs an exported program in this process.
+    """Return a function that runs an exported program, ``"torch"`` or ``"onnx"``, in this process.
 
-    Args:
-        data: content of the file.
-        kind: ``"torch"`` or ``"onnx"``.
-        threads: threads of onnxruntime; default: all cores. No effect on torch.
-
-    Returns:
-        Function that takes the inputs in order and returns the picture; for films, the picture and the state.
+    It takes the inputs in order and returns the picture; for films, the picture and the state.
     """
     if kind == "torch":
         return torch.export.load(io.BytesIO(data)).module()

@@ -300,9 +300,6 @@ class FilmMaker:
 
         Returns:
             rgb (G, 3, s H, s W), in [0, 1].
-
-        Raises:
-            ValueError: the number of clocks differs from that of clips, or they do not increase.
         """
         if len(clocks) != len(spikes) or any(after <= before for before, after in pairwise(clocks)):
             raise ValueError(f"clocks: expected {len(spikes)} increasing ones, got {list(clocks)}")

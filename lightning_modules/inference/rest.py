@@ -123,16 +123,8 @@ def find_misfits(off: Tensor, before: Tensor, after: Tensor, spike: float) -> Te
 
     A cell contradicts if its sum of squares over blocks of 1, 2, 4 or 8 pixels exceeds twice that of its neighbours by
     more than chance, or if the mean difference of a part of 4 x 4 cells or of all is not that of the neighbours, as
-    under a lamp.
-
-    Args:
-        off: light (H, W) by the spikes minus that of the picture.
-        before: the same of the picture before.
-        after: the same of the picture after.
-        spike: light of a spike.
-
-    Returns:
-        Cells (h, w).
+    under a lamp. Given are the light (H, W) by the spikes minus that of the picture, the same of the picture before and
+    of that after, and the light of a spike.
     """
     planes, found = torch.stack([off, before, after]) / spike, False
     each = _sum(torch.ones_like(off), CELL)

@@ -338,16 +338,11 @@ class _SearchSites(torch.autograd.Function):
 
 
 def search_sites(features: Tensor, flow: Tensor, shares: Tensor, table: SiteTable) -> Tensor:
-    """Return the temporal pixels of all sites and time points as channels.
+    """Return the temporal pixels of all sites and time points as channels (B, T F s^2, H, W), channels last.
 
-    Args:
-        features: features of every time point, (B, T, F, H, W), floating, H and W at least :data:`SMALLEST`.
-        flow: flow from the middle to the first and the last time point, (B, 2, 2, H, W), in sensor pixels.
-        shares: factors of both flows for the motion to every time point, float32, (T, 2).
-        table: table of the colour, on the device of the features.
-
-    Returns:
-        (B, T F s^2, H, W), channels last, in the dtype of ``features``; differentiable in ``features`` only.
+    Features (B, T, F, H, W) have at least :data:`SMALLEST` rows and columns; the result is differentiable in them only.
+    The flow (B, 2, 2, H, W) is that from the middle to the first and the last time point, in sensor pixels; ``shares``
+    (T, 2), float32, are factors of both for the motion to every time point.
     """
     flow = finite(flow.detach().float())
     return (_search_in_graph if is_exporting() else _SearchSites.apply)(features, flow, shares, table)
