@@ -208,17 +208,16 @@ class FilmMaker:
         psnr_tolerance: PSNR in dB that a picture may lose to save work. Above 0, the network runs only where the spikes
             show motion, see :class:`lightning_modules.inference.rest.Rest`, and less often where it is slow; the first
             picture is always complete.
-        how: ``self_ensemble`` of :func:`lightning_modules.inference.predict.predict`, with which every clip is
-            reconstructed alone, without a state.
+        self_ensemble: as of :func:`lightning_modules.inference.predict.predict`; above 1, every clip is reconstructed
+            alone, without a state.
 
     Attributes:
         calibration: of the sensor; if set, the spikes are those that it fired, and are corrected for the network.
         computed: cells (h, w) that the network computed of every picture of the last group, with a tolerance.
 
     Raises:
-        ValueError: ``future`` is negative, or for a network without a state; an option that the network does not
-            support; or a tolerance that is negative, is combined with ``future``, or is for a network without a
-            ``halo``.
+        ValueError: ``tile``, ``future`` or the tolerance is negative; ``future`` is for a network without a state, or
+            combined with a tolerance; or a tolerance is for a network without a ``halo``.
 
     Example:
         >>> from lightning_modules.networks import CSCSR
@@ -234,24 +233,26 @@ class FilmMaker:
         future: int = 0,
         tile: int | None = None,
         psnr_tolerance: float = 0.0,
-        **how: Any,
+        self_ensemble: int = 1,
     ) -> None:
         kind = type(network).__name__
-        self.carries_on = isinstance(network, RecurrentCSCSR) and how.get("self_ensemble", 1) == 1
+        self.carries_on = isinstance(network, RecurrentCSCSR) and self_ensemble == 1
         if isinstance(future, bool) or not isinstance(future, int) or future < 0:
             raise ValueError(f"future: expected a whole number >= 0, got {future!r}")
         if future and not self.carries_on:
             raise ValueError(f"future: expected 0, as {kind} takes single clips, got {future}")
-        check_views(how.get("self_ensemble", 1))
+        check_views(self_ensemble)
         if not 0 <= psnr_tolerance < math.inf:
             raise ValueError(f"psnr_tolerance: expected 0 dB or more, got {psnr_tolerance}")
         if psnr_tolerance and future:
             raise ValueError(f"psnr_tolerance: expected 0 with future, got {psnr_tolerance}")
         if psnr_tolerance and network.halo is None:
             raise ValueError(f"psnr_tolerance: expected 0 for {kind}, run on whole pictures only, got {psnr_tolerance}")
-        self.network, self.future, self._how = network, future, how
+        self.network, self.future, self.self_ensemble = network, future, self_ensemble
         on_gpu = any(part.is_cuda for part in network.parameters())
         self.tile = (TILE_ON_GPU if on_gpu else TILE) if tile is None else tile
+        if self.tile < 0:
+            raise ValueError(f"tile: expected 0 pixels or more, got {tile}")
         self.calibration: Calibration | None = None
         self._last: _Made | None = None
         self._known: _Known | None = None
@@ -426,7 +427,8 @@ class FilmMaker:
         """Return the network's pictures of clips."""
         if self.carries_on:
             return self._carried_on(spikes, clocks, flow, static).mul_(exposure).clamp_(0, 1)
-        return predict(self.network, spikes, flow, static, exposure=exposure, tile=self.tile, **self._how)
+        how = {"tile": self.tile, "self_ensemble": self.self_ensemble}
+        return predict(self.network, spikes, flow, static, exposure=exposure, **how)
 
     def _interpolate(self, left: _Made, right: _Made, clock: int) -> Tensor:
         share = (clock - left.clock) / (right.clock - left.clock)

@@ -19,6 +19,7 @@ from lightning_modules.inference.predict import precision_of
 from lightning_modules.inference.presets import SPEEDS, Conditions, Preset, choose
 from lightning_modules.networks import ClassicalDecoder, Network
 from spikekit import __version__, correct_spikes
+from spikekit.arguments import one_line
 from spikekit.check import check_positive
 from spikekit.color.cfa import GREY, PATTERNS
 from spikekit.io.image_bytes import to_bytes
@@ -114,7 +115,7 @@ def reconstruct(
     white = looks.white if white is None else white
     check_positive("white", white)
     if network is None:
-        scale = scale or (1 if recording.pattern == GREY else 4)
+        scale = (1 if recording.pattern == GREY else 4) if scale is None else scale
         speed = "balanced" if budget is None and speed is None else speed
         preset, notes = _chosen(recording, speed, budget, scale, frame, level)
         how = {**preset.given("tile", "self_ensemble"), **how}
@@ -158,7 +159,11 @@ class Reconstruction:
     ) -> None:
         if precision not in (None, "32-true", "bf16-mixed"):
             raise ValueError(f"precision: expected 32-true or bf16-mixed, got {precision!r}")
-        self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        try:
+            self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+            torch.empty(0, device=self.device)
+        except (AssertionError, RuntimeError) as error:
+            raise ValueError(f"device: expected one of this machine, got {device} ({one_line(error)[:80]})") from error
         self.precision = precision or precision_of(self.device)
         self.network = network.to(self.device).eval()
         self.clips, self.notes, self.how = clips, notes or [], how

@@ -121,10 +121,20 @@ def test_dim_light_joins_frames_if_there_is_room(flat, speed, white, frame, join
         assert rgb.mean().item() == pytest.approx(0.5, abs=0.1)
 
 
-@pytest.mark.parametrize("white", [0, -0.1, float("nan")])
-def test_invalid_white_levels_are_rejected(flat, white):
-    with pytest.raises(ValueError, match=f"white: expected a finite number above 0, got {white}"):
-        reconstruct(flat(0.4), "fastest", white=white)
+@pytest.mark.parametrize(
+    ("wrong", "error", "said"),
+    [
+        ({"white": 0}, ValueError, "white: expected a finite number above 0, got 0"),
+        ({"white": float("nan")}, ValueError, "white: expected a finite number above 0, got nan"),
+        ({"scale": 0}, ValueError, "scale: expected one that was measured .*, got 0"),
+        ({"tile": -1}, ValueError, "tile: expected 0 pixels or more, got -1"),
+        ({"device": "nowhere"}, ValueError, "device: expected one of this machine, got nowhere"),
+        ({"psnr_tolerence": 0}, TypeError, "psnr_tolerence"),
+    ],
+)
+def test_invalid_arguments_are_rejected_at_once(flat, wrong, error, said):
+    with pytest.raises(error, match=said):
+        reconstruct(flat(0.3), "fast", **wrong)
 
 
 @pytest.mark.parametrize(("every", "size"), [(1, 12), (3, 4), (20, 2), (21, 1)])
