@@ -170,28 +170,34 @@ def apart(picture: Tensor, truth: Tensor, part: Tensor) -> float:
 
 def false_rests(size: tuple[int, int], pictures: int) -> None:
     """Print how many cells that move are said to rest, by how much their light changes; a quarter does rest."""
-    clocks, scale, moving = EVERY * pictures + 21, 2, size[0] * 3 // 4 // CELL * CELL
-    layer = Layer(read_picture(embedded_pictures()[0]), Motion(velocity=(0.5 * scale / EVERY, 0.0)))
-    scene = Scene([layer], scale * size[0], scale * size[1], clocks)
-    light = scene.light("RGGB", scale=scale, alpha=ALPHA)
-    light[:, moving:] = light[0, moving:].clone()
-    nothing = torch.zeros(3, *size)
     print("sensor,change of light (rms / white),cells and pictures,false rests in 10 000,at most (95 %)")
     for sensor, noise in (("ideal", None), ("noisy", NOISE)):
-        spikes = simulate_spikes(light, generator=torch.Generator().manual_seed(0), noise=noise)
-        rest = Rest(1, "RGGB", ALPHA, noise is not None)
-        changes, resting = [], []
-        for clock in range(20, clocks - 20, EVERY):
-            rest(spikes[clock - 20 : clock + 21], clock, lambda box, static: box.of(nothing), 1.0, None)
-            change = (light[clock] - light[clock - EVERY]) / ALPHA
-            changes.append(F.avg_pool2d(change.square()[None], CELL, ceil_mode=True)[0].sqrt())
-            resting.append(~rest.moving)
-        change, false = (torch.stack(cells[7:])[:, : moving // CELL] for cells in (changes, resting))
+        films = [_rests_of_film(read_picture(path), size, pictures, noise) for path in embedded_pictures()]
+        change, false = (torch.cat(cells) for cells in zip(*films, strict=True))
         for least in (0.0, 0.0025, 0.005, 0.01, 0.02):
             seen = change >= least
             count, wrong = seen.sum().item(), false[seen].sum().item()
             most = chi2.ppf(0.95, 2 * wrong + 2) / 2
-            print(f"{sensor},>= {least:g},{count},{1e4 * wrong / count:.2f},{1e4 * most / count:.2f}")
+            print(f"{sensor},>= {least:g},{count},{1e4 * wrong / count:.2f},{1e4 * most / count:.2f}", flush=True)
+
+
+def _rests_of_film(
+    picture: Tensor, size: tuple[int, int], pictures: int, noise: SensorNoise | None
+) -> tuple[Tensor, Tensor]:
+    """Return by how much the light of cells that move changes, and which of them are said to rest."""
+    clocks, scale, moving = EVERY * pictures + 21, 2, size[0] * 3 // 4 // CELL * CELL
+    layer = Layer(picture, Motion(velocity=(0.5 * scale / EVERY, 0.0)))
+    light = Scene([layer], scale * size[0], scale * size[1], clocks).light("RGGB", scale=scale, alpha=ALPHA)
+    light[:, moving:] = light[0, moving:].clone()
+    spikes = simulate_spikes(light, generator=torch.Generator().manual_seed(0), noise=noise)
+    rest, nothing, changes, resting = Rest(1, "RGGB", ALPHA, noise is not None), torch.zeros(3, *size), [], []
+    for clock in range(20, clocks - 20, EVERY):
+        rest(spikes[clock - 20 : clock + 21], clock, lambda box, static: box.of(nothing), 1.0, None)
+        change = (light[clock] - light[clock - EVERY]) / ALPHA
+        changes.append(F.avg_pool2d(change.square()[None], CELL, ceil_mode=True)[0].sqrt())
+        resting.append(~rest.moving)
+    change, false = (torch.stack(cells[7:])[:, : moving // CELL].flatten() for cells in (changes, resting))
+    return change, false
 
 
 def write_overlay(folder: Path, name: str, made: list[Tensor], truth: Tensor, computed: Tensor) -> None:

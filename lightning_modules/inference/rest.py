@@ -22,6 +22,7 @@ _TESTS = 16  # tests per cell: single blocks of 1, 2 and 4 pixels, all of each s
 _DARK = 0.02  # spikes per clock and pixel of a cell that is dark
 _PICTURES = 8  # pictures of the network that a cell at rest shows the mean of
 _SURE = 160  # clocks without a change before the clip of a resting cell
+_SURER = 640  # the same where half of the cells around, or a sixth of all, are not sure
 _MORE = 1.25  # clocks, relative to those that a resting cell was drawn with, after which it is drawn again
 _BUSY, _UNTESTED = 0.75, 8  # share of cells that makes a picture busy, and pictures after it that are not tested
 _FADE = 0.96  # weight of the sums of squares of the previous key frame
@@ -219,11 +220,12 @@ class Rest:
         step with the key frames gives them equal sums.
 
         A cell is still if nothing changed during its clip, and rests if nothing changed in the 160 clocks before it
-        either, as a single test may miss slow motion. A resting cell shows the mean of the network's first eight
-        pictures of the still cell; after these the network does not run. Neighbours of cells that do not rest are
-        computed and blended; in the dark, where motion is seen late, they do not rest either. The gain of a lamp is
-        removed from the mean, and applied to the picture. When 75 % of the cells have changed, or have a neighbour that
-        did, the next eight pictures are computed without a test.
+        either, as a single test may miss slow motion. If half of the 9 x 9 cells around or a sixth of all do not rest,
+        these are 640 clocks, as what has little contrast probably moves with them. A resting cell shows the mean of the
+        network's first eight pictures of the still cell; after these the network does not run. Neighbours of cells that
+        do not rest are computed and blended; in the dark, where motion is seen late, they do not rest either. The gain
+        of a lamp is removed from the mean, and applied to the picture. When 75 % of the cells have changed, or have a
+        neighbour that did, the next eight pictures are computed without a test.
 
         The mean over all clocks of an ideal sensor converges to the exact light. At the resolution of the sensor, the
         picture is corrected towards it, by the share of their difference that is not noise of the mean, but not at
@@ -284,6 +286,8 @@ class Rest:
         self._clock = clock
         still = self._calm >= frames - 1
         unsure = self._calm < frames - 1 + _SURE
+        around = F.avg_pool2d(unsure[None].float(), 9, 1, 4, count_include_pad=False)[0]
+        unsure |= (around.clamp(min=3 * unsure.float().mean()) > 0.5) & (self._calm < frames - 1 + _SURER)
         dark = _sum(self._earlier + self._later, CELL) < _DARK * CELL**2 * (self._before + self._since)
         unsure |= grown(unsure & dark) & dark
         self.moving = near = grown(unsure)

@@ -161,6 +161,13 @@ def test_a_dark_object_does_not_rest_while_it_moves():
         assert cells[3:5, (5 + n) // CELL : (20 + n) // CELL + 1].all()
 
 
+def test_what_has_little_contrast_does_not_rest_where_the_rest_of_a_scene_moves():
+    light = moving(401, (0.05, 0.0)).clone()
+    faint = light[..., : 6 * CELL]
+    faint.sub_(faint.mean()).mul_(0.03).add_(0.2)
+    assert all(cells.all() for _, cells in film(light, psnr_tolerance=0.1))
+
+
 @pytest.mark.parametrize(("contrast", "speed", "share"), [(1.0, 1 / 300, 0.95), (0.08, 1 / 100, 0.85)])
 def test_slow_drift_is_seen_before_it_is_half_a_pixel(contrast, speed, share):
     light = moving(441, (speed, 0.0))
