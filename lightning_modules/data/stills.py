@@ -385,7 +385,9 @@ class StillScenes(ClipScenes):
             OSError: the cache folder cannot be made.
             ValueError: an argument is out of range.
         """
-        if self.batch_size < 1 or self.train_clips < self.batch_size:
+        for name in ("batch_size", "val_clips"):
+            check_whole(name, getattr(self, name))
+        if self.train_clips < self.batch_size:
             raise ValueError(f"train_clips: expected at least batch_size = {self.batch_size}, got {self.train_clips}")
         for name, good, expected in (
             ("pool", self.pool >= 0, "0 or more clips"),

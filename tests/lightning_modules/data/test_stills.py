@@ -229,6 +229,8 @@ def test_errors_name_the_argument(folder, tmp_path):
         ("gains", (0.0, 1.0), "gains: expected two numbers"),
         ("flow_times", (5, 41), r"flow_times: expected clocks in \[0, 41\), got \(5, 41\)"),
         ("batch_size", 9, "train_clips: expected at least batch_size"),
+        ("batch_size", 0, "batch_size: expected a whole number >= 1, got 0"),
+        ("val_clips", 0, "val_clips: expected a whole number >= 1, got 0"),
     ):
         with pytest.raises(ValueError, match=message):
             scenes(**{name: value})
