@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from functools import partial
+from functools import cache
 from io import BytesIO
 from itertools import chain, count, islice, pairwise
 from pathlib import Path
@@ -159,15 +159,8 @@ class _Group:
         self, clocks: Sequence[int], clips: Sequence[Tensor], exposures: Sequence[float], alpha: float
     ) -> None:
         self.clocks, self.clips, self.exposures, self._alpha = clocks, clips, exposures, alpha
-        self.correct: Callable[[Tensor], Tensor]
-        self._corrected: dict[int, Tensor] = {}
+        self.corrected: Callable[[int], Tensor]  # a clip as the network takes it
         self.ahead: tuple[int, _Made, _Known | None] | None = None
-
-    def corrected(self, n: int) -> Tensor:
-        """Return a clip as the network takes it."""
-        if n not in self._corrected:
-            self._corrected[n] = self.correct(self.clips[n])
-        return self._corrected[n]
 
     def light(self, n: int) -> tuple[Tensor, float]:
         """Return the light (H, W) in the middle of a clip, and that of a spike."""
@@ -306,8 +299,9 @@ class FilmMaker:
             raise ValueError(f"clocks: expected {len(spikes)} increasing ones, got {list(clocks)}")
         if self.rest is not None and not static:
             light = torch.as_tensor(exposure).flatten().expand(len(spikes)).tolist()
-            group = _Group(clocks, spikes.split(1), light, self.network.settings["alpha"])
-            group.correct = partial(correct_spikes, calibration=self.calibration, pattern=self.network.pattern)
+            clips = spikes.split(1)
+            group = _Group(clocks, clips, light, self.network.settings["alpha"])
+            group.corrected = cache(lambda n: correct_spikes(clips[n], self.calibration, self.network.pattern))
             pictures, self.computed = [], []
             for n in range(len(clocks)):
                 pictures.append(self._where_it_moves(group, n))
@@ -326,15 +320,15 @@ class FilmMaker:
         if before is not None and clock - before.clock > self.network.frames:
             before = None
         state = None if before is None else before.state
-        interpolated = False
+        after = clock
 
         def make(box: Box, static: bool) -> Tensor:
-            nonlocal state, interpolated
+            nonlocal state, after
             last = self._last
             if (last is None or last.clock != clock) and box == whole and not static:
                 between = self._between(group, n)
                 if between is not None:
-                    interpolated = True
+                    after = before and before.clock
                     return between
                 last = self._last = self._whole(group, n)
                 state = self._known.state if self.carries_on else None
@@ -349,10 +343,7 @@ class FilmMaker:
             return rgb
 
         rgb = self.rest(clips[0], clock, make, exposure, self.calibration)
-        if interpolated:
-            self._known = before
-        else:
-            self._known = None if state is None else _Known(clock, state)
+        self._known = None if state is None else _Known(after, state)
         return rgb
 
     def _part(
