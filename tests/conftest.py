@@ -37,6 +37,11 @@ def pytest_addoption(parser):
     parser.addoption("--table", metavar="FILE", help="CSV file for the rows of tests/extremes")
 
 
+@pytest.fixture(autouse=True)
+def _seed():
+    torch.manual_seed(0)
+
+
 @pytest.fixture(scope="session")
 def device(request):
     return torch.device(request.config.getoption("device"))

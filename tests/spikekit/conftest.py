@@ -9,11 +9,6 @@ settings.register_profile("spikekit", deadline=None, derandomize=True, database=
 settings.load_profile("spikekit")
 
 
-@pytest.fixture(autouse=True)
-def _seed():
-    torch.manual_seed(0)
-
-
 @pytest.fixture(name="without_kernels")
 def _without_kernels():
     """Context in which custom operators use their torch path on the CPU."""

@@ -156,7 +156,6 @@ def test_films_of_fast_and_balanced_compute_only_what_moves(flat, speed, how, to
 
 
 def test_recording_equals_stream_and_its_parts(recording):
-    torch.manual_seed(0)
     network = RecurrentCSCSR(**TINY).eval()
     for weight in (network.fusion.share.weight, network.fusion.rest.weight):
         torch.nn.init.normal_(weight, std=0.05)
@@ -192,7 +191,6 @@ def test_resumed_film_equals_the_unbroken_one_where_it_moves_and_where_it_rests(
 
 
 def test_self_ensemble_reaches_the_network(recording):
-    torch.manual_seed(0)
     network = CSCSR(**TINY).eval()
     ((_, plain),) = reconstruct(recording, network=network, frame="40", white=0.3)
     ((_, mean),) = reconstruct(recording, network=network, frame="40", white=0.3, self_ensemble=2)

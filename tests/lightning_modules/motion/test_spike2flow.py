@@ -13,11 +13,6 @@ PAPER = {"window": 21, "widths": (64, 96, 128), "blocks": 2, "features": 216, "a
 PAPER |= {"correlation": (196, 160), "motion": 96, "head": 196, "levels": 3, "radius": 3, "iterations": 8}
 
 
-@pytest.fixture(autouse=True)
-def _seed():
-    torch.manual_seed(0)
-
-
 def clip(batch=1, height=16, width=20, seed=0):
     generator = torch.Generator().manual_seed(seed)
     return (torch.rand(batch, 41, height, width, generator=generator) < 0.3).to(torch.uint8)

@@ -102,7 +102,6 @@ def test_sensor_resolution_keeps_the_place_of_each_pixel():
 @pytest.mark.parametrize("global_perception", [True, False])
 def test_representation_fuses_windows_with_the_whole_clip(global_perception):
     """Fig. 4: features of the clip and of each window are concatenated and convolved."""
-    torch.manual_seed(0)
     part = SpikeRepresentation(9, 5, 2, 4, 3, global_perception).double()
     spikes = (torch.rand(2, 9, 7, 6) < 0.4).double()
     expected = []
@@ -193,7 +192,6 @@ def test_training_works_after_inference_mode():
 
 @pytest.mark.parametrize("half", [False, True])
 def test_inference_gives_the_features_of_training(half):
-    torch.manual_seed(0)
     blocks, x = torch.nn.Sequential(ConvBlock(3, 8), *res_blocks(8, 2)), torch.randn(2, 3, 9, 7)
     with torch.autocast("cpu", torch.bfloat16, enabled=half):
         trained = blocks(x).detach()

@@ -21,7 +21,6 @@ DATA = {"patch": 12, "val_patch": 16, "train_clips": 8, "val_clips": 2, "batch_s
     ("kind", "key_frames", "pattern"), [(CSCSR, 1, "grey"), (CSCSR, 2, "RGGB"), (RecurrentCSCSR, 2, "grey")]
 )
 def test_gains_and_noise_are_learned_at_scale_1(kind, key_frames, pattern, tmp_path):
-    torch.manual_seed(0)
     cameras = {"gains": (0.1, 1.0), "noise": SensorNoise(photons=500), "pattern": pattern, "key_frames": key_frames}
     data = StillScenes(scale=1, **DATA, **cameras)
     network = kind(scale=1, pattern=pattern, **TINY)
@@ -35,7 +34,6 @@ def test_gains_and_noise_are_learned_at_scale_1(kind, key_frames, pattern, tmp_p
 
 
 def test_tests_tell_the_network_the_noise():
-    torch.manual_seed(0)
     module = SuperResolution(CSCSR(scale=1, pattern="grey", **TINY))
     module.log = lambda *_, **__: None
     torch.nn.init.ones_(module.network.reconstruction.noise.shift)
@@ -49,7 +47,6 @@ def test_tests_tell_the_network_the_noise():
 
 def test_dim_clips_do_not_dominate_the_loss(tmp_path):
     """The errors of two clips, one with a hundredth of the light, fall by similar fractions."""
-    torch.manual_seed(0)
     module = SuperResolution(CSCSR(scale=1, pattern="grey", **TINY))
     module.log = lambda *_, **__: None
     spikes = (torch.rand(2, 41, 12, 12) < 0.3).to(torch.uint8)

@@ -54,7 +54,6 @@ def batch(count=5):
 
 
 def test_loss_covers_both_passes_over_a_film():
-    torch.manual_seed(0)
     module = SuperResolution(RecurrentCSCSR(**TINY), flow="estimated", future=4)
     for weight in module.network.fusion.parameters():
         torch.nn.init.normal_(weight, std=0.05)
@@ -67,7 +66,6 @@ def test_loss_covers_both_passes_over_a_film():
 
 
 def test_network_without_state_takes_single_key_frames():
-    torch.manual_seed(0)
     module = SuperResolution(CSCSR(**TINY), flow="estimated").eval()
     module.log = lambda *_, **__: None
     clips = batch(count=3)

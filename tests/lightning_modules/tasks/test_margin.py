@@ -20,7 +20,6 @@ from lightning_modules.tasks.super_resolution import SuperResolution
     ],
 )
 def test_margin_serves_only_motion_estimation(flow, motion, key_frames):
-    torch.manual_seed(0)
     sizes = {"width": 4, "representation_width": 4, "features": 1, "stages": 1, "end_blocks": 1}
     network = CSCSR(scale=2, **sizes, motion=motion())
     module = SuperResolution(network, flow=flow)

@@ -16,7 +16,6 @@ def _steps(optimizer, parameter, gradients):
 
 @pytest.mark.parametrize(("shape", "size"), [((6, 6), 1.0), ((12, 5), 1e-6), ((5, 12), 1e6)])
 def test_orthogonalisation_keeps_singular_vectors(shape, size):
-    torch.manual_seed(0)
     left, _ = torch.linalg.qr(torch.randn(shape[0], 5, dtype=torch.float64))
     right, _ = torch.linalg.qr(torch.randn(shape[1], 5, dtype=torch.float64))
     values = torch.tensor([1.0, 0.7, 0.3, 0.1, 0.05], dtype=torch.float64)
@@ -29,7 +28,6 @@ def test_orthogonalisation_keeps_singular_vectors(shape, size):
 
 
 def test_matches_torch_on_matrices():
-    torch.manual_seed(0)
     start, gradients = torch.randn(8, 20), torch.randn(4, 8, 20)
     ours, theirs = nn.Parameter(start.clone()), nn.Parameter(start.clone())
     reference = torch.optim.Muon([theirs], lr=1e-2, weight_decay=0, adjust_lr_fn="match_rms_adamw")
@@ -39,7 +37,6 @@ def test_matches_torch_on_matrices():
 
 
 def test_convolution_is_a_matrix_with_one_row_per_output_channel():
-    torch.manual_seed(0)
     start, gradients = torch.randn(8, 4, 3, 3), torch.randn(3, 8, 4, 3, 3)
     whole, flat = nn.Parameter(start.clone()), nn.Parameter(start.flatten(1).clone())
     last = nn.Parameter(start.clone().contiguous(memory_format=torch.channels_last))
@@ -49,7 +46,6 @@ def test_convolution_is_a_matrix_with_one_row_per_output_channel():
 
 
 def test_layers_of_equal_shape_are_independent():
-    torch.manual_seed(0)
     shapes = [(8, 4, 3, 3), (8, 4, 3, 3), (6, 8), (8, 4, 3, 3), (8, 6), (5,)]
     start = [torch.randn(shape) for shape in shapes]
     gradients = [[10.0**n * torch.randn(shape) for n, shape in enumerate(shapes)] for _ in range(3)]
@@ -69,7 +65,6 @@ def test_layers_of_equal_shape_are_independent():
 
 @pytest.mark.parametrize("shape", [(7,), (16, 3), (3, 16, 3, 3), ()])
 def test_biases_and_layers_with_three_channels_use_adam(shape):
-    torch.manual_seed(0)
     start, gradients = torch.randn(shape), torch.randn(5, *shape)
     ours, theirs = nn.Parameter(start.clone()), nn.Parameter(start.clone())
     reference = torch.optim.Adam([theirs], lr=1e-2, betas=(0.9, 0.99))
@@ -78,7 +73,6 @@ def test_biases_and_layers_with_three_channels_use_adam(shape):
 
 
 def test_state_is_restored():
-    torch.manual_seed(0)
     start, gradients = [torch.randn(6, 5), torch.randn(6)], [(torch.randn(6, 5), torch.randn(6)) for _ in range(4)]
 
     def run(parameters, optimizer, part):

@@ -111,16 +111,10 @@ def test_estimator_of_a_checkpoint_can_be_replaced():
 
 
 @pytest.fixture(scope="module")
-def overlay(tmp_path_factory):
-    path = tmp_path_factory.mktemp("overlay") / "tiny.yaml"
-    path.write_text(TINY)
-    return path
-
-
-@pytest.fixture(scope="module")
-def trained(overlay, tmp_path_factory):
+def trained(tmp_path_factory):
     output = tmp_path_factory.mktemp("run")
-    main(["fit", "-c", "flow", "-c", str(overlay), "-o", str(output)])
+    (output / "tiny.yaml").write_text(TINY)
+    main(["fit", "-c", "flow", "-c", str(output / "tiny.yaml"), "-o", str(output)])
     return output
 
 
@@ -133,8 +127,8 @@ def test_fit_logs_errors_and_pictures(trained):
 
 
 @pytest.mark.slow
-def test_test_compares_estimators_on_the_same_clips(trained, overlay, configs, capsys):
-    args = ["test", "-c", configs / "flow.yaml", "-c", overlay, "-o", trained, "--ckpt_path", "best"]
+def test_test_compares_estimators_on_the_same_clips(trained, configs, capsys):
+    args = ["test", "-c", configs / "flow.yaml", "-c", trained / "tiny.yaml", "-o", trained, "--ckpt_path", "best"]
     main([*map(str, args)])
     printed = capsys.readouterr().out
     estimators = ["Spike2Flow", "ClassicalFlow", "ZeroFlow"]

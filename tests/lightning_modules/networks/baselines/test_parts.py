@@ -16,11 +16,6 @@ from lightning_modules.networks.baselines.tscnn import KnownPixels
 from spikekit import bayer_mask, bayer_sites, demosaic_along_motion, flow_warp, mosaic, tfi, tfp
 
 
-@pytest.fixture(autouse=True)
-def _seed():
-    torch.manual_seed(0)
-
-
 def clip(batch=1, height=12, width=16):
     spikes = (torch.rand(batch, 41, height, width) < 0.3).to(torch.uint8)
     return spikes, torch.randn(batch, 2, 2, height, width)
