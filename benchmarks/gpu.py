@@ -187,14 +187,14 @@ def main() -> None:
         rows = [
             scenes(found[:2], 4, 8, device, bytes_s), motion([(2, 16, 16)], device),
             sensor((4, 8, 8), device, bytes_s), pictures(["cscsr_tiny_x4"], [(16, 16)], device, flops),
-            training(["cscsr_large_x4"], [5], 8, device, flops),
+            training(["cscsr_small_x4"], [5], 8, device, flops),
         ]  # fmt: skip
     else:
         rows = [
             scenes(found, 960, 48, device, bytes_s),
             motion([(1, 250, 400), (960, 48, 48), (1, 1000, 1000)], device),
             sensor((200, 1000, 1000), device, bytes_s), training(best, [48, 240, 480], 48, device, flops),
-            pictures([*best, "cscsr_tiny_x4", "cscsr_large_x4"], [(250, 400), (1000, 1000)], device, flops),
+            pictures([*best, "cscsr_tiny_x4"], [(250, 400), (1000, 1000)], device, flops),
         ]  # fmt: skip
     args.output.parent.mkdir(parents=True, exist_ok=True)
     with open(args.output, "w", newline="") as file:

@@ -29,7 +29,7 @@ networks = {
     "TFI, bicubic": ClassicalDecoder("tfi", scale, "RGGB", alpha),
     "TFP, bicubic": ClassicalDecoder("tfp", scale, "RGGB", alpha),
     "cscsr_tiny_x4": CSCSR.from_pretrained("cscsr_tiny_x4"),
-    "cscsr_large_x4": CSCSR.from_pretrained("cscsr_large_x4"),
+    "cscsr_huge_x4": CSCSR.from_pretrained("cscsr_huge_x4"),
 }
 with torch.no_grad():
     pictures = {name: network(spikes)[0].clamp(0, 1) for name, network in networks.items()}

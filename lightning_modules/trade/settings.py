@@ -136,4 +136,4 @@ def _reference(models: Sequence[Model]) -> Model:
     """Return the reference of the ratios, which also gets most variants: a network of medium size with short clips."""
     short = min(one.frames for one in models)
     those = [one for one in models if one.frames == short]
-    return those[(len(those) - 1) // 2]
+    return those[len(those) // 2]

@@ -103,8 +103,8 @@ def test_distant_key_frames_are_not_neighbours(network, clips):
 @pytest.mark.parametrize(
     ("settings", "parameters", "future", "mmac"),
     [
-        ({"size": "large"}, 2_635_654, 0, 2.99),
-        ({"size": "large"}, 2_635_654, 4, 3.41),
+        ({"size": "huge"}, 4_180_390, 0, 4.53),
+        ({"size": "huge"}, 4_180_390, 4, 4.99),
         ({"size": "huge", "frames": 101}, 4_206_310, 0, 4.56),
     ],
 )

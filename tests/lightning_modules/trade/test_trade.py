@@ -207,7 +207,7 @@ def networks_of(settings):
 def test_default_settings_are_the_networks_of_the_package_and_the_decoders():
     settings = {setting.name: setting for setting in usual_settings(4)}
     networks = networks_of(settings.values())
-    sizes = "small", "micro", "tiny", "large", "huge"  # the reference first
+    sizes = "small", "micro", "tiny", "huge"  # the reference first
     assert networks == [*settings][: len(networks)] == [f"cscsr_{size}_x4" for size in sizes]
     assert "cscsr_tiny_x4, no motion" in settings
     assert "cscsr_micro_x4, no motion" not in settings
@@ -231,7 +231,7 @@ def test_default_settings_are_the_networks_of_the_package_and_the_decoders():
         ("nothing:", Preset()),
         ("--model.network ClassicalDecoder --model.network.order 2", Preset(network="ClassicalDecoder", order=2)),
         ("-c my.yaml --model.weights cscsr_small_x4", None),
-        ("--model.weights cscsr_small_x4 --model.weights cscsr_large_x4", None),
+        ("--model.weights cscsr_small_x4 --model.weights cscsr_huge_x4", None),
         ("--model.weights cscsr_small_x4 --tile", None),
         ("--model.weights cscsr_small_x4 --tile wide", None),
         ("--model.weights cscsr_small_x4 --model.network CSCSR", None),
@@ -249,7 +249,7 @@ def test_unnamed_setting_is_named_after_its_arguments():
 def test_presets_read_the_written_table(tmp_path, monkeypatch):
     """Presets read the table of a trade and skip rows that are no presets."""
     rows, _ = some_rows(3, [(9.0, 9.0), (2.0, 2.0), (1.0, 1.0)])
-    typed = ["lost: --model.weights cscsr_large_x4", f"tfi: {TFI}", "-c my.yaml --model.weights cscsr_small_x4"]
+    typed = ["lost: --model.weights cscsr_huge_x4", f"tfi: {TFI}", "-c my.yaml --model.weights cscsr_small_x4"]
     for row, text in zip(rows, typed, strict=True):
         row.setting, row.memory = read_setting(text), 10.0
     rows[0].reason = "no such file"
