@@ -22,8 +22,8 @@ WEIGHTS = "--model.weights", "--model.init_args.weights"
 def with_network_of_weights(args: Sequence[str]) -> list[str]:
     """Insert the network of ``--model.weights``, so that it need not be specified again.
 
-    It comes after all configurations and overrides their network, except its ``motion`` and ``alpha``. Other arguments
-    override it.
+    It comes after all configurations and overrides their network, except its ``motion`` and ``alpha``, and a ``noise``
+    that it is to learn. Other arguments override it.
     """
     asked, kept, place = None, {}, 1
     for end, option, value in options(args):
@@ -32,7 +32,7 @@ def with_network_of_weights(args: Sequence[str]) -> list[str]:
             model = inner_arguments(read_config(value).get("model")) if os.path.exists(value) else {}
             asked = model.get("weights") or asked
             network = inner_arguments(model.get("network"))
-            kept |= {name: network[name] for name in ("motion", "alpha") if network.get(name) is not None}
+            kept |= {name: network[name] for name in ("motion", "alpha", "noise") if network.get(name)}
         elif option in WEIGHTS:
             asked = value
     if asked in (None, "", "null"):
