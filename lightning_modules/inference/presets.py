@@ -27,7 +27,7 @@ _FOLDER = Path(__file__).parents[1] / "weights"
 _DECODER = "ClassicalDecoder"
 
 #: largest loss against the best preset, in dB
-SPEEDS = {"fastest": float("inf"), "fast": 2.0, "balanced": 0.3, "best": 0.005}
+SPEEDS = {"fastest": float("inf"), "fast": 2.7, "balanced": 0.3, "best": 0.005}
 
 #: presets whose times differ by less than this factor count as equally fast
 _AS_FAST = 1.2

@@ -102,7 +102,7 @@ def test_ideal_sensors_get_weights_for_ideal_sensors(flat, tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     write_picture("photo.png", torch.ones(3, 30, 40))
     spikekit_main(["simulate", "photo.png", "-o", "a.dat", "--scale", "1"])
-    simulated = reconstruct("a.dat", "fast")
+    simulated = reconstruct("a.dat", "balanced")
     assert not find_model(simulated.notes[0].split(",")[0].split(":")[0]).noise
 
 
@@ -139,7 +139,7 @@ def test_invalid_arguments_are_rejected_at_once(flat, wrong, error, said):
 
 @pytest.mark.parametrize(("every", "size"), [(1, 12), (3, 4), (20, 2), (21, 1)])
 def test_close_pictures_are_made_together(flat, every, size):
-    pictures = reconstruct(flat(0.3), "fast", frame=f"60:120:{every}", calibration="none")
+    pictures = reconstruct(flat(0.3), "balanced", frame=f"60:120:{every}", calibration="none")
     sizes = [len(group) for group, _ in pictures._groups(FilmMaker(pictures.network, **pictures.how), set(), 0, 1)]
     assert sizes[:3] == [1, size, size][: len(sizes)]
     assert FilmMaker(pictures.network).together(every) == 1
