@@ -404,8 +404,6 @@ class FilmMaker:
 
     def _fast(self, made: _Made, span: float) -> Tensor:
         """Return the cells (h, w) that move too far in some clocks for a picture between."""
-        if made.flow is None:
-            return torch.zeros((), dtype=torch.bool)
         first, middle, last = self.network.flow_times
         clocks = made.flow.new_tensor([middle - first, last - middle])[:, None, None]
         speed = (made.flow[0].square().sum(1).sqrt() / clocks).amax(0, keepdim=True)
@@ -423,8 +421,6 @@ class FilmMaker:
 
     def _interpolate(self, left: _Made, right: _Made, clock: int) -> Tensor:
         share = (clock - left.clock) / (right.clock - left.clock)
-        if left.flow is None or right.flow is None:
-            return torch.lerp(left.rgb, right.rgb, share)
         scale, whole = self.network.scale, Box(0, 0, *left.flow.shape[-2:])
         first, middle, last = self.network.flow_times
         to_first, to_last = torch.lerp(left.flow, right.flow, share).unbind(1)
