@@ -80,7 +80,8 @@ def _scores(spikes: Tensor, truth: dict[int, Tensor], network: CSCSR, known: Cal
     sums = [0.0] * 3
     corrected = fill_defects(spikes, PATTERN) if known is None else correct_spikes(spikes, known, PATTERN)
     rates = corrected[:400].unflatten(0, (2, -1)).float().mean(1)
-    network.noise_level = (gain_spread(rates, 200, PATTERN) or 0) / NOISE.gain_spread
+    spread = gain_spread(rates, 200, PATTERN)
+    network.noise_level = 1.0 if spread is None else spread / NOISE.gain_spread
     for middle, rgb in truth.items():
         near = spikes[middle - 60 : middle + 61].float()
         small = F.avg_pool2d(rgb, network.scale)

@@ -77,7 +77,8 @@ class Recording:
     def looks(self) -> tuple[Tensor, int]:
         """Corrected rates (P, H, W) of parts evenly spread over the recording, and frames of a part."""
         parts = min(max(self.frames // _LEAST_PART, 1), _PARTS)
-        frames = min(self.frames // parts, 2 * _LEAST_PART)
+        room = self.frames if parts == 1 else 9 * self.frames // 10  # across gaps, counts are rounded independently
+        frames = min(room // parts, 2 * _LEAST_PART)
         starts = np.linspace(0, self.frames - frames, parts).astype(int).tolist()
         return self.correct(torch.stack([self.counts(start, frames) for start in starts]) / frames), frames
 

@@ -121,7 +121,7 @@ class Command(LightningCLI):
         network = "model.init_args.network.init_args"
         for name in _SHARED:
             parser.link_arguments(f"{network}.{name}", f"data.init_args.{name}")
-        parser.link_arguments("model.init_args.flow", "data.init_args.flow_patch", {"scene": 0, "estimated": 48}.get)
+        parser.link_arguments("model.init_args.flow", "data.init_args.flow_patch", _flow_patch)
         parser.link_arguments("model", "data.init_args.flow_times", _ends, apply_on="instantiate")
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:  # noqa: D102
@@ -129,16 +129,22 @@ class Command(LightningCLI):
             with input_errors():
                 args = with_network_of_weights(self.typed)
             self.config = parser.parse_args(args)
-            given = given_data(self.typed)
-            for name in [name for name in _SHARED if name in given]:  # a link replaces it without a word
-                expected = self.config.get(f"{self.typed[0]}.data.init_args.{name}", given[name])
-                if given[name] != expected:
-                    said = f"expected {expected}, the value of model.network.{name}, got {given[name]}"
-                    raise UsageError(f"data.{name}: {said}")
+            self.given, verb = given_data(self.typed), self.typed[0]
+            for name in _SHARED:
+                expected = self.config.get(f"{verb}.data.init_args.{name}", self.given.get(name))
+                self._check_given(name, expected, f"the value of model.network.{name}")
+            flow = self.config.get(f"{verb}.model.init_args.flow")
+            self._check_given("flow_patch", _flow_patch(flow), "as model.flow sets it")
         except SystemExit as error:
             if not isinstance(error.code, str):
                 raise
             raise UsageError(f"{error.code} (see lightning {self.typed[0]} --help)") from error
+
+    def _check_given(self, name: str, expected: Any, reason: str) -> None:
+        """Reject an argument of the data that a link would replace without a word."""
+        got = self.given.get(name, expected)
+        if got != expected:
+            raise UsageError(f"data.{name}: expected {expected}, {reason}, got {got}")
 
     def _dump_config(self) -> None:
         """Take the configuration as it is, as to check and write it once more would take as long as to build all."""
@@ -196,6 +202,7 @@ class Command(LightningCLI):
         config = self.config[self.subcommand]
         try:
             super().instantiate_classes()
+            self._check_given("flow_times", [*_ends(self.model)], "those of the network")
             # here, so that errors are found before anything is written
             self.datamodule.setup(self.subcommand)
             if (workers := getattr(self.datamodule, "workers", 0)) < 0:
@@ -253,6 +260,11 @@ class Command(LightningCLI):
                 self.model.pictures(),
             ]
         return [self.model.report(output)] if self.subcommand == "test" else []
+
+
+def _flow_patch(flow: str | None) -> int:
+    """Return the smallest side for the estimate of motion: 0 unless motion is estimated."""
+    return 48 if flow == "estimated" else 0
 
 
 def _ends(model: BaseTask) -> tuple[int, int]:

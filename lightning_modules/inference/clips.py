@@ -144,12 +144,19 @@ class RecordingClips:
         return self.recording.alpha or white_rate(self.recording.looks[0].mean(0), self.recording.bayer)
 
     @cached_property
-    def noise_level(self) -> float:
-        """Noise level for networks: 0 for an ideal or calibrated sensor, and 1 for that of the training."""
+    def gain_spread(self) -> float | None:
+        """Spread of the gains: 0 for an ideal or calibrated sensor, ``None`` if it cannot be measured."""
         if not self._unknown:
             return 0.0
-        spread = gain_spread(*self.recording.looks, self.recording.pattern or "RGGB")
-        return self.joined**0.5 * (1.0 if spread is None else min(spread / _SPREAD, _MOST))
+        rates, frames = self.recording.looks
+        rates = replace_pixels(rates[..., self.top :, self.left :], *self._defects)
+        return gain_spread(rates, frames, self.recording.pattern or "RGGB")
+
+    @property
+    def noise_level(self) -> float:
+        """Noise level for networks: 0 for an ideal sensor, and 1 for that of the training or if it is not known."""
+        level = 1.0 if self.gain_spread is None else min(self.gain_spread / _SPREAD, _MOST)
+        return level * self.joined**0.5
 
 
 def clip_in_light(frames: int, white: float, room: float = math.inf, join: bool = True) -> tuple[int, int]:

@@ -117,7 +117,7 @@ def reconstruct(
     if network is None:
         scale = (1 if recording.pattern == GREY else 4) if scale is None else scale
         speed = "balanced" if budget is None and speed is None else speed
-        preset, notes = _chosen(recording, speed, budget, scale, frame, level)
+        preset, notes = _chosen(recording, speed, budget, scale, frame)
         how = {**preset.given("tile", "self_ensemble"), **how}
         if speed in ("fast", "balanced") and not how.get("future"):
             how = {"psnr_tolerance": 0.1, **how}
@@ -293,13 +293,12 @@ def _chosen(
     budget: str | None,
     scale: int,
     frame: str | None,
-    level: float,
 ) -> tuple[Preset, list[str]]:
     """Return the preset for a speed or a budget, and lines that tell its name and cost."""
     clips = RecordingClips(recording, frame=frame)
     every = min((later - clock for clock, later in pairwise(clips.chosen)), default=clips.frames + 1)
     film = every <= clips.frames  # neighbouring clips overlap
-    noisy, grey = level > NOISY, recording.pattern == GREY
+    noisy, grey = clips.noise_level > NOISY, recording.pattern == GREY
     conditions = Conditions(scale, clips.size, film, clips.room, noisy, grey)
     choice = choose(conditions, speed, budget)
     said = [str(choice)]
@@ -308,13 +307,17 @@ def _chosen(
         other = choose(conditions, sooner)
         said += [f"faster, --speed {sooner}: {other}"] if other != choice else []
     if noisy and choice.preset.weights:
-        said.append(_unmeasured(recording, level))
+        said.append(_uncalibrated(clips))
     return choice.preset, said
 
 
-def _unmeasured(recording: Recording, level: float) -> str:
+def _uncalibrated(clips: RecordingClips) -> str:
     """Return a line on the weights used for a noisy sensor without calibration."""
-    dark = ", with a recording in the dark," if recording.calibration is not None else ""
-    measure = f"spikekit calibrate{dark} measures it, --calibration none takes it for ideal"
-    said = f"this sensor is not calibrated, noise level about {level:.1f}: using weights trained for noisy sensors"
-    return f"{said}; {measure}"
+    level = f"noise level {clips.noise_level:.1f}"
+    small = "the picture is too small, too dark or too textured to measure noise"
+    said = f"{small}, {level} is assumed" if clips.gain_spread is None else f"{level} is measured"
+    dark = ", with a recording in the dark," if clips.recording.calibration is not None else ""
+    return (
+        f"this sensor is not calibrated; {said}: using weights trained for noisy sensors; spikekit calibrate{dark} "
+        "measures the pixels, --calibration none takes them for ideal"
+    )

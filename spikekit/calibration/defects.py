@@ -54,7 +54,8 @@ def fill_defects(spikes: Tensor, pattern: str | None = None) -> Tensor:
         pattern: Bayer phase; ``None`` or ``"grey"`` for a grey sensor.
 
     Returns:
-        Spikes of the same shape and dtype; those of other pixels are unchanged.
+        Spikes of the same shape and dtype; those of other pixels are unchanged. A gradient goes to the pixel that a
+        spike is from.
 
     Raises:
         TypeError: ``spikes`` is not a tensor of real numbers.

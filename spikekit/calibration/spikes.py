@@ -25,7 +25,8 @@ def correct_spikes(spikes: Tensor, calibration: Calibration | None, pattern: str
         The light at every clock is that of :func:`spikekit.tfi`, which integrates to one threshold between two spikes.
         It is corrected by :meth:`Calibration.correct` and fed to :func:`spikekit.spike_integrate_fire`. The initial
         charge reproduces the first spike of each pixel. A pixel that needs no correction keeps its spikes, bit for bit;
-        a dead or hot one fires according to the mean light of its neighbours. No gradient.
+        a dead or hot one fires according to the mean light of its neighbours. Only pixels that keep their spikes pass
+        their gradient.
 
     Args:
         spikes: zeros and ones, :math:`(*, T, H, W)`.

@@ -50,6 +50,8 @@ WRONG = {
     f"fit {X4} --data.patern RGGB": "data: Option 'patern' is not accepted",
     f"fit {X4} --data.pattern BGGR": "data.pattern: expected RGGB",
     f"validate {X4} --data.val_clips 1 --data.alpha 0.2": "data.alpha: expected 0.4, the value of model.network",
+    f"fit {X4} --data.flow_patch 64": "data.flow_patch: expected 0, as model.flow sets it, got 64",
+    f"fit {X4} --data.flow_times [3,35]": "data.flow_times: expected [5, 35], those of the network, got [3, 35]",
     "fit -c flow --data.frames 51": "data.frames: expected 41, the value of the model, got 51",
     f"fit {X4} --data.workers -1": "workers: expected 0 or more, got -1",
     f"fit {X4} --trainer.logger WandbLogger": "Requirement 'wandb",

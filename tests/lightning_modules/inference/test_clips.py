@@ -135,3 +135,9 @@ def test_calibration_corrects_spikes(opened, tmp_path):
     assert before.equal(spikes)
     assert (after.sum(0) - 41 * 0.2).abs().max() < 2
     assert corrected.white < 0.3
+
+
+def test_noise_of_short_dim_recordings_is_measured(opened):
+    light = torch.linspace(0.04, 0.08, 64).expand(400, 64, 64)
+    clips = RecordingClips(opened(SpikeSensor(SensorNoise(gain_spread=0.03), seed=0).expose(light), pattern="grey"))
+    assert 0.2 < clips.noise_level < 0.6

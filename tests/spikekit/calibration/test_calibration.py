@@ -164,6 +164,19 @@ def test_corrected_spikes_have_the_rate_of_an_ideal_sensor(truth):
     assert not again[0][:, truth.defects == HOT].all(0).any()
 
 
+def test_gradients_of_spikes_go_to_the_pixel_they_are_from(truth):
+    spikes = SpikeSensor().expose(torch.full((41, *SIZE), 0.3)).double()
+    spikes[:, 5, 7] = 0  # dead
+    spikes.requires_grad_()
+    gain = torch.ones(SIZE)
+    gain[:, 20:] = 1.1
+    known = Calibration(gain, torch.zeros(SIZE), truth.defects)
+    (passed,) = torch.autograd.grad(correct_spikes(spikes, known).sum(), spikes)
+    assert passed.equal(((gain == 1) & (truth.defects == WORKS)).double().expand(41, *SIZE))
+    (passed,) = torch.autograd.grad(fill_defects(spikes).sum(), spikes)
+    assert (passed[0, 5, 7], passed[0, 4:7, 6:9].sum(), passed.sum()) == (0, 9, passed.numel())
+
+
 def test_corrected_pictures_are_close_to_those_of_an_ideal_sensor(truth):
     y, x = torch.meshgrid(torch.linspace(0, 6, SIZE[0]), torch.linspace(0, 6, SIZE[1]), indexing="ij")
     light = (0.2 + 0.1 * torch.sin(x + y)).expand(101, *SIZE)
