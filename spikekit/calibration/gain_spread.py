@@ -26,11 +26,11 @@ SECOND_DIFFERENCE = torch.tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.
 def gain_spread(rates: Tensor, frames: int, pattern: str = GREY) -> float | None:
     r"""Estimate the relative standard deviation of the gains from the mean rates of the pixels.
 
-    The smaller of two estimates, both from rates relative to the mean of their colour nearby: the noise of the flattest
-    blocks, without the rounding of an ideal sensor, whose counts have a variance of 1/6 on average; and, if there are
-    several parts, the noise that they have in common in the median block, unless most blocks have few spikes. Texture is
-    not taken for noise by the first if some of the picture is flat, by the second if it moves. Otherwise, a spread
-    above 0.06 in blocks that differ, or above 0.15, more than sensors have, tells nothing.
+    The smaller of two estimates, both from rates relative to the mean of their colour nearby: the noise of the
+    flattest blocks, without the rounding of an ideal sensor, whose counts have a variance of 1/6 on average; and, if
+    there are several parts, the noise that they have in common in the median block, unless most blocks have few spikes.
+    Texture is not taken for noise by the first if some of the picture is flat, by the second if it moves. Otherwise, a
+    spread above 0.06 in blocks that differ, or above 0.15, more than sensors have, tells nothing.
 
     Args:
         rates: spikes per clock in parts of a recording, apart from each other, :math:`(P, H, W)`.
