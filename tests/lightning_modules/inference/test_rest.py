@@ -251,7 +251,8 @@ class Counted(Sensor):
 
     def forward(self, spikes, flow=None, static=False):
         self.seen += spikes[0, 0].numel()
-        return torch.nn.functional.interpolate(super().forward(spikes[:, 12:-12]), scale_factor=self.scale, mode="bilinear")
+        seen = super().forward(spikes[:, 12:-12])
+        return torch.nn.functional.interpolate(seen, scale_factor=self.scale, mode="bilinear")
 
 
 def in_pairs(light, scale=2, **how):
