@@ -50,6 +50,9 @@ _NOTHING_TO_DO = (
     r"\s*``[\w.]+`` was deprecated",
     r"No seed found",
     r".*the `outputs` folder",
+    r"Be aware that when using `ckpt_path`",
+    r"Checkpoint directory .* exists",
+    r"`ModelCheckpoint\(monitor=.*could not find",
 )
 
 # an int is a number of batches, a float a fraction

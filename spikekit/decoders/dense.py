@@ -190,7 +190,7 @@ def spike_interval(spikes: Tensor) -> Tensor:
         Dong et al., CVPR 2024, eq. (4); Zhu et al., ICME 2019.
     """
     check_planes("spikes", spikes, 3, "(*, T, H, W)")
-    interval = _spike_interval(spikes)
+    interval = _spike_interval(spikes.detach())
     return interval.to(spikes.dtype) if spikes.is_floating_point() else interval
 
 
