@@ -87,11 +87,6 @@ def test_imports_follow_the_order_of_packages(house):
     assert not against
 
 
-def test_spikekit_does_not_import_lightning_modules(house):
-    known = {name for name, others in house.items() if any(room(other).startswith(PACKAGES[1]) for other in others)}
-    assert not [name for name in known if name.startswith("spikekit")]
-
-
 def test_sweep_and_trade_do_not_import_each_other(house):
     edges, pair = rooms(house), {"lightning_modules.sweep", "lightning_modules.trade"}
     assert not [(name, other) for name in pair for other in edges[name] & pair]

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from lightning_modules.motion import ClassicalFlow, MotionEstimator, ZeroFlow, classical
+from lightning_modules.motion import ClassicalFlow, MotionEstimator, Spike2Flow, ZeroFlow, classical
 from spikekit import mosaic, spike_integrate_fire, tfp_at
 
 TIMES = (5, 20, 35)
@@ -29,6 +29,15 @@ def test_classical_flow_finds_a_translation(velocity, pattern):
     for flow, expected in ((to_first, -truth), (to_last, truth)):
         error = (flow - expected).norm(dim=1)[..., 8:-8, 8:-8]
         assert error.mean() < 0.2, error.mean()
+
+
+@pytest.mark.parametrize("pairs", [1600, 0])
+def test_weights_of_spike2flow_give_the_flow_that_they_were_trained_for(pairs, monkeypatch):
+    """Correlations are of all pairs or looked up. The scene moves by (3.75, -3) pixels."""
+    monkeypatch.setattr("lightning_modules.motion.recurrent._ALL_PAIRS", pairs)
+    flow = Spike2Flow(weights="spike2flow")(moving((0.25, -0.2)), TIMES, "RGGB")[1][0]
+    found = [*flow.mean((1, 2)).tolist(), *flow[:, 0, 0].tolist()]
+    assert found == pytest.approx([4.221, -2.888, 4.171, -2.867], abs=0.005)
 
 
 @pytest.mark.parametrize("around", [torch.autocast("cpu", torch.bfloat16), torch.device("meta")])

@@ -3,7 +3,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from lightning_modules.motion import Spike2Flow
-from lightning_modules.motion.recurrent import Correlation, GlobalAttention, upsample_convex
+from lightning_modules.motion.recurrent import Correlation, GlobalAttention
 from lightning_modules.networks import CSCSR
 from spikekit import spike_interval, split_bayer
 
@@ -111,26 +111,6 @@ def _kind(request, monkeypatch):
 
 
 @pytest.mark.usefixtures("_kind")
-def test_correlation_against_brute_force():
-    generator = torch.Generator().manual_seed(0)
-    here = torch.randn(2, 5, 6, 7, generator=generator, dtype=torch.float64)
-    there = torch.randn(2, 3, 5, 6, 7, generator=generator, dtype=torch.float64)
-    flow = torch.randn(6, 2, 6, 7, generator=generator, dtype=torch.float64) * 2
-    found = Correlation(here, there, levels=1, radius=1)(flow).unflatten(0, (2, 3))
-    assert found.shape == (2, 3, 9, 6, 7)
-    for b, k, y, x in ((0, 0, 0, 0), (1, 2, 3, 4), (0, 1, 5, 6)):
-        u, v = flow.unflatten(0, (2, 3))[b, k, :, y, x].tolist()
-        for number, (dy, dx) in enumerate((dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)):
-            picked = sum(
-                max(0, 1 - abs(x + u + dx - j)) * max(0, 1 - abs(y + v + dy - i)) * there[b, k, :, i, j]
-                for i in range(6)
-                for j in range(7)
-            )
-            expected = (here[b, :, y, x] * picked).sum() / 5**0.5
-            assert found[b, k, number, y, x].item() == pytest.approx(float(expected), abs=1e-9)
-
-
-@pytest.mark.usefixtures("_kind")
 def test_half_precision_looks_up_exact_positions():
     here = torch.ones(1, 1, 1, 700, dtype=torch.bfloat16)
     there = torch.zeros(1, 1, 1, 1, 700, dtype=torch.bfloat16)
@@ -138,30 +118,6 @@ def test_half_precision_looks_up_exact_positions():
     flow = torch.tensor([0.25, 0]).reshape(1, 2, 1, 1).expand(1, 2, 1, 700)
     found = Correlation(here, there, levels=1, radius=0)(flow)
     torch.testing.assert_close(found[0, 0, 0, 599:603], torch.tensor([0.0, 0.25, 0.75, 0.0]))
-
-
-@pytest.mark.usefixtures("_kind")
-def test_coarse_correlations_are_centred_on_the_same_point():
-    """A linear correlation has the same value on every scale."""
-    here = torch.ones(1, 1, 16, 16)
-    there = torch.arange(16.0).expand(1, 1, 1, 16, 16)
-    found = Correlation(here, there, levels=3, radius=1)(torch.full((1, 2, 16, 16), 0.5)).reshape(3, 9, 16, 16)
-    centre = found[:, 4, 6:10, 6:10]
-    torch.testing.assert_close(centre, (torch.arange(6.0, 10) + 0.5).expand(3, 4, 4))
-    torch.testing.assert_close(found[:, 5, 8, 8] - found[:, 4, 8, 8], torch.tensor([1.0, 2, 4]))  # x varies fastest
-
-
-def test_convex_upsampling_keeps_constant_flow():
-    generator = torch.Generator().manual_seed(0)
-    flow = torch.randn(2, 3, 2, 4, 5, generator=generator)
-    fine = upsample_convex(flow, torch.randn(2, 9 * 16, 4, 5, generator=generator), 4)
-    assert fine.shape == (2, 3, 2, 16, 20)
-    constant = upsample_convex(torch.ones(1, 3, 2, 4, 5), torch.randn(1, 9 * 4, 4, 5, generator=generator), 2)
-    torch.testing.assert_close(constant, torch.full_like(constant, 2.0))  # also at the border
-    right = torch.zeros(2, 9, 4, 4, 5)
-    right[:, 5, 1] = 200  # the second of four fine pixels takes the coarse pixel to its right
-    moved = upsample_convex(flow, right.flatten(1, 2), 2)[..., ::2, 1::2]
-    torch.testing.assert_close(moved[..., :-1], 2 * flow[..., 1:])
 
 
 def test_attention_against_brute_force():

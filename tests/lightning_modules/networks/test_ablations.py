@@ -8,12 +8,9 @@ from lightning_modules.inference.tiles import forward_in_tiles
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks import CSCSR, CSCSRConfig
 from lightning_modules.tasks.super_resolution import SuperResolution
-from spikekit import bayer_mask, bayer_sites, spike_integrate_fire, spike_interval
+from spikekit import bayer_mask, bayer_sites, spike_interval
 
 TINY = {"width": 4, "representation_width": 4, "features": 2, "stages": 2, "blocks": 1, "end_blocks": 1}
-# parameters at size full_base
-VARIANTS = dict.fromkeys("dej", 726_447) | dict.fromkeys("ac", 398_979) | dict.fromkeys("fg", 632_847)
-VARIANTS |= {"b": 607_791, "h": 624_975, "i": 652_655}
 
 
 class Motions(MotionEstimator):
@@ -80,17 +77,7 @@ def test_variant_j_is_the_default_and_variant_d_estimates_motion(configs):
     assert yaml.safe_load((configs / "ablation/d.yaml").read_text())["model"]["flow"] == "estimated"
 
 
-@pytest.mark.parametrize("letter", VARIANTS)
-def test_number_of_parameters_of_each_variant(letter, configs):
-    with torch.device("meta"):
-        network = CSCSR(**{**settings(configs, "x4", f"ablation/{letter}"), "size": "full_base"})
-    assert sum(p.numel() for p in network.parameters()) == VARIANTS[letter]
-    learns = letter not in "ac"
-    assert any(name.startswith("representation") for name in network.state_dict()) == learns
-    assert any(".whole." in name for name in network.state_dict()) == (learns and letter != "b")
-
-
-@pytest.mark.parametrize("letter", VARIANTS)
+@pytest.mark.parametrize("letter", "abcdefghij")
 def test_any_size_works_and_every_parameter_has_a_gradient(letter, configs):
     spikes, flow = clip(2, 9, 7)
     network = variant(letter, configs, 3, motion=Motions())
@@ -136,17 +123,6 @@ def test_a_gives_the_firing_rate_and_c_the_inverse_interval(letter, configs):
         expected = mask / spike_interval(spikes)[:, 5:36:3]
         expected[..., 2, 2] = 0
     torch.testing.assert_close(seen[:, :, 0], expected)
-
-
-@pytest.mark.parametrize("velocity", [(0.0, 0.0), (1.37, -0.81)])
-def test_flat_scene_gives_a_flat_picture_at_rest_and_in_motion(velocity):
-    """Measured: 0.15 to 0.25 steps of 8 bits, at rest and in motion."""
-    network = CSCSR.from_pretrained("cscsr_small_x4")
-    spikes, _ = spike_integrate_fire(torch.full((1, 41, 32, 32), 0.2), charge=torch.full((1, 32, 32), 0.05))
-    flow = torch.tensor(velocity).reshape(1, 2, 1, 1).expand(1, 2, 32, 32)
-    with torch.no_grad():
-        middle = network(spikes, torch.stack([-flow, flow], dim=1))[..., 48:-48, 48:-48]
-    assert 255 * middle.std(dim=(-2, -1)).max() < 0.4
 
 
 @pytest.mark.parametrize(("letter", "sees"), [("a", False), ("b", False), ("j", True)])

@@ -1,14 +1,13 @@
 import pytest
 import torch
+from skimage import data
 from torch.utils.flop_counter import FlopCounterMode
 
 from lightning_modules.inference.tiles import forward_in_tiles
 from lightning_modules.motion import ZeroFlow
 from lightning_modules.networks import CSCSR, ClassicalDecoder
 from lightning_modules.networks.layers import ConvBlock, res_blocks
-from lightning_modules.networks.refinement import FeatureRefinement
-from lightning_modules.networks.representation import SpikeRepresentation
-from spikekit import demosaic, mosaic, psnr, spike_integrate_fire, tfi, tfp
+from spikekit import bin_to_sensor, demosaic, mosaic, psnr, simulate_spikes, spike_integrate_fire, tfi, tfp
 
 TINY = {"width": 4, "representation_width": 4, "features": 2, "stages": 2, "blocks": 1, "end_blocks": 1}
 
@@ -76,48 +75,23 @@ def test_any_size_and_scale_works_and_every_parameter_has_a_gradient(scale, size
     assert all(p.grad is not None and p.grad.isfinite().all() and p.grad.any() for p in network.parameters())
 
 
+@torch.no_grad()
+@pytest.mark.parametrize(("name", "expected"), [("tiny_x4", 26.54), ("base_x3", 27.23), ("small_noisy_x4", 26.84)])
+def test_weights_of_the_package_give_the_picture_that_they_were_trained_for(name, expected):
+    network = CSCSR.from_pretrained(f"cscsr_{name}")
+    side = 48 * network.scale
+    rgb = torch.tensor(data.astronaut()).movedim(-1, 0)[:, :side, 150 : 150 + side] / 255
+    raw = [bin_to_sensor(rgb.roll((n - 20) // 4, -1), scale=network.scale) for n in range(41)]
+    spikes = simulate_spikes(0.4 * torch.stack(raw), generator=torch.Generator().manual_seed(0))
+    assert psnr(network(spikes[None])[0].clamp(0, 1), rgb).item() == pytest.approx(expected, abs=0.02)
+
+
 def test_network_is_equivariant_to_shifts_by_bayer_cells():
     network = CSCSR(2, **TINY).double()
     spikes, _ = clip(1, 48, 48)
     still = torch.zeros(1, 2, 2, 48, 48, dtype=torch.float64)
     moved = network(spikes.roll((2, 4), dims=(-2, -1)), still).roll((-4, -8), dims=(-2, -1))
     torch.testing.assert_close(moved[..., 32:-32, 32:-32], network(spikes, still)[..., 32:-32, 32:-32])
-
-
-def test_sensor_resolution_keeps_the_place_of_each_pixel():
-    """A changed sensor pixel changes the picture around its own position."""
-    network = CSCSR(3, **TINY, resolution="sensor").double()
-    still = torch.zeros(1, 2, 2, 40, 44, dtype=torch.float64)
-    spikes, _ = clip(1, 40, 44)
-    other = spikes.clone()
-    other[..., 18, 24] ^= 1
-    change = (network(spikes, still) - network(other, still)).abs().sum(dim=1)[0].detach()
-    y, x = torch.meshgrid(torch.arange(120.0), torch.arange(132.0), indexing="ij")
-    centre = [(change * axis).sum() / change.sum() for axis in (y, x)]
-    assert centre[0] == pytest.approx(18 * 3 + 1, abs=1.5)
-    assert centre[1] == pytest.approx(24 * 3 + 1, abs=1.5)
-
-
-@pytest.mark.parametrize("global_perception", [True, False])
-def test_representation_fuses_windows_with_the_whole_clip(global_perception):
-    """Fig. 4: features of the clip and of each window are concatenated and convolved."""
-    part = SpikeRepresentation(9, 5, 2, 4, 3, global_perception).double()
-    spikes = (torch.rand(2, 9, 7, 6) < 0.4).double()
-    expected = []
-    for begin in (0, 2, 4):
-        seen = [part.local(spikes[:, begin : begin + 5])]
-        if global_perception:
-            seen.append(part.whole(spikes))
-        expected.append(part.fuse(torch.cat(seen, dim=1)))
-    torch.testing.assert_close(part(spikes), torch.stack(expected, dim=1))
-
-
-def test_refinement_sees_the_deviation_from_the_temporal_mean():
-    """Section 4.3: a base layer of all features, and a residual layer without their temporal mean."""
-    refine, pixels = FeatureRefinement(5, 3, 4).double(), torch.rand(2, 5, 3, 6, 7, dtype=torch.float64)
-    residual = pixels - pixels.mean(dim=1, keepdim=True)
-    expected = refine.base(pixels.flatten(1, 2)) + refine.residual(residual.flatten(1, 2))
-    torch.testing.assert_close(refine(pixels.flatten(1, 2)), expected)
 
 
 def test_skip_starts_from_a_smooth_classical_picture():

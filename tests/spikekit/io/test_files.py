@@ -1,7 +1,6 @@
 """Recordings: bits, rows, flips, parts of files, and invalid files."""
 
 import tracemalloc
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,8 +8,6 @@ import torch
 
 from spikekit import SpikeFileError, iter_spikes, read_spikes, spikes_shape, write_spikes
 from spikekit.decoders.packing import pack_spikes
-
-SPIKES = Path(__file__).parents[4] / "shared" / "data" / "spikes"
 
 
 def random_spikes(*shape):
@@ -210,17 +207,3 @@ def test_failed_write_keeps_the_old_file(tmp_path, name, spikes, error, message)
         write_spikes(tmp_path / name, map(open, ["picture_7.png"]) if isinstance(spikes, str) else spikes)
     assert [file.name for file in tmp_path.iterdir()] == [name]
     assert read_spikes(tmp_path / name, 4, 5).equal(old)
-
-
-@pytest.mark.skipif(not SPIKES.is_dir(), reason="the shared recordings are not beside the repository")
-def test_public_recordings_are_read(tmp_path):
-    file = SPIKES / "reds_sim_mono_203_250x400.dat"
-    spikes = read_spikes(file, 250, 400, flip=True)
-    assert spikes.shape == (301, 250, 400)
-    sky, ground = spikes[:, :40, :200].float().mean(), spikes[:, 60:90, :180].float().mean()
-    assert sky > 2 * ground  # a white awning over a dark roof: upright
-    write_spikes(tmp_path / "again.dat", spikes, flip=True)
-    assert (tmp_path / "again.dat").read_bytes() == file.read_bytes()
-    file = SPIKES / "uhsr_real_mono_helicopter_250x250.npz"
-    with np.load(file) as arrays:
-        assert np.array_equal(read_spikes(file, 250, 250, start=150, frames=3).numpy(), arrays["spk"][150:153])
