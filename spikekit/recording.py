@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -28,6 +29,8 @@ _BLOCK = 1 << 24
 
 # parts of a recording that white and noise are measured on, and least frames of a part of several
 _PARTS, _LEAST_PART = 4, 200
+# short parts for the white level, their least frames, and spikes of a white pixel in them
+_SHORT_PARTS, _SHORT, _SPIKES = 8, 41, 24
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,15 @@ class Recording:
         frames = min(room // parts, 2 * _LEAST_PART)
         starts = np.linspace(0, self.frames - frames, parts).astype(int).tolist()
         return self.correct(torch.stack([self.counts(start, frames) for start in starts]) / frames), frames
+
+    @cached_property
+    def white(self) -> float:
+        """Default white level: that of the mean or, if higher, of a short part, which blurs moving highlights less."""
+        white = white_rate(self.looks[0].mean(0), self.bayer)
+        frames = min(max(math.ceil(_SPIKES / white), _SHORT), self.frames)
+        starts = np.linspace(0, self.frames - frames, min(self.frames // frames, _SHORT_PARTS)).astype(int).tolist()
+        parts = (self.correct(self.counts(start, frames) / frames) for start in starts)
+        return max(white, *(white_rate(part, self.bayer) - 0.5 / frames for part in parts))  # counts are rounded up
 
     def correct(self, raw: Tensor) -> Tensor:
         """Return the rates (*, H, W), in spikes per clock, that an ideal sensor would give."""

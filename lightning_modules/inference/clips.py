@@ -17,7 +17,7 @@ from spikekit.arguments import frames_of
 from spikekit.calibration.defects import find_outliers, replace_pixels
 from spikekit.calibration.gain_spread import gain_spread
 from spikekit.color.cfa import GREY
-from spikekit.recording import Recording, white_rate
+from spikekit.recording import Recording
 
 Item = TypeVar("Item")
 
@@ -138,10 +138,10 @@ class RecordingClips:
         dead, hot, other = find_outliers(count, frames * len(rates), self.recording.bayer)
         return dead | hot, other
 
-    @cached_property
+    @property
     def white(self) -> float:
-        """White level in spikes per frame: the side-car's, else the level that 99.9 % of the pixels do not exceed."""
-        return self.recording.alpha or white_rate(self.recording.looks[0].mean(0), self.recording.bayer)
+        """White level in spikes per frame: the side-car's, else what 99.9 % of the pixels do not exceed at any time."""
+        return self.recording.alpha or self.recording.white
 
     @cached_property
     def gain_spread(self) -> float | None:

@@ -78,7 +78,7 @@ def reconstruct(
             Default: NAME.calibration.safetensors beside the recording.
         frame: spike frames to show: N, or A to B - 1 as A:B or A:B:STEP; STEP is 20 by default.
         white: white level in spikes per frame; smaller values give brighter pictures. Default: that of the side-car,
-            else the level that 99.9 % of the pixels do not exceed, the same in all pictures.
+            else what 99.9 % of the pixels do not exceed at any time, the same in all pictures.
         device: device of the network; default: a GPU if there is one.
         precision: ``"32-true"`` or ``"bf16-mixed"``; default: the latter if the device computes in bfloat16.
         how: ``tile``, ``psnr_tolerance``, ``self_ensemble`` and ``future`` of
