@@ -26,6 +26,7 @@ _SURER = 640  # the same where half of the cells around, or a sixth of all, are 
 _MORE = 1.25  # clocks, relative to those that a resting cell was drawn with, after which it is drawn again
 _BUSY, _UNTESTED = 0.75, 8  # share of cells that makes a picture busy, and pictures after it that are not tested
 _FADE = 0.96  # weight of the sums of squares of the previous key frame
+_ALIKE = 1, 2, 4, 8  # key frames with much the same rounding of blocks of 1, 2, 4 and 8 pixels of even light
 _LEAST = 1 / 12  # smallest variance of a count, as light is not known exactly
 _NOISE = 0.001, 0.01  # variance per spike of a calibrated and a noisy sensor: 1000 and 100 electrons per threshold
 
@@ -47,8 +48,8 @@ def find_changes(
 
     The gain g of flickering lamps is the median ratio over all cells, weighted by their light. If a tenth of the cells
     has another, as a lamp lights only a part, cells have that of the two gains that suits their neighbourhood. A gain
-    counts only if it reduces squares of cells by more than 25 in all, where parts of the picture with more than before
-    count twice, and if no more cells have moved with it than without.
+    counts only if it reduces squares of cells, also of those at rest with it, by more than 25 in all, where parts of
+    the picture with more than before count twice, and if no more cells have moved with it than without.
 
     A cell has moved if the sum of :math:`d^2 / \operatorname{var}` over its K blocks of 1, 2, 4 or 8 pixels exceeds
     :math:`K + 2 \sqrt{K x} + 2 x` with :math:`x = \ln(\text{tests} / \text{risk})`, which K normal numbers exceed with
@@ -78,12 +79,12 @@ def find_changes(
     each = _pixels(share.where(known, 0.0), Box(0, 0, *recent.shape))
     expected = each * reference
     spread = _spread(expected, each, noise, step)
-    gain = _gains(_sum(recent, CELL), _sum(expected, CELL), _sum(spread[0], CELL).sqrt(), known)
+    gain, better = _gains(_sum(recent, CELL), _sum(expected, CELL), _sum(spread[0], CELL).sqrt(), known)
     moved, excess = _moved(recent, expected, *spread)
-    if (gain != 1).any():
+    if _counts(better):
         lit = _pixels(gain, Box(0, 0, *recent.shape))
         with_gain = _moved(recent, lit * expected, *_spread(lit * expected, lit * each, noise, step))
-        if with_gain[0].sum() <= moved.sum():
+        if with_gain[0].sum() <= moved.sum() and _counts(better * ~with_gain[0]):
             return with_gain[0] | ~known, gain, with_gain[1] * known
     return moved | ~known, torch.ones_like(gain), excess * known
 
@@ -105,8 +106,12 @@ def _moved(recent: Tensor, expected: Tensor, variance: Tensor, bound: Tensor) ->
 
 def _spread(expected: Tensor, each: Tensor, noise: float, step: Tensor) -> tuple[Tensor, Tensor]:
     """Return the variance of the difference of a count from the expected one, and its bound."""
-    part = (expected - expected.floor()).sub_(0.5).square_()
-    counted = (0.25 - part).clamp_(min=_LEAST).add_(each * (5 * each + 3) / 12)
+    part = 0.25 - (expected - expected.floor()).sub_(0.5).square_()
+    # that of a pixel depends on the rounding of its reference, so cells take their mean, but those with too few spikes
+    even, count = F.avg_pool2d(torch.stack([part, expected]), CELL, ceil_mode=True)
+    even, few = (_pixels(cells, Box(0, 0, *part.shape)) for cells in (even, count < 0.5))
+    part = torch.where(few, part, even).clamp_(min=_LEAST)
+    counted = part + each * (5 * each + 3) / 12
     timed = step**2 * (1 + each + each.square()) / 4
     extra = noise * expected * (1 + each)
     are_timed = (step < 1).float()
@@ -142,8 +147,11 @@ def find_misfits(off: Tensor, before: Tensor, after: Tensor, spike: float) -> Te
     return found
 
 
-def _gains(recent: Tensor, expected: Tensor, spread: Tensor, cells: Tensor) -> Tensor:
-    """Return the gain of every cell: that of most cells, or that of most others, if these are a tenth or more."""
+def _gains(recent: Tensor, expected: Tensor, spread: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the gain of every cell, and by how much it reduces the square.
+
+    It is that of most cells, or that of most others, if these are a tenth or more.
+    """
     gain = _gain(recent[cells], expected[cells])
     recent, expected = (cells * light / spread for light in (recent, expected))
     off = (recent - gain * expected).square()
@@ -154,8 +162,14 @@ def _gains(recent: Tensor, expected: Tensor, spread: Tensor, cells: Tensor) -> T
         others = F.avg_pool2d(better.clamp(-25, 25)[None], 3, 1, 1)[0] > 0
         same = cells & ~others
         gain = torch.where(others, other, _gain(recent[same], expected[same]))
-    better = _sum(((recent - expected).square() - (recent - gain * expected).square()).clamp(-25, 25), CELL)
-    return torch.where(cells & (better.minimum(2 * better).sum() > 25), gain, 1.0)
+    better = ((recent - expected).square() - (recent - gain * expected).square()).clamp(-25, 25)
+    return torch.where(cells, gain, 1.0), better
+
+
+def _counts(better: Tensor) -> bool:
+    """Whether squares of cells are smaller with a gain by more than 25; parts where they are larger count twice."""
+    parts = _sum(better, CELL)
+    return parts.minimum(2 * parts).sum().item() > 25
 
 
 def _gain(recent: Tensor, expected: Tensor) -> float:
@@ -324,10 +338,11 @@ class Rest:
         near = (frames - clocks) // 2
         middle = slice(frames // 2 - clocks // 2, frames // 2 - clocks // 2 + clocks)
         recent = spikes[middle].sum(0, dtype=torch.float32)
-        # intervals are shorter than what a clip has before and after its middle
-        self._timed &= (recent - 1) * (frames - clocks) >= 2 * clocks
-        if near:
-            recent += self._timed * (_charge(spikes, middle.stop, near) - _charge(spikes, middle.start, near))
+        timed = recent + (_charge(spikes, middle.stop, near) - _charge(spikes, middle.start, near) if near else 0)
+        # where intervals are shorter than near; of even light all pixels, as a choice by chance favours some charges
+        around = F.avg_pool2d(timed[None], 5, 1, 2, count_include_pad=False)[0]
+        self._timed &= (near * timed >= 1.2 * clocks) & ((near * around >= 1.5 * clocks) | (self._earlier > 0))
+        recent = torch.where(self._timed, timed, recent)
         if known is not None:
             recent *= (known.defects == 0).to(recent.device)
         step = torch.where(self._timed, recent / clocks, 1)
@@ -349,8 +364,9 @@ class Rest:
         full = self._since >= self._before
         fade = self._light.new_tensor([_FADE, _FADE**2])[:, None, None, None]
         self._excess = (fade * self._excess + excess) * ~changed
-        for one in (self._excess, slow_excess * ~changed):
-            total, tests = F.avg_pool2d(one, 3, 1, 1, divisor_override=1)
+        alike = self._light.new_tensor(_ALIKE)[:, None, None]
+        for one, times in ((self._excess, alike), (slow_excess * ~changed, 1)):
+            total, tests = F.avg_pool2d(one, 3, 1, 1, divisor_override=1) / times
             self._calm[(total + tests > _limit(tests)).any(0)] = 0
         kept, renewed = (_pixels(cells.float(), whole) for cells in (~changed, full & ~changed))
         self._timed |= kept == 0

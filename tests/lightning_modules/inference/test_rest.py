@@ -118,6 +118,12 @@ def test_a_scene_at_rest_asks_the_network_for_eight_pictures_and_no_more(kind, s
     assert not any(computed[11:])
 
 
+@pytest.mark.parametrize("light", [0.125, 0.15, 0.2])
+def test_even_light_rests(light):
+    computed = [cells.any().item() for _, cells in film(torch.full((641, SIDE, SIDE), light), psnr_tolerance=0.1)]
+    assert not any(computed[11:])
+
+
 def test_where_everything_moves_pictures_equal_those_without_tolerance_until_it_stops():
     light, network = moving(141), CSCSR(**TINY).eval()
     light = torch.cat([light, light[-1:].expand(520, -1, -1)])
