@@ -437,9 +437,9 @@ class FilmMaker:
                 flow = upsample_flow(near.of(offset), scale)
                 inside = _ends_inside(flow, near, whole, scale)
                 weight = weight * torch.where(inside, 1.0, 1e-6)
-                total = total + weight * flow_warp(near.of(made.rgb, scale=scale), flow.to(made.rgb))
+                total = total + weight * _warp(near.of(made.rgb, scale=scale), flow)
                 weights = weights + weight
-            return box.of(total / weights, near[:2], scale)
+            return box.of((total / weights).clamp_(0, 1), near[:2], scale)
 
         return tiled(run, whole, self.tile, lambda _: 0, scale)
 
@@ -502,6 +502,15 @@ class FilmMaker:
         """Return planes in half precision for frames larger than a tile, to save memory."""
         large = 0 < self.tile < max(whole.bottom, whole.right)
         return planes.half() if large and planes.dtype == torch.float32 else planes
+
+
+def _warp(image: Tensor, flow: Tensor) -> Tensor:
+    """Return an image warped like :func:`spikekit.flow_warp`, but not blurred: second differences undo the mean."""
+    across = F.pad(image[..., :-2] - 2 * image[..., 1:-1] + image[..., 2:], (1, 1))
+    down = F.pad(image[..., :-2, :] - 2 * image[..., 1:-1, :] + image[..., 2:, :], (0, 0, 1, 1))
+    warped, across, down = flow_warp(torch.cat([image, across, down], 1), flow.to(image)).chunk(3, 1)
+    x, y = (flow - flow.floor()).split(1, 1)
+    return warped - (x - x * x) / 2 * across - (y - y * y) / 2 * down
 
 
 def _ends_inside(flow: Tensor, near: Box, whole: Box, scale: int) -> Tensor:

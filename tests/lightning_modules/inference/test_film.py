@@ -152,7 +152,7 @@ def between(network, clock, *ends, tile=None):
 @pytest.mark.parametrize("tile", [0, 8])
 @pytest.mark.parametrize("clock", [14, 16, 22])
 def test_interpolated_pictures_match_the_scene_up_to_the_edges(clock, tile):
-    assert error(between(Truth(), clock, 10, 26, tile=tile)[0], waves(clock)) < 0.01
+    assert error(between(Truth(), clock, 10, 26, tile=tile)[0], waves(clock)) < 0.002
     assert error(waves(10), waves(14)) > 0.05
 
 
