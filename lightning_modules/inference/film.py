@@ -185,7 +185,7 @@ class FilmMaker:
     .. math:: I_n(x) = (1 - a) \, I_l(x + o_l(x)) + a \, I_r(x + o_r(x)), \quad a = \frac{n - l}{r - l}
 
     with offsets o along the motion of both clips, blended with the same weights. Where one of the two points lies
-    outside the picture, only the other is used. At x1, pictures have detail that a warp blurs.
+    outside the picture, only the other is used. At x1, pictures have detail that small errors of the motion would blur.
 
     Cells of 8 x 8 sensor pixels that move faster are computed, and those where the spikes contradict an interpolated
     picture, see :func:`lightning_modules.inference.rest.find_misfits`.
