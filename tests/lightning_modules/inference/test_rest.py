@@ -118,9 +118,10 @@ def test_a_scene_at_rest_asks_the_network_for_eight_pictures_and_no_more(kind, s
     assert not any(computed[11:])
 
 
-@pytest.mark.parametrize("light", [0.125, 0.15, 0.2])
+@pytest.mark.parametrize("light", [0.11, 0.125])
 def test_even_light_rests(light):
-    computed = [cells.any().item() for _, cells in film(torch.full((641, SIDE, SIDE), light), psnr_tolerance=0.1)]
+    pictures = film(torch.full((641, 2 * SIDE, 2 * SIDE), light), psnr_tolerance=0.1)
+    computed = [cells.any().item() for _, cells in pictures]
     assert not any(computed[11:])
 
 
