@@ -28,11 +28,11 @@ _BUSY, _UNTESTED = 0.75, 8  # share of cells that makes a picture busy, and pict
 _FADE = 0.96  # weight of the sums of squares of the previous key frame
 _ALIKE = 1, 2, 4, 8  # key frames with much the same rounding of blocks of 1, 2, 4 and 8 pixels of even light
 _LEAST = 1 / 12  # smallest variance of a count, as light is not known exactly
-_NOISE = 0.001, 0.01  # variance per spike of a calibrated and a noisy sensor: 1000 and 100 electrons per threshold
+_NOISE = 0.001  # variance of the sensor per spike, besides rounding: 1000 electrons per threshold
 
 
 def find_changes(
-    recent: Tensor, reference: Tensor, share: Tensor, noise: float = 0.0, step: Tensor | float = 1.0
+    recent: Tensor, reference: Tensor, share: Tensor, step: Tensor | float = 1.0
 ) -> tuple[Tensor, Tensor, Tensor]:
     r"""Find where a scene has changed between two counts of spikes, and by how much its light has.
 
@@ -62,7 +62,6 @@ def find_changes(
         reference: earlier counts (H, W).
         share: (h, w) ratio of the clocks of the recent counts to those of the reference, for every cell; infinity for
             cells without a reference, which count as moved.
-        noise: variance of the sensor per spike, besides rounding; 0 for an ideal sensor.
         step: what counts are rounded to, (H, W): 1 for numbers of spikes, less for sums of :func:`spikekit.tfi`.
 
     Returns:
@@ -78,12 +77,12 @@ def find_changes(
     known, step = share.isfinite(), torch.as_tensor(step, device=recent.device)
     each = _pixels(share.where(known, 0.0), Box(0, 0, *recent.shape))
     expected = each * reference
-    spread = _spread(expected, each, noise, step)
+    spread = _spread(expected, each, step)
     gain, better = _gains(_sum(recent, CELL), _sum(expected, CELL), _sum(spread[0], CELL).sqrt(), known)
     moved, excess = _moved(recent, expected, *spread)
     if _counts(better):
         lit = _pixels(gain, Box(0, 0, *recent.shape))
-        with_gain = _moved(recent, lit * expected, *_spread(lit * expected, lit * each, noise, step))
+        with_gain = _moved(recent, lit * expected, *_spread(lit * expected, lit * each, step))
         if with_gain[0].sum() <= moved.sum() and _counts(better * ~with_gain[0]):
             return with_gain[0] | ~known, gain, with_gain[1] * known
     return moved | ~known, torch.ones_like(gain), excess * known
@@ -104,7 +103,7 @@ def _moved(recent: Tensor, expected: Tensor, variance: Tensor, bound: Tensor) ->
     return moved, torch.stack(sums, 1)
 
 
-def _spread(expected: Tensor, each: Tensor, noise: float, step: Tensor) -> tuple[Tensor, Tensor]:
+def _spread(expected: Tensor, each: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
     """Return the variance of the difference of a count from the expected one, and its bound."""
     part = 0.25 - (expected - expected.floor()).sub_(0.5).square_()
     # that of a pixel depends on the rounding of its reference, so cells take their mean, but those with too few spikes
@@ -113,7 +112,7 @@ def _spread(expected: Tensor, each: Tensor, noise: float, step: Tensor) -> tuple
     part = torch.where(few, part, even).clamp_(min=_LEAST)
     counted = part + each * (5 * each + 3) / 12
     timed = step**2 * (1 + each + each.square()) / 4
-    extra = noise * expected * (1 + each)
+    extra = _NOISE * expected * (1 + each)
     are_timed = (step < 1).float()
     return torch.lerp(counted, timed, are_timed) + extra, each + 1.1 + 6 * extra.sqrt() + are_timed / (1 - are_timed)
 
@@ -334,7 +333,7 @@ class Rest:
 
     def _compare(self, spikes: Tensor, clocks: int, known: Calibration | None) -> None:
         """Add the middle of a clip to the counts, which start anew where the scene has changed."""
-        noise, whole, frames = _NOISE[self.noisy], Box(0, 0, *spikes.shape[1:]), len(spikes)
+        whole, frames = Box(0, 0, *spikes.shape[1:]), len(spikes)
         near = (frames - clocks) // 2
         middle = slice(frames // 2 - clocks // 2, frames // 2 - clocks // 2 + clocks)
         recent = spikes[middle].sum(0, dtype=torch.float32)
@@ -346,16 +345,16 @@ class Rest:
         if known is not None:
             recent *= (known.defects == 0).to(recent.device)
         step = torch.where(self._timed, recent / clocks, 1)
-        sudden, gain, excess = find_changes(recent, self._earlier, clocks * self._light / self._before, noise, step)
+        sudden, gain, excess = find_changes(recent, self._earlier, clocks * self._light / self._before, step)
         self._light *= gain
         self._later += recent
         self._since += clocks * self._light
-        slow, slow_gain, slow_excess = find_changes(self._later, self._earlier, self._since / self._before, noise, step)
+        slow, slow_gain, slow_excess = find_changes(self._later, self._earlier, self._since / self._before, step)
         self._since *= slow_gain
         changed = (sudden | slow) & (self._before > 0)
         if (self._count < _PICTURES).any() and (gain == 1).all():
             first, second = spikes[middle][clocks % 2 :].unflatten(0, (2, -1)).sum(1, dtype=torch.float32)
-            changed |= find_changes(second, first, torch.ones_like(self._calm), noise)[0]
+            changed |= find_changes(second, first, torch.ones_like(self._calm))[0]
         if grown(changed).float().mean() > _BUSY:
             self._untested = _UNTESTED
         self._calm += clocks
