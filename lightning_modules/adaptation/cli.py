@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 from time import perf_counter
 
 import torch
@@ -20,7 +19,7 @@ from lightning_modules.inference.reconstruct import other_sensor
 from lightning_modules.networks import Network
 from lightning_modules.registry import list_models
 from lightning_modules.storage.pretrained import Weights, motion_of, settings_of, write_weights
-from spikekit.arguments import whole
+from spikekit.arguments import home_path, whole
 from spikekit.cli import recordings
 from spikekit.color.cfa import GREY
 from spikekit.recording import Recording
@@ -50,7 +49,7 @@ def parser() -> argparse.ArgumentParser:
         "times; one for noisy sensors if the sensor turns out to be noisy)",
     )
     add("--steps", type=whole(1), default=100, help="training steps (default: 100)")
-    add("-o", "--output", type=Path, required=True, metavar="OUT", help="output folder")
+    add("-o", "--output", type=home_path, required=True, metavar="OUT", help="output folder")
     return made
 
 

@@ -73,10 +73,6 @@ class Parser(LightningArgumentParser):
         """Report the error in one line; jsonargparse would show every option and every type it tried."""
         if not self.exit_on_error:
             super().error(message, ex)
-        if "the following arguments are required: network" in message:
-            message = (
-                "expected a network: --model.weights NAME (lightning models lists them), or a configuration, -c FILE"
-            )
         sys.exit(reason(message))
 
 

@@ -20,6 +20,7 @@ from lightning_modules.storage.pretrained import (
     settings_of,
     write_weights,
 )
+from spikekit.arguments import home_path
 from spikekit.timing import duration
 
 
@@ -39,7 +40,9 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument("--format", choices=("safetensors", *FORMATS), default="safetensors", help="default: safetensors")
     made.add_argument("--still", action="store_true", help="nothing moves: no flow input (torch, onnx)")
-    made.add_argument("-o", "--output", required=True, metavar="FILE", help=".safetensors, .pt2 or .onnx file")
+    made.add_argument(
+        "-o", "--output", type=home_path, required=True, metavar="OUT", help=".safetensors, .pt2 or .onnx"
+    )
     return made
 
 
@@ -48,7 +51,7 @@ def export(args: Sequence[str]) -> None:
     asked = parser().parse_args(args)
     begin = perf_counter()
     ending = FORMATS.get(asked.format, ".safetensors")
-    if Path(asked.output).suffix != ending:
+    if asked.output.suffix != ending:
         raise InputError(f"-o: expected a file name ending in {ending} for {asked.format}, got {asked.output}")
     said = ""
     with input_errors():
@@ -57,7 +60,7 @@ def export(args: Sequence[str]) -> None:
             said = f", {export_network(network, asked.output, asked.format, still=asked.still)}"
         else:
             write_weights(_weights(asked), asked.output)
-    size = Path(asked.output).stat().st_size / 2**20
+    size = asked.output.stat().st_size / 2**20
     print(f"{asked.output}: {size:.1f} MiB{said}, in {duration(perf_counter() - begin)}")
 
 

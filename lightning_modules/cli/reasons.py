@@ -21,6 +21,9 @@ def reason(message: str) -> str:
         >>> reason("\n".join(['Parser key "data.height":', *lines]))
         "data.height: expected int, got 'high'"
     """
+    if re.search(r"arguments are required: network|class_path 'lightning_modules\.networks\.Network'", message):
+        named = "a configuration that names one, such as -c x4, before its overlays"
+        return f"expected a network: {named}, or weights (lightning models lists them)"
     lines = message.strip().splitlines() or [message]
     if lines[0].startswith("Problems parsing config"):
         return " ".join(message.split())[:_MOST]

@@ -110,6 +110,8 @@ def reconstruct(
     notes: list[str] = []
     if not (network is None or isinstance(network, Network)):
         network = Network.from_pretrained(network)
+    if network is not None and scale not in (None, network.settings["scale"]):
+        raise ValueError(f"scale: expected {network.settings['scale']}, that of the network, got {scale}")
     looks = RecordingClips(recording, FRAMES if network is None else network.frames)
     level = looks.noise_level
     white = looks.white if white is None else white

@@ -104,8 +104,9 @@ def test_command_writes_usable_weights(recording, tmp_path, capsys):
 def test_weights_without_gain_are_not_written(recording, tmp_path, monkeypatch, after):
     monkeypatch.setattr(cli, "fine_tune", lambda *_: (30.0, after))
     monkeypatch.setattr(cli, "make_distillation_set", lambda *_: None)
+    monkeypatch.setenv("HOME", str(tmp_path))
     with pytest.raises(SystemExit, match=r"expected a gain of 0\.1 dB; nothing written, keep using cscsr_tiny_x4"):
-        main(typed(recording, tmp_path))
+        main(typed(recording, "~"))
     assert [path.name for path in tmp_path.iterdir()] == ["lock"]
 
 

@@ -265,7 +265,8 @@ def test_own_network_and_estimator_make_pictures(words, tmp_path, monkeypatch):
     write_weights(Weights(tmp_path, settings_of(my_network.Mean()), {}, {"weight": torch.tensor(0.5)}), "w.safetensors")
     main([*words, "--weights", "w.safetensors"])
     assert len(pictures(tmp_path / "out")) == 1
-    main(["export", "w.safetensors", "-c", "own.yaml", "-o", "copy.safetensors"])
+    monkeypatch.setenv("HOME", str(tmp_path))
+    main(["export", "w.safetensors", "-c", "own.yaml", "-o", "~/copy.safetensors"])
     main(["export", "w.safetensors", "-c", "own.yaml", "--format", "torch", "-o", "copy.pt2"])
     main([*words[:-1], "again", "--weights", "copy.safetensors"])
     assert pictures(tmp_path / "again") == pictures(tmp_path / "out")

@@ -128,6 +128,7 @@ def test_dim_light_joins_frames_if_there_is_room(flat, speed, white, frame, join
         ({"white": 0}, ValueError, "white: expected a finite number above 0, got 0"),
         ({"white": float("nan")}, ValueError, "white: expected a finite number above 0, got nan"),
         ({"scale": 0}, ValueError, "scale: expected one that was measured .*, got 0"),
+        ({"speed": None, "network": "cscsr_micro_x4", "scale": 2}, ValueError, "scale: expected 4, .* network, got 2"),
         ({"tile": -1}, ValueError, "tile: expected 0 pixels or more, got -1"),
         ({"device": "nowhere"}, ValueError, "device: expected one of this machine, got nowhere"),
         ({"psnr_tolerence": 0}, TypeError, "psnr_tolerence"),
@@ -135,7 +136,7 @@ def test_dim_light_joins_frames_if_there_is_room(flat, speed, white, frame, join
 )
 def test_invalid_arguments_are_rejected_at_once(flat, wrong, error, said):
     with pytest.raises(error, match=said):
-        reconstruct(flat(0.3), "fast", **wrong)
+        reconstruct(flat(0.3), **{"speed": "fast", **wrong})
 
 
 @pytest.mark.parametrize(("every", "size"), [(1, 12), (3, 4), (20, 2), (21, 1)])
