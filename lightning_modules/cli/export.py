@@ -40,9 +40,7 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument("--format", choices=("safetensors", *FORMATS), default="safetensors", help="default: safetensors")
     made.add_argument("--still", action="store_true", help="nothing moves: no flow input (torch, onnx)")
-    made.add_argument(
-        "-o", "--output", type=home_path, required=True, metavar="OUT", help=".safetensors, .pt2 or .onnx"
-    )
+    made.add_argument("-o", "--output", type=home_path, required=True, metavar="OUT", help=".safetensors, .pt2, .onnx")
     return made
 
 
