@@ -190,7 +190,7 @@ def _rests_of_film(
     light = Scene([layer], scale * size[0], scale * size[1], clocks).light("RGGB", scale=scale, alpha=ALPHA)
     light[:, moving:] = light[0, moving:].clone()
     spikes = simulate_spikes(light, generator=torch.Generator().manual_seed(0), noise=noise)
-    rest, nothing, changes, resting = Rest(1, "RGGB", ALPHA, noise is not None), torch.zeros(3, *size), [], []
+    rest, nothing, changes, resting = Rest(1, "RGGB", ALPHA, float(noise is not None)), torch.zeros(3, *size), [], []
     for clock in range(20, clocks - 20, EVERY):
         rest(spikes[clock - 20 : clock + 21], clock, lambda box, static: box.of(nothing), 1.0, None)
         change = (light[clock] - light[clock - EVERY]) / ALPHA

@@ -253,7 +253,7 @@ class FilmMaker:
         self.computed: list[Tensor] = []
         self._interpolates = psnr_tolerance > 0 and network.takes_flow and network.scale > 1
         if psnr_tolerance:
-            self.rest = Rest(network.scale, network.pattern, network.settings["alpha"], network.noise_level > 0)
+            self.rest = Rest(network.scale, network.pattern, network.settings["alpha"], network.noise_level)
 
     @property
     def warm_up(self) -> int:

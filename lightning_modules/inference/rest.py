@@ -28,6 +28,8 @@ _BUSY, _UNTESTED = 0.75, 8  # share of cells that makes a picture busy, and pict
 _FADE = 0.96  # weight of the sums of squares of the previous key frame
 _ALIKE = 1, 2, 4, 8  # key frames with much the same rounding of blocks of 1, 2, 4 and 8 pixels of even light
 _LEAST = 1 / 12  # smallest variance of a count, as light is not known exactly
+_DEEP = 3  # largest change of light by a lamp, in powers of two, as dark current does not follow it
+_LEAK = 0.0047  # dark current at noise level 1, in spikes per clock
 _NOISE = 0.001  # variance of the sensor per spike, besides rounding: 1000 electrons per threshold
 
 
@@ -236,9 +238,10 @@ class Rest:
         either, as a single test may miss slow motion. If half of the 9 x 9 cells around or a sixth of all do not rest,
         these are 640 clocks, as what has little contrast probably moves with them. A resting cell shows the mean of the
         network's first eight pictures of the still cell; after these the network does not run. Neighbours of cells that
-        do not rest are computed and blended; in the dark, where motion is seen late, they do not rest either. The gain
-        of a lamp is removed from the mean, and applied to the picture. When 75 % of the cells have changed, or have a
-        neighbour that did, the next eight pictures are computed without a test.
+        do not rest are computed and blended; in the dark, where motion is seen late, they do not rest either. The light
+        of a lamp at the clock of the picture is removed from the mean, and applied to the picture; if it has changed by
+        more than a factor of 8, the cell has. When 75 % of the cells have changed, or have a neighbour that did, the
+        next eight pictures are computed without a test.
 
         The mean over all clocks of an ideal sensor converges to the exact light. At the resolution of the sensor, the
         picture is corrected towards it, by the share of their difference that is not noise of the mean, but not at
@@ -250,7 +253,7 @@ class Rest:
         scale: pixels of the picture per sensor pixel.
         pattern: Bayer phase of the sensor, or grey.
         white: white level of the network in spikes per clock.
-        noisy: the sensor may be noisy; its mean is then not used.
+        noise_level: that of an unknown sensor, 1 for the one used in training; its mean is not used above 0.
 
     Attributes:
         moving: cells (h, w) of the last picture that do not rest, and their neighbours.
@@ -260,8 +263,8 @@ class Rest:
     #: earlier pictures that a part of a film begins with, so that what rests is found again
     warm_up = _PICTURES + 3
 
-    def __init__(self, scale: int, pattern: str, white: float, noisy: bool = False) -> None:
-        self.scale, self.pattern, self.white, self.noisy = scale, pattern, white, noisy
+    def __init__(self, scale: int, pattern: str, white: float, noise_level: float = 0.0) -> None:
+        self.scale, self.pattern, self.white, self.noise_level = scale, pattern, white, noise_level
         self._clock, self._untested = -math.inf, 0
 
     def _start(self, spikes: Tensor) -> None:
@@ -270,6 +273,7 @@ class Rest:
         # clocks of both counts, scaled to the first light; clocks without a change; pictures in the mean; clocks drawn
         self._before, self._since, self._calm, self._count, self._drawn = _sum(self._seen, CELL).repeat(5, 1, 1)
         self._light, self._excess = torch.ones_like(self._calm), self._calm.repeat(2, 4, 1, 1)
+        self._lit = self._light
         self._mean: Tensor | None = None
 
     def __call__(
@@ -319,14 +323,14 @@ class Rest:
             weight = _pixels(new / self._count.clamp(min=1), box, scale)
             if weight.any():
                 mean = box.of(self._mean, scale=scale)
-                mean.lerp_(part / _pixels(self._light, box, scale), weight)
+                mean.lerp_(part / _pixels(self._lit, box, scale), weight)
                 box.of(self._seen).copy_(bin_to_sensor(mean, self.pattern, scale=scale))
         if boxes[:1] == [(whole, False)]:  # blending the few cells at rest would cost more than it gains
             return parts[0][1]
         due = ~unsure & (new | (self._before + self._since > _MORE * self._drawn))
-        if due.any() and not self.noisy:
+        if due.any() and not self.noise_level:
             self._draw(due, exposure, known)
-        shown = (self._mean if self.noisy else self._shown) * _pixels(self._light, whole, scale)
+        shown = (self._mean if self.noise_level else self._shown) * _pixels(self._lit, whole, scale)
         for box, part in parts:
             box.of(shown, scale=scale).lerp_(part, blend(unsure, box, scale))
         return shown.clamp_(0, 1)
@@ -351,7 +355,7 @@ class Rest:
         self._since += clocks * self._light
         slow, slow_gain, slow_excess = find_changes(self._later, self._earlier, self._since / self._before, step)
         self._since *= slow_gain
-        changed = (sudden | slow) & (self._before > 0)
+        changed = (sudden | slow | (self._light.log2().abs() > _DEEP)) & (self._before > 0)
         if (self._count < _PICTURES).any() and (gain == 1).all():
             first, second = spikes[middle][clocks % 2 :].unflatten(0, (2, -1)).sum(1, dtype=torch.float32)
             changed |= find_changes(second, first, torch.ones_like(self._calm))[0]
@@ -360,6 +364,7 @@ class Rest:
         self._calm += clocks
         self._calm[changed] = self._before[changed] = self._since[changed] = 0
         self._light[changed] = 1
+        self._lit = self._light_at(spikes, middle, known)
         full = self._since >= self._before
         fade = self._light.new_tensor([_FADE, _FADE**2])[:, None, None, None]
         self._excess = (fade * self._excess + excess) * ~changed
@@ -373,6 +378,22 @@ class Rest:
         self._later *= kept * (1 - renewed)
         self._before += self._since * full
         self._since *= ~full
+
+    def _light_at(self, spikes: Tensor, middle: slice, known: Calibration | None) -> Tensor:
+        """Return the light of lamps at the clock of the picture, relative to the first."""
+        under = (self._light != 1) & (self._before > 0)
+        if not under.any():
+            return self._light
+        quarter = len(spikes) // 4
+        parts = (spikes, spikes[quarter:-quarter], spikes[middle])
+        total, half, mean = (_sum(part.mean(0, dtype=torch.float32), CELL)[under].sum() for part in parts)
+        # dark current does not follow the light
+        rate = (_sum(self._earlier, CELL) / self._before)[under] / CELL**2
+        dark = _LEAK * self.noise_level if known is None else known.dark.mean().item()
+        share = dark / (rate.square().sum() / rate.sum()).clamp(min=2 * dark)
+        # the mean of a parabola over a clip differs from its middle four times as much as that over half of it
+        lit = ((4 * half - total) / (3 * mean) * self._light - share) / (1 - share)
+        return lit.nan_to_num(1).clamp(min=0.01).where(under, 1.0)
 
     def _draw(self, due: Tensor, exposure: float, known: Calibration | None) -> None:
         """Correct the mean of pictures towards that of all spikes, in boxes around some cells."""
