@@ -29,7 +29,7 @@ _FADE = 0.96  # weight of the sums of squares of the previous key frame
 _ALIKE = 1, 2, 4, 8  # key frames with much the same rounding of blocks of 1, 2, 4 and 8 pixels of even light
 _LEAST = 1 / 12  # smallest variance of a count, as light is not known exactly
 _DEEP = 3  # largest change of light by a lamp, in powers of two, as dark current does not follow it
-_LEAK = 0.0047  # dark current at noise level 1, in spikes per clock
+_LEAK = 0.0047  # dark current at noise level 1, in spikes per clock, see configs/cameras.yaml
 _NOISE = 0.001  # variance of the sensor per spike, besides rounding: 1000 electrons per threshold
 
 

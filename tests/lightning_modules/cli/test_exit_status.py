@@ -60,6 +60,7 @@ WRONG = {
     f"fit {X4} --trainer.callbacks Foo": "trainer.callbacks: expected the name of a class, got Foo",
     f"test {X4} -o a.txt": "-o: expected a folder, got the file",
     "predict a.dat -o out --speed nonsense": "nonsense",
+    "predict a.dat -o out --speed fast --weights cscsr_tiny_x4": "--speed",
     "sweep x4 --steps abc": "abc",
     "sweep x4 --set a=3": "a=3",
     "trade -c x4 --rounds 0": "rounds",
