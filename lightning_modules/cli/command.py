@@ -187,7 +187,9 @@ class Command(LightningCLI):
                 raise
             saved = subcommand == "fit" and Path(config.output, "checkpoints", "last.ckpt").is_file()
             goes_on = "; --ckpt_path last resumes" if saved else ""
-            raise Ended(f"lightning: {config.output}: {subcommand} was stopped by SIGTERM{goes_on}", 143) from error
+            interrupted = any(getattr(saves, "interrupted", False) for saves in self.trainer.checkpoint_callbacks)
+            by, status = ("Ctrl-C", 130) if interrupted else ("SIGTERM", 143)
+            raise Ended(f"lightning: {config.output}: {subcommand} was stopped by {by}{goes_on}", status) from error
         except SystemExit as error:
             if isinstance(error.__context__, KeyboardInterrupt):  # Lightning turns it into status 1
                 raise KeyboardInterrupt from None
@@ -306,8 +308,9 @@ def _check_continuation(path: str, model: BaseTask) -> None:
 
 def without_chatter() -> None:
     """Silence messages of Lightning that users cannot act upon."""
-    for says in ("pytorch_lightning.utilities.rank_zero", "lightning_fabric.utilities.seed"):
-        logging.getLogger(says).setLevel(logging.WARNING)  # tips and lists of devices
+    signals = "pytorch_lightning.trainer.connectors.signal_connector"
+    for says in ("pytorch_lightning.utilities.rank_zero", "lightning_fabric.utilities.seed", signals):
+        logging.getLogger(says).setLevel(logging.WARNING)  # tips, lists of devices, and what our last line says
     for nothing_to_do in _NOTHING_TO_DO:
         warnings.filterwarnings("ignore", nothing_to_do)
 

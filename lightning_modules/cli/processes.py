@@ -29,7 +29,7 @@ def calls_on_ray(
     try:
         import ray
     except ImportError as error:
-        raise InputError("--engine ray: Ray is not installed; run pip install 'spikekit[ray]'") from error
+        raise InputError("--engine ray: Ray is not installed; run pip install '.[ray]' in a clone") from error
 
     try:
         ray.init(log_to_driver=False, include_dashboard=False, logging_level="ERROR")

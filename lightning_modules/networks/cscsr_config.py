@@ -107,26 +107,22 @@ class CSCSRConfig:
             object.__setattr__(self, "stride", default_stride(self.frames, self.window))
         frames, window, stride = self.frames, self.window, self.stride
         if frames % 2 == 0 or window % 2 == 0 or window >= frames or (frames - window) % stride:
-            raise ValueError(
-                "frames, window, stride: expected odd frames and window, and a stride that divides frames - window, "
-                f"got {frames}, {window}, {stride}"
-            )
+            expected = "expected odd frames and window, and a stride that divides frames - window"
+            raise ValueError(f"frames, window, stride: {expected}, got {frames}, {window}, {stride}")
         if self.representation != "bssr" and not self.global_perception:
             raise ValueError(f"global_perception: expected true for representation {self.representation}, got false")
         if self.motion_fusion != "joint" and not self.search:
-            raise ValueError(
-                f"motion_fusion: expected joint, as motion has no effect without search, got {self.motion_fusion}"
-            )
+            expected = "expected joint, as motion has no effect without search"
+            raise ValueError(f"motion_fusion: {expected}, got {self.motion_fusion}")
         if self.noise and (self.representation, self.reconstruction) != ("bssr", "correlated"):
             got = f"{self.representation} and {self.reconstruction}"
             raise ValueError(f"noise: expected representation bssr and reconstruction correlated, got {got}")
         if self.noise_blocks and not self.noise:
             raise ValueError(f"noise_blocks: expected None without noise, got {self.noise_blocks}")
         if self.pattern == GREY and (self.motion_fusion, self.reconstruction) != ("joint", "correlated"):
+            expected = "expected joint and correlated for a grey sensor"
             got = f"{self.motion_fusion} and {self.reconstruction}"
-            raise ValueError(
-                f"motion_fusion, reconstruction: expected joint and correlated for a grey sensor, got {got}"
-            )
+            raise ValueError(f"motion_fusion, reconstruction: {expected}, got {got}")
         if self.end_width is not None and self.reconstruction == "separate":
             raise ValueError(f"end_width: expected None, as separate colours are never fused, got {self.end_width}")
 

@@ -44,10 +44,9 @@ class RecurrentCSCSRConfig(CSCSRConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.reconstruction != "correlated" or self.resolution != "sensor":
-            raise ValueError(
-                "reconstruction, resolution: expected correlated and sensor for a recurrent network, "
-                f"got {self.reconstruction} and {self.resolution}"
-            )
+            expected = "expected correlated and sensor for a recurrent network"
+            got = f"{self.reconstruction} and {self.resolution}"
+            raise ValueError(f"reconstruction, resolution: {expected}, got {got}")
 
 
 class StateFusion(nn.Module):

@@ -37,9 +37,9 @@ class ValidationPictures(Callback):
     """Show the first clips of every validation in TensorBoard: decoded input (TFI), result and truth side by side."""
 
     title = "tfi, result, truth"
+    clips = 4
 
-    def __init__(self, clips: int = 4) -> None:
-        self.clips = clips
+    def __init__(self) -> None:
         self._rows: list[list[Tensor]] = []
 
     def rows(self, module: LightningModule, outputs: Any, batch: dict[str, Tensor]) -> list[list[Tensor]]:
@@ -70,15 +70,14 @@ class TestReport(Callback):
 
     Args:
         output: folder of the run.
-        clips: number of clips in the picture.
     """
 
     __test__ = False  # not a test for pytest
     truth = True  # whether there is any
+    clips = 6  # in the picture
 
-    def __init__(self, output: str | Path, clips: int = 6) -> None:
+    def __init__(self, output: str | Path) -> None:
         self.output = Path(output)
-        self.clips = clips
 
     def columns(self) -> list[tuple[str, str, int]]:
         """Return columns of ``test.csv``, their headings in the table, and their decimal places there."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,29 @@ _HANDED_ON = ".temp.ckpt"
 
 
 class LastCheckpoint(ModelCheckpoint):
-    """Checkpoint that is also saved on SIGTERM, after which Lightning ends the training between two steps."""
+    """Checkpoint that is also saved on SIGTERM and Ctrl-C, after which Lightning ends the training between two steps.
+
+    A second Ctrl-C ends it at once. With several processes, and where Lightning does not handle SIGTERM, so does the
+    first.
+    """
+
+    interrupted = False
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:  # noqa: D102
+        super().on_train_start(trainer, pl_module)
+
+        def interrupt(*_: object) -> None:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            self.interrupted = True
+            print("\nCtrl-C: a checkpoint is saved after this step; a second Ctrl-C stops at once")  # noqa: T201
+            signal.raise_signal(signal.SIGTERM)
+
+        if trainer.world_size == 1 and signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+            signal.signal(signal.SIGINT, interrupt)  # until Lightning restores all handlers
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:  # noqa: D102
+        if trainer.progress_bar_callback is not None:
+            print()  # noqa: T201 - ends the line of the progress bar
         self.save_on_exception = isinstance(exception, SIGTERMException)
         super().on_exception(trainer, pl_module, exception)
 

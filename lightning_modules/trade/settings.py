@@ -36,11 +36,8 @@ class Setting(NamedTuple):
         """
         words = [part for word in self.args for part in (word.split("=", 1) if word.startswith("--") else [word])]
         given = {_COLUMNS.get(option): value for option, value in zip(words[::2], words[1::2], strict=False)}
-        if (
-            None in given
-            or 2 * len(given) != len(words)
-            or given.get("network", "ClassicalDecoder") != "ClassicalDecoder"
-        ):
+        own_network = given.get("network", "ClassicalDecoder") != "ClassicalDecoder"
+        if None in given or 2 * len(given) != len(words) or own_network:
             return None
         try:
             return Preset.read(given)

@@ -36,8 +36,9 @@ def run(args: argparse.Namespace) -> None:
     print(f"always fire  {full} of {pixels} pixels, {full / pixels:.2%}")
     if recording.calibration is not None:
         known = recording.calibration
-        bad = int((known.defects != 0).sum())
-        print(f"calibration  gain SD {known.gain.std():.2%}, dark {known.dark.median():.2g} per frame, {bad} defects")
+        works = known.defects == 0
+        gain, dark, bad = known.gain[works].std(), known.dark[works].mean(), int((~works).sum())
+        print(f"calibration  gain SD {gain:.2%}, dark rate {dark:.2g} spikes per frame, {bad} defects")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -98,9 +98,7 @@ def unpack_spikes(packed: Tensor, width: int, *, dtype: torch.dtype = torch.uint
         raise TypeError(f"packed: expected bytes, torch.uint8, got {packed.dtype}")
     width = check_whole("width", width)
     if packed.shape[-1] != (width + 7) // 8:
-        raise ValueError(
-            f"width: expected {8 * packed.shape[-1] - 7} .. {8 * packed.shape[-1]} for rows of {packed.shape[-1]} "
-            f"bytes, got {width}"
-        )
+        row = packed.shape[-1]
+        raise ValueError(f"width: expected {8 * row - 7} .. {8 * row} for rows of {row} bytes, got {width}")
     spikes = _unpack_bits(packed, width)
     return spikes.view(dtype) if dtype is torch.bool else spikes.to(dtype=dtype)

@@ -205,10 +205,8 @@ def linear_motion(
     _check_flow("flow_to_first", flow_to_first)
     _check_flow("flow_to_last", flow_to_last)
     if flow_to_first.shape != flow_to_last.shape:
-        raise ValueError(
-            f"flow_to_first, flow_to_last: expected one size, got {tuple(flow_to_first.shape)} and "
-            f"{tuple(flow_to_last.shape)}"
-        )
+        first, last = tuple(flow_to_first.shape), tuple(flow_to_last.shape)
+        raise ValueError(f"flow_to_first, flow_to_last: expected one size, got {first} and {last}")
     times, first, middle, last = _check_times(times, first, middle, last)
     scale = check_whole("scale", scale)
     to_first, to_last = _upsample(flow_to_first, scale), _upsample(flow_to_last, scale)

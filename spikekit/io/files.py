@@ -281,7 +281,6 @@ def _open(
 def _check_suffix(path: Path) -> str:
     suffix = path.suffix.lower()
     if suffix not in RECORDING_ENDINGS:
-        raise SpikeFileError(
-            f"{path}: expected a recording that ends in {', '.join(RECORDING_ENDINGS)}, got {suffix or 'no ending'}"
-        )
+        expected = f"expected a recording that ends in {', '.join(RECORDING_ENDINGS)}"
+        raise SpikeFileError(f"{path}: {expected}, got {suffix or 'no ending'}")
     return suffix

@@ -85,10 +85,8 @@ def dat_shape(path: Path, size: int, height: int | None, width: int | None) -> t
     step = _frame_bytes(height, width)
     whole, rest = divmod(size, step)
     if rest:
-        raise SpikeFileError(
-            f"{path}: truncated, or not {height} x {width}: {size} bytes at {step} bytes per frame give {whole} whole "
-            f"frames and {rest} extra bytes"
-        )
+        found = f"{size} bytes at {step} bytes per frame give {whole} whole frames and {rest} extra bytes"
+        raise SpikeFileError(f"{path}: truncated, or not {height} x {width}: {found}")
     return whole, height, width
 
 
@@ -212,9 +210,8 @@ def _member(path: Path, archive: zipfile.ZipFile) -> zipfile.ZipInfo:
 def _check_array(path: Path, name: str, shape: tuple[int, ...], dtype: np.dtype, present: int) -> None:
     """Raise unless an array is a recording and as long as its header says."""
     if len(shape) != 3 or dtype.kind not in "buif":
-        raise SpikeFileError(
-            f"{path}: expected an array (T, H, W) of zeros and ones, got {name} {shape} of type {dtype}"
-        )
+        got = f"{name} {shape} of type {dtype}"
+        raise SpikeFileError(f"{path}: expected an array (T, H, W) of zeros and ones, got {got}")
     if 0 in shape:
         raise SpikeFileError(f"{path}: empty recording, {name} is {shape}")
     needed = math.prod(shape) * dtype.itemsize

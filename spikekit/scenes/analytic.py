@@ -95,9 +95,8 @@ class Layer:
     def __post_init__(self) -> None:
         check_planes("picture", self.picture, 3, "(3, h, w)", floating=True)
         if self.picture.ndim > 4 or self.picture.shape[-3] not in (1, 3):
-            raise ValueError(
-                f"picture: expected (3, h, w), (1, h, w), or a batch of them, got {tuple(self.picture.shape)}"
-            )
+            got = tuple(self.picture.shape)
+            raise ValueError(f"picture: expected (3, h, w), (1, h, w), or a batch of them, got {got}")
         if self.picture.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"picture: expected float32 or float64, got {self.picture.dtype}")
         size = tuple(self.picture.shape[:-3] + self.picture.shape[-2:])

@@ -255,9 +255,8 @@ class FrameSequence:
         left = self.clock_count - first
         count = left if count is None else count
         if first < 0 or not 1 <= count <= left:
-            raise ValueError(
-                f"first, count: expected clocks of the film, 0 to {self.clock_count - 1}, got {count} from {first} on"
-            )
+            expected = f"expected clocks of the film, 0 to {self.clock_count - 1}"
+            raise ValueError(f"first, count: {expected}, got {count} from {first} on")
         return count
 
     def _read(self, frame: int) -> Tensor:

@@ -221,10 +221,8 @@ class NoisyPixels:
 
     def __init__(self, noise: SensorNoise, size: tuple[int, ...], seed: int) -> None:
         if noise.calibration is not None and noise.calibration.gain.shape != tuple(size[-2:]):
-            expected, got = noise.calibration.gain.shape, tuple(size[-2:])
-            raise ValueError(
-                f"light: expected {expected[0]} x {expected[1]} as the calibration, got {got[0]} x {got[1]}"
-            )
+            expected, got = (f"{rows} x {columns}" for rows, columns in (noise.calibration.gain.shape, size[-2:]))
+            raise ValueError(f"light: expected {expected} as the calibration, got {got}")
         self.noise, self.size, self.seed = noise, size, seed
         known, self._gain, self._dark, self._stuck = noise.calibration, None, None, []
         if known is not None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from spikekit.check import check_dtype, check_index, check_picture, check_planes, check_positive, check_whole
+from spikekit.check import check_dtype, check_index, check_picture, check_positive, check_whole
 
 
 @pytest.mark.parametrize(
@@ -32,4 +32,3 @@ def test_only_given_types_of_results_are_accepted():
     for wrong in (torch.int16, torch.bool, "uint8", float):
         with pytest.raises(TypeError, match="dtype: expected"):
             check_dtype(wrong, torch.uint8)
-    check_planes("raw", torch.ones(2, 3).bool(), 2, "(*, H, W)")

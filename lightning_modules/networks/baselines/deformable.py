@@ -29,9 +29,7 @@ class DeformableConv2d(nn.Module):
     def __init__(self, width: int, groups: int = 8) -> None:
         super().__init__()
         if width % groups:
-            raise ValueError(
-                f"width: expected a multiple of {groups}, the groups of the deformable convolution, got {width}"
-            )
+            raise ValueError(f"width: expected a multiple of {groups}, the groups of offsets, got {width}")
         self.where = conv(width, 27 * groups)
         nn.init.zeros_(self.where.weight)
         nn.init.zeros_(self.where.bias)

@@ -2,6 +2,7 @@
 
 import os
 import re
+import signal
 import sys
 
 import pytest
@@ -47,9 +48,10 @@ def _fit(tmp_path, monkeypatch, configs):
     return run
 
 
-def stop(step, where="step", number=15):
-    arguments = f'{{"step": {step}, "where": "{where}", "signal": {number}}}'
-    return [f'--trainer.callbacks={{"class_path": "stops.Stop", "init_args": {arguments}}}']
+def stop(step, where="step", number=signal.SIGTERM, times=1):
+    arguments = f'{{"step": {step}, "where": "{where}", "signal": {number:d}}}'
+    each = f'{{"class_path": "stops.Stop", "init_args": {arguments}}}'
+    return [f"--trainer.callbacks=[{', '.join([each] * times)}]"]
 
 
 def logged(folder):
@@ -72,13 +74,19 @@ def same(weights, others):
     return all(value.equal(others[name]) for name, value in weights.items())
 
 
-@pytest.mark.parametrize(("step", "where", "requeued"), [(6, "step", True), (8, "validation", False)])
-def test_training_resumes_exactly_after_sigterm(fit, unbroken, tmp_path, step, where, requeued, capfd, monkeypatch):
+@pytest.mark.parametrize(
+    ("step", "where", "number", "requeued"),
+    [(6, "step", signal.SIGTERM, True), (8, "validation", signal.SIGTERM, False), (7, "step", signal.SIGINT, False)],
+)
+def test_training_resumes_exactly_when_stopped(
+    fit, unbroken, tmp_path, step, where, number, requeued, capfd, monkeypatch
+):
     """By ``--ckpt_path last``, or where Slurm starts a job again, without being asked."""
     with pytest.raises(SystemExit) as ended:
-        fit("broken", *stop(step, where))
-    assert ended.value.code == 143
-    assert "SIGTERM; --ckpt_path last resumes" in capfd.readouterr().err
+        fit("broken", *stop(step, where, number))
+    assert ended.value.code == 128 + number
+    by = "Ctrl-C" if number == signal.SIGINT else "SIGTERM"
+    assert f"stopped by {by}; --ckpt_path last resumes" in capfd.readouterr().err
     last = tmp_path / "broken" / "checkpoints" / "last.ckpt"
     assert torch.load(last, weights_only=True)["global_step"] == step
     if requeued:
@@ -90,11 +98,12 @@ def test_training_resumes_exactly_after_sigterm(fit, unbroken, tmp_path, step, w
     assert best("broken") == unbroken["best"]
 
 
-def test_ctrl_c_gives_one_line_and_status_130(fit, capfd):
+def test_a_second_ctrl_c_stops_at_once_with_one_line_and_status_130(fit, tmp_path, capfd):
     with pytest.raises(SystemExit) as ended:
-        fit("broken", *stop(2, number=2))
+        fit("broken", *stop(2, number=signal.SIGINT, times=2))
     assert ended.value.code == 130
     assert len(re.findall("lightning: .*", capfd.readouterr().err)) == 1
+    assert not (tmp_path / "broken" / "checkpoints" / "last.ckpt").exists()
 
 
 def test_plateau_schedule_monitors_the_best_metric(fit):
