@@ -119,14 +119,15 @@ def published(output: Path) -> Iterator[Path]:
         if stream != output.name:
             raise ValueError(f"{output}: its side-car {sidecar} would overwrite that of {stream}; choose another name")
     target.mkdir(parents=True, exist_ok=True)
-    with _owned(target / f"{hidden_name(sidecar.name)}.part") as part:
-        try:
+    part = target / f"{hidden_name(sidecar.name)}.part"
+    try:
+        with _owned(part) as part:
             yield part
             _publish(part, target, sidecar.name)
-        except OSError as error:
-            name = error.filename2 or error.filename or output
-            error.filename = str(Path(str(name).replace(str(part), str(target))))
-            raise
+    except OSError as error:
+        name = error.filename2 or error.filename or output
+        error.filename = str(Path(str(name).replace(str(part), str(target))))
+        raise
 
 
 @contextmanager

@@ -130,10 +130,8 @@ def _open(path: Path) -> _Pictures | _Film:
         return _Pictures(path, [path])
     if ending in VIDEO_ENDINGS:
         return _Film(path)
-    raise VideoError(
-        f"{path}: expected a folder of pictures, a picture ({', '.join(PICTURE_ENDINGS)}) or a video "
-        f"({', '.join(VIDEO_ENDINGS)})"
-    )
+    pictures, videos = ", ".join(PICTURE_ENDINGS), ", ".join(VIDEO_ENDINGS)
+    raise VideoError(f"{path}: expected a folder of pictures, a picture ({pictures}) or a video ({videos})")
 
 
 # --- folders ----------------------------------------------------------------------------------------------------------
