@@ -126,4 +126,4 @@ class TestReport(Callback):
         places = [digits for _, _, digits in self.columns()]
         lines = [[method, *map("{:.{}f}".format, values, places)] for method, values in means.items()]
         print(f"\n{table(head, lines)}\n\n{missing or ''}")  # noqa: T201
-        print(f"{self.output / 'test.csv'}, {self.output / 'test.png'} (columns: {', '.join(shown)})")  # noqa: T201
+        print(f"{self.output / 'test.csv'}, {self.output / 'test.png'} (columns: {'; '.join(shown)})")  # noqa: T201
