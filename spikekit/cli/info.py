@@ -37,8 +37,9 @@ def run(args: argparse.Namespace) -> None:
     if recording.calibration is not None:
         known = recording.calibration
         works = known.defects == 0
-        gain, dark, bad = known.gain[works].std(), known.dark[works].mean(), int((~works).sum())
-        print(f"calibration  gain SD {gain:.2%}, dark rate {dark:.2g} spikes per frame, {bad} defects")
+        gain = f"SD {known.gain[works].std():.2%}" if known.gain.ne(1).any() else "not measured"
+        dark = f"{known.dark[works].mean():.2g} spikes per frame" if known.dark.any() else "not measured"
+        print(f"calibration  gain {gain}, dark rate {dark}, {int((~works).sum())} defects")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -54,10 +54,9 @@ def test_calibration_is_stored_beside_the_recording_and_reported(capsys, truth):
     assert "dark rate    0.01 spikes per frame" in said
     assert "dead         1 of 768 pixels\nhot          1 of 768 pixels" in said
     assert "scene.calibration.safetensors: flat 300 frames, dark 500 frames" in said
-    stored = read_calibration(f"scene{ENDING}")
-    assert stored.flip().defects.equal(truth.defects), "rows as they are stored"
+    assert read_calibration(f"scene{ENDING}").flip().defects.equal(truth.defects), "rows as they are stored"
     assert main(["info", "scene.dat", "--height", "24", "--width", "32"]) == 0
-    assert "calibration  gain SD 9." in capsys.readouterr().out
+    assert re.search(r"gain SD 9\.\d+%, dark rate 0\.01 spikes per frame, 2 defects", capsys.readouterr().out)
     for flip in (False, True):
         wall = open_recording("wall.dat", height=24, width=32, flip=flip, calibration=f"scene{ENDING}")
         assert wall.calibration.defects.equal(truth.defects if flip else truth.defects.flip(0))
@@ -82,8 +81,9 @@ def test_pictures_are_corrected(command, capsys):
 
 def test_defects_are_found_in_a_scene(capsys, truth):
     assert main(["calibrate", "scene.dat", *HOW, "-o", "alone.safetensors"]) == 0
+    assert main(["info", "scene.dat", *HOW, "--calibration", "alone.safetensors"]) == 0
     assert read_calibration("alone.safetensors").flip().defects.equal(truth.defects)
-    assert "gain         not measured in 300 frames: too little motion, or gains are" in capsys.readouterr().out
+    assert re.search(r"gain +not measured in 300 frames: too (.|\n)*gain not measured, dark", capsys.readouterr().out)
 
 
 def test_gains_are_found_in_a_moving_scene(capsys, truth):
