@@ -205,6 +205,7 @@ def write_overlay(folder: Path, name: str, made: list[Tensor], truth: Tensor, co
     folder.mkdir(parents=True, exist_ok=True)
     side = CELL * truth.shape[-1] // (CELL * computed.shape[-1])
     green = computed.repeat_interleave(side, 0).repeat_interleave(side, 1)[: truth.shape[-2], : truth.shape[-1]]
+    made = [picture.expand(3, -1, -1) for picture in made]  # grey ones too
     shown = made[1].clone()
     shown[1] = torch.where(green, 0.6 * shown[1] + 0.4, shown[1])
     apart = (0.5 + 4 * (made[1] - made[0])).clamp(0, 1)

@@ -27,6 +27,9 @@ _MORE = 1.25  # clocks, relative to those that a resting cell was drawn with, af
 _BUSY, _UNTESTED = 0.75, 8  # share of cells that makes a picture busy, and pictures after it that are not tested
 _FADE = 0.96  # weight of the sums of squares of the previous key frame
 _ALIKE = 1, 2, 4, 8  # key frames with much the same rounding of blocks of 1, 2, 4 and 8 pixels of even light
+_WINDOWS = 0, 0, 5, 5, 3, 3, 3, 3  # sides in cells, averaged over twice, of steps towards a smooth gain; 0: of all
+_SAME = 10  # weight of no change in these, relative to that of a spike more or less
+_SOFT = 90  # by how much a smooth gain reduces the squares of a part of 8 x 8 cells
 _LEAST = 1 / 12  # smallest variance of a count, as light is not known exactly
 _DEEP = 3  # largest change of light by a lamp, in powers of two, as dark current does not follow it
 _LEAK = 0.0047  # dark current at noise level 1, in spikes per clock, see configs/cameras.yaml
@@ -34,7 +37,7 @@ _NOISE = 0.001  # variance of the sensor per spike, besides rounding: 1000 elect
 
 
 def find_changes(
-    recent: Tensor, reference: Tensor, share: Tensor, step: Tensor | float = 1.0
+    recent: Tensor, reference: Tensor, share: Tensor | float, step: Tensor | float = 1.0, soft: bool = False
 ) -> tuple[Tensor, Tensor, Tensor]:
     r"""Find where a scene has changed between two counts of spikes, and by how much its light has.
 
@@ -48,10 +51,10 @@ def find_changes(
     that of the next count. Sums of :func:`spikekit.tfi` also count parts of intervals. They are rounded to the light of
     a clock, l, and their variance is at most :math:`l^2 (1 + q + q^2) / 4`, which is much smaller.
 
-    The gain g of flickering lamps is the median ratio over all cells, weighted by their light. If a tenth of the cells
-    has another, as a lamp lights only a part, cells have that of the two gains that suits their neighbourhood. A gain
-    counts only if it reduces squares of cells, also of those at rest with it, by more than 25 in all, where parts of
-    the picture with more than before count twice, and if no more cells have moved with it than without.
+    The gain g of flickering lamps is that of all cells, by robust least squares, or one that varies smoothly over the
+    picture, by the same in windows, if this reduces the squares of a part of 8 x 8 cells by more than 90. A gain counts
+    only if it reduces squares of cells, also of those at rest with it, by more than 25 in all, and if no more cells
+    have moved with it than without.
 
     A cell has moved if the sum of :math:`d^2 / \operatorname{var}` over its K blocks of 1, 2, 4 or 8 pixels exceeds
     :math:`K + 2 \sqrt{K x} + 2 x` with :math:`x = \ln(\text{tests} / \text{risk})`, which K normal numbers exceed with
@@ -62,32 +65,34 @@ def find_changes(
     Args:
         recent: counts (H, W).
         reference: earlier counts (H, W).
-        share: (h, w) ratio of the clocks of the recent counts to those of the reference, for every cell; infinity for
+        share: ratio of the clocks of the recent counts to those of the reference, a number or (H, W); infinity for
             cells without a reference, which count as moved.
         step: what counts are rounded to, (H, W): 1 for numbers of spikes, less for sums of :func:`spikekit.tfi`.
+        soft: the gain always varies, as only then its errors cancel over time, like those of counts.
 
     Returns:
-        The cells (h, w) that have moved; their gains (h, w); and (2, 4, h, w): by how much the sums over blocks of 1,
+        The cells (h, w) that have moved; the gain (H, W); and (2, 4, h, w): by how much the sums over blocks of 1,
         2, 4 and 8 pixels exceed K, and K, all 0 without a reference.
 
     Example:
         >>> at_rest, lamp = torch.full((16, 16), 8.0), torch.full((16, 16), 12.0)
-        >>> moved, gain, _ = find_changes(lamp, at_rest, torch.ones(2, 2))
-        >>> moved.any().item(), gain.unique().item()
+        >>> moved, gain, _ = find_changes(lamp, at_rest, 1.0)
+        >>> moved.any().item(), round(gain.mean().item(), 2)
         (False, 1.5)
     """
-    known, step = share.isfinite(), torch.as_tensor(step, device=recent.device)
-    each = _pixels(share.where(known, 0.0), Box(0, 0, *recent.shape))
+    share, step = (torch.as_tensor(given, device=recent.device).expand_as(recent) for given in (share, step))
+    unknown, each = share[::CELL, ::CELL].isinf(), share.where(share.isfinite(), 0.0)
     expected = each * reference
     spread = _spread(expected, each, step)
-    gain, better = _gains(_sum(recent, CELL), _sum(expected, CELL), _sum(spread[0], CELL).sqrt(), known)
     moved, excess = _moved(recent, expected, *spread)
-    if _counts(better):
-        lit = _pixels(gain, Box(0, 0, *recent.shape))
+    gain, better = _gain(*(_sum(plane, CELL) for plane in (recent, expected, spread[0])), ~unknown, soft)
+    if soft or better.sum() > 25:
+        lit = F.interpolate(gain[None, None], scale_factor=CELL, mode="bicubic")[0, 0]
+        lit = lit[: recent.shape[0], : recent.shape[1]]
         with_gain = _moved(recent, lit * expected, *_spread(lit * expected, lit * each, step))
-        if with_gain[0].sum() <= moved.sum() and _counts(better * ~with_gain[0]):
-            return with_gain[0] | ~known, gain, with_gain[1] * known
-    return moved | ~known, torch.ones_like(gain), excess * known
+        if with_gain[0].sum() <= moved.sum() and (soft or better[~with_gain[0]].sum() > 25):
+            return with_gain[0] | unknown, lit, with_gain[1] * ~unknown
+    return moved | unknown, torch.ones_like(recent), excess * ~unknown
 
 
 def _moved(recent: Tensor, expected: Tensor, variance: Tensor, bound: Tensor) -> tuple[Tensor, Tensor]:
@@ -148,38 +153,25 @@ def find_misfits(off: Tensor, before: Tensor, after: Tensor, spike: float) -> Te
     return found
 
 
-def _gains(recent: Tensor, expected: Tensor, spread: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the gain of every cell, and by how much it reduces the square.
-
-    It is that of most cells, or that of most others, if these are a tenth or more.
-    """
-    gain = _gain(recent[cells], expected[cells])
-    recent, expected = (cells * light / spread for light in (recent, expected))
-    off = (recent - gain * expected).square()
-    others = off > 25
-    if others.sum() > 0.1 * cells.sum():
-        other = _gain(recent[others], expected[others])
-        better = off - (recent - other * expected).square()
-        others = F.avg_pool2d(better.clamp(-25, 25)[None], 3, 1, 1)[0] > 0
-        same = cells & ~others
-        gain = torch.where(others, other, _gain(recent[same], expected[same]))
-    better = ((recent - expected).square() - (recent - gain * expected).square()).clamp(-25, 25)
-    return torch.where(cells, gain, 1.0), better
-
-
-def _counts(better: Tensor) -> bool:
-    """Whether squares of cells are smaller with a gain by more than 25; parts where they are larger count twice."""
-    parts = _sum(better, CELL)
-    return parts.minimum(2 * parts).sum().item() > 25
-
-
-def _gain(recent: Tensor, expected: Tensor) -> float:
-    """Return the weighted median of ratios."""
-    if not expected.any():
-        return 1.0
-    ratio, order = (recent / expected).nan_to_num().sort()
-    weight = expected[order].cumsum(0)
-    return ratio[int(torch.searchsorted(weight, weight[-1] / 2))].item()
+def _gain(recent: Tensor, expected: Tensor, variance: Tensor, cells: Tensor, soft: bool) -> tuple[Tensor, Tensor]:
+    """Return the gain of every cell, and by how much it reduces the square."""
+    gain, found = torch.ones_like(recent), []
+    for side in (*_WINDOWS, 1):  # the last step is not used
+        lit = gain * expected
+        off = recent - lit
+        squares = cells * off.square() / variance
+        found.append((gain, squares))
+        weight = cells / (1 + squares / (4 * squares.mean()).clamp(min=4))  # less for what moves
+        parts = weight * torch.stack([lit * off / variance, lit.square() / variance + _SAME])
+        if side:
+            parts = F.avg_pool2d(F.avg_pool2d(parts, side, 1, side // 2), side, 1, side // 2)
+        else:
+            parts = parts.mean((1, 2), keepdim=True)
+        gain = gain * (1 + parts[0] / parts[1].clamp(min=1e-6)).clamp(0.1, 10)
+    (_, before), (_, _), (same, even), *_, (smooth, after) = found
+    if soft or (_sum((even - after).clamp(-25, 25), CELL) > _SOFT).any():
+        return smooth, (before - after).clamp(-25, 25)
+    return same, (before - even).clamp(-25, 25)
 
 
 def _charge(spikes: Tensor, clock: int, near: int) -> Tensor:
@@ -197,6 +189,11 @@ def _sum(plane: Tensor, side: int) -> Tensor:
     return F.avg_pool2d(plane[None], side, ceil_mode=True, divisor_override=1)[0]
 
 
+def _mean(plane: Tensor) -> Tensor:
+    """Return means of cells."""
+    return F.avg_pool2d(plane[None], CELL, ceil_mode=True)[0]
+
+
 def grown(cells: Tensor) -> Tensor:
     """Return cells and their neighbours."""
     return F.max_pool2d(cells[None].float(), 3, 1, 1)[0] > 0
@@ -209,10 +206,14 @@ def _cells(cells: Tensor, box: Box) -> Tensor:
 
 def _pixels(cells: Tensor, box: Box, scale: int = 1) -> Tensor:
     """Return the value of its cell for every pixel of a box."""
-    cells = _cells(cells, box)
-    if (cells == cells[0, 0]).all():
-        return cells[:1, :1].expand(scale * (box.bottom - box.top), scale * (box.right - box.left))
-    return box.of(cells.repeat_interleave(CELL * scale, -2).repeat_interleave(CELL * scale, -1), box[:2], scale)
+    return box.of(_enlarged(_cells(cells, box), CELL * scale), box[:2], scale)
+
+
+def _enlarged(plane: Tensor, times: int) -> Tensor:
+    """Return every value ``times`` times in both directions."""
+    if (plane == plane[0, 0]).all():
+        return plane[:1, :1].expand(*(times * side for side in plane.shape))
+    return plane.repeat_interleave(times, 0).repeat_interleave(times, 1)
 
 
 def blend(cells: Tensor, box: Box, scale: int) -> Tensor:
@@ -271,10 +272,12 @@ class Rest:
         self._earlier, self._later, self._seen = spikes.new_zeros(3, *spikes.shape[-2:], dtype=torch.float32)
         self._timed = self._seen == 0
         # clocks of both counts, scaled to the first light; clocks without a change; pictures in the mean; clocks drawn
-        self._before, self._since, self._calm, self._count, self._drawn = _sum(self._seen, CELL).repeat(5, 1, 1)
-        self._light, self._excess = torch.ones_like(self._calm), self._calm.repeat(2, 4, 1, 1)
-        self._lit = self._light
+        self._before, self._since = self._seen.repeat(2, 1, 1)
+        self._calm, self._count, self._drawn = _sum(self._seen, CELL).repeat(3, 1, 1)
+        self._excess = self._calm.repeat(2, 4, 1, 1)
+        self._light = self._lit = torch.ones_like(self._seen)
         self._mean: Tensor | None = None
+        self._soft = False
 
     def __call__(
         self, spikes: Tensor, clock: int, make: Callable[..., Tensor], exposure: float, known: Calibration | None
@@ -305,7 +308,7 @@ class Rest:
         unsure = self._calm < frames - 1 + _SURE
         around = F.avg_pool2d(unsure[None].float(), 9, 1, 4, count_include_pad=False)[0]
         unsure |= (around.clamp(min=3 * unsure.float().mean()) > 0.5) & (self._calm < frames - 1 + _SURER)
-        dark = _sum(self._earlier + self._later, CELL) < _DARK * CELL**2 * (self._before + self._since)
+        dark = _sum(self._earlier + self._later - _DARK * (self._before + self._since), CELL) < 0
         unsure |= grown(unsure & dark) & dark
         self.moving = near = grown(unsure)
         new = still & (self._count < _PICTURES)
@@ -323,14 +326,15 @@ class Rest:
             weight = _pixels(new / self._count.clamp(min=1), box, scale)
             if weight.any():
                 mean = box.of(self._mean, scale=scale)
-                mean.lerp_(part / _pixels(self._lit, box, scale), weight)
+                mean.lerp_(part / _enlarged(box.of(self._lit), scale), weight)
                 box.of(self._seen).copy_(bin_to_sensor(mean, self.pattern, scale=scale))
         if boxes[:1] == [(whole, False)]:  # blending the few cells at rest would cost more than it gains
             return parts[0][1]
-        due = ~unsure & (new | (self._before + self._since > _MORE * self._drawn))
+        clocks = _mean(self._before + self._since)
+        due = ~unsure & (new | (clocks > _MORE * self._drawn))
         if due.any() and not self.noise_level:
             self._draw(due, exposure, known)
-        shown = (self._mean if self.noise_level else self._shown) * _pixels(self._lit, whole, scale)
+        shown = (self._mean if self.noise_level else self._shown) * _enlarged(self._lit, scale)
         for box, part in parts:
             box.of(shown, scale=scale).lerp_(part, blend(unsure, box, scale))
         return shown.clamp_(0, 1)
@@ -349,35 +353,40 @@ class Rest:
         if known is not None:
             recent *= (known.defects == 0).to(recent.device)
         step = torch.where(self._timed, recent / clocks, 1)
-        sudden, gain, excess = find_changes(recent, self._earlier, clocks * self._light / self._before, step)
+        share = clocks * self._light / self._before
+        sudden, gain, excess = find_changes(recent, self._earlier, share, step, self._soft)
         self._light *= gain
+        self._soft |= bool(gain.amax() > 1.001 * gain.amin())
         self._later += recent
         self._since += clocks * self._light
-        slow, slow_gain, slow_excess = find_changes(self._later, self._earlier, self._since / self._before, step)
+        share = self._since / self._before
+        slow, slow_gain, slow_excess = find_changes(self._later, self._earlier, share, step, self._soft)
         self._since *= slow_gain
-        changed = (sudden | slow | (self._light.log2().abs() > _DEEP)) & (self._before > 0)
-        if (self._count < _PICTURES).any() and (gain == 1).all():
+        changed = sudden | slow | (_mean(self._light).log2().abs() > _DEEP)
+        changed &= self._before[::CELL, ::CELL] > 0
+        if (self._count < _PICTURES).any():
             first, second = spikes[middle][clocks % 2 :].unflatten(0, (2, -1)).sum(1, dtype=torch.float32)
-            changed |= find_changes(second, first, torch.ones_like(self._calm))[0]
+            changed |= find_changes(second, first, 1.0, soft=self._soft)[0]
         if grown(changed).float().mean() > _BUSY:
             self._untested = _UNTESTED
         self._calm += clocks
-        self._calm[changed] = self._before[changed] = self._since[changed] = 0
-        self._light[changed] = 1
+        self._calm[changed] = 0
+        gone = _pixels(changed, whole)
+        for plane in (self._earlier, self._later, self._before, self._since):
+            plane.masked_fill_(gone, 0)
+        self._timed |= gone
+        self._light.masked_fill_(gone, 1)
         self._lit = self._light_at(spikes, middle, known)
-        full = self._since >= self._before
         fade = self._light.new_tensor([_FADE, _FADE**2])[:, None, None, None]
         self._excess = (fade * self._excess + excess) * ~changed
         alike = self._light.new_tensor(_ALIKE)[:, None, None]
         for one, times in ((self._excess, alike), (slow_excess * ~changed, 1)):
             total, tests = F.avg_pool2d(one, 3, 1, 1, divisor_override=1) / times
             self._calm[(total + tests > _limit(tests)).any(0)] = 0
-        kept, renewed = (_pixels(cells.float(), whole) for cells in (~changed, full & ~changed))
-        self._timed |= kept == 0
-        self._earlier = self._earlier * kept + self._later * renewed
-        self._later *= kept * (1 - renewed)
-        self._before += self._since * full
-        self._since *= ~full
+        full = _pixels(_sum(self._since - self._before, CELL) >= 0, whole)
+        for one, more in ((self._earlier, self._later), (self._before, self._since)):
+            one += more * full
+            more *= ~full
 
     def _light_at(self, spikes: Tensor, middle: slice, known: Calibration | None) -> Tensor:
         """Return the light of lamps at the clock of the picture, relative to the first."""
@@ -386,9 +395,9 @@ class Rest:
             return self._light
         quarter = len(spikes) // 4
         parts = (spikes, spikes[quarter:-quarter], spikes[middle])
-        total, half, mean = (_sum(part.mean(0, dtype=torch.float32), CELL)[under].sum() for part in parts)
+        total, half, mean = (part.mean(0, dtype=torch.float32)[under].sum() for part in parts)
         # dark current does not follow the light
-        rate = (_sum(self._earlier, CELL) / self._before)[under] / CELL**2
+        rate = (self._earlier / self._before)[under]
         dark = _LEAK * self.noise_level if known is None else known.dark.mean().item()
         share = dark / (rate.square().sum() / rate.sum()).clamp(min=2 * dark)
         # the mean of a parabola over a clip differs from its middle four times as much as that over half of it
@@ -398,17 +407,17 @@ class Rest:
     def _draw(self, due: Tensor, exposure: float, known: Calibration | None) -> None:
         """Correct the mean of pictures towards that of all spikes, in boxes around some cells."""
         clocks = self._before + self._since
-        self._drawn = clocks.where(due, self._drawn)
+        self._drawn = _mean(clocks).where(due, self._drawn)
         each, whole, scale = (1 / clocks).nan_to_num(posinf=0), Box(0, 0, *self._seen.shape), self.scale
-        rate = (self._earlier + self._later) * _pixels(each, whole)
+        rate = (self._earlier + self._later) * each
         if known is not None:
             rate = known.correct(rate, self.pattern)
         white = exposure / self.white
         for box, _ in boxes_around(due, due, whole):
             near = box.grown(CELL, whole)
             off = white * near.of(rate) - near.of(self._seen)
-            inside, power = Box(0, 0, *off.shape), F.avg_pool2d(off.square()[None], CELL, ceil_mode=True)[0]
-            trust = 1 - (white * _cells(each, near)).square() / 6 / power
+            inside, power = Box(0, 0, *off.shape), _mean(off.square())
+            trust = 1 - (white * _mean(near.of(each))).square() / 6 / power
             trust = trust.nan_to_num(0).clamp(min=0) * (_cells(self._count, near) > 0)
             off = off * (off.square() < 25 * _pixels(power, inside)) * _pixels(trust, inside)
             colors = demosaic(off, self.pattern)
