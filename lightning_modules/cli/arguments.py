@@ -43,8 +43,8 @@ def with_network_of_weights(args: Sequence[str]) -> list[str]:
     check_weights(found, {**NETWORKS, **ESTIMATORS})
     kind, arguments = own_class(found.settings, found.source, {**NETWORKS, **ESTIMATORS})
     if issubclass(kind, MotionEstimator):
-        takes = f"of the estimator {kind.__name__}; --model.network.motion.weights takes them"
-        raise ValueError(f"model.weights: expected weights of a network, got {asked}, {takes}")
+        takes = f"--model.network.motion {kind.__name__} --model.network.motion.weights {asked}"
+        raise ValueError(f"model.weights: expected weights of a network, got those of an estimator; use {takes}")
     if found.motion:
         estimator, its = own_class(found.motion, found.source, ESTIMATORS)
         arguments["motion"] = {"class_path": estimator.__name__, "init_args": its}
