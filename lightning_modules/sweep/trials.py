@@ -91,7 +91,7 @@ def make_trials(
     folders = [trial.folder for trial in trials]
     twice = next((folder for folder in folders if folders.count(folder) > 1), None)
     if twice:
-        raise UsageError(f"two trials have the name {twice.name}: give overlays and values different names")
+        raise UsageError(f"two trials have the name {twice.name}: expected different names, values and seeds")
     _check_differences(trials)
     return trials
 
