@@ -145,7 +145,7 @@ def _to_arrays(clips: list[dict[str, Tensor]]) -> dict[str, np.ndarray]:
 def start_worker(_: int) -> None:
     """Prepare a worker process."""
     # schedulers and terminals signal all processes, but training needs its workers to finish its step and save
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, lambda *_: signal.signal(signal.SIGTERM, signal.SIG_DFL))  # the loader's, at its end
     signal.signal(signal.SIGTERM, lambda *_: threading.Timer(_GRACE, os._exit, (0,)).start())
     end_when_orphaned()  # torch's own watchdog does not reach workers that wait for a full pipe
 
