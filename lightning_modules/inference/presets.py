@@ -13,7 +13,6 @@ from typing import Any
 
 import torch
 
-from lightning_modules import motion as estimators
 from lightning_modules.inference.clips import FRAMES
 from lightning_modules.inference.predict import precision_of, predict
 from lightning_modules.inference.tiles import FAR, TILE
@@ -51,14 +50,13 @@ class Preset:
         order: order of the decoder.
         scale: super-resolution factor of the decoder; weights have their own.
         frames: spike frames of a clip of the decoder; weights have their own.
-        motion: class name of a motion estimator, such as ``"ZeroFlow"``, that replaces the one used in training.
         tile: side of a tile in sensor pixels, see :func:`lightning_modules.inference.predict.predict`.
         self_ensemble: number of views, 1, 2, 4 or 8, see :func:`lightning_modules.inference.predict.predict`.
         precision: precision of the Trainer, such as ``"bf16-mixed"``.
 
     Example:
-        >>> Preset("cscsr_small_x4", motion="ZeroFlow").build().motion
-        ZeroFlow()
+        >>> Preset("cscsr_small_x4").build().scale
+        4
     """
 
     weights: str | None = None
@@ -68,7 +66,6 @@ class Preset:
     order: int | None = None
     scale: int | None = None
     frames: int | None = None
-    motion: str | None = None
     tile: int | None = None
     self_ensemble: int | None = None
     precision: str | None = None
@@ -88,7 +85,7 @@ class Preset:
     def moves(self) -> bool:
         """Whether motion is estimated; assumed for weights from outside the package."""
         model = find_model(self.weights or "")
-        return self.weights is not None and self.motion != "ZeroFlow" and (model is None or model.search)
+        return self.weights is not None and (model is None or model.search)
 
     @classmethod
     def read(cls, row: Mapping[str, str]) -> Preset:
@@ -113,9 +110,7 @@ class Preset:
             return ClassicalDecoder(**options, pattern=pattern).eval()
         if self.weights is None or self.network is not None:
             raise ValueError(f"preset: expected weights, or {_DECODER} as network, got {self}")
-        if self.motion not in (None, *estimators.__all__):
-            raise ValueError(f"motion: expected one of {', '.join(estimators.__all__)}, got {self.motion!r}")
-        return CSCSR.from_pretrained(self.weights, self.motion and getattr(estimators, self.motion)())
+        return CSCSR.from_pretrained(self.weights)
 
 
 @dataclass(frozen=True)

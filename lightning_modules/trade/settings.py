@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Sequence
-from inspect import signature
 from typing import NamedTuple
 
 from lightning_modules.cli.errors import UsageError
@@ -14,7 +13,7 @@ from lightning_modules.networks import Network
 from lightning_modules.registry import Model, for_noise, list_models
 
 #: columns of a table, by option
-_COLUMNS = {f"--model.network.{name}": name for name in ("method", "window", "order", "scale", "frames", "motion")}
+_COLUMNS = {f"--model.network.{name}": name for name in ("method", "window", "order", "scale", "frames")}
 _COLUMNS |= {f"--{name}": name for name in ("tile", "self_ensemble")}
 _COLUMNS |= {"--model.weights": "weights", "--model.network": "network", "--trainer.precision": "precision"}
 
@@ -69,8 +68,8 @@ def read_setting(text: str) -> Setting:
 #: options of the decoders in the table
 _DECODERS = {"TFI": {}, "TFP 41": {"window": 41}, "TFP 13, order 3": {"window": 13, "order": 3}}
 
-#: variants of every network: name and arguments
-_NO_MOTION, _TWO_VIEWS = ("no motion", "--model.network.motion ZeroFlow"), ("self-ensemble of 2", "--self_ensemble 2")
+#: variant of every network: name and arguments
+_TWO_VIEWS = "self-ensemble of 2", "--self_ensemble 2"
 
 #: further variants of the largest network only, as a larger network gains more than more views of a smaller one
 _MOST = [(f"self-ensemble of {views}", f"--self_ensemble {views}") for views in (4, 8)]
@@ -94,9 +93,8 @@ def usual_settings(
     """Return the default settings.
 
     First the networks of the package: the reference, then the others by their multiplications. Then variants: every
-    network without motion and as a self-ensemble, the reference also with other estimators, in float32 and with other
-    tiles, the largest network also with larger self-ensembles. Last the classical decoders. For films: only the
-    networks, with and without motion.
+    network as a self-ensemble, the reference also in float32 and with other tiles, the largest network also with larger
+    self-ensembles. Last the classical decoders. For films: only the networks and decoders.
 
     If ``own`` options, such as ``--ckpt_path``, give weights to the shared ``network``, it replaces those of the
     package, and variants that it has no options for are left out.
@@ -106,20 +104,15 @@ def usual_settings(
     models.sort(key=lambda model: model.macs)
     largest = models[-1].name if models else None
     reference = _reference(models) if models else None
-    still = {one.name for one in models if not one.search}
     networks = {one.name: f"--model.weights {one.name}" for one in sorted(models, key=lambda one: one is not reference)}
     if own:
         networks, largest = {"own weights": ""}, "own weights"
-    lacking: tuple[str, ...] = ()
-    if network is not None and "motion" not in signature(type(network)).parameters:
-        lacking += ("--model.network.motion",)
-    if network is not None and network.halo is None:  # never runs in tiles
-        lacking += ("--tile",)
+    in_tiles = network is None or network.halo is not None
     typed = dict(networks)
     for place, (weights, text) in enumerate(networks.items()):
         more = [_TWO_VIEWS, *(_MOST if weights == largest else []), *(_VARIANTS if place == 0 else [])]
-        for name, changes in [_NO_MOTION, *([] if film else more)]:
-            if not changes.startswith(lacking) and (name != _NO_MOTION[0] or weights not in still):
+        for name, changes in [] if film else more:
+            if in_tiles or not changes.startswith("--tile"):
                 typed[f"{weights}, {name}"] = f"{text} {changes}"
     without = " ".join(f"{option} null" for option in own)  # decoders take no weights
     for name, options in _DECODERS.items():

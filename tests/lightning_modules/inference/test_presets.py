@@ -21,7 +21,7 @@ ROWS = [
     ("all", 30.0, 400, 80, WEIGHTS, ""),
     ("no tiles", 30.0, 350, 20, WEIGHTS | {"tile": 0}, ""),
     ("small tiles", 30.0, 500, 20, WEIGHTS | {"tile": 16}, ""),
-    ("no motion", 29.85, 200, 70, WEIGHTS | {"motion": "ZeroFlow"}, ""),
+    ("faster", 29.85, 200, 70, WEIGHTS, ""),
     ("tfp", 29.6, 10, 5, DECODER | {"method": "tfp"}, ""),
     ("tfp 5", 24.0, 3.8, 3, DECODER | {"method": "tfp", "window": 5}, ""),
     ("bf16", 30.1, 300, 60, WEIGHTS | {"precision": "bf16-true"}, ""),
@@ -54,7 +54,7 @@ def _table(tmp_path, monkeypatch):
     ("wish", "expected"),
     [
         ({"speed": "best"}, "all"),
-        ({"speed": "balanced"}, "no motion"),
+        ({"speed": "balanced"}, "faster"),
         ({"speed": "fast"}, "tfp"),
         ({"speed": "fastest"}, "tfi"),
         ({"budget": "400ms"}, "all"),
@@ -63,7 +63,7 @@ def _table(tmp_path, monkeypatch):
         ({"budget": "20MiB"}, "small tiles"),
         ({"budget": "20MB"}, "tfp"),
         ({"budget": "0.4s"}, "all"),
-        ({"budget": "2.6 fps"}, "no motion"),
+        ({"budget": "2.6 fps"}, "faster"),
     ],
 )
 def test_speeds_and_budgets_scale_with_the_frame(table, wish, expected):
@@ -93,7 +93,7 @@ def test_same_network_for_films_and_single_clips():
 def test_time_budget_is_for_this_machine(table, monkeypatch):
     monkeypatch.setattr(speed, "pace", lambda *_: 2.0)
     choice = choose(Conditions(3, (40, 50)), budget="400ms")
-    assert (choice.name, choice.ms) == ("no motion", 2 * 200)
+    assert (choice.name, choice.ms) == ("faster", 2 * 200)
     assert choose(Conditions(3, (40, 50)), budget="1GB").ms == 400  # memory is the same here
 
 
@@ -126,7 +126,7 @@ def test_invalid_speeds_and_budgets_are_rejected(table, arguments, message):
 
 
 def test_presets_survive_writing_and_reading():
-    for given in ({}, WEIGHTS | {"motion": "Spike2Flow", "self_ensemble": 2, "tile": 0}):
+    for given in ({}, WEIGHTS | {"self_ensemble": 2, "tile": 0}):
         preset = Preset(**given)
         assert Preset.read({name: "" if cell is None else str(cell) for name, cell in vars(preset).items()}) == preset
         assert preset.given(*vars(Preset())) == given
@@ -138,8 +138,6 @@ def test_invalid_presets_are_rejected():
     for nothing in (Preset(tile=32), Preset(network="CSCSR")):
         with pytest.raises(ValueError, match="preset: expected weights, or ClassicalDecoder as network"):
             nothing.build()
-    with pytest.raises(ValueError, match=r"motion: expected one of .*ZeroFlow.*, got 'os'"):
-        Preset("cscsr_small_x4", motion="os").build()
 
 
 def test_tables_of_the_package_are_valid():

@@ -104,7 +104,7 @@ def test_every_setting_has_a_row_in_both_files(traded):
     tiles = rows["small tiles"]
     assert (tiles["tile"], tiles["height"], tiles["width"]) == ("4", "12", "12")
     assert {row["reference"] for row in rows.values()} == {"as it is"}
-    assert {name for name, row in rows.items() if any(row[key] for key in vars(Preset()))} == set(names[2:])
+    assert {name for name, row in rows.items() if any(row[key] for key in vars(Preset()))} == set(names[3:])
 
 
 @pytest.mark.slow
@@ -190,14 +190,14 @@ def test_work_and_weights_are_counted(traded, convolutions):
 
 @pytest.mark.slow
 def test_default_settings_run_on_own_weights(shared, checkpoint, tmp_path, monkeypatch):
-    names = [*(f"own weights{name}" for name in ("", ", no motion", ", self-ensemble of 2")), "TFI", "TFP 13, order 3"]
+    names = [*(f"own weights{name}" for name in ("", ", self-ensemble of 2")), "TFI", "TFP 13, order 3"]
     monkeypatch.setattr(cli, "usual_settings", lambda *of: [one for one in usual_settings(*of) if one.name in names])
     own = ["--ckpt_path", str(checkpoint), "--data.val_clips", "1"]
     main(["trade", *shared, *own, "--rounds", "1", "-o", str(tmp_path)])
     rows = rows_of(tmp_path)
     assert sorted(rows) == sorted(names)
     assert [name for name, row in rows.items() if row["failed"]] == []
-    assert len({rows[name]["psnr"] for name in (*names[:2], *names[-2:])}) == 4
+    assert len({rows[name]["psnr"] for name in names}) == 4
 
 
 def networks_of(settings):
@@ -209,8 +209,6 @@ def test_default_settings_are_the_networks_of_the_package_and_the_decoders():
     networks = networks_of(settings.values())
     sizes = "small", "micro", "tiny", "huge"  # the reference first
     assert networks == [*settings][: len(networks)] == [f"cscsr_{size}_x4" for size in sizes]
-    assert "cscsr_tiny_x4, no motion" in settings
-    assert "cscsr_micro_x4, no motion" not in settings
     two = ["--model.weights", "cscsr_tiny_x4", "--self_ensemble", "2"]
     assert settings["cscsr_tiny_x4, self-ensemble of 2"].args == two
     assert settings["TFI"].preset == Preset(network="ClassicalDecoder", method="tfi", scale=4, frames=41)
@@ -219,8 +217,8 @@ def test_default_settings_are_the_networks_of_the_package_and_the_decoders():
     assert not networks_of(own.values())
     assert own["own weights"].args == []
     assert own["TFI"].args[-2:] == ["--ckpt_path", "null"]
-    tscnn = [setting.name for setting in usual_settings(4, ["--ckpt_path"], TSCNN(width=8, blocks=1))]
-    assert not [name for name in tscnn if "motion" in name or "Flow" in name]
+    whole = usual_settings(4, ["--ckpt_path"], TSCNN(width=8, blocks=1))
+    assert [one.name for one in whole if "own" in one.name and "tiles" in one.name] == []
     assert "cscsr_huge_long_x4" in networks_of(usual_settings(4, film=True, frames=101))
 
 
