@@ -66,7 +66,7 @@ def list_models(scale: int | None = None, pattern: str | None = None) -> list[Mo
 
     Example:
         >>> [(model.name, model.size, model.frames, model.macs) for model in list_models(scale=4)][:2]
-        [('cscsr_micro_x4', 'micro', 41, 182928), ('cscsr_tiny_x4', 'tiny', 41, 356394)]
+        [('cscsr_micro_x4', 'micro', 41, 163584), ('cscsr_tiny_x4', 'tiny', 41, 356394)]
         >>> max(list_models(scale=4), key=lambda model: model.kodak).name
         'cscsr_huge_x4'
     """

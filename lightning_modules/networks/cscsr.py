@@ -13,15 +13,22 @@ from torch.compiler import is_exporting
 
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks.cscsr_config import CSCSRConfig
-from lightning_modules.networks.layers import channels_last, enlarge, enlarge_smoothly, fold, start_pixel_by_pixel
+from lightning_modules.networks.layers import (
+    channels_last,
+    enlarge,
+    enlarge_smoothly,
+    fold,
+    pack_cells,
+    start_pixel_by_pixel,
+)
 from lightning_modules.networks.motion_fusion import assembled_motion, independent_motion, joint_motion
 from lightning_modules.networks.network import Network
-from lightning_modules.networks.reconstruction import ColorCorrelation, EarlyFusion, SeparateColors
+from lightning_modules.networks.reconstruction import CellReconstruction, ColorCorrelation, EarlyFusion, SeparateColors
 from lightning_modules.networks.refinement import FeatureRefinement, TimeFusion
 from lightning_modules.networks.representation import IntervalRepresentation, SpikeRepresentation, WindowMeans
 from lightning_modules.signatures import inherit_signature
 from spikekit import bayer_mask, demosaic, flow_warp_idw, linear_motion, tfp_at
-from spikekit.color.cfa import count_colors
+from spikekit.color.cfa import bayer_sites, count_colors
 from spikekit.filters import separable_filter
 from spikekit.kernels import compiler_kept_out
 from spikekit.warp.site_search import SMALLEST, apart, search_sites, site_table
@@ -53,6 +60,17 @@ def _representation(config: CSCSRConfig) -> nn.Module:
         config.global_perception,
         config.noise and not config.noise_blocks,
     )
+
+
+def _reconstruction(config: CSCSRConfig, colors: int, enlarge: int) -> nn.Module:
+    """Build the module that makes the picture."""
+    if config.resolution == "cell":
+        return CellReconstruction(config.frames, config.width, config.end_blocks, enlarge, colors, config.noise)
+    own = {} if config.end_width is None else {"end_width": config.end_width}
+    own |= {"colors": 1} if colors == 1 else {}
+    own |= {"noise": not config.noise_blocks, "noise_blocks": config.noise_blocks} if config.noise else {}
+    kind = _RECONSTRUCTIONS[config.reconstruction]
+    return kind(config.width, config.stages, config.blocks, config.end_blocks, enlarge, **own)
 
 
 @compiler_kept_out
@@ -130,22 +148,16 @@ class CSCSR(Network):
         self.config = config
         self.takes_flow = config.search
         self.times = times
-        sensor = config.resolution == "sensor"
-        self.fold = config.scale if sensor else 1
         self.colors = count_colors(config.pattern)
-        self.representation = nn.ModuleList(_representation(config) for _ in range(self.colors))
+        self.fold = {"output": 1, "sensor": config.scale, "cell": 2 * config.scale}[config.resolution]
+        parts = 0 if config.resolution == "cell" else self.colors
+        self.representation = nn.ModuleList(_representation(config) for _ in range(parts))
         refine = FeatureRefinement if config.refinement else TimeFusion
         self._side = self.fold if config.search else 1  # of the square of temporal pixels that a feature becomes
         self.refinement = nn.ModuleList(
             refine(len(times), part.features * self._side**2, config.width) for part in self.representation
         )
-        own = {} if config.end_width is None else {"end_width": config.end_width}
-        own |= {"colors": 1} if self.colors == 1 else {}
-        own |= {"noise": not config.noise_blocks, "noise_blocks": config.noise_blocks} if config.noise else {}
-        reconstruct = _RECONSTRUCTIONS[config.reconstruction]
-        self.reconstruction = reconstruct(
-            config.width, config.stages, config.blocks, config.end_blocks, self.fold, **own
-        )
+        self.reconstruction = _reconstruction(config, self.colors, self.fold)
         if not self.reconstruction.rgb.weight.is_meta:
             self._initialize()
 
@@ -163,6 +175,8 @@ class CSCSR(Network):
                 nn.init.zeros_(block.body[-1].weight)
         if self.config.skip:
             nn.init.zeros_(self.reconstruction.rgb.weight)
+        if isinstance(self.reconstruction, CellReconstruction):
+            self.reconstruction.start_at_the_mean()
 
     def forward(  # noqa: D102
         self,
@@ -173,11 +187,27 @@ class CSCSR(Network):
         noise: float | Tensor | None = None,
     ) -> Tensor:
         self.check_spikes(spikes)
+        if self.config.resolution == "cell":
+            return self._exposed(self._by_cells(spikes, noise), alpha)
         spikes = spikes.to(self.reconstruction.rgb.weight.dtype)
         told = self._told(noise, spikes)
         rgb = self.reconstruction(self._colors(spikes, self.resolve_flow(spikes, flow, static), **told), **told)
         rgb = rgb.add_(self._base(spikes)) if self.config.skip else rgb
         return self._exposed(F.pixel_shuffle(rgb, self.fold), alpha)
+
+    def _by_cells(self, spikes: Tensor, noise: float | Tensor | None) -> Tensor:
+        """Return the picture by cells of 2 x 2 pixels, red first; borders are mirrored to whole cells."""
+        height, width = spikes.shape[-2:]
+        (_, top, left), *_ = bayer_sites("RGGB" if self.colors == 1 else self.pattern)
+        border = left, (left + width) % 2, top, (top + height) % 2
+        planes = self._tfp(spikes)
+        told = self._told(noise, planes)
+        auto = torch.is_autocast_enabled(spikes.device.type)
+        spikes = spikes.to(torch.get_autocast_dtype(spikes.device.type) if auto else planes.dtype)
+        cells = (pack_cells(F.pad(part, border, "reflect") if any(border) else part) for part in (spikes, planes))
+        rgb = F.pixel_shuffle(self.reconstruction(*cells, **told), self.fold)
+        top, left, height, width = (self.scale * length for length in (top, left, height, width))
+        return rgb[..., top : top + height, left : left + width]
 
     def _told(self, noise: float | Tensor | None, spikes: Tensor) -> dict[str, Tensor]:
         """Return the noise level of clips (B, N, H, W) as a keyword argument (B, 1, 1, 1), or no argument."""
@@ -292,18 +322,21 @@ class CSCSR(Network):
         known = enlarge(mask[None, :: self.scale, :: self.scale].to(pixels.dtype), self.scale)
         return pixels / known.where(mask, 1)
 
+    def _tfp(self, spikes: Tensor) -> Tensor:
+        """Return the TFP picture (B, 1, H, W): of the whole clip, or of third order for a grey sensor."""
+        window, order = ((self.frames - 1) // 6 * 2 + 1, 3) if self.colors == 1 else (self.frames, 1)
+        dtype = self.reconstruction.rgb.weight.dtype
+        return tfp_at(spikes, self.frames // 2, window, order=order, dtype=dtype).unsqueeze(1) / self.config.alpha
+
     def _base(self, spikes: Tensor) -> Tensor:
         """Return the enlarged TFP picture, as ``reconstruction`` does; not in bfloat16, which has too few levels.
 
-        It is demosaiced and smoothed, or third-order TFP for a grey sensor.
+        It is demosaiced and smoothed, except that of a grey sensor.
         """
         with torch.autocast(spikes.device.type, enabled=False):
-            if self.colors == 1:
-                raw = tfp_at(spikes, self.frames // 2, (self.frames - 1) // 6 * 2 + 1, order=3)
-                smooth = raw.unsqueeze(1) / self.config.alpha
-            else:
-                raw = tfp_at(spikes, self.frames // 2, self.frames) / self.config.alpha
+            planes = self._tfp(spikes)
+            if self.colors > 1:
                 # zero at the Nyquist frequency, to remove the zipper artefacts of demosaicing
-                smooth = separable_filter(demosaic(raw, self.pattern), (0.25, 0.5, 0.25))
-            large = enlarge_smoothly(smooth, self.scale)
+                planes = separable_filter(demosaic(planes[:, 0], self.pattern), (0.25, 0.5, 0.25))
+            large = enlarge_smoothly(planes, self.scale)
             return large if self.fold == self.scale else F.pixel_shuffle(large, self.scale)

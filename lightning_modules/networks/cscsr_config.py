@@ -57,13 +57,15 @@ class CSCSRConfig:
             ``"early"`` (I) fuses the colours once, at the beginning.
         resolution: resolution of refinement and reconstruction. ``"output"`` is that of the picture, as in the paper;
             ``"sensor"`` has s x s temporal pixels per sensor pixel as channels and ends with a sub-pixel convolution,
-            for 1 / s^2 of the work at the same width.
+            for 1 / s^2 of the work at the same width. ``"cell"`` has all spikes of 2 x 2 sensor pixels as channels, and
+            neither representation nor search nor refinement: only ``width`` and ``end_blocks`` count. It always
+            predicts a residual, as with ``skip``.
 
     Raises:
         ValueError: values are inconsistent or unknown, or options have no effect together:
             ``global_perception=False`` without BSSR, ``motion_fusion`` without search, ``end_width`` with separate
             colours, ``noise`` without BSSR and correlated colours, ``noise_blocks`` without ``noise``,
-            ``motion_fusion`` or ``reconstruction`` with a grey sensor.
+            ``motion_fusion`` or ``reconstruction`` with a grey sensor, parts that resolution ``"cell"`` lacks.
 
     Example:
         >>> CSCSRConfig(scale=2).times
@@ -94,7 +96,7 @@ class CSCSRConfig:
     search: bool = True
     refinement: bool = True
     reconstruction: Literal["correlated", "separate", "early"] = "correlated"
-    resolution: Literal["output", "sensor"] | None = None
+    resolution: Literal["output", "sensor", "cell"] | None = None
 
     def __post_init__(self) -> None:
         if self.size not in SIZES:
@@ -103,6 +105,14 @@ class CSCSRConfig:
             if getattr(self, name) is None:
                 object.__setattr__(self, name, value)  # frozen
         _check_fields(self)
+        if self.resolution == "cell":
+            if (self.representation, self.reconstruction, self.noise_blocks) != ("bssr", "correlated", None):
+                got = f"{self.representation}, {self.reconstruction} and {self.noise_blocks}"
+                raise ValueError(
+                    "representation, reconstruction, noise_blocks: expected bssr, correlated and None for resolution "
+                    f"cell, which has none of them, got {got}"
+                )
+            object.__setattr__(self, "search", False)
         if self.stride is None:
             object.__setattr__(self, "stride", default_stride(self.frames, self.window))
         frames, window, stride = self.frames, self.window, self.stride

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from lightning_modules.networks.layers import NoiseLevel, conv, res_blocks
+from lightning_modules.networks.layers import ConvBlock, NoiseLevel, conv, res_blocks
 
 
 class ToRgb(nn.Conv2d):
@@ -123,3 +123,60 @@ class EarlyFusion(nn.Module):
     def forward(self, colors: list[Tensor]) -> Tensor:  # noqa: D102
         fused = self.fuse(torch.cat(colors, dim=1))
         return self.rgb(fused + self.refine(fused))
+
+
+class CellReconstruction(nn.Module):
+    """Reconstruction without motion, at half the resolution of the sensor, with all spikes of 2 x 2 pixels as channels.
+
+    Chen et al. pack raw pictures in this way (Learning to See in the Dark, CVPR 2018). The result is a linear function
+    of a TFP picture plus a residual.
+
+    Args:
+        frames: spike frames per clip, N.
+        width: channels.
+        blocks: residual blocks.
+        enlarge: size of the picture relative to the cells.
+        colors: number of colours, 3, or 1 for a grey sensor.
+        noise: the noise level of the sensor changes gain and shift of the first features.
+
+    Shape:
+        - Input: spikes of the cells, :math:`(B, 4 N, H, W)`, red first; their TFP picture, :math:`(B, 4, H, W)`;
+          optionally the noise level, :math:`(B, 1, 1, 1)`
+        - Output: rgb with its sub-pixels as channels, :math:`(B, colors enlarge^2, H, W)`
+    """
+
+    def __init__(
+        self, frames: int, width: int, blocks: int, enlarge: int, colors: int = 3, noise: bool = False
+    ) -> None:
+        super().__init__()
+        self.colors = colors
+        self.begin = ConvBlock(4 * frames, width)
+        self.noise = NoiseLevel(width) if noise else None
+        self.end = res_blocks(width, blocks)
+        self.rgb = conv(width, colors * enlarge**2)
+        self.base = nn.Conv2d(4, colors * enlarge**2, 3, padding=1, padding_mode="replicate", bias=False)
+
+    @torch.no_grad()
+    def start_at_the_mean(self) -> None:
+        """Initialise the first channels as firing rates, and the picture as the mean of each colour in a cell."""
+        weight = self.begin[0].weight.unflatten(1, (4, -1))
+        frames = weight.shape[2]
+        weight *= 0.3
+        for channel in range(min(12, len(weight))):
+            near = max(1, frames // 3 ** (channel // 4))
+            first = (frames - near) // 2
+            weight[channel] = 0
+            weight[channel, channel % 4, first : first + near, 1, 1] = 1 / near
+        self.rgb.weight *= 0.01
+        nn.init.zeros_(self.base.weight)
+        own = torch.full((1, 4), 0.25)
+        if self.colors > 1:
+            own = torch.tensor([[1, 0, 0, 0], [0, 0.5, 0.5, 0], [0, 0, 0, 1]])
+        self.base.weight[..., 1, 1] = own.repeat_interleave(len(self.base.weight) // self.colors, dim=0)
+
+    def forward(self, spikes: Tensor, planes: Tensor, noise: Tensor | None = None) -> Tensor:  # noqa: D102
+        seen = self.begin(spikes)
+        seen = seen if self.noise is None else self.noise(seen, noise)
+        residual = self.rgb(self.end(seen))
+        with torch.autocast(spikes.device.type, enabled=False):  # half precision would round the picture
+            return self.base(planes) + residual

@@ -39,6 +39,7 @@ def test_trace_does_not_record_the_motion_of_its_example():
         ("small", 1_080_294, 1.48),
         ("tiny", 300_963, 0.356),
         ("huge", 3_783_526, 4.18),
+        ("micro", 655_360, 0.164),
     ],
 )
 def test_parameters_and_multiplications_of_each_size(size, parameters, mmac):
@@ -63,6 +64,8 @@ def test_parameters_and_multiplications_of_each_size(size, parameters, mmac):
         (2, (9, 7), {"resolution": "sensor", "reconstruction": "separate"}),
         (3, (9, 7), {"resolution": "sensor", "reconstruction": "early"}),
         (3, (9, 7), {"resolution": "sensor", "reconstruction": "early", "end_width": 6}),
+        (1, (9, 7), {"resolution": "cell"}),
+        (4, (9, 8), {"resolution": "cell", "pattern": "GBRG"}),
     ],
 )
 def test_any_size_and_scale_works_and_every_parameter_has_a_gradient(scale, size, choice):
@@ -76,7 +79,9 @@ def test_any_size_and_scale_works_and_every_parameter_has_a_gradient(scale, size
 
 
 @torch.no_grad()
-@pytest.mark.parametrize(("name", "expected"), [("tiny_x4", 26.54), ("base_x3", 27.23), ("small_noisy_x4", 26.84)])
+@pytest.mark.parametrize(
+    ("name", "expected"), [("micro_x4", 26.11), ("tiny_x4", 26.54), ("base_x3", 27.23), ("small_noisy_x4", 26.84)]
+)
 def test_weights_of_the_package_give_the_picture_that_they_were_trained_for(name, expected):
     network = CSCSR.from_pretrained(f"cscsr_{name}")
     side = 48 * network.scale
@@ -92,6 +97,20 @@ def test_network_is_equivariant_to_shifts_by_bayer_cells():
     still = torch.zeros(1, 2, 2, 48, 48, dtype=torch.float64)
     moved = network(spikes.roll((2, 4), dims=(-2, -1)), still).roll((-4, -8), dims=(-2, -1))
     torch.testing.assert_close(moved[..., 32:-32, 32:-32], network(spikes, still)[..., 32:-32, 32:-32])
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(("pattern", "row", "column"), [("GRBG", 0, 1), ("GBRG", 1, 0), ("BGGR", 1, 1)])
+def test_cells_begin_with_red(pattern, row, column):
+    """The network of one phase serves the others, also in tiles."""
+    made = {"scale": 2, **TINY, "resolution": "cell"}
+    network, other = CSCSR(**made), CSCSR(**made, pattern=pattern)
+    spikes, _ = clip(1, 40, 40)
+    other.load_state_dict(network.state_dict())
+    cut = spikes[..., row:, column:]
+    part, whole = other(cut), network(spikes)[..., 2 * row :, 2 * column :]
+    torch.testing.assert_close(part[..., 20:-20, 20:-20], whole[..., 20:-20, 20:-20])
+    torch.testing.assert_close(forward_in_tiles(other, cut, 16), part)
 
 
 def test_skip_starts_from_a_smooth_classical_picture():
