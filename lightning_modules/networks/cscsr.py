@@ -13,14 +13,7 @@ from torch.compiler import is_exporting
 
 from lightning_modules.motion import MotionEstimator
 from lightning_modules.networks.cscsr_config import CSCSRConfig
-from lightning_modules.networks.layers import (
-    channels_last,
-    enlarge,
-    enlarge_smoothly,
-    fold,
-    pack_cells,
-    start_pixel_by_pixel,
-)
+from lightning_modules.networks.layers import channels_last, enlarge, enlarge_smoothly, fold, start_pixel_by_pixel
 from lightning_modules.networks.motion_fusion import assembled_motion, independent_motion, joint_motion
 from lightning_modules.networks.network import Network
 from lightning_modules.networks.reconstruction import CellReconstruction, ColorCorrelation, EarlyFusion, SeparateColors
@@ -204,8 +197,8 @@ class CSCSR(Network):
         told = self._told(noise, planes)
         auto = torch.is_autocast_enabled(spikes.device.type)
         spikes = spikes.to(torch.get_autocast_dtype(spikes.device.type) if auto else planes.dtype)
-        cells = (pack_cells(F.pad(part, border, "reflect") if any(border) else part) for part in (spikes, planes))
-        rgb = F.pixel_shuffle(self.reconstruction(*cells, **told), self.fold)
+        whole = (F.pad(part, border, "reflect") if any(border) else part for part in (spikes, planes))
+        rgb = F.pixel_shuffle(self.reconstruction(*whole, **told), self.fold)
         top, left, height, width = (self.scale * length for length in (top, left, height, width))
         return rgb[..., top : top + height, left : left + width]
 

@@ -56,12 +56,6 @@ def fold(planes: Tensor, size: int) -> Tensor:
     return channels_last(blocks.flatten(3).movedim(-1, 1))
 
 
-def pack_cells(planes: Tensor) -> Tensor:
-    """Pack cells of 2 x 2 pixels, (B, C, 2 H, 2 W) to (B, 4 C, H, W), channels last, pixel after pixel."""
-    cells = planes.unflatten(3, (-1, 2)).unflatten(2, (-1, 2))
-    return cells.permute(0, 2, 4, 3, 5, 1).flatten(3).movedim(-1, 1)
-
-
 def conv(inputs: int, outputs: int) -> nn.Conv2d:
     """Return a 3 x 3 convolution that keeps the size."""
     return nn.Conv2d(inputs, outputs, 3, padding=1)

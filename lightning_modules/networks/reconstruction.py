@@ -125,6 +125,12 @@ class EarlyFusion(nn.Module):
         return self.rgb(fused + self.refine(fused))
 
 
+def _packed(planes: Tensor) -> Tensor:
+    """Pack cells of 2 x 2 pixels, (B, C, 2 H, 2 W) to (B, 4 C, H, W), channels last, pixel after pixel."""
+    cells = planes.unflatten(3, (-1, 2)).unflatten(2, (-1, 2))
+    return cells.permute(0, 2, 4, 3, 5, 1).flatten(3).movedim(-1, 1)
+
+
 class CellReconstruction(nn.Module):
     """Reconstruction without motion, at half the resolution of the sensor, with all spikes of 2 x 2 pixels as channels.
 
@@ -140,7 +146,7 @@ class CellReconstruction(nn.Module):
         noise: the noise level of the sensor changes gain and shift of the first features.
 
     Shape:
-        - Input: spikes of the cells, :math:`(B, 4 N, H, W)`, red first; their TFP picture, :math:`(B, 4, H, W)`;
+        - Input: spikes :math:`(B, N, 2 H, 2 W)`, with red at (0, 0); their TFP picture, :math:`(B, 1, 2 H, 2 W)`;
           optionally the noise level, :math:`(B, 1, 1, 1)`
         - Output: rgb with its sub-pixels as channels, :math:`(B, colors enlarge^2, H, W)`
     """
@@ -175,8 +181,8 @@ class CellReconstruction(nn.Module):
         self.base.weight[..., 1, 1] = own.repeat_interleave(len(self.base.weight) // self.colors, dim=0)
 
     def forward(self, spikes: Tensor, planes: Tensor, noise: Tensor | None = None) -> Tensor:  # noqa: D102
-        seen = self.begin(spikes)
+        seen = self.begin(_packed(spikes))
         seen = seen if self.noise is None else self.noise(seen, noise)
         residual = self.rgb(self.end(seen))
         with torch.autocast(spikes.device.type, enabled=False):  # half precision would round the picture
-            return self.base(planes) + residual
+            return self.base(_packed(planes)) + residual
