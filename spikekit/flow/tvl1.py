@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from spikekit.kernels import gpu_kernel, loops
+from spikekit.kernels import gpu_kernel, import_loops
 from spikekit.kernels.graphs import Replayed
 from spikekit.warp import flow_warp
 
@@ -78,7 +78,7 @@ def _improve(pictures: Tensor, times: Tensor, limit: Tensor, flow: Tensor, warps
     if pictures.is_cuda and pictures.dtype is torch.float32 and find_spec("triton") is not None:
         constants = ROUNDS, SMOOTHINGS, STEP, STEP / COUPLING
         return gpu_kernel("tvl1_level")(pictures, times, limit, flow, warps, *constants)
-    compiled = loops.import_loops("spikekit.flow.cpu_tvl1") if pictures.device.type == "cpu" else None
+    compiled = import_loops("spikekit.flow.cpu_tvl1") if pictures.device.type == "cpu" else None
     return (refine if compiled is None else compiled.refine)(pictures, times, limit, flow, warps)
 
 

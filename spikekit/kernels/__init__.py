@@ -15,6 +15,8 @@ from torch.utils._pytree import tree_map
 
 from spikekit.kernels import cpu
 
+NUMBA = find_spec("numba") is not None
+
 
 def operator(fake: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
     """Turn the decorated function into a custom operator with any number of leading dimensions.
@@ -31,7 +33,7 @@ def operator(fake: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
         op = custom_operator(name, plain, fake)
         if hasattr(cpu, name):
             register_kernel(op, "cpu")(getattr(cpu, name))
-            register_on_gpu(op, lambda *args: gpu_kernel(name)(*args))
+            register_kernel(op, "cuda")(lambda *args: gpu_kernel(name)(*args))
         register_vmap(op)
         return op
 
@@ -49,9 +51,12 @@ def custom_operator(name: str, plain: Callable[..., Any], fake: Callable[..., An
 def register_kernel(op: Any, device: str) -> Callable[[Callable[..., Any]], None]:
     """Register the decorated function as the kernel of a custom operator on a type of device.
 
-    The operator's own ``register_kernel`` imports the compiler at the first call, which takes a second or two, and
-    checks for aliasing of results and arguments at every call, which a test does here.
+    Kernels for CUDA need Triton, and are left out without it. The operator's own ``register_kernel`` imports the
+    compiler at the first call, which takes a second or two, and checks for aliasing of results and arguments at every
+    call, which a test does here.
     """
+    if device == "cuda" and find_spec("triton") is None:
+        return lambda kernel: None
     return lambda kernel: torch.library.impl(f"spikekit::{op._name}", device, compiler_kept_out(kernel))
 
 
@@ -66,15 +71,17 @@ def compiler_kept_out(function: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
-def register_on_gpu(op: Any, kernel: Callable[..., Any]) -> None:
-    """Register a Triton kernel of a custom operator, if Triton is installed."""
-    if find_spec("triton") is not None:
-        register_kernel(op, "cuda")(kernel)
-
-
 def gpu_kernel(name: str) -> Callable[..., Any]:
     """Return a function of :mod:`spikekit.kernels.gpu`, which is imported lazily."""
     return getattr(import_module("spikekit.kernels.gpu"), name)
+
+
+def import_loops(module: str) -> Any:
+    """Import a module with loops compiled by Numba; return None if Numba is missing or does not work."""
+    try:
+        return import_module(module) if NUMBA else None
+    except ImportError:  # incompatible with the installed NumPy
+        return None
 
 
 def register_vmap(op: Any, folded: int = 0) -> None:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from spikekit.check import wide_dtype
-from spikekit.kernels import cpu_warp, custom_operator, gpu_kernel, register_kernel, register_on_gpu, register_vmap
+from spikekit.kernels import cpu_warp, custom_operator, gpu_kernel, register_kernel, register_vmap
 from spikekit.kernels.layout import empty_like_layout, is_channels_last
 
 _FEW = 8  # channels; with fewer, a CPU is faster plane by plane
@@ -59,11 +59,11 @@ def _operator(plain: Callable[..., Tensor], fake: Callable[..., Tensor]) -> Any:
     def _(first: Tensor, *others: Any) -> Tensor:
         return (rows if is_channels_last(first) or first.shape[1] >= _FEW else plain)(first, *others)
 
-    def on_gpu(*args: Any) -> Tensor:
+    @register_kernel(op, "cuda")
+    def _(*args: Any) -> Tensor:
         result = gpu_kernel(name)(*args)
         return plain(*args) if result is NotImplemented else result
 
-    register_on_gpu(op, on_gpu)
     register_vmap(op, 3)
     return op
 

@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
-from spikekit.kernels import custom_operator, gpu_kernel, register_kernel, register_on_gpu, register_vmap
-from spikekit.kernels.loops import import_loops
+from spikekit.kernels import custom_operator, gpu_kernel, import_loops, register_kernel, register_vmap
 
 _FARTHEST = 2.0**30  # flow is clamped to it, so that positions fit an integer
 _CHUNK = 1 << 15  # positions per search: fits in the cache of one thread
@@ -190,12 +189,12 @@ def _(flow: Tensor, mask: Tensor, neighbors: int) -> tuple[Tensor, Tensor]:
     return loops.nearest_known(flow, products_of(mask, neighbors), neighbors)
 
 
-def _on_gpu(flow: Tensor, mask: Tensor, neighbors: int) -> tuple[Tensor, Tensor]:
+@register_kernel(nearest_known, "cuda")
+def _(flow: Tensor, mask: Tensor, neighbors: int) -> tuple[Tensor, Tensor]:
     index, weight = gpu_kernel("nearest_known")(flow, products_of(mask, neighbors), neighbors)
     return index, weight.to(flow.dtype)
 
 
-register_on_gpu(nearest_known, _on_gpu)
 register_vmap(nearest_known, 1)
 
 

@@ -27,8 +27,7 @@ from torch.compiler import is_exporting
 
 from spikekit.check import wide_dtype
 from spikekit.color.cfa import bayer_mask
-from spikekit.kernels import compiler_kept_out, custom_operator, gpu_kernel, register_kernel, register_on_gpu
-from spikekit.kernels.loops import import_loops
+from spikekit.kernels import compiler_kept_out, custom_operator, gpu_kernel, import_loops, register_kernel
 from spikekit.warp.neighbors import finite, products_of, search_and_weigh
 
 STEPS = 32  #: positions per sensor pixel and axis that flow is rounded to
@@ -305,16 +304,16 @@ def _operator(plain: Callable[..., Tensor], fake: Callable[..., Tensor]) -> Any:
     name = plain.__name__.removeprefix("_")
     op = custom_operator(name, plain, fake)
 
-    def on_cpu(first: Tensor, *others: Any) -> Tensor:
+    @register_kernel(op, "cpu")
+    def _(first: Tensor, *others: Any) -> Tensor:
         loops = import_loops("spikekit.kernels.cpu_sites")
         compiled = loops is not None and first.dtype in (torch.float32, torch.bfloat16)
         return (getattr(loops, name) if compiled else plain)(first, *others)
 
-    def on_gpu(first: Tensor, *others: Any) -> Tensor:
+    @register_kernel(op, "cuda")
+    def _(first: Tensor, *others: Any) -> Tensor:
         return (plain if first.dtype is torch.float64 else gpu_kernel(name))(first, *others)
 
-    register_kernel(op, "cpu")(on_cpu)
-    register_on_gpu(op, on_gpu)
     return op
 
 

@@ -3,10 +3,10 @@ import pytest
 import torch
 from skimage.registration import optical_flow_tvl1
 
+from spikekit import kernels
 from spikekit.flow.tvl1 import refine, tvl1_flow
-from spikekit.kernels import loops
 
-needs_numba = pytest.mark.skipif(not loops.NUMBA, reason="needs Numba")
+needs_numba = pytest.mark.skipif(not kernels.NUMBA, reason="needs Numba")
 
 FORWARD = torch.tensor([[0.0, 1.0]])
 
@@ -50,7 +50,7 @@ def test_compiled_loops_equal_tensor_operations(dtype, size):
     limit, flow = (torch.rand(3, *lead, *size, generator=generator, dtype=dtype) for lead in ((), (2,)))
     times = torch.tensor([[-0.5, 0.5], [0.0, 1.0], [-0.4, 0.6]])
     expected = refine(pictures, times, 40 * limit, flow, 3)
-    compiled = loops.import_loops("spikekit.flow.cpu_tvl1")
+    compiled = kernels.import_loops("spikekit.flow.cpu_tvl1")
     got = compiled.refine(pictures, times, 40 * limit, flow, 3)
     assert got.dtype == dtype
     difference = (got - expected).abs()
@@ -62,7 +62,7 @@ def test_compiled_loops_equal_tensor_operations(dtype, size):
 class TestBothPaths:
     @pytest.fixture(autouse=True)
     def path(self, monkeypatch, numba):
-        monkeypatch.setattr(loops, "NUMBA", numba)
+        monkeypatch.setattr(kernels, "NUMBA", numba)
 
     def test_a_batch_is_its_members(self):
         pictures = torch.cat([moved((0.1, 0.0)), moved((3.0, -2.0)), moved((0.0, 0.0))])
