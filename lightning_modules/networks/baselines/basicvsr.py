@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lightning_modules.networks.baselines.pictures import (
+from lightning_modules.networks.baselines.parts import (
     Baseline,
     decode_pictures,
     sub_pixel_convolutions,

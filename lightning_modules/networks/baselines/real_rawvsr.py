@@ -9,10 +9,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lightning_modules.motion import ZeroFlow
-from lightning_modules.networks.baselines.deformable import DeformableConv2d
-from lightning_modules.networks.baselines.pictures import (
+from lightning_modules.networks.baselines.parts import (
     Baseline,
     Decoder,
+    DeformableConv2d,
     begin_at_zero,
     check_decoder,
     cut_to,

@@ -8,13 +8,13 @@ import torch
 from torch import Tensor, nn
 
 from lightning_modules.motion import ZeroFlow
-from lightning_modules.networks.baselines.deformable import DeformableConv2d
-from lightning_modules.networks.baselines.per_channel import per_channel as run_per_channel
-from lightning_modules.networks.baselines.pictures import (
+from lightning_modules.networks.baselines.parts import (
     Baseline,
+    DeformableConv2d,
     begin_at_zero,
     decode_pictures,
     enlarged_raw,
+    run_per_channel,
     sub_pixel_convolutions,
     whole_sizes,
 )

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lightning_modules.networks.baselines.pictures import (
+from lightning_modules.networks.baselines.parts import (
     Baseline,
     along_motion,
     begin_at_zero,

@@ -8,12 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lightning_modules.networks.baselines.per_channel import per_channel as run_per_channel
-from lightning_modules.networks.baselines.pictures import (
+from lightning_modules.networks.baselines.parts import (
     Baseline,
     begin_at_zero,
     decode_pictures,
     enlarged_raw,
+    run_per_channel,
     whole_sizes,
 )
 from lightning_modules.networks.layers import conv

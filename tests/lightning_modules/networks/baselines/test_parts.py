@@ -8,9 +8,7 @@ import torch
 import torch.nn.functional as F
 
 from lightning_modules.networks import BasicVSR, RealRawVSR, SpikeSRNetLike, VidarSR
-from lightning_modules.networks.baselines.deformable import DeformableConv2d
-from lightning_modules.networks.baselines.per_channel import per_channel
-from lightning_modules.networks.baselines.pictures import mirror_to_multiple
+from lightning_modules.networks.baselines.parts import DeformableConv2d, mirror_to_multiple, run_per_channel
 from lightning_modules.networks.baselines.swinir import AttentionLayer, _hidden
 from lightning_modules.networks.baselines.tscnn import KnownPixels
 from spikekit import bayer_mask, bayer_sites, demosaic_along_motion, flow_warp, mosaic, tfi, tfp
@@ -92,7 +90,7 @@ def test_separate_colours_are_aligned(scale, pattern, size):
         return F.interpolate(planes, scale_factor=2 * scale, mode="bilinear", align_corners=False)
 
     raw = mosaic(ramps(*size)[None], pattern)[:, None]
-    rgb = per_channel(enlarge, raw, torch.zeros(1, 2, 2, *size).double(), pattern, scale)
+    rgb = run_per_channel(enlarge, raw, torch.zeros(1, 2, 2, *size).double(), pattern, scale)
     assert rgb.shape == (1, 3, scale * size[0], scale * size[1])
     inner = (..., slice(4 * scale, -4 * scale), slice(4 * scale, -4 * scale))
     torch.testing.assert_close(rgb[0][inner], ramps(*size, scale)[inner])
@@ -106,7 +104,7 @@ def test_flow_of_sub_streams_is_in_their_pixels():
         seen.extend([planes, flows])
         return planes[:, :1].repeat_interleave(4, -1).repeat_interleave(4, -2)
 
-    per_channel(reconstruct, spikes, flow, "GRBG", 2)
+    run_per_channel(reconstruct, spikes, flow, "GRBG", 2)
     for n, (_, row, column) in enumerate(bayer_sites("GRBG")):
         for got, whole in zip(seen, (spikes, flow / 2), strict=True):
             assert torch.equal(got[2 * n : 2 * n + 2], whole[..., row::2, column::2])

@@ -1,8 +1,8 @@
-"""Parts shared by the baselines: decoded pictures, padding, settings, the skip, sub-pixel convolutions."""
+"""Parts shared by the baselines: decoded pictures, padding, settings, the skip, sub-streams, convolutions."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import torch
@@ -11,10 +11,12 @@ from torch import Tensor, nn
 from torch.compiler import is_exporting
 
 from lightning_modules.motion import MotionEstimator
+from lightning_modules.motion.estimator import split_any_size
 from lightning_modules.networks.layers import conv
 from lightning_modules.networks.network import Network
-from spikekit import bayer_pattern, demosaic_along_motion, demosaic_residual, linear_motion, tfi_at, tfp_at
+from spikekit import bayer_pattern, demosaic_along_motion, demosaic_residual, flow_warp, linear_motion, tfi_at, tfp_at
 from spikekit.check import check_positive, check_whole
+from spikekit.color.cfa import bayer_sites
 
 Decoder = Literal["tfi", "tfp"]
 
@@ -149,3 +151,65 @@ def sub_pixel_convolutions(width: int, scale: int, *after: nn.Module) -> nn.Sequ
             scale //= factor
         factor += 1
     return nn.Sequential(*layers)
+
+
+def run_per_channel(
+    reconstruct: Callable[[Tensor, Tensor], Tensor], spikes: Tensor, flow: Tensor, pattern: str, scale: int
+) -> Tensor:
+    r"""Reconstruct each Bayer sub-stream separately with one shared single-channel network, and merge the colours.
+
+    The paper only says that VidarSR\* and SpikeSR-Net\* handle "each color channel separately". Here the four
+    sub-streams, each half the size of the sensor, are enlarged by 2 s and shifted bilinearly by half a sensor pixel,
+    the distance of their pixels from the centre of the Bayer cell. The two greens are averaged.
+
+    ``reconstruct`` maps the spikes of sub-streams, (4 B, N, h, w), and their flows, (4 B, 2, 2, h, w), in pixels of
+    the sub-streams, to pictures (4 B, 1, 2 s h, 2 s w). The result is rgb (B, 3, s H, s W).
+    """
+    batch, (height, width) = len(spikes), spikes.shape[-2:]
+    planes = split_any_size(spikes, pattern)
+    flows = split_any_size(flow.flatten(1, 2), pattern).unflatten(2, (2, 2)) / 2
+    pictures = reconstruct(planes.flatten(0, 1), flows.flatten(0, 1)).unflatten(0, (4, batch))
+    colors: list[list[Tensor]] = [[], [], []]
+    for picture, (color, row, column) in zip(pictures, bayer_sites(pattern), strict=True):
+        # the value at (x, y) is at (x, y) + shift in the sub-stream's picture
+        shift = picture.new_tensor([scale / 2 - scale * column, scale / 2 - scale * row]).reshape(1, 2, 1, 1)
+        colors[color].append(flow_warp(picture, shift.expand(batch, 2, *picture.shape[-2:])))
+    rgb = torch.cat([torch.stack(found).mean(dim=0) for found in colors], dim=1)
+    return rgb[..., : scale * height, : scale * width]
+
+
+class DeformableConv2d(nn.Module):
+    r"""Modulated deformable 3 x 3 convolution; a convolution predicts its offsets and masks from guide features.
+
+    The predictor is initialised with zeros: no offset, and all masks 0.5. Positions are computed in the precision of
+    the weights, also under autocast. Each of the ``groups`` of channels has its own offsets.
+
+    Shape:
+        - Input: features and guide, each :math:`(B, C, H, W)`
+        - Output: :math:`(B, C, H, W)`
+
+    Example:
+        >>> DeformableConv2d(8, groups=2)(torch.rand(1, 8, 5, 6), torch.rand(1, 8, 5, 6)).shape
+        torch.Size([1, 8, 5, 6])
+
+    Reference:
+        Zhu et al., Deformable ConvNets v2, CVPR 2019.
+    """
+
+    def __init__(self, width: int, groups: int = 8) -> None:
+        super().__init__()
+        if width % groups:
+            raise ValueError(f"width: expected a multiple of {groups}, the groups of offsets, got {width}")
+        self.where = conv(width, 27 * groups)
+        begin_at_zero(self.where)
+        taps = conv(width, width)
+        self.weight, self.bias = taps.weight, taps.bias
+
+    def forward(self, features: Tensor, guide: Tensor) -> Tensor:  # noqa: D102
+        from kornia.feature.aliked.deform_conv2d import deform_conv2d
+
+        where = self.where(guide).to(self.weight.dtype)
+        offsets, masks = where.split([where.shape[1] * 2 // 3, where.shape[1] // 3], dim=1)
+        with torch.autocast(features.device.type, enabled=False):
+            features = features.to(self.weight.dtype)
+            return deform_conv2d(features, offsets, self.weight, self.bias, padding=1, mask=masks.sigmoid())
