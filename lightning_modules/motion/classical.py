@@ -15,7 +15,7 @@ from spikekit.color.cfa import cfa_pattern
 from spikekit.filters import separable_filter
 from spikekit.flow.tvl1 import tvl1_flow
 from spikekit.kernels import compiler_kept_out
-from spikekit.sensor.quantization_noise import flicker
+from spikekit.sensor.noise import flicker
 
 
 def _gaussian(length: int, sigma: float) -> list[float]:

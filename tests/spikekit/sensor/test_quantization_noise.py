@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from spikekit import spike_integrate_fire
-from spikekit.sensor.quantization_noise import flicker
+from spikekit.sensor.noise import flicker
 
 
 @pytest.mark.parametrize("frames", [1, 7, 41])
