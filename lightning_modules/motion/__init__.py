@@ -1,9 +1,8 @@
 """Motion estimators: flows from the middle of a clip to its first and last time points."""
 
 from lightning_modules.motion.classical import ClassicalFlow
-from lightning_modules.motion.estimator import MotionEstimator
+from lightning_modules.motion.estimator import MotionEstimator, ZeroFlow
 from lightning_modules.motion.spike2flow import Spike2Flow
-from lightning_modules.motion.zero import ZeroFlow
 
 #: estimators by name, for weights and configurations
 ESTIMATORS = {kind.__name__: kind for kind in (ClassicalFlow, Spike2Flow, ZeroFlow)}

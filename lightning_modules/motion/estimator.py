@@ -1,7 +1,8 @@
-"""Base class of the motion estimators, and the joint flow of the four sub-streams."""
+"""Base class of the motion estimators, the joint flow of the four sub-streams, and the estimator for scenes at rest."""
 
 from __future__ import annotations
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
@@ -64,3 +65,24 @@ def split_any_size(raw: Tensor, pattern: str) -> Tensor:
     if pattern == GREY:
         return raw.unsqueeze(0)
     return split_bayer(F.pad(raw, (0, width % 2, 0, height % 2), "reflect"), pattern)
+
+
+class ZeroFlow(MotionEstimator):
+    r"""Estimator for scenes without motion; both flows are zero.
+
+    Shape:
+        As :class:`MotionEstimator`.
+
+    Example:
+        >>> ZeroFlow()(torch.ones(1, 41, 16, 16), (5, 20, 35), "RGGB")[0].any().item()
+        False
+    """
+
+    static = True
+
+    def channel_flows(  # noqa: D102
+        self, spikes: Tensor, times: tuple[int, int, int], pattern: str
+    ) -> tuple[Tensor, Tensor]:
+        (height, width), (sites, side) = spikes.shape[-2:], cfa_sites(pattern)
+        zero = spikes.new_zeros(len(sites), len(spikes), 2, -(-height // side), -(-width // side), dtype=torch.float32)
+        return zero, zero
