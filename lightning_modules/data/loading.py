@@ -1,4 +1,4 @@
-"""Data loaders for clips, which workers make anew in every epoch."""
+"""Data loaders for clips, which workers make anew in every epoch, and cuts of clips."""
 
 from __future__ import annotations
 
@@ -84,6 +84,22 @@ def cut_key_frames(clip: dict[str, Tensor], key_frames: int, frames: int, every:
         return clip
     spikes = clip["spikes"].unfold(-3, frames, every).movedim(-1, -3).contiguous()
     return {**clip, "spikes": spikes, "every": torch.tensor(every)}
+
+
+def flow_margin(patch: int, flow_patch: int) -> int:
+    """Return the even margin around a patch that lets motion be estimated on at least ``flow_patch`` pixels.
+
+    Example:
+        >>> flow_margin(24, 48), flow_margin(26, 48), flow_margin(96, 48)
+        (12, 12, 0)
+    """
+    return 2 * max(0, -((patch - flow_patch) // 4))
+
+
+def trim(planes: Tensor, margin: int) -> Tensor:
+    """Crop a margin: (*, H, W) to (*, H - 2 margin, W - 2 margin)."""
+    height, width = planes.shape[-2:]
+    return planes[..., margin : height - margin, margin : width - margin]
 
 
 def load_clips(clips: Dataset, batch_size: int, workers: int, **options: object) -> DataLoader:

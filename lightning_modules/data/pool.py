@@ -12,8 +12,7 @@ from pytorch_lightning import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from lightning_modules.data.loading import Resumable, made_on_cpu, process, start_worker
-from lightning_modules.data.margin import trim
+from lightning_modules.data.loading import Resumable, made_on_cpu, process, start_worker, trim
 from lightning_modules.data.rendering import Gallery
 
 _AT_ONCE = 128  # scenes rendered together

@@ -18,8 +18,7 @@ from torch.utils.data import Dataset
 
 from lightning_modules.data.cache import ClipCache, clip_key, file_digest, pack_clip, unpack_clip
 from lightning_modules.data.layouts import EXPECTED, Collection, SequenceFiles, find_sequences
-from lightning_modules.data.loading import ClipScenes, cut_key_frames
-from lightning_modules.data.margin import flow_margin, trim
+from lightning_modules.data.loading import ClipScenes, cut_key_frames, flow_margin, trim
 from lightning_modules.data.pictures import split_pictures
 from lightning_modules.signatures import inherit_signature
 from spikekit import VideoError, bin_to_sensor

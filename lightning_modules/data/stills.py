@@ -15,8 +15,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from lightning_modules.data.cache import ClipCache, clip_key, file_digest, unpack_clip
-from lightning_modules.data.loading import ClipScenes, cut_key_frames
-from lightning_modules.data.margin import flow_margin, trim
+from lightning_modules.data.loading import ClipScenes, cut_key_frames, flow_margin, trim
 from lightning_modules.data.pictures import embedded_pictures, folder_pictures, split_pictures
 from lightning_modules.data.pool import ScenePool
 from lightning_modules.data.rendering import Gallery, Pictures, draw_cut, render_scene, see

@@ -9,7 +9,7 @@ import torch
 from pytorch_lightning.cli import LRSchedulerCallable, OptimizerCallable
 from torch import Tensor, nn
 
-from lightning_modules.data.margin import trim
+from lightning_modules.data.loading import trim
 from lightning_modules.inference.clips import film_groups
 from lightning_modules.inference.film import FilmMaker
 from lightning_modules.inference.predict import predict
