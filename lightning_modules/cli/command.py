@@ -15,6 +15,7 @@ from time import perf_counter
 from typing import Any, NoReturn
 
 import torch
+import yaml
 from pytorch_lightning import Callback, LightningDataModule, LightningModule, Trainer
 from pytorch_lightning.callbacks import LearningRateMonitor, ModelCheckpoint
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
@@ -33,9 +34,8 @@ from lightning_modules.inference.predict import precision_of
 from lightning_modules.storage.checkpoint import read_checkpoint
 from lightning_modules.storage.pretrained import check_settings
 from lightning_modules.tasks import optical_flow, super_resolution  # noqa: F401  (classes that --model names)
-from lightning_modules.tasks.base import BaseTask
+from lightning_modules.tasks.base import BaseTask, check_resume, load_weights_of
 from lightning_modules.tasks.checkpoint_io import Checkpoints, LastCheckpoint, requeued_checkpoint
-from lightning_modules.tasks.resume import check_resume, load_weights_of
 from spikekit.arguments import one_line
 from spikekit.io import PictureError, SpikeFileError, VideoError
 from spikekit.io.whole_file import whole_file
@@ -261,6 +261,23 @@ class Command(LightningCLI):
                 self.model.pictures(),
             ]
         return [self.model.report(output)] if self.subcommand == "test" else []
+
+
+class Rehearsal(Command):
+    """A command that parses and builds everything and raises any errors, but runs and writes nothing."""
+
+    verb = "test"
+
+    def init_parser(self, **kwargs: Any) -> Any:  # noqa: D102
+        return super().init_parser(**kwargs, exit_on_error=False)
+
+    def _run_subcommand(self, subcommand: str) -> None:
+        pass
+
+
+def resolved(command: Rehearsal) -> dict[str, Any]:
+    """Return the complete configuration of a command, as plain values."""
+    return yaml.safe_load(command.parser.dump(command.config, skip_none=False, skip_validation=True))[command.verb]
 
 
 def _flow_patch(flow: str | None) -> int:

@@ -1,8 +1,8 @@
-"""Base class of the LightningModules: optimiser, schedule and checkpoints with the settings of their network."""
+"""Base class of the LightningModules: optimiser, schedule, checkpoints with settings, and checks before a resume."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -14,6 +14,7 @@ from torch import nn
 from lightning_modules.networks.network import read_network
 from lightning_modules.storage.checkpoint import read_checkpoint
 from lightning_modules.storage.pretrained import check_settings, motion_of, settings_of
+from spikekit.arguments import one_line
 
 
 def step_schedule(optimizer: torch.optim.Optimizer) -> torch.optim.lr_scheduler.StepLR:
@@ -106,3 +107,30 @@ class BaseTask(LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:  # noqa: D102
         check_settings(self.network, checkpoint.get("network", {}), "the checkpoint")
+
+
+def check_resume(checkpoint: Mapping[str, Any], path: str | Path, module: BaseTask) -> None:
+    """Check a checkpoint by one step with a temporary optimiser and schedule."""
+    weights = [nn.Parameter(weight.detach().clone()) for weight in module.network.parameters()]
+    made = module.optimizers_of(weights)
+    try:
+        parts = {"optimizer_states": made["optimizer"], "lr_schedulers": made["lr_scheduler"]["scheduler"]}
+        for name, part in parts.items():
+            [state] = checkpoint[name]
+            part.load_state_dict(state)
+        for weight in weights:
+            weight.grad = torch.zeros_like(weight)
+        made["optimizer"].step()
+        for name in ("epoch", "global_step", "loops"):
+            checkpoint[name]
+    except Exception as error:  # the type depends on the damage
+        raise ValueError(f"{path}: training cannot resume from this checkpoint: {one_line(error)[:300]}") from error
+
+
+def load_weights_of(checkpoint: Mapping[str, Any], path: str | Path, module: BaseTask) -> None:
+    """Load the weights of a checkpoint into a module."""
+    try:
+        module.on_load_checkpoint(dict(checkpoint))
+        module.load_state_dict(checkpoint["state_dict"])
+    except (KeyError, RuntimeError) as error:
+        raise ValueError(f"{path}: weights of another network: {one_line(error)[:300]}") from error

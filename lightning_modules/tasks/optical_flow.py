@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
 from lightning_modules.tasks.base import BaseTask, step_schedule
-from lightning_modules.tasks.flow_callbacks import FlowPictures, FlowReport
+from lightning_modules.tasks.callbacks import FlowPictures, FlowReport
 from spikekit import bayer_pattern, split_bayer
 
 _DISCOUNT = 0.8  # weight of an iteration relative to the next
