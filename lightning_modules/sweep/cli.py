@@ -11,11 +11,10 @@ from lightning_modules.cli.command import check_folder
 from lightning_modules.cli.errors import Ended, InputError, UsageError, VerbParser
 from lightning_modules.cli.folder_lock import locked_folder
 from lightning_modules.configurations import find_configs
-from lightning_modules.sweep.budget import seconds
 from lightning_modules.sweep.engines import run_locally, run_on_ray
 from lightning_modules.sweep.state import LOG, PROGRESS, RESULT, read_progress, read_result
 from lightning_modules.sweep.table import collect, markdown, write_csv
-from lightning_modules.sweep.trials import Trial, make_trials
+from lightning_modules.sweep.trials import Trial, make_trials, seconds
 from spikekit.arguments import home_path, one_line, positive, whole
 from spikekit.io.whole_file import whole_file
 

@@ -1,12 +1,13 @@
-"""Trials of a sweep: all combinations with their names and resolved configurations."""
+"""Trials of a sweep: all combinations with their names, resolved configurations and training budgets."""
 
 from __future__ import annotations
 
 import itertools
 import json
 import re
-from argparse import ArgumentError
+from argparse import ArgumentError, ArgumentTypeError
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,16 +15,20 @@ from typing import Any
 import yaml
 
 from lightning_modules.cli.arguments import flatten
-from lightning_modules.cli.command import run
+from lightning_modules.cli.command import Rehearsal, resolved, run
 from lightning_modules.cli.errors import InputError, UsageError
 from lightning_modules.cli.reasons import reason
-from lightning_modules.cli.rehearsal import Rehearsal, resolved
-from lightning_modules.sweep.budget import with_budget
 from lightning_modules.sweep.state import read_settings, write_json
 from spikekit.io.whole_file import whole_file
 from spikekit.progress import progress
 
 _LONGEST = 240  # bytes of a folder's name
+
+#: arguments of learning-rate schedules for their last step
+_ENDS = ("T_max", "total_steps")
+
+_CONSTANT = {"class_path": "torch.optim.lr_scheduler.ConstantLR", "init_args": {"factor": 1.0}}
+_PACE = {"class_path": "lightning_modules.tasks.pace.Pace", "init_args": {}}
 
 
 @dataclass(frozen=True)
@@ -155,3 +160,37 @@ def _difference(there: dict[str, Any], asked: dict[str, Any]) -> str:
     holds, wanted = (" ".join(str(values.get(key, "none")).split())[:80] for values in (there, asked))
     shown = " ".join(key.replace(".init_args", "").split())[:80]
     return f"holds a trial with {shown}={holds}, expected {wanted} for this sweep"
+
+
+def seconds(text: str) -> float:
+    """Parse a time above 0, ``HH:MM:SS`` or ``DD:HH:MM:SS``; raise ``ArgumentTypeError`` for anything else."""
+    if not re.fullmatch(r"(\d+:)?\d+:[0-5]?\d:[0-5]?\d", text):
+        raise ArgumentTypeError(f"expected HH:MM:SS or DD:HH:MM:SS, got {text}")
+    time = sum(int(part) * unit for part, unit in zip(text.split(":")[::-1], (1, 60, 3600, 86400), strict=False))
+    if time == 0:
+        raise ArgumentTypeError(f"expected a time above 0, got {text}")
+    return time
+
+
+def with_budget(config: dict[str, Any], budget: dict[str, float]) -> dict[str, Any]:
+    """Return a configuration of ``lightning fit`` with a training budget.
+
+    The budget is empty, for that of the configuration, or ``steps``, or ``seconds`` of wall time including validation,
+    or ``flops``, which :mod:`lightning_modules.sweep.worker` converts to steps. With ``steps``, a schedule with an end,
+    such as ``CosineAnnealingLR``, ends at the last step. With ``seconds``, :class:`lightning_modules.tasks.pace.Pace`
+    replaces it; its cosine ends with the time.
+    """
+    if not budget:
+        return config
+    config = deepcopy(config)
+    steps, time = budget.get("steps"), budget.get("seconds")
+    config["trainer"] |= {"max_epochs": -1, "max_steps": steps or -1, "max_time": time and {"seconds": time}}
+    schedule = config["model"].get("init_args", {}).get("lr_scheduler")
+    arguments = schedule.get("init_args", {}) if isinstance(schedule, dict) else {}
+    for name in [name for name in _ENDS if arguments.get(name) is not None]:
+        if steps:
+            arguments[name] = steps
+        if time:
+            config["model"]["init_args"]["lr_scheduler"] = _CONSTANT
+            config["trainer"]["callbacks"] = [*(config["trainer"]["callbacks"] or []), _PACE]
+    return config

@@ -20,8 +20,8 @@ from lightning_modules.cli.command import Command, run
 from lightning_modules.cli.errors import as_one_line
 from lightning_modules.cli.processes import end_with_parent
 from lightning_modules.storage.checkpoint import DivergedError, read_checkpoint
-from lightning_modules.sweep.budget import with_budget
 from lightning_modules.sweep.state import RESULT, check_result, read_settings, say_progress, write_json
+from lightning_modules.sweep.trials import with_budget
 from lightning_modules.tasks.pace import share_done
 from spikekit.io.whole_file import whole_file
 

@@ -11,10 +11,9 @@ import torch
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 
-from lightning_modules.cli.command import run
+from lightning_modules.cli.command import Rehearsal, resolved, run
 from lightning_modules.cli.errors import InputError, UsageError, VerbParser, causes
 from lightning_modules.cli.reasons import reason
-from lightning_modules.cli.rehearsal import Rehearsal, resolved
 from lightning_modules.inference.film import FilmFrame, FilmMaker, film
 from lightning_modules.inference.predict import precision_of
 from lightning_modules.storage.pretrained import load_weights, read_weights

@@ -15,9 +15,9 @@ import yaml
 import spikekit
 from lightning_modules import list_models
 from lightning_modules.__main__ import main
+from lightning_modules.cli.command import Rehearsal
 from lightning_modules.cli.command import run as run_command
 from lightning_modules.cli.errors import InputError
-from lightning_modules.cli.rehearsal import Rehearsal
 from lightning_modules.storage.checkpoint import read_checkpoint
 from spikekit import read_picture, write_spikes
 

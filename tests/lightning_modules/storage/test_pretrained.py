@@ -11,8 +11,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from lightning_modules.__main__ import main
-from lightning_modules.cli.command import run
-from lightning_modules.cli.rehearsal import Rehearsal
+from lightning_modules.cli.command import Rehearsal, run
 from lightning_modules.motion import ClassicalFlow, Spike2Flow, ZeroFlow
 from lightning_modules.networks import CSCSR, ClassicalDecoder
 from lightning_modules.storage.pretrained import load_weights, read_weights, write_weights
