@@ -38,7 +38,7 @@ from lightning_modules.tasks.base import BaseTask, check_resume, load_weights_of
 from lightning_modules.tasks.checkpoint_io import Checkpoints, LastCheckpoint, requeued_checkpoint
 from spikekit.arguments import one_line
 from spikekit.io import PictureError, SpikeFileError, VideoError
-from spikekit.io.whole_file import whole_file
+from spikekit.io.whole_file import write_whole
 from spikekit.timing import duration
 
 # warnings that users cannot act upon: internals of Lightning and jsonargparse, seeds, and data without workers
@@ -80,8 +80,8 @@ class Configuration(SaveConfigCallback):
     """Write ``config.yaml`` atomically; not to ``trainer.log_dir``, as reading it waits for other processes."""
 
     def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:  # noqa: D102
-        with whole_file(Path(trainer.default_root_dir) / self.config_filename, "w", encoding="utf-8") as file:
-            file.write(self.parser.dump(self.config, skip_none=False))
+        text = self.parser.dump(self.config, skip_none=False)
+        write_whole(Path(trainer.default_root_dir) / self.config_filename, text)
 
 
 class Command(LightningCLI):

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from lightning_modules.inference.tiles import call
 from lightning_modules.networks import Network, RecurrentCSCSR
-from spikekit.io.whole_file import whole_file
+from spikekit.io.whole_file import write_whole
 
 #: file endings of the formats
 FORMATS = {"torch": ".pt2", "onnx": ".onnx"}
@@ -112,8 +112,7 @@ def export_network(network: Network, path: str | Path, kind: str, *, still: bool
         raise ValueError(
             f"{type(network).__name__}: expected an export within {_WITHIN} of the network, got {worst:.2g}"
         )
-    with whole_file(path) as file:
-        file.write(data)
+    write_whole(path, data)
     takes = " and ".join(f"{name} {_shape(value)}" for name, value in clips[0].items())
     return f"takes {takes}, H and W even, within {worst:.1g} of the network"
 

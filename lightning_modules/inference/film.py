@@ -23,7 +23,7 @@ from lightning_modules.networks import Network, RecurrentCSCSR
 from lightning_modules.networks.recurrent_cscsr import read_forward, read_from_end
 from spikekit import Calibration, bin_to_sensor, correct_spikes, flow_warp, linear_motion, upsample_flow
 from spikekit.check import check_planes, check_positive, check_whole
-from spikekit.io.whole_file import whole_file
+from spikekit.io.whole_file import write_whole
 from spikekit.recording import white_rate
 
 #: distance of two pictures of the network, in clocks, between which all pictures are made together
@@ -269,8 +269,7 @@ class FilmMaker:
     def save(self, path: Path, clock: int) -> None:
         """Write the state after a picture, from which a film continues as if it had not stopped."""
         torch.save((clock, self._last, self._known, self.rest), state := BytesIO())
-        with whole_file(path) as file:
-            file.write(state.getbuffer())
+        write_whole(path, state.getbuffer())
 
     def load(self, path: Path, before: int, device: torch.device) -> int:
         """Read a state of an earlier clock and return that; without one, nothing changes, and -1 is returned."""

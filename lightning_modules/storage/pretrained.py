@@ -18,7 +18,7 @@ from lightning_modules.registry import find_model, list_models
 from lightning_modules.storage.checkpoint import check_tensors, read_checkpoint
 from lightning_modules.storage.settings import check_plain, check_shapes, load_state
 from spikekit.arguments import one_line
-from spikekit.io.whole_file import whole_file
+from spikekit.io.whole_file import write_whole
 
 _MOTION = "motion."
 _COMPILED = "_orig_mod."  # prefix of parameter names after torch.compile
@@ -125,8 +125,7 @@ def write_weights(weights: Weights, path: str | Path) -> None:
         for name, value in weights.tensors.items()
     }
     said = {"network": json.dumps(weights.settings), "motion": json.dumps(weights.motion)}
-    with whole_file(path) as file:
-        file.write(_same_every_time(save(tensors, said)))
+    write_whole(path, _same_every_time(save(tensors, said)))
 
 
 def _same_every_time(data: bytes) -> bytes:

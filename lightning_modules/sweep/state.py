@@ -11,15 +11,14 @@ import yaml
 from lightning_modules.cli.errors import InputError
 from spikekit.arguments import one_line, printable
 from spikekit.io.failures import no_pipe
-from spikekit.io.whole_file import whole_file
+from spikekit.io.whole_file import write_whole
 
 PROGRESS, RESULT, LOG = "progress.txt", "result.json", "log.txt"
 
 
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file atomically."""
-    with whole_file(path, "w") as file:
-        file.write(json.dumps(value, indent=1))
+    write_whole(path, json.dumps(value, indent=1))
 
 
 def read_settings(path: Path) -> dict[str, Any]:
@@ -43,8 +42,7 @@ def check_result(result: dict[str, Any]) -> dict[str, Any]:
 
 def say_progress(folder: Path, text: str) -> None:
     """Write the progress line of a trial."""
-    with whole_file(folder / PROGRESS, "w") as file:
-        file.write(text)
+    write_whole(folder / PROGRESS, text)
 
 
 def read_progress(folder: Path) -> str:

@@ -19,7 +19,7 @@ from lightning_modules.cli.command import Rehearsal, resolved, run
 from lightning_modules.cli.errors import InputError, UsageError
 from lightning_modules.cli.reasons import reason
 from lightning_modules.sweep.state import read_settings, write_json
-from spikekit.io.whole_file import whole_file
+from spikekit.io.whole_file import write_whole
 from spikekit.progress import progress
 
 _LONGEST = 240  # bytes of a folder's name
@@ -57,8 +57,7 @@ class Trial:
         elif self.folder.is_dir() and any(path != config for path in self.folder.iterdir()):
             raise InputError(f"{self.folder}: is not empty, and holds no trial; choose another -o")
         else:
-            with whole_file(config, "w") as file:
-                file.write(yaml.safe_dump(self.config, sort_keys=False))
+            write_whole(config, yaml.safe_dump(self.config, sort_keys=False))
             write_json(budget, self.budget)
 
 

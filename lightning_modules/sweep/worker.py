@@ -23,7 +23,7 @@ from lightning_modules.storage.checkpoint import DivergedError, read_checkpoint
 from lightning_modules.sweep.state import RESULT, check_result, read_settings, say_progress, write_json
 from lightning_modules.sweep.trials import with_budget
 from lightning_modules.tasks.pace import share_done
-from spikekit.io.whole_file import whole_file
+from spikekit.io.whole_file import write_whole
 
 _A_MOMENT = 0.5  # seconds between two reports
 
@@ -130,8 +130,7 @@ def plan(folder: Path) -> Path:
                 f"lightning: a step takes {cost.flops:.3g} FLOPs, more than the budget {budget['flops']:.3g}"
             )
         text = yaml.safe_dump(with_budget(config, {"steps": count}), sort_keys=False)
-        with whole_file(planned, "w") as file:
-            file.write(f"# a step: {cost.flops:.6g} FLOPs\n{text}")
+        write_whole(planned, f"# a step: {cost.flops:.6g} FLOPs\n{text}")
     return planned
 
 

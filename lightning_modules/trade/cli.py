@@ -15,7 +15,7 @@ from lightning_modules.trade.runner import CannotRunError, Runner, make_runner
 from lightning_modules.trade.settings import Setting, read_setting, usual_settings
 from lightning_modules.trade.table import COLUMNS, markdown, write_csv
 from spikekit.arguments import home_path, whole
-from spikekit.io.whole_file import whole_file
+from spikekit.io.whole_file import write_whole
 from spikekit.progress import progress
 
 _OUTPUT, _ROUNDS = Path("runs/trade"), 9
@@ -101,8 +101,7 @@ def _measured(rows: Sequence[Measurement], base: Runner, asked: argparse.Namespa
             timed = measure_films(rows, base.data, base.network.frames, asked.film, asked.rounds)
     _check_any(rows)
     text = markdown(rows, command, timed)
-    with whole_file(asked.output / "trade.md", "w") as file:
-        file.write(text)
+    write_whole(asked.output / "trade.md", text)
     write_csv(rows, timed, asked.output / "trade.csv")
     print(f"\n{text}")
     print(", ".join(str(path) for path in (asked.output / "trade.csv", asked.output / "trade.md")))

@@ -8,7 +8,7 @@ from spikekit.arguments import home_path, one_line
 from spikekit.calibration.calibration import Calibration
 from spikekit.io.failures import no_pipe
 from spikekit.io.images import MOST_PIXELS
-from spikekit.io.whole_file import whole_file
+from spikekit.io.whole_file import write_whole
 
 #: Ending of a recording's own calibration file.
 ENDING = ".calibration.safetensors"
@@ -41,8 +41,7 @@ def write_calibration(path: str | Path, calibration: Calibration) -> None:
     from safetensors.torch import save
 
     planes = {name: getattr(calibration, name).contiguous() for name in _PLANES}
-    with whole_file(path) as file:
-        file.write(save(planes, {"kind": _KIND}))
+    write_whole(path, save(planes, {"kind": _KIND}))
 
 
 def read_calibration(path: str | Path) -> Calibration:

@@ -18,7 +18,7 @@ from spikekit.decoders.single_frame import search
 from spikekit.flow.fields import upsample_flow
 from spikekit.io.images import flow_to_rgb
 from spikekit.io.sidecar import check_unclaimed
-from spikekit.io.whole_file import whole_file
+from spikekit.io.whole_file import write_whole
 from spikekit.recording import Recording, white_rate
 from spikekit.standard_output import say
 
@@ -44,9 +44,7 @@ def run(args: argparse.Namespace) -> None:
     begin, end = chosen.start, chosen.stop
     check_unclaimed([args.output], args.file)
     moment = Moment(shown, begin, end, args.window or _WINDOW, args.alpha or shown.alpha)
-    data = moment.sheet()
-    with whole_file(args.output) as file:
-        file.write(data)
+    write_whole(args.output, moment.sheet())
     white = f"white: alpha {moment.alpha:g}" if moment.alpha else f"white: {moment.white:.3g} spikes per frame"
     say(f"{args.output}: frames {begin} .. {end - 1} of {shown.frames}, {white}{shown.said}")
 

@@ -17,7 +17,7 @@ from spikekit.arguments import home_path, one_line
 from spikekit.check import check_picture, check_planes, check_positive
 from spikekit.io.image_bytes import PictureError, picture_bytes
 from spikekit.io.quiet import quiet
-from spikekit.io.whole_file import whole_file
+from spikekit.io.whole_file import write_whole
 
 #: Largest number of pixels that is read; a small file could claim more than fits into memory.
 MOST_PIXELS = 1 << 27
@@ -211,8 +211,7 @@ def write_picture(path: str | Path, image: Tensor, *, bits: int = 8, quality: in
     """
     check_picture("image", image, "(3, H, W) or (H, W)", grey=True)
     path = home_path(path)
-    with whole_file(path) as file:
-        file.write(picture_bytes(image, path.suffix, bits=bits, quality=quality))
+    write_whole(path, picture_bytes(image, path.suffix, bits=bits, quality=quality))
 
 
 def panel(rows: Sequence[Sequence[Tensor]], gap: int = 4) -> Tensor:

@@ -87,6 +87,13 @@ def whole_file(path: str | Path, mode: str = "wb", **how: Any) -> Iterator[IO[An
     flush_folder(target.parent)
 
 
+def write_whole(path: str | Path, data: bytes | memoryview | str) -> None:
+    """Write a file atomically, see :func:`whole_file`; text as UTF-8."""
+    how = {"mode": "w", "encoding": "utf-8"} if isinstance(data, str) else {}
+    with whole_file(path, **how) as file:
+        file.write(data)
+
+
 def hidden_name(name: str) -> str:
     """Return the stem of a hidden file's name, short enough for an ending within 255 bytes."""
     raw = os.fsencode(name)

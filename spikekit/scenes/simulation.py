@@ -22,7 +22,7 @@ from spikekit.io.formats import dat_bytes
 from spikekit.io.image_bytes import png_bytes
 from spikekit.io.sidecar import Sidecar, published
 from spikekit.io.video import read_video
-from spikekit.io.whole_file import whole_file
+from spikekit.io.whole_file import write_whole
 from spikekit.progress import progress
 from spikekit.scenes.adaptive_sampling import Plan
 from spikekit.scenes.frame_sequence import FrameSequence
@@ -107,9 +107,8 @@ def simulate(path: Path, settings: Settings, output: Path) -> list[str]:
             raise ValueError(f"{output}: its ground truth {picture} would overwrite the source; choose another name")
     with _one_thread(), published(output) as part:
         for frame, picture in progress(pictures.items(), "pictures"):
-            with whole_file(part / picture) as file:
-                rgb = film.rgb(frame)
-                file.write(png_bytes(bin_to_sensor(rgb, GREY, scale=1) if film.pattern == GREY else rgb))
+            rgb = film.rgb(frame)
+            write_whole(part / picture, png_bytes(bin_to_sensor(rgb, GREY, scale=1) if film.pattern == GREY else rgb))
         noise, left_out = _needed_noise(settings, film, looked_at)
         plans: dict[int, Plan] = {}
         bits, digest = _expose(settings, film, (first, count), noise, part / output.name, plans)
@@ -124,8 +123,7 @@ def simulate(path: Path, settings: Settings, output: Path) -> list[str]:
             },
             versions={"spikekit": __version__, "torch": torch.__version__, "numpy": np.__version__},
         )
-        with whole_file(part / f"{stem}.json", "w", encoding="utf-8") as file:
-            file.write(sidecar.dumps())
+        write_whole(part / f"{stem}.json", sidecar.dumps())
     latent = [plan.latent for plan in plans.values()]
     return [
         f"source       {path}: {video.height} x {video.width} (H x W), cropped to {film.height} x {film.width}",
