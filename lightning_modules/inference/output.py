@@ -18,7 +18,7 @@ from spikekit import write_video
 from spikekit.io.image_bytes import PictureError, png_bytes, png_pixels, to_bytes
 from spikekit.io.quiet import quiet
 from spikekit.io.video import VIDEO_ENDINGS
-from spikekit.io.whole_file import whole_file
+from spikekit.io.whole_file import write_whole
 from spikekit.progress import progress
 
 #: name of the lock file in a folder of pictures
@@ -85,8 +85,7 @@ class Output:
             raise PictureError(f"{path}: expected finite values, got NaN from the network; the picture is not written")
         _check_picture(path)
         pixels = to_bytes(rgb).movedim(-1, 0)
-        with whole_file(path) as file:
-            file.write(png_bytes(pixels, {_NOTE: f"{self._record} {_digest(pixels)}"}))
+        write_whole(path, png_bytes(pixels, {_NOTE: f"{self._record} {_digest(pixels)}"}))
         return path
 
     def finish(self, fps: float) -> None:
@@ -139,9 +138,3 @@ def _check_picture(path: Path) -> None:
             if _NOTE in picture.info:
                 return
         raise PictureError(f"{path}: expected a picture of lightning predict, got another file; choose another -o")
-
-
-def file_identity(path: str | Path) -> list[Any]:
-    """Return path, size and time of change of a file, which identify its content."""
-    path = Path(path).resolve()
-    return [str(path), path.stat().st_size, path.stat().st_mtime_ns]

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from lightning_modules.inference.clips import FRAMES, NOISY, RecordingClips, film_groups
 from lightning_modules.inference.film import FilmFrame, FilmMaker
-from lightning_modules.inference.output import file_identity
 from lightning_modules.inference.predict import precision_of
 from lightning_modules.inference.presets import SPEEDS, Conditions, Preset, choose
 from lightning_modules.networks import ClassicalDecoder, Network
@@ -251,9 +250,10 @@ class Reconstruction:
     def identity(self) -> dict[str, Any]:
         """Return everything that the pictures depend on, as plain values."""
         recording, clips = self.clips.recording, self.clips
+        path, stat = recording.path.resolve(), recording.path.stat()
         measured = recording.calibration and sorted(vars(recording.calibration).items())
         return {
-            "recording": file_identity(recording.path),
+            "recording": [str(path), stat.st_size, stat.st_mtime_ns],
             "read": [recording.stored, recording.flip, recording.pattern, clips.top, clips.left, recording.camera],
             "clip": [clips.frames, clips.joined],
             "calibration": measured and _digest((name, value) for name, value in measured),
