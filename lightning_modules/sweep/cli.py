@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import argparse
+import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+
+import torch
 
 from lightning_modules.cli.command import check_folder
 from lightning_modules.cli.errors import Ended, InputError, UsageError, VerbParser
 from lightning_modules.cli.folder_lock import locked_folder
+from lightning_modules.cli.processes import calls_on_ray, exit_reason, run_to_end, start, stop
 from lightning_modules.configurations import find_configs
-from lightning_modules.sweep.engines import run_locally, run_on_ray
 from lightning_modules.sweep.state import LOG, PROGRESS, RESULT, read_progress, read_result
 from lightning_modules.sweep.table import collect, markdown, write_csv
 from lightning_modules.sweep.trials import Trial, make_trials, seconds
 from spikekit.arguments import home_path, one_line, positive, whole
-from spikekit.io.whole_file import whole_file
+from spikekit.io.whole_file import write_whole
 
-_ENGINES = {"local": run_locally, "ray": run_on_ray}
-
+_A_MOMENT = 0.2  # seconds between two looks at the trials
 _A_WHILE = 60  # seconds between two progress lines of a trial
 
 
@@ -165,7 +167,47 @@ def _run(trials: Sequence[Trial], asked: argparse.Namespace) -> dict[Path, str]:
 def _write_tables(trials: Sequence[Trial], failed: dict[Path, str], asked: argparse.Namespace) -> str:
     rows = collect(trials, failed)
     text = markdown(rows)
-    with whole_file(asked.output / "sweep.md", "w") as file:
-        file.write(text)
+    write_whole(asked.output / "sweep.md", text)
     write_csv(rows, asked.output / "sweep.csv")
     return text
+
+
+def run_locally(folders: Sequence[Path], jobs: int | None, every: float) -> Iterator[dict[Path, str | None]]:
+    """Run trials on this machine, ``jobs`` at once with a share of the cores; repeatedly yield those that ended.
+
+    Each has the reason of its failure, or ``None``.
+    """
+    jobs = jobs or 1
+    threads = {"OMP_NUM_THREADS": str(max(1, torch.get_num_threads() // jobs))} if jobs > 1 else {}
+    waiting, running = list(folders), {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < jobs:
+                folder = waiting.pop(0)
+                running[folder] = start(folder / LOG, _trial(folder, every), threads)
+            time.sleep(_A_MOMENT)
+            ended = [folder for folder, process in running.items() if process.poll() is not None]
+            yield {folder: exit_reason(folder / LOG, running.pop(folder).returncode) for folder in ended}
+    finally:
+        for process in running.values():
+            stop(process)
+
+
+def run_on_ray(folders: Sequence[Path], jobs: int | None, every: float) -> Iterator[dict[Path, str | None]]:
+    """Run trials on the Ray cluster of ``RAY_ADDRESS``, else on a running one, else on a new one on this machine.
+
+    A trial takes one GPU, or all cores of a node if the cluster has no GPU; with ``jobs``, a share that lets as many
+    run at once. All nodes need this package, the working directory and the folders under the same paths.
+    """
+    here = os.getcwd()
+    calls = {
+        folder: (run_to_end, folder.absolute() / LOG, _trial(folder.absolute(), every), here) for folder in folders
+    }
+    return calls_on_ray(lambda _: calls, jobs)
+
+
+def _trial(folder: Path, every: float) -> list[str]:
+    return ["-m", "lightning_modules.sweep.worker", str(folder), str(every)]
+
+
+_ENGINES = {"local": run_locally, "ray": run_on_ray}

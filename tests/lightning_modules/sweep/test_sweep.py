@@ -18,7 +18,7 @@ from lightning_modules.__main__ import main
 from lightning_modules.cli.command import run
 from lightning_modules.cli.errors import InputError
 from lightning_modules.storage.checkpoint import DivergedError
-from lightning_modules.sweep import cli, engines, worker
+from lightning_modules.sweep import cli, worker
 from lightning_modules.sweep.state import RESULT, read_result, say_progress, write_json
 from lightning_modules.sweep.table import collect, markdown, reference
 from lightning_modules.sweep.trials import Trial, _Resolver, make_trials
@@ -186,7 +186,7 @@ def test_killed_sweep_resumes_exactly(typed, overlays, tmp_path, monkeypatch, fo
     command = [*typed, "-c", str(overlays / "cosine.yaml"), *sets, "--steps", "10", "-o", str(tmp_path / "broken")]
     first, second = (tmp_path / "broken" / f"log_every_n_steps={steps}" for steps in (1, 2))
     with monkeypatch.context() as patch:
-        patch.setitem(cli._ENGINES, "local", engines.run_locally)
+        patch.setitem(cli._ENGINES, "local", cli.run_locally)
         sweep = forked([*command, "--every", "0.01"])
     until = time.monotonic() + 200
     while not (first / "checkpoints" / "last.ckpt").is_file():
@@ -368,7 +368,7 @@ def test_trials_report_how_their_process_ended(started, tmp_path, monkeypatch):
         (tmp_path / name).mkdir()
         (tmp_path / name / "code").write_text(code)
     found = {}
-    for ended in engines.run_locally([tmp_path / name for name in ends], 3, 60):
+    for ended in cli.run_locally([tmp_path / name for name in ends], 3, 60):
         found |= {folder.name: reason for folder, reason in ended.items()}
     assert list(started) == list(ends)
     assert found == {name: reason for name, (_, reason) in ends.items()}
@@ -376,7 +376,7 @@ def test_trials_report_how_their_process_ended(started, tmp_path, monkeypatch):
 
 def test_trials_end_with_the_sweep(started, tmp_path):
     (tmp_path / "code").write_text("import sys; sys.stdin.read()")
-    running = engines.run_locally([tmp_path], None, 60)
+    running = cli.run_locally([tmp_path], None, 60)
     next(running)
     [process] = started.values()
     assert process.poll() is None
