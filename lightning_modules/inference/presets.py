@@ -18,7 +18,6 @@ from lightning_modules.inference.predict import precision_of, predict
 from lightning_modules.inference.tiles import FAR, TILE
 from lightning_modules.networks import CSCSR, ClassicalDecoder, Network
 from lightning_modules.registry import find_model, for_noise
-from spikekit.arguments import one_line
 from spikekit.timing import timer_of
 
 _FOLDER = Path(__file__).parents[1] / "weights"
@@ -199,19 +198,8 @@ def _table(conditions: Conditions) -> list[dict[str, str]]:
     if path is None:
         there = ", ".join(sorted(path.stem for path in _FOLDER.glob("x?.csv"))) or "none"
         raise ValueError(f"scale: expected one that was measured ({there}), got {scale}")
-    try:
-        with open(path, newline="", encoding="utf-8") as file:
-            rows = [row for row in csv.DictReader(file) if not row["failed"]]
-        for row in rows:
-            Preset.read(row)
-            for name in ("height", "width", "psnr", "ratio", "ms", "mib"):
-                if not 0 < (int if name in ("height", "width") else float)(row[name]) < float("inf"):
-                    raise ValueError(f"{name}: expected a number above 0, got {row[name]}")
-        _reference(rows)
-    except Exception as error:  # the type depends on the damage
-        said = f"not a table of lightning trade, or a damaged one ({one_line(error)[:300]})"
-        raise ValueError(f"{path}: {said}") from error
-    return rows
+    with open(path, newline="", encoding="utf-8") as file:
+        return [row for row in csv.DictReader(file) if not row["failed"]]
 
 
 def _reference(rows: list[dict[str, str]]) -> dict[str, str]:

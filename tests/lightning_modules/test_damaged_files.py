@@ -8,7 +8,6 @@ import io
 import json
 import os
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,12 +17,9 @@ import yaml
 from lightning_modules.cli.arguments import with_network_of_weights
 from lightning_modules.cli.errors import InputError
 from lightning_modules.data.cache import ClipCache
-from lightning_modules.inference import presets
 from lightning_modules.sweep.state import RESULT, read_settings
 from lightning_modules.sweep.table import collect, markdown, write_csv
 from lightning_modules.sweep.trials import Trial
-
-WEIGHTS = Path(presets.__file__).parents[1] / "weights"
 
 CONFIG = {
     "seed_everything": 0,
@@ -58,12 +54,6 @@ def _read_configuration(path):
     with_network_of_weights(["fit", "-c", str(path)])
 
 
-def _read_presets(path):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(presets, "_FOLDER", path.parent)
-        presets.choose(presets.Conditions(4), "balanced")
-
-
 def _read_clip(path):
     """Read a damaged cached clip, which is ignored with one warning."""
     cache, made = ClipCache(path.parent), []
@@ -89,7 +79,6 @@ GOOD = {
     "budget.json": _json(BUDGET),
     "trial.yaml": yaml.safe_dump(CONFIG, sort_keys=False).encode(),
     "a.yaml": yaml.safe_dump(CONFIG).replace("weights", "tile").encode(),  # the name of weights would be sought
-    "x4.csv": b"\n".join((WEIGHTS / "x4.csv").read_bytes().splitlines()[:6]),
     "a.npz": _clip(),
 }
 READ = {
@@ -97,7 +86,6 @@ READ = {
     "budget.json": _read_trial,
     "trial.yaml": _read_trial,
     "a.yaml": _read_configuration,
-    "x4.csv": _read_presets,
     "a.npz": _read_clip,
 }
 VALUES = {RESULT: FINISHED, "budget.json": BUDGET, "trial.yaml": CONFIG}
