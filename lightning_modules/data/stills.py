@@ -110,6 +110,13 @@ class StillClips(Dataset):
         self.gains = self.gains and tuple(self.gains)
         self.sources = Pictures(self.pictures, self.textures)
         self.clocks = self.frames + (self.key_frames - 1) * self.every
+        #: side of the view in its pixels, and margin around it that motion, rotation and zoom can bring into view
+        self.side = self.scale * (self.patch + 2 * self.margin)
+        # half length of a film, relative to that of a clip
+        longer = (self.clocks // 2) / max(self.frames // 2, 1) if self.key_frames > 1 else 1
+        turns = (self.side - 1) / 2 * math.sqrt(2) * (math.radians(self.rotation) + self.zoom)
+        reach = turns * longer + (self.motion * longer + self.bend * longer**2) * self.scale
+        self.around = math.ceil(reach) + 2
 
     def __len__(self) -> int:
         return self.length
@@ -182,33 +189,16 @@ class StillClips(Dataset):
         return Scene(alone, scene.height, scene.width, scene.frames)
 
     def _scene(self, drawn: dict[str, np.ndarray], gallery: Gallery) -> Scene:
-        return render_scene(drawn, gallery, self.pattern, self._side, self._around, self.clocks)
-
-    @cached_property
-    def _side(self) -> int:
-        """Side of the view in its pixels."""
-        return self.scale * (self.patch + 2 * self.margin)
-
-    @cached_property
-    def _longer(self) -> float:
-        """Half length of a film relative to that of a clip."""
-        return (self.clocks // 2) / max(self.frames // 2, 1) if self.key_frames > 1 else 1
-
-    @cached_property
-    def _around(self) -> int:
-        """Margin around the view that motion, rotation and zoom can bring into view."""
-        turns = (self._side - 1) / 2 * math.sqrt(2) * (math.radians(self.rotation) + self.zoom)
-        reach = turns * self._longer + (self.motion * self._longer + self.bend * self._longer**2) * self.scale
-        return math.ceil(reach) + 2
+        return render_scene(drawn, gallery, self.pattern, self.side, self.around, self.clocks)
 
     def draw(self, index: int) -> dict[str, np.ndarray]:
         """Draw the random numbers of a scene, for its background and objects; :meth:`render` makes a clip of them."""
-        rng, side, half = self._rng(index, "scene"), self._side, max(self.frames // 2, 1)
+        rng, side, half = self._rng(index, "scene"), self.side, max(self.frames // 2, 1)
         middle = (side - 1) / 2
         brightness = rng.uniform(*self.brightness)
         velocity = _in_disc(rng) * self.motion * self.scale / half
-        around = side + 2 * self._around
-        layers = [self._layer(around, (-self._around, -self._around), velocity, (middle, middle), rng, index)]
+        around = side + 2 * self.around
+        layers = [self._layer(around, (-self.around, -self.around), velocity, (middle, middle), rng, index)]
         for n in range(rng.integers(self.objects + 1)):
             size = max(4, round(side * rng.uniform(0.15, 0.5)))
             corner = rng.integers(-size // 2, side - size // 2, 2)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -72,8 +71,7 @@ def film_scenes(data: LightningDataModule, frames: int, every: int) -> Iterator[
     """
     length = film_length(frames, every)
     if isinstance(data, StillScenes):
-        stills = copy.copy(data.val_set)
-        stills.key_frames, stills.every, stills.clocks = PICTURES, every, length
+        stills = replace(data.val_set, key_frames=PICTURES, every=every)
         for n in range(len(stills)):
             yield _film_scene(stills.whole(n)["spikes"], stills.scene(n), every, stills.scale)
     elif isinstance(data, FilmScenes) and all(source.truth is None for source in data.found.test):
