@@ -117,7 +117,7 @@ class ScenePool(Resumable):
             sampler=self._wanted(first),
             num_workers=self.workers,
             worker_init_fn=start_worker,
-            collate_fn=_as_it_is,
+            collate_fn=dict,  # as it is
         )
         drawn, pools = made_on_cpu(loader.__iter__), [{} for _ in self.kinds]
         for kind, turn, batch in self._events(first):
@@ -168,10 +168,6 @@ class ScenePool(Resumable):
                 part = part.flip(-3) if name in ("flow", "motion") else part
             batch[name] = part if name == "spikes" else part.float()
         return batch | {"every": batch["every"].expand(len(batch["rgb"]))} if film else batch
-
-
-def _as_it_is(item: Any) -> Any:
-    return item
 
 
 def _estimator(data: LightningDataModule) -> Any:

@@ -347,22 +347,14 @@ class FilmScenes(ClipScenes):
         clips, cache = self.clips or found.clips, self.cache and ClipCache(self.cache)
         if found.train:
             self.train_set = SequenceClips(found.train, recipe, clips, self.patch, cache or None, self.flow_patch)
+            self.train_clips = len(self.train_set)
         if found.val:
             self.val_set = SequenceClips(found.val, recipe, clips, None, cache or None)
         if found.test:
             self.test_set = SequenceClips(found.test, recipe, clips, None, cache or None)
+            self.test_names = self.test_set.names
         if stage == "fit" and self.train_clips < self.batch_size:
             raise ValueError(
                 f"batch_size: expected at most the {self.train_clips} training clips of {self.root}, got "
                 f"{self.batch_size}"
             )
-
-    @property
-    def train_clips(self) -> int:
-        """Training clips in an epoch."""
-        return len(self.train_set)
-
-    @property
-    def test_names(self) -> list[str]:
-        """Names of sequence and frame of every test clip."""
-        return self.test_set.names
