@@ -97,7 +97,6 @@ class Baseline(Network):
             raise ValueError(f"frames: expected an odd number, 9 or more, got {frames}")
         settings = {"scale": scale, "frames": frames, "pattern": bayer_pattern(pattern), "alpha": alpha, **more}
         super().__init__(settings, (frames // 8, frames // 2, frames - 1 - frames // 8), motion)
-        self.alpha = alpha
 
     def flow_or_estimate(self, spikes: Tensor, flow: Tensor | None, static: bool = False) -> Tensor:
         """Return the given flow, the estimated flow, or zeros if ``static``, (B, 2, 2, H, W)."""
