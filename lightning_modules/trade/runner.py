@@ -49,8 +49,6 @@ class Runner:
 
     def __init__(self, args: Sequence[str]) -> None:
         how, args = _how().parse_known_args(args)
-        if how.tile is not None and how.tile % 2:
-            raise UsageError(f"tile: expected an even number of sensor pixels, or 0 for no tiles, got {how.tile}")
         logging.disable(logging.INFO)  # Lightning would describe the machine for every setting
         try:
             command = _built(args)
