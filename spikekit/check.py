@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -31,6 +32,15 @@ def check_picture(
     check_planes(name, value, 2 if grey else 3, shape, floating=floating)
     if value.ndim > 3 or (value.ndim == 3 and value.shape[0] != 3):
         raise ValueError(f"{name}: expected {shape}, got {tuple(value.shape)}")
+
+
+def check_size(
+    name: object, size: Sequence[int], expected: Sequence[int], said: str = "", kind: type[ValueError] = ValueError
+) -> None:
+    """Raise a ``kind`` unless a size (H, W) is the expected one, which ``said`` explains."""
+    if tuple(size) != tuple(expected):
+        wanted, got = (f"{height} x {width}" for height, width in (expected, size))
+        raise kind(f"{name}: expected {wanted}{said}, got {got}")
 
 
 def check_dtype(dtype: torch.dtype | None, *others: torch.dtype) -> None:

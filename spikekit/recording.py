@@ -16,6 +16,7 @@ from spikekit.arguments import UsageError, home_path
 from spikekit.calibration.calibration import Calibration
 from spikekit.calibration.defects import find_outliers
 from spikekit.calibration.files import ENDING, read_calibration
+from spikekit.check import check_size
 from spikekit.color.cfa import GREY, cfa_pattern
 from spikekit.io.cameras import Camera, usual_sizes
 from spikekit.io.cameras import camera as load_camera
@@ -166,9 +167,7 @@ def open_recording(
     if calibration is None and not file.is_file():
         return recording
     known = read_calibration(file)
-    if known.size != tuple(recording.size):
-        sizes = " x ".join(map(str, recording.size)), " x ".join(map(str, known.size))
-        raise ValueError(f"{file}: expected {sizes[0]} pixels, the size of {recording.path}, got {sizes[1]}")
+    check_size(file, known.size, recording.size, f" pixels, the size of {recording.path}")
     return replace(recording, calibration=known.flip() if recording.flip else known)
 
 

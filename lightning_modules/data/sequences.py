@@ -22,7 +22,7 @@ from lightning_modules.data.loading import ClipScenes, cut_key_frames, flow_marg
 from lightning_modules.data.pictures import split_pictures
 from lightning_modules.signatures import inherit_signature
 from spikekit import VideoError, bin_to_sensor
-from spikekit.check import check_positive, check_whole
+from spikekit.check import check_positive, check_size, check_whole
 from spikekit.color.cfa import GREY, cfa_pattern
 from spikekit.flow.interpolate import FlowInterpolation
 from spikekit.io.failures import reading
@@ -135,9 +135,7 @@ class ClipRecipe:
         paths = self.files(sequence, middle)[: sum(self.reach) + 1]
         frames = [_shrunk(read_video(path)[0], sequence.shrink) for path in paths]
         for path, rgb in zip(paths, frames, strict=True):
-            if rgb.shape != frames[0].shape:
-                (height, width), (h, w) = frames[0].shape[1:], rgb.shape[1:]
-                raise VideoError(f"{path}: expected {height} x {width} (H x W) as {paths[0]}, got {h} x {w}")
+            check_size(path, rgb.shape[1:], frames[0].shape[1:], f" (H x W) as {paths[0]}", VideoError)
         scale = self.scale if sequence.truth is None else 1
         names = "pattern", "alpha", "clocks", "interpolation"
         with reading(sequence.folder, VideoError):  # raised in a worker, any other error would be a traceback

@@ -15,7 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 from spikekit import write_video
-from spikekit.io.image_bytes import PictureError, png_bytes, png_pixels, to_bytes
+from spikekit.io.images import PictureError, png_bytes, png_pixels, to_bytes
 from spikekit.io.quiet import quiet
 from spikekit.io.video import VIDEO_ENDINGS
 from spikekit.io.whole_file import write_whole

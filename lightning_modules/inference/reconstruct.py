@@ -21,7 +21,7 @@ from spikekit import __version__, correct_spikes
 from spikekit.arguments import one_line
 from spikekit.check import check_positive
 from spikekit.color.cfa import GREY, PATTERNS
-from spikekit.io.image_bytes import to_bytes
+from spikekit.io.images import to_bytes
 from spikekit.recording import Recording, open_recording
 
 # width of the white gap between two pictures side by side, in pixels

@@ -16,6 +16,7 @@ from spikekit.calibration.in_motion import (
 )
 from spikekit.calibration.measure import Measured, calibrate, find_defects
 from spikekit.calibration.pixel_rates import PixelRates
+from spikekit.check import check_size
 from spikekit.cli import recordings
 from spikekit.recording import Recording, open_recording, own_calibration
 from spikekit.sensor.noise import DEAD, HOT, WORKS
@@ -48,9 +49,7 @@ def run(args: argparse.Namespace) -> None:
             raise ValueError(f"{output}: exists and is not a calibration; choose another name") from error
     others = {name: open_recording(path, **known) for name in ("flat", "dark") if (path := getattr(args, name))}
     for other in others.values():
-        if other.size != recording.size:
-            sizes = " x ".join(map(str, recording.size)), " x ".join(map(str, other.size))
-            raise ValueError(f"{other.path}: expected {sizes[0]} pixels, the size of {recording.path}, got {sizes[1]}")
+        check_size(other.path, other.size, recording.size, f" pixels, the size of {recording.path}")
     seen = {name: _halves(other) for name, other in (others or {"scene": recording}).items()}
     try:
         if others:

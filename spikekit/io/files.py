@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from spikekit.arguments import home_path
-from spikekit.check import check_index, check_planes, check_whole
+from spikekit.check import check_index, check_planes, check_size, check_whole
 from spikekit.io.formats import (
     SpikeFileError,
     Wanted,
@@ -250,8 +250,7 @@ def _chunks(spikes: Tensor | Iterable[Tensor]) -> Iterator[Tensor]:
         if chunk.ndim > 3 or 0 in chunk.shape:
             raise ValueError(f"spikes: expected (T, H, W), got {tuple(chunk.shape)}")
         size = size or chunk.shape[-2:]
-        if chunk.shape[-2:] != size:
-            raise ValueError(f"spikes: expected frames of {size[0]} x {size[1]} as before, got {tuple(chunk.shape)}")
+        check_size("spikes", chunk.shape[-2:], size, " as the first frame")
         yield chunk.detach().reshape(-1, *size)
     if size is None:
         raise ValueError("spikes: expected at least one chunk (T, H, W), got none")

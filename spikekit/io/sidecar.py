@@ -33,6 +33,21 @@ class Sidecar:
     plan: dict[str, Any]  # what was modelled
     versions: dict[str, str]  # of the software
 
+    def __post_init__(self) -> None:
+        for part, values in vars(self).items():
+            if not isinstance(values, dict):
+                raise ValueError(f"{part}: expected names and values, got {values!r}")
+        if not isinstance(self.stream["file"], str):
+            raise ValueError(f"stream.file: expected a string, got {self.stream['file']!r}")
+        for name in ("frames", "height", "width"):
+            check_whole(f"stream.{name}", self.stream[name])
+        alpha, pattern = self.settings.get("alpha", 1.0), self.settings.get("pattern", "RGGB")
+        if type(alpha) not in (int, float):
+            raise ValueError(f"settings.alpha: expected a number, got {alpha!r}")
+        check_positive("settings.alpha", float(alpha))
+        if pattern not in (*PATTERNS, GREY):
+            raise ValueError(f"settings.pattern: expected one of {', '.join(PATTERNS)}, {GREY}, got {pattern!r}")
+
     def dumps(self) -> str:
         """Return the text of the file."""
         return json.dumps({"kind": KIND} | asdict(self), indent=1) + "\n"
@@ -41,14 +56,12 @@ class Sidecar:
 def read_sidecar(path: Path) -> Sidecar:
     """Read a side-car; raise a ValueError that names it if it is unreadable or another file."""
     try:
-        sidecar = Sidecar(**_data(path))
-        _check(sidecar)
+        return Sidecar(**_data(path))
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror or error})") from error
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         said = f"lacks {error}" if isinstance(error, KeyError) else one_line(error)[:300]
         raise ValueError(f"{path}: not a readable side-car ({said})") from error
-    return sidecar
 
 
 def _data(path: Path) -> dict[str, Any]:
@@ -56,23 +69,6 @@ def _data(path: Path) -> dict[str, Any]:
     if not isinstance(data, dict) or data.pop("kind", None) != KIND:
         raise ValueError(f"expected the side-car of a simulation ({KIND})")
     return data
-
-
-def _check(sidecar: Sidecar) -> None:
-    """Raise unless all values that are read have the expected types."""
-    for part, values in vars(sidecar).items():
-        if not isinstance(values, dict):
-            raise ValueError(f"{part}: expected names and values, got {values!r}")
-    if not isinstance(sidecar.stream["file"], str):
-        raise ValueError(f"stream.file: expected a string, got {sidecar.stream['file']!r}")
-    for name in ("frames", "height", "width"):
-        check_whole(f"stream.{name}", sidecar.stream[name])
-    alpha, pattern = sidecar.settings.get("alpha", 1.0), sidecar.settings.get("pattern", "RGGB")
-    if type(alpha) not in (int, float):
-        raise ValueError(f"settings.alpha: expected a number, got {alpha!r}")
-    check_positive("settings.alpha", float(alpha))
-    if pattern not in (*PATTERNS, GREY):
-        raise ValueError(f"settings.pattern: expected one of {', '.join(PATTERNS)}, {GREY}, got {pattern!r}")
 
 
 def find_sidecar(stream: Path) -> Sidecar | None:

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from spikekit.arguments import home_path
+from spikekit.check import check_size
 from spikekit.io.failures import no_pipe, reading
 from spikekit.io.images import MOST_PIXELS, picture_size, read_picture
 
@@ -170,9 +171,7 @@ class _Pictures:
             self._check_size(file, size)
 
     def _check_size(self, file: Path, size: tuple[int, ...]) -> None:
-        if size != self.size:
-            (h, w), (height, width) = size, self.size
-            raise VideoError(f"{file}: expected {height} x {width} (H x W) as {self.like}, got {h} x {w}")
+        check_size(file, size, self.size, f" (H x W) as {self.like}", VideoError)
 
     def name(self, index: int) -> str:
         return self.files[index].name
@@ -264,9 +263,8 @@ class _Film:
                         raise VideoError(f"{self.path}: ends after {self._next} of {self.count} frames")
                     if frame.is_corrupt:
                         raise VideoError(f"{self.path}: frame {self._next}: damaged")
-                    if (frame.height, frame.width) != self.stored:
-                        sizes = " x ".join(map(str, self.stored)), f"{frame.height} x {frame.width}"
-                        raise VideoError(f"{self.path}: frame {self._next}: expected {sizes[0]}, got {sizes[1]}")
+                    where, size = f"{self.path}: frame {self._next}", (frame.height, frame.width)
+                    check_size(where, size, self.stored, kind=VideoError)
             except VideoError:
                 self._forget()  # earlier frames can still be read
                 raise

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from spikekit.arguments import home_path
-from spikekit.check import check_picture, check_positive
-from spikekit.io.image_bytes import to_bytes
+from spikekit.check import check_picture, check_positive, check_size
+from spikekit.io.images import to_bytes
 from spikekit.io.video import VideoError
 from spikekit.io.whole_file import whole_file
 
@@ -96,9 +96,7 @@ def _pictures(path: str | Path, frames: Iterable[Tensor]) -> Iterator[np.ndarray
     for frame in frames:
         check_picture("frames", frame, "(3, H, W) or (H, W)", grey=True, floating=frame.dtype != torch.uint8)
         size = size or frame.shape[-2:]
-        if frame.shape[-2:] != size:
-            got = " x ".join(map(str, frame.shape[-2:]))
-            raise VideoError(f"{path}: expected frames of {size[0]} x {size[1]} (H x W) as before, got {got}")
+        check_size(path, frame.shape[-2:], size, " (H x W) as the first frame", VideoError)
         yield to_bytes(frame.expand(3, *size)).numpy()
 
 

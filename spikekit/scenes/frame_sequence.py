@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from spikekit.check import check_picture, check_positive, check_whole
+from spikekit.check import check_picture, check_positive, check_size, check_whole
 from spikekit.color.cfa import Pattern, bin_to_sensor, cfa_pattern
 from spikekit.flow.interpolate import Blend, FlowInterpolation, Still
 from spikekit.scenes.adaptive_sampling import Plan, Region, SceneProfile, profile_interval
@@ -270,9 +270,7 @@ class FrameSequence:
 
         def read() -> Tensor:
             rgb = self._read(frame)
-            if tuple(rgb.shape[1:]) != self._size:
-                expected, got = (f"{height} x {width}" for height, width in (self._size, rgb.shape[1:]))
-                raise ValueError(f"frames[{frame}]: expected {expected} as the first frame, got {got}")
+            check_size(f"frames[{frame}]", rgb.shape[1:], self._size, " as the first frame")
             return rgb[:, : self.height, : self.width].contiguous()
 
         return _kept(self._views, frame, read)

@@ -15,11 +15,12 @@ from torch import Tensor
 
 from spikekit._version import __version__
 from spikekit.arguments import UsageError
+from spikekit.check import check_size
 from spikekit.color.cfa import GREY, bin_to_sensor
 from spikekit.flow.interpolate import Blend, FlowInterpolation, Still
 from spikekit.io.files import write_spikes
 from spikekit.io.formats import dat_bytes
-from spikekit.io.image_bytes import png_bytes
+from spikekit.io.images import png_bytes
 from spikekit.io.sidecar import Sidecar, published
 from spikekit.io.video import read_video
 from spikekit.io.whole_file import write_whole
@@ -86,9 +87,8 @@ def simulate(path: Path, settings: Settings, output: Path) -> list[str]:
         raise ValueError(f"{path}: {error}") from error
     height, width = film.height // film.scale, film.width // film.scale
     known = settings.noise.calibration
-    if known is not None and known.size != (height, width):
-        sizes = f"expected {height} x {width} pixels, as in the film, got {known.size[0]} x {known.size[1]}"
-        raise ValueError(f"{settings.calibration}: {sizes}")
+    if known is not None:
+        check_size(settings.calibration, known.size, (height, width), " pixels, as in the film")
     try:
         first, count, clocks = settings.span(film)
     except ValueError as error:

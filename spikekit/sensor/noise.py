@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spikekit.check import check_whole
+from spikekit.check import check_size, check_whole
 
 # Each purpose has a random stream of its own, given by its index: append, never reorder.
 _PURPOSES = ("charge", "gain", "dark current", "defects", "photons", "electrons")
@@ -220,12 +220,10 @@ class NoisyPixels:
     """Pixels (*, H, W) of a sensor, with fixed-pattern and temporal noise."""
 
     def __init__(self, noise: SensorNoise, size: tuple[int, ...], seed: int) -> None:
-        if noise.calibration is not None and noise.calibration.gain.shape != tuple(size[-2:]):
-            expected, got = (f"{rows} x {columns}" for rows, columns in (noise.calibration.gain.shape, size[-2:]))
-            raise ValueError(f"light: expected {expected} as the calibration, got {got}")
         self.noise, self.size, self.seed = noise, size, seed
         known, self._gain, self._dark, self._stuck = noise.calibration, None, None, []
         if known is not None:
+            check_size("light", size[-2:], known.gain.shape, " as the calibration")
             self._gain, self._dark = known.gain, known.dark
             self._stuck = [(known.defects == kind, bit) for kind, bit in ((HOT, 1), (DEAD, 0))]
             return

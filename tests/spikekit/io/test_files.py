@@ -195,7 +195,7 @@ def test_a_file_truncated_while_it_is_read_is_reported(clip):
         (torch.full((2, 3, 5), torch.nan), ValueError, "zeros and ones, got values from nan"),
         ([], ValueError, "at least one chunk"),
         (5, TypeError, r"spikes: expected a tensor of shape \(T, H, W\), or chunks of it, got int"),
-        ([torch.ones(2, 3, 5), torch.ones(2, 5, 3)], ValueError, r"frames of 3 x 5 as before, got \(2, 5, 3\)"),
+        ([torch.ones(2, 3, 5), torch.ones(2, 5, 3)], ValueError, "expected 3 x 5 as the first frame, got 5 x 3"),
         ([torch.ones(2, 3, 5), [1, 0]], TypeError, "expected a tensor of shape"),
         ([torch.ones(2, 3, 5), torch.full((3, 5), 2)], ValueError, "values from 2 to 2 in frame 2"),
         ("chunks", FileNotFoundError, "'picture_7.png'"),  # what the chunks raise stays as it is

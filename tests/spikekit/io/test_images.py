@@ -8,8 +8,7 @@ from deep_pictures import write_lzw_tiff
 from PIL import Image
 
 from spikekit import flow_to_rgb, panel, read_picture, write_picture
-from spikekit.io.image_bytes import png_bytes
-from spikekit.io.images import picture_size
+from spikekit.io.images import picture_size, png_bytes
 
 
 def over_white(pixels):

@@ -312,7 +312,7 @@ def test_failed_film_gives_one_line_and_no_file(tmp_path, monkeypatch):
     for path, frames, fps, error, said in (
         ("a.avi", good, 25, VideoError, "a.avi: expected a film that ends in .mp4, .mov, .mkv, .gif"),
         ("a.mp4", [], 25, VideoError, "a.mp4: expected at least one frame, got none"),
-        ("a.mp4", [*good, good[0][:, 1:]], 25, VideoError, "expected frames of 33 x 47 .* got 32 x 47"),
+        ("a.mp4", [*good, good[0][:, 1:]], 25, VideoError, "expected 33 x 47 .* as the first frame, got 32 x 47"),
         ("file/a.mp4", good, 25, OSError, r"file.a\.mp4"),
         ("a.mp4", [torch.zeros(3, 4, 4, dtype=torch.int16)], 25, TypeError, "expected a floating-point tensor"),
     ):
