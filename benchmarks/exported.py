@@ -23,7 +23,7 @@ from lightning_modules.inference.export import (
 from lightning_modules.networks import Network
 from spikekit.arguments import whole
 from spikekit.tables import table
-from spikekit.timing import cpu_name, cpu_timer
+from spikekit.timing import cpu_name, timer_of
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -63,7 +63,7 @@ def _rows(name: str, formats: Sequence[str], size: Sequence[int], rounds: int) -
             worst = difference(run(*inputs), module(*inputs)).item()
             cells[kind] = [f"{len(data) / 2**20:.1f}", f"{took:.0f}", f"{worst:.1g}"]
             runs[kind] = lambda run=run: run(*inputs)
-        times = interleave(runs, rounds, cpu_timer(time.process_time))
+        times = interleave(runs, rounds, timer_of(torch.device("cpu"), 1)[0])
     found = [[name, "network", "", "", "", "1", f"{1e3 * min(times['network']):.0f}"]]
     for kind in list(runs)[1:]:
         compared = ratio(times[kind], times["network"])

@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from spikekit.arguments import UsageError, home_path
-from spikekit.calibration.calibration import Calibration
+from spikekit.calibration.calibration import ENDING, Calibration, read_calibration
 from spikekit.calibration.defects import find_outliers
-from spikekit.calibration.files import ENDING, read_calibration
 from spikekit.check import check_size
 from spikekit.color.cfa import GREY, cfa_pattern
 from spikekit.io.cameras import Camera, usual_sizes

@@ -35,11 +35,6 @@ def duration(seconds: float) -> str:
     return f"{hours} h {minutes_left} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
-def cpu_timer(now: Callable[[], float]) -> Timer:
-    """Return a timer that reads ``now``, such as :func:`time.process_time` or :func:`time.perf_counter`."""
-    return lambda run, number: timeit.timeit(run, timer=now, number=number) / number
-
-
 def cuda_timer(run: Run, number: int) -> float:
     """Return seconds per call by CUDA events, synchronised before and after."""
     begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
@@ -56,9 +51,8 @@ def timer_of(device: torch.device, threads: int) -> tuple[Timer, str]:
     """Return the timer for a device and a number of threads, and its description."""
     if device.type == "cuda":
         return cuda_timer, "CUDA events, synchronised"
-    if threads == 1:
-        return cpu_timer(time.process_time), "process CPU time"
-    return cpu_timer(time.perf_counter), "wall time"
+    now, said = (time.process_time, "process CPU time") if threads == 1 else (time.perf_counter, "wall time")
+    return lambda run, number: timeit.timeit(run, timer=now, number=number) / number, said
 
 
 def cpu_name() -> str:

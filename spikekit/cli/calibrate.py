@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 
 from spikekit.arguments import UsageError, home_path
-from spikekit.calibration.calibration import Calibration
-from spikekit.calibration.files import ENDING, read_calibration, write_calibration
+from spikekit.calibration.calibration import ENDING, Calibration, read_calibration, write_calibration
 from spikekit.calibration.in_motion import (
     LEAST_SEGMENTS,
     MOST_SEGMENTS,

@@ -8,7 +8,7 @@ from inspect import signature
 from typing import Any
 
 from spikekit.arguments import home_path, whole
-from spikekit.calibration.files import ENDING
+from spikekit.calibration.calibration import ENDING
 from spikekit.color.cfa import GREY, PATTERNS
 from spikekit.io.cameras import CAMERAS
 from spikekit.recording import Recording, open_recording

@@ -8,7 +8,7 @@ from dataclasses import fields
 from typing import Any
 
 from spikekit.arguments import UsageError, ending_in, home_path, positive, whole
-from spikekit.calibration.files import read_calibration
+from spikekit.calibration.calibration import read_calibration
 from spikekit.cli.recordings import pattern
 from spikekit.color.cfa import GREY, PATTERNS
 from spikekit.io.files import RECORDING_ENDINGS

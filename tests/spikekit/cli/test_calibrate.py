@@ -9,7 +9,7 @@ from safetensors.torch import save_file
 
 from spikekit import Calibration, SensorNoise, SpikeSensor, read_calibration, read_picture
 from spikekit import write_spikes as write
-from spikekit.calibration.files import ENDING
+from spikekit.calibration.calibration import ENDING
 from spikekit.cli.command import main
 from spikekit.recording import open_recording
 from spikekit.sensor.noise import DEAD, HOT
