@@ -1,4 +1,4 @@
-"""Calibration of a sensor: gain, dark rate and defects of every pixel, the correction of light and spikes, and files."""
+"""Calibration of a sensor: gain, dark rate and defects of every pixel, the correction of light and spikes, its file."""
 
 from __future__ import annotations
 

@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from spikekit import write_picture, write_spikes, write_video
-from spikekit.calibration.calibration import Calibration
-from spikekit.calibration.calibration import write_calibration
+from spikekit.calibration.calibration import Calibration, write_calibration
 from spikekit.cli.command import main
 
 SPIKES = (torch.rand(200, 64, 64, generator=torch.Generator().manual_seed(0)) < 0.4).to(torch.uint8)
