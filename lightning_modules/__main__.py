@@ -79,7 +79,7 @@ def main(args: Sequence[str] | None = None) -> None:
     with errors.as_one_line():
         verb, *rest = typed or [""]
         if verb in ("-h", "--help"):
-            print(overview())  # noqa: T201
+            print(_overview())  # noqa: T201
         elif verb == "--version":
             from spikekit import __version__
 
@@ -88,7 +88,7 @@ def main(args: Sequence[str] | None = None) -> None:
             expected = f"expected a verb, one of {', '.join(_VERBS)}, got {verb or 'none'}"
             raise errors.Ended(f"lightning: {expected} (see lightning --help)", 2)
         elif verb not in _OURS and {"-h", "--help"} & {*rest}:
-            print(usage(verb))  # noqa: T201
+            print(_usage(verb))  # noqa: T201
         else:
             if "" not in sys.path and os.getcwd() not in sys.path:
                 sys.path.append(os.getcwd())  # for users' own networks; last, so that it shadows nothing
@@ -121,7 +121,7 @@ def _aligned(rows: dict[str, str]) -> str:
     return "\n".join(f"  {name:{width}}{said}" for name, said in rows.items())
 
 
-def overview() -> str:
+def _overview() -> str:
     """Return the text of ``lightning --help``."""
     return (
         f"usage: lightning VERB ...\n\n{_aligned(_VERBS)}\n\n"
@@ -129,13 +129,8 @@ def overview() -> str:
     )
 
 
-def usage(verb: str) -> str:
-    """Return the text of ``lightning VERB --help`` for one of Lightning's verbs.
-
-    Example:
-        >>> print(usage("fit").splitlines()[0])
-        lightning fit: Train a network on clips with ground truth.
-    """
+def _usage(verb: str) -> str:
+    """Return the text of ``lightning VERB --help`` for one of Lightning's verbs."""
     return (
         f"lightning {verb}: {_VERBS[verb]}\n\n{_aligned(_OPTIONS)}\n\nexample:\n  {_EXAMPLES[verb]}\n\n"
         f"lightning {verb} --help=all lists all options, also those of Lightning's Trainer. --model.help CLASS and "

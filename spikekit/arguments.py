@@ -28,22 +28,22 @@ def whole(least: int) -> Callable[[str], int]:
     return read
 
 
-def frames_of(text: str, first: int, last: int, step: int = 1) -> range:
-    """Parse ``N`` or ``A:B[:STEP]``, the frames A to B - 1; all must lie within ``first`` .. ``last``.
+def frames_of(name: str, text: str, first: int, last: int, step: int = 1) -> range:
+    """Parse an option ``N`` or ``A:B[:STEP]``, the frames A to B - 1; all must lie within ``first`` .. ``last``.
 
     Example:
-        >>> list(frames_of("20:80:20", 20, 99)), list(frames_of(":23", 20, 99))
+        >>> list(frames_of("--frame", "20:80:20", 20, 99)), list(frames_of("--frame", ":23", 20, 99))
         ([20, 40, 60], [20, 21, 22])
     """
     if not re.fullmatch(r"\d+|\d*:\d*(:0*[1-9]\d*)?", text, re.ASCII):
-        raise ValueError(f"expected a whole number, 0 or more, or A:B or A:B:STEP, got {text}")
+        raise UsageError(f"{name}: expected a whole number, 0 or more, or A:B or A:B:STEP, got {text}")
     if ":" in text:
         begin, end, every = (text + ":").split(":")[:3]
         chosen = range(int(begin or first), int(end or last + 1), int(every or step))
     else:
         chosen = range(int(text), int(text) + 1)
     if not chosen or chosen.start < first or chosen.stop > last + 1:
-        raise ValueError(f"expected frames within {first} .. {last}, got {text}")
+        raise UsageError(f"{name}: expected frames within {first} .. {last}, got {text}")
     return chosen
 
 

@@ -67,9 +67,9 @@ class RecordingClips:
             raise ValueError(f"{path}: expected at least 3 x 3 pixels that begin with {crop_to}, got {self.size}")
         first, last = frames // 2, total - 1 - (frames - 1) // 2
         try:
-            chosen = range(first, last + 1, EVERY) if frame is None else frames_of(frame, first, last, EVERY)
+            chosen = range(first, last + 1, EVERY) if frame is None else frames_of("frame", frame, first, last, EVERY)
         except ValueError as error:
-            raise ValueError(f"frame: {error}; a clip has {frames} frames of the {total} of {path}") from error
+            raise ValueError(f"{error}; a clip has {frames} frames of the {total} of {path}") from error
         self.chosen = list(chosen)
 
     def __len__(self) -> int:

@@ -45,10 +45,7 @@ def run(args: argparse.Namespace) -> None:
         raise UsageError(f"--order: expected --method tfp, got {args.order} with tfi")
     recording = recordings.opened(args)
     frames = recording.frames
-    try:
-        chosen = range(frames // 2, frames // 2 + 1) if args.frame is None else frames_of(args.frame, 0, frames - 1)
-    except ValueError as error:
-        raise UsageError(f"--frame: {error}") from error
+    chosen = frames_of("--frame", str(frames // 2) if args.frame is None else args.frame, 0, frames - 1)
     if len(chosen) > 1 and _NUMBER not in str(args.output):
         raise UsageError(f"--output: expected {_NUMBER} in the name of {len(chosen)} pictures, got {args.output}")
     if args.order > frames:

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from spikekit.arguments import UsageError, ending_in, frames_of, positive, whole
+from spikekit.arguments import ending_in, frames_of, positive, whole
 from spikekit.cli import recordings
 from spikekit.color.demosaic import demosaic
 from spikekit.decoders.single_frame import search
@@ -37,10 +37,7 @@ def run(args: argparse.Namespace) -> None:
     Size, Bayer phase and brightness may be omitted if a side-car or --camera gives them.
     """
     shown = recordings.opened(args)
-    try:
-        chosen = frames_of(args.frames or ":", 0, shown.frames - 1)
-    except ValueError as error:
-        raise UsageError(f"--frames: {error}") from error
+    chosen = frames_of("--frames", args.frames or ":", 0, shown.frames - 1)
     begin, end = chosen.start, chosen.stop
     check_unclaimed([args.output], args.file)
     moment = Moment(shown, begin, end, args.window or _WINDOW, args.alpha or shown.alpha)

@@ -22,8 +22,8 @@ def test_whole_numbers():
 
 
 def test_frame_ranges_at_the_ends():
-    assert frames_of("3:", 3, 9) == range(3, 10) == frames_of(":", 3, 9)
-    assert frames_of("9", 3, 9) == range(9, 10)
+    assert frames_of("--frame", "3:", 3, 9) == range(3, 10) == frames_of("--frame", ":", 3, 9)
+    assert frames_of("--frame", "9", 3, 9) == range(9, 10)
     for text in ("2", "10", "3:11", "5:5", "-1", "3:9:0"):
         with pytest.raises(ValueError, match="got " + text):
-            frames_of(text, 3, 9)
+            frames_of("--frame", text, 3, 9)
