@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from spikekit.kernels import gpu_kernel, import_loops
+from spikekit.kernels import TRITON, gpu_kernel, import_loops
 from spikekit.kernels.graphs import Replayed
 from spikekit.warp import flow_warp
 
@@ -75,7 +73,7 @@ _replayed = Replayed(_estimate)
 
 
 def _improve(pictures: Tensor, times: Tensor, limit: Tensor, flow: Tensor, warps: int) -> Tensor:
-    if pictures.is_cuda and pictures.dtype is torch.float32 and find_spec("triton") is not None:
+    if pictures.is_cuda and pictures.dtype is torch.float32 and TRITON:
         constants = ROUNDS, SMOOTHINGS, STEP, STEP / COUPLING
         return gpu_kernel("tvl1_level")(pictures, times, limit, flow, warps, *constants)
     compiled = import_loops("spikekit.flow.cpu_tvl1") if pictures.device.type == "cpu" else None

@@ -15,7 +15,7 @@ from torch.utils._pytree import tree_map
 
 from spikekit.kernels import cpu
 
-NUMBA = find_spec("numba") is not None
+NUMBA, TRITON = (find_spec(name) is not None for name in ("numba", "triton"))
 
 
 def operator(fake: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
@@ -55,7 +55,7 @@ def register_kernel(op: Any, device: str) -> Callable[[Callable[..., Any]], None
     compiler at the first call, which takes a second or two, and checks for aliasing of results and arguments at every
     call, which a test does here.
     """
-    if device == "cuda" and find_spec("triton") is None:
+    if device == "cuda" and not TRITON:
         return lambda kernel: None
     return lambda kernel: torch.library.impl(f"spikekit::{op._name}", device, compiler_kept_out(kernel))
 
