@@ -8,7 +8,7 @@ import yaml
 
 from lightning_modules.__main__ import main
 from lightning_modules.configurations import find_configs, with_found_configs
-from lightning_modules.networks import CSCSR
+from lightning_modules.networks import CSCSR, RecurrentCSCSR
 from lightning_modules.networks.sizes import SIZES
 
 NAMES = ["x1", "x2", "x3", "x4", "quick", "flow", "ablation/a", "grey", "data/films", "motion/spike2flow"]
@@ -53,10 +53,12 @@ def test_command_finds_configurations_from_an_empty_folder(tmp_path, monkeypatch
 
 @pytest.mark.parametrize("scale", [1, 2, 3, 4])
 def test_every_size_builds_at_every_scale(scale, configs):
-    said, quick = (
+    said, quick, gpu = (
         yaml.safe_load((configs / f"{name}.yaml").read_text())["model"]["network"]["init_args"]
-        for name in (f"x{scale}", "quick")
+        for name in (f"x{scale}", "quick", "gpu")
     )
     for size in ({}, *({"size": name} for name in SIZES)):
         with torch.device("meta"):
             assert CSCSR(**{**said, **quick, **size}).scale == scale
+    with torch.device("meta"):
+        assert RecurrentCSCSR(**{**said, **gpu}).scale == scale
