@@ -39,6 +39,8 @@ def frames_of(name: str, text: str, first: int, last: int, step: int = 1) -> ran
         raise UsageError(f"{name}: expected a whole number, 0 or more, or A:B or A:B:STEP, got {text}")
     if ":" in text:
         begin, end, every = (text + ":").split(":")[:3]
+        if begin and end and int(begin) >= int(end):
+            raise UsageError(f"{name}: expected A below B in A:B, got {text}")
         chosen = range(int(begin or first), int(end or last + 1), int(every or step))
     else:
         chosen = range(int(text), int(text) + 1)

@@ -27,3 +27,5 @@ def test_frame_ranges_at_the_ends():
     for text in ("2", "10", "3:11", "5:5", "-1", "3:9:0"):
         with pytest.raises(ValueError, match="got " + text):
             frames_of("--frame", text, 3, 9)
+    with pytest.raises(ValueError, match="expected A below B in A:B, got 7:5"):
+        frames_of("--frame", "7:5", 3, 9)
