@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from spikekit._version import __version__
 from spikekit.arguments import UsageError, one_line, printable
@@ -50,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 words = sys.argv[1:] if argv is None else list(argv)
                 if argv is None:  # collecting all that was imported takes a quarter of the command, at its end
                     gc.freeze()
-                args = _parser(*words[:1]).parse_args(words)
+                args = _parser(*words).parse_args(words)
                 args.run(args)
             print(end="", flush=True)
         return 0
@@ -75,6 +75,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
+    def parse_known_args(self, *args: Any, **options: Any) -> tuple[argparse.Namespace, list[str]]:
+        # argparse would report a verb's unknown options as those of the command
+        known, unknown = super().parse_known_args(*args, **options)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return known, unknown
+
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message} (see {self.prog} --help)")
 
