@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from spikekit.arguments import home_path, one_line
-from spikekit.check import check_planes, default_float
+from spikekit.check import check_planes, check_size, default_float
 from spikekit.color.cfa import GREY, bayer_mask
 from spikekit.decoders.dense import tfi
 from spikekit.io.failures import no_pipe
@@ -108,8 +108,7 @@ class Calibration:
             ValueError: ``raw`` has another size, or no pixel of a colour works.
         """
         check_planes("raw", raw, 2, "(*, H, W)", floating=True)
-        if tuple(raw.shape[-2:]) != self.size:
-            raise ValueError(f"raw: expected (*, {self.size[0]}, {self.size[1]}), got {tuple(raw.shape)}")
+        check_size("raw", raw.shape[-2:], self.size, " as the calibration")
         light = ((raw - self.dark.to(raw)) / self.gain.to(raw)).clamp(min=0)
         if pattern not in self._fills:
             self._fills[pattern] = _nearest_that_work(self.defects.numpy() != WORKS, pattern)
@@ -171,6 +170,7 @@ def correct_spikes(spikes: Tensor, calibration: Calibration | None, pattern: str
     check_planes("spikes", spikes, 3, "(*, T, H, W)")
     if calibration is None:
         return spikes
+    check_size("spikes", spikes.shape[-2:], calibration.size, " as the calibration")
     fired = spikes != 0
     light = calibration.correct(tfi(fired, dtype=torch.promote_types(default_float(spikes), torch.float32)), pattern)
     first = fired.byte().argmax(-3, keepdim=True)

@@ -78,7 +78,7 @@ def test_one_recording_alone_gives_a_part_of_the_calibration(truth):
 
 
 @pytest.mark.parametrize(
-    ("light", "said"), [(1.0, "without saturation"), (0.0, "brighter than the dark one")], ids=["white", "black"]
+    ("light", "said"), [(1.0, "without saturation"), (0.0, "twice as bright as the dark one")], ids=["white", "black"]
 )
 def test_a_flat_recording_of_the_wrong_brightness_is_rejected(light, said):
     flat = SpikeSensor().expose(torch.full((200, 4, 4), light))
@@ -156,6 +156,8 @@ def test_corrected_spikes_have_the_rate_of_an_ideal_sensor(truth):
     # the count of an ideal sensor: off by one at each end, and by what an interval at the ends does not say
     works = truth.defects == WORKS
     assert ((found.sum(0) - light.sum(0)).abs()[works] < 2.5).all()
+    with pytest.raises(ValueError, match=r"spikes: expected .* as the calibration, got 3 x 4"):
+        correct_spikes(spikes[:, :3, :4], truth, "BGGR")
     first = spikes.argmax(0, keepdim=True)
     assert (found.gather(0, first)[0, works] == 1).all()
     ideal = Calibration(torch.ones(SIZE), torch.zeros(SIZE), truth.defects)
