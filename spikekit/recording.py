@@ -166,6 +166,10 @@ def open_recording(
     if calibration is None and not file.is_file():
         return recording
     known = read_calibration(file)
+    if known.size != recording.size == known.size[::-1]:
+        (height, width), (rows, columns) = known.size, recording.size
+        expected = f"expected {height} x {width} pixels, the size of {file}, got {rows} x {columns}"
+        raise ValueError(f"{recording.path}: {expected}; height and width may be swapped")
     check_size(file, known.size, recording.size, f" pixels, the size of {recording.path}")
     return replace(recording, calibration=known.flip() if recording.flip else known)
 

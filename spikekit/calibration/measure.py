@@ -15,6 +15,7 @@ from spikekit.color.cfa import GREY, bayer_mask
 from spikekit.sensor.noise import DEAD, HOT
 
 _HOT_RATE = 0.5  # dark rate from which on a pixel is hot, in spikes per clock
+_LIT_RATE = 0.1  # median rate that dark current does not reach: published sensors have 0.005 at 20 kHz
 
 
 class Measured(NamedTuple):
@@ -43,7 +44,8 @@ def calibrate(
         for shot noise, and an upper bound for light that arrives evenly.
 
     Raises:
-        ValueError: the flat recording is not brighter than the dark one, or its pixels are saturated.
+        ValueError: the flat recording is less than twice as bright as the dark one, or its pixels are saturated; or
+            there is none, and most pixels of the dark one fire in more than a tenth of the clocks.
     """
     size = tuple((flat or dark)[0].count.shape)
     leak, gain = torch.zeros(size, dtype=torch.float64), torch.ones(size, dtype=torch.float64)
@@ -51,6 +53,8 @@ def calibrate(
     gain_error = dark_error = None
     if dark is not None:
         leak = (dark[0] + dark[1]).rate
+        if flat is None and (rate := leak.median().item()) > _LIT_RATE:
+            raise ValueError(f"expected a dark recording, at most {_LIT_RATE} spikes per clock, got {rate:.3g}")
         defects[leak >= _HOT_RATE] = HOT
         dark_error = _error(dark[0].rate, dark[1].rate, defects == 0)
     if flat is not None:
@@ -59,8 +63,9 @@ def calibrate(
         if brightness >= ALWAYS:
             raise ValueError(f"expected a flat recording without saturation, got {brightness:.3g} per clock")
         light = whole.rate - leak
-        if light.median() <= 0:
-            raise ValueError(f"expected a flat recording brighter than the dark one, got {brightness:.3g} per clock")
+        if light.median() <= brightness / 2:
+            rates = f"{brightness:.3g} and {leak.median():.3g} spikes per clock"
+            raise ValueError(f"expected a flat recording more than twice as bright as the dark one, got {rates}")
         defects[whole.rate >= ALWAYS] = HOT
         errors = []
         for pixels in bayer_mask(*size, pattern or GREY, dtype=torch.bool):

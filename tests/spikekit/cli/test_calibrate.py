@@ -57,6 +57,9 @@ def test_calibration_is_stored_beside_the_recording_and_reported(capsys, truth):
     assert read_calibration(f"scene{ENDING}").flip().defects.equal(truth.defects), "rows as they are stored"
     assert main(["info", "scene.dat", "--height", "24", "--width", "32"]) == 0
     assert re.search(r"gain SD 9\.\d+%, dark rate 0\.01 spikes per frame, 2 defects", capsys.readouterr().out)
+    assert main(["info", "scene.dat", "--height", "32", "--width", "24"]) == 1
+    assert "scene.dat: expected 24 x 32 pixels, the size of scene.calibration" in (said := capsys.readouterr().err)
+    assert said.endswith("got 32 x 24; height and width may be swapped\n")
     for flip in (False, True):
         wall = open_recording("wall.dat", height=24, width=32, flip=flip, calibration=f"scene{ENDING}")
         assert wall.calibration.defects.equal(truth.defects if flip else truth.defects.flip(0))
@@ -105,7 +108,8 @@ def test_gains_are_found_in_a_moving_scene(capsys, truth):
 @pytest.mark.parametrize(
     ("args", "status", "said"),
     [
-        (["scene.dat", *HOW, "--flat", "cap.dat", "--dark", "wall.dat"], 1, "cap.dat: expected a flat recording"),
+        (["scene.dat", *HOW, "--flat", "wall.dat", "--dark", "scene.dat"], 1, "wall.dat: expected a flat recording"),
+        (["scene.dat", *HOW, "--dark", "wall.dat"], 1, "wall.dat: expected a dark recording, at most 0.1 spikes"),
         (["scene.dat", *HOW, "--flat", "none.dat"], 1, "none.dat: no such file"),
         (["scene.dat", *HOW, "-o", "a.npz"], 2, "--output: expected a name that ends in .safetensors, got a.npz"),
         (["scene.dat", *HOW, "-o", "weights.safetensors"], 1, "weights.safetensors: exists and is not a calibration"),
