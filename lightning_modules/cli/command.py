@@ -180,6 +180,12 @@ class Command(LightningCLI):
                 checkpoint = read_checkpoint(config.ckpt_path)
                 check_settings(self.model.network, checkpoint["network"], config.ckpt_path)
                 load_weights_of(checkpoint, config.ckpt_path, self.model)
+            elif subcommand != "fit" and any(True for _ in self.model.network.parameters()):
+                chosen = config.model.init_args
+                if not (chosen.get("weights") or chosen.get("network.init_args.weights")):
+                    name = type(self.model.network).__name__
+                    said = f"no weights given, those of {name} are random (see lightning {subcommand} --help)"
+                    print(f"note: {said}", file=sys.stderr)
             with _locked(subcommand, config):
                 super()._run_subcommand(subcommand)
         except (SIGTERMException, RuntimeError) as error:  # Lightning would end with status 0

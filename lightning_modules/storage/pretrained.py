@@ -60,6 +60,8 @@ def read_weights(source: str | Path) -> Weights:
     model = find_model(str(source))
     path = model.path if model else Path(source)
     if not path.is_file():
+        if len(path.parts) > 1 or path.suffix in (".ckpt", ".safetensors"):
+            raise FileNotFoundError(f"{source}: no such file of weights")
         names = ", ".join(model.name for model in list_models())
         raise FileNotFoundError(f"{source}: expected a file of weights or a name in the package ({names})")
     found = _read_safetensors(path) if path.suffix == ".safetensors" else _read_checkpoint(path)

@@ -74,6 +74,7 @@ FAILED = {
     f"test {X4} --ckpt_path best": "best.ckpt: no such checkpoint",
     f"validate {X4} --data.val_clips 1 --ckpt_path other.ckpt -o out": "other.ckpt was trained with scale=2",
     f"test {X4} --model.weights cut.safetensors -o out": "cut.safetensors",
+    f"test {X4} --model.weights gone/best.ckpt": "gone/best.ckpt: no such file of weights\n",
     f"test {X4} --model.weights spike2flow": "motion Spike2Flow --model.network.motion.weights spike2flow",
     f"fit {X4} --data.root nowhere": "nowhere",
     f"fit {X4} -c red.yaml": "?[31mred",

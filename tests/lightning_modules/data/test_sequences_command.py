@@ -60,7 +60,9 @@ def test_test_on_vid4_names_all_clips(tmp_path, command, capsys, write_film):
     write_film(tmp_path / "vid4/GT/walk", 3)
     write_film(tmp_path / "vid4/GT/city", 3, (40, 32))
     command("test", "--data.root", tmp_path / "vid4", "-o", tmp_path / "run")
-    assert "mean of 2 clips" in capsys.readouterr().out
+    printed = capsys.readouterr()
+    assert "mean of 2 clips" in printed.out
+    assert "note: no weights given, those of CSCSR are random (see lightning test --help)\n" in printed.err
     rows = list(csv.DictReader((tmp_path / "run" / "test.csv").open()))
     assert [row["clip"] for row in rows] == ["city/00000001", "walk/00000001", "mean"] * 4
     assert [row["method"] for row in rows[::3]] == ["TFI", "TFP", "CSCSR", "CSCSR, true flow"]
