@@ -43,14 +43,14 @@ class Seen:
     truth: list[Tensor]
 
     def clips(self, frames: int) -> RecordingClips:
-        """Return its clips of ``frames`` frames."""
-        return RecordingClips(replace(open_recording(self.path), alpha=self.alpha, pattern="RGGB"), frames)
+        """Return its clips of ``frames`` frames, of an unknown sensor."""
+        return RecordingClips(replace(open_recording(self.path), pattern="RGGB"), frames)
 
     def psnr(self, network: Network) -> float:
         """Return the PSNR in dB of the held-out pictures by a network."""
         exposure = network.settings["alpha"] / self.alpha
         clips = self.clips(network.frames).in_order(self.frames)
-        seen = [predict(network, clip[None], exposure=exposure)[0] for _, clip in clips.in_order()]
+        seen = [predict(network, clip[None], exposure=exposure)[0] for _, clip in clips]
         return torch.stack([psnr(*pair) for pair in zip(seen, self.truth, strict=True)]).mean().item()
 
 
@@ -97,6 +97,7 @@ def main() -> None:
         seen = [record(path, n, *shared, folder / f"{n}.npz") for n, path in enumerate(chosen)]
         for one, other in zip(seen, [*seen[1:], seen[0]], strict=True):
             student = Network.from_pretrained(args.weights).eval()
+            student.noise_level = teacher.noise_level = one.clips(longest).noise_level
             before = one.psnr(student), other.psnr(student)
             examples = make_distillation_set(student, teacher, one.clips(longest))
             alike = fine_tune(student, examples, args.steps)
