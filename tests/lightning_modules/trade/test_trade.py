@@ -91,7 +91,7 @@ def test_every_setting_has_a_row_in_both_files(traded):
         assert f" {name} " in text
         if name == "missing":
             assert (row["psnr"], row["ms"]) == ("", "")
-            assert "nowhere.safetensors: expected a file of weights or a name" in row["failed"]
+            assert "nowhere.safetensors: no such file of weights" in row["failed"]
             assert f"missing cannot run: {row['failed']}" in text
             continue
         assert row["failed"] == ""
