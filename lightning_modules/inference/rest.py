@@ -22,7 +22,7 @@ _TESTS = 16  # tests per cell: single blocks of 1, 2 and 4 pixels, all of each s
 _DARK = 0.02  # spikes per clock and pixel of a cell that is dark
 _PICTURES = 8  # pictures of the network that a cell at rest shows the mean of
 _SURE = 160  # clocks without a change before the clip of a resting cell
-_SURER = 640  # the same where half of the cells around, or a sixth of all, are not sure
+_SURER = 640  # the same where half of the cells around, or a sixth of all, are not sure, and after a drift
 _MORE = 1.25  # clocks, relative to those that a resting cell was drawn with, after which it is drawn again
 _BUSY, _UNTESTED = 0.75, 8  # share of cells that makes a picture busy, and pictures after it that are not tested
 _FADE = 0.96  # weight of the sums of squares of the previous key frame
@@ -237,12 +237,12 @@ class Rest:
 
         A cell is still if nothing changed during its clip, and rests if nothing changed in the 160 clocks before it
         either, as a single test may miss slow motion. If half of the 9 x 9 cells around or a sixth of all do not rest,
-        these are 640 clocks, as what has little contrast probably moves with them. A resting cell shows the mean of the
-        network's first eight pictures of the still cell; after these the network does not run. Neighbours of cells that
-        do not rest are computed and blended; in the dark, where motion is seen late, they do not rest either. The light
-        of a lamp at the clock of the picture is removed from the mean, and applied to the picture; if it has changed by
-        more than a factor of 8, the cell has. When 75 % of the cells have changed, or have a neighbour that did, the
-        next eight pictures are computed without a test.
+        these are 640 clocks, as what has little contrast probably moves with them; also if a cell rested until a sum of
+        key frames showed its drift. A resting cell shows the mean of the network's first eight pictures of the still
+        cell; after these the network does not run. Neighbours of cells that do not rest are computed and blended; in
+        the dark, where motion is seen late, they do not rest either. The light of a lamp at the clock of the picture is
+        removed from the mean, and applied to the picture; if it has changed by more than a factor of 8, the cell has.
+        When 75 % of the cells have changed, or have a neighbour that did, the next eight pictures are not tested.
 
         The mean over all clocks of an ideal sensor converges to the exact light. At the resolution of the sensor, the
         picture is corrected towards it, by the share of their difference that is not noise of the mean, but not at
@@ -369,8 +369,8 @@ class Rest:
             changed |= find_changes(second, first, 1.0, soft=self._soft)[0]
         if grown(changed).float().mean() > _BUSY:
             self._untested = _UNTESTED
-        self._calm += clocks
-        self._calm[changed] = 0
+        late = slow & ~sudden & ((self._calm < 0) | (self._calm > _SURE))
+        self._calm = torch.where(changed, late * float(_SURE - _SURER), self._calm + clocks)
         gone = _pixels(changed, whole)
         for plane in (self._earlier, self._later, self._before, self._since):
             plane.masked_fill_(gone, 0)
