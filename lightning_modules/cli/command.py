@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 
 import torch
 import yaml
+from jsonargparse import Namespace
 from pytorch_lightning import Callback, LightningDataModule, LightningModule, Trainer
 from pytorch_lightning.callbacks import LearningRateMonitor, ModelCheckpoint
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
@@ -67,13 +68,13 @@ _FIRST = "SPIKEKIT_FIRST_PROCESS"
 
 
 class Parser(LightningArgumentParser):
-    """A parser whose errors are one line."""
+    """A parser of a verb, whose errors are one line."""
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Report the error in one line; jsonargparse would show every option and every type it tried."""
         if not self.exit_on_error:
             super().error(message, ex)
-        sys.exit(reason(message))
+        raise Ended(f"lightning: {reason(message)} (see lightning {self.subcommand} --help)", 2)
 
 
 class Configuration(SaveConfigCallback):
@@ -124,20 +125,18 @@ class Command(LightningCLI):
         parser.link_arguments("model", "data.init_args.flow_times", _ends, apply_on="instantiate")
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:  # noqa: D102
-        try:
-            with input_errors():
-                args = with_network_of_weights(self.typed)
-            self.config = parser.parse_args(args)
-            self.given, verb = given_data(self.typed), self.typed[0]
-            for name in _SHARED:
-                expected = self.config.get(f"{verb}.data.init_args.{name}", self.given.get(name))
-                self._check_given(name, expected, f"the value of model.network.{name}")
-            flow = self.config.get(f"{verb}.model.init_args.flow")
-            self._check_given("flow_patch", _flow_patch(flow), "as model.flow sets it")
-        except SystemExit as error:
-            if not isinstance(error.code, str):
-                raise
-            raise UsageError(f"{error.code} (see lightning {self.typed[0]} --help)") from error
+        with input_errors():
+            verb, *words = with_network_of_weights(self.typed)
+        own = self._parser(verb)  # the one above it would complete and check everything once more
+        above = vars(own).pop("parent_parser")  # --print_config would be left to it
+        self.config = Namespace(subcommand=verb, **{verb: own.parse_args(words)})
+        own.parent_parser = above
+        self.given = given_data(self.typed)
+        for name in _SHARED:
+            expected = self.config.get(f"{verb}.data.init_args.{name}", self.given.get(name))
+            self._check_given(name, expected, f"the value of model.network.{name}")
+        flow = self.config.get(f"{verb}.model.init_args.flow")
+        self._check_given("flow_patch", _flow_patch(flow), "as model.flow sets it")
 
     def _check_given(self, name: str, expected: Any, reason: str) -> None:
         """Reject an argument of the data that a link would replace without a word."""
