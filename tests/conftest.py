@@ -13,13 +13,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-import torch
 
 gc.disable()  # until all is imported and collected, of which nothing is garbage
 
 if "PYTEST_XDIST_WORKER" in os.environ:
-    os.environ["OMP_NUM_THREADS"] = "1"
-    torch.set_num_threads(1)
+    os.environ["OMP_NUM_THREADS"] = "1"  # before torch is imported
 
 
 def pytest_configure(config):
@@ -39,11 +37,15 @@ def pytest_addoption(parser):
 
 @pytest.fixture(autouse=True)
 def _seed():
+    import torch  # here and below, as the process that only distributes tests needs none of it
+
     torch.manual_seed(0)
 
 
 @pytest.fixture(scope="session")
 def device(request):
+    import torch
+
     return torch.device(request.config.getoption("device"))
 
 
@@ -166,6 +168,7 @@ def _typed_in():
 
     def run(folder, main, words):
         """Call ``main(words)`` in the folder; return the exit status."""
+        import torch
 
         def typed():
             torch.set_num_threads(1)

@@ -159,10 +159,10 @@ def test_full_disk_ends_with_status_1():
 
 
 def test_closed_standard_output():
-    """As with ``| head -1``, but without a race."""
+    """As with ``| head -1``, but without a race; at exit, Triton's bindings do not report what is kept as leaks."""
     reader, writer = os.pipe()
     os.close(reader)
-    command = [sys.executable, "-m", "lightning_modules", "models"]
+    command = [sys.executable, "-m", "lightning_modules", "fit", "-c", "x4", "--print_config"]
     done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, timeout=120)
     os.close(writer)
     assert (done.returncode, done.stderr) == (141, "")
@@ -174,11 +174,3 @@ def test_ctrl_c_while_torch_is_imported(monkeypatch, capsys):
         with pytest.raises(SystemExit, match="130"):
             main(["export"])
     assert capsys.readouterr().err == "lightning: stopped by Ctrl-C\n"
-
-
-@pytest.mark.slow
-def test_a_process_says_nothing_after_its_error():
-    """Such as the leaks that Triton's bindings report at exit, of objects that were kept from garbage collection."""
-    command = [sys.executable, "-m", "lightning_modules", "fit", "-c", "nowhere"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert len(done.stderr.splitlines()) == 1, done.stderr
