@@ -68,11 +68,9 @@ def read_setting(text: str) -> Setting:
 #: options of the decoders in the table
 _DECODERS = {"TFI": {}, "TFP 41": {"window": 41}, "TFP 13, order 3": {"window": 13, "order": 3}}
 
-#: variant of every network: name and arguments
-_TWO_VIEWS = "self-ensemble of 2", "--self_ensemble 2"
-
-#: further variants of the largest network only, as a larger network gains more than more views of a smaller one
-_MOST = [(f"self-ensemble of {views}", f"--self_ensemble {views}") for views in (4, 8)]
+#: variants with more views: two for every network, up to four without motion, as the next network is several times
+#: slower, and up to eight for the largest
+_VIEWS = {views: (f"self-ensemble of {views}", f"--self_ensemble {views}") for views in (2, 4, 8)}
 
 #: further variants of the reference
 _VARIANTS = [
@@ -93,8 +91,9 @@ def usual_settings(
     """Return the default settings.
 
     First the networks of the package: the reference, then the others by their multiplications. Then variants: every
-    network as a self-ensemble, the reference also in float32 and with other tiles, the largest network also with larger
-    self-ensembles. Last the classical decoders. For films: only the networks and decoders.
+    network as a self-ensemble, the reference also in float32 and with other tiles, the largest network and those
+    without motion also with larger self-ensembles. Last the classical decoders. For films, of the variants only the
+    self-ensembles of networks without motion.
 
     If ``own`` options, such as ``--ckpt_path``, give weights to the shared ``network``, it replaces those of the
     package, and variants that it has no options for are left out.
@@ -102,7 +101,7 @@ def usual_settings(
     noisy = {name for ideal, name in for_noise(scale).items() if ideal != name}  # they would need other scenes
     models = [one for one in list_models(scale, pattern) if one.name not in noisy and one.frames <= frames]
     models.sort(key=lambda model: model.macs)
-    largest = models[-1].name if models else None
+    largest, quick = models[-1].name if models else None, [one.name for one in models if not one.search]
     reference = _reference(models) if models else None
     networks = {one.name: f"--model.weights {one.name}" for one in sorted(models, key=lambda one: one is not reference)}
     if own:
@@ -110,8 +109,13 @@ def usual_settings(
     in_tiles = network is None or network.halo is not None
     typed = dict(networks)
     for place, (weights, text) in enumerate(networks.items()):
-        more = [_TWO_VIEWS, *(_MOST if weights == largest else []), *(_VARIANTS if place == 0 else [])]
-        for name, changes in [] if film else more:
+        most = 8 if weights == largest else 4 if weights in quick else 2
+        more = [variant for views, variant in _VIEWS.items() if views <= most]
+        if film:
+            more = more if weights in quick else []
+        elif place == 0:
+            more += _VARIANTS
+        for name, changes in more:
             if in_tiles or not changes.startswith("--tile"):
                 typed[f"{weights}, {name}"] = f"{text} {changes}"
     without = " ".join(f"{option} null" for option in own)  # decoders take no weights

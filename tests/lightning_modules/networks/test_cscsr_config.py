@@ -54,7 +54,7 @@ def test_command_line_takes_all_fields_and_documents_them():
         ({"alpha": float("nan")}, "alpha: expected a finite number above 0, got nan"),
         ({"pattern": "RGB"}, "pattern: expected one of"),
         ({"resolution": "view"}, "resolution: expected one of output, sensor, cell, got 'view'"),
-        ({"size": "gigantic"}, "size: expected one of micro, tiny, small, "),
+        ({"size": "gigantic"}, "size: expected one of nano, micro, tiny, "),
         ({"frames": 40}, "frames, window, stride: expected odd frames"),
         ({"stride": 7}, "frames, window, stride: .* divides frames - window"),
         ({"representation": "tfp"}, "representation: expected one of bssr, spikes, interval, got 'tfp'"),

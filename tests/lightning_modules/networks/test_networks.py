@@ -40,6 +40,7 @@ def test_trace_does_not_record_the_motion_of_its_example():
         ("tiny", 300_963, 0.356),
         ("huge", 3_783_526, 4.18),
         ("micro", 655_360, 0.164),
+        ("nano", 146_656, 0.0366),
     ],
 )
 def test_parameters_and_multiplications_of_each_size(size, parameters, mmac):
