@@ -128,7 +128,7 @@ class Command(LightningCLI):
         with input_errors():
             verb, *words = with_network_of_weights(self.typed)
         own = self._parser(verb)  # the one above it would complete and check everything once more
-        above = vars(own).pop("parent_parser")  # --print_config would be left to it
+        above = vars(own).pop("parent_parser", None)  # --print_config would be left to it
         self.config = Namespace(subcommand=verb, **{verb: own.parse_args(words)})
         own.parent_parser = above
         self.given = given_data(self.typed)
