@@ -2,7 +2,7 @@
 # Measure the tables that --speed and --budget read, lightning_modules/weights/x*.csv: sh benchmarks/trade_tables.sh [TABLE ...]
 set -e
 cd "$(dirname "$0")/.."
-all="x1 x1_film x1_grey x1_grey_film x2 x2_film x2_grey x2_grey_film x3 x3_film x4 x4_film"
+all="x1 x1_film x1_grey x1_grey_film x2 x2_film x3 x3_film x4 x4_film"
 for name in ${*:-$all}; do
     set -- -c "configs/${name%%_*}.yaml"
     case $name in *_grey*) set -- "$@" -c configs/grey.yaml ;; esac

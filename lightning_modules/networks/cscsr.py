@@ -196,7 +196,9 @@ class CSCSR(Network):
         planes = self._tfp(spikes)
         told = self._told(noise, planes)
         auto = torch.is_autocast_enabled(spikes.device.type)
-        spikes = spikes.to(torch.get_autocast_dtype(spikes.device.type) if auto else planes.dtype)
+        dtype = torch.get_autocast_dtype(spikes.device.type) if auto else planes.dtype
+        if any(border) or spikes.dtype.itemsize > dtype.itemsize:
+            spikes = spikes.to(dtype)  # bytes are packed faster than floating-point numbers
         whole = (F.pad(part, border, "reflect") if any(border) else part for part in (spikes, planes))
         rgb = F.pixel_shuffle(self.reconstruction(*whole, **told), self.fold)
         top, left, height, width = (self.scale * length for length in (top, left, height, width))

@@ -181,7 +181,8 @@ class CellReconstruction(nn.Module):
         self.base.weight[..., 1, 1] = own.repeat_interleave(len(self.base.weight) // self.colors, dim=0)
 
     def forward(self, spikes: Tensor, planes: Tensor, noise: Tensor | None = None) -> Tensor:  # noqa: D102
-        seen = self.begin(_packed(spikes))
+        cells = _packed(spikes)
+        seen = self.begin(cells if cells.is_floating_point() else cells.to(planes.dtype))
         seen = seen if self.noise is None else self.noise(seen, noise)
         residual = self.rgb(self.end(seen))
         with torch.autocast(spikes.device.type, enabled=False):  # half precision would round the picture

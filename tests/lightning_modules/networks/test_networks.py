@@ -112,6 +112,8 @@ def test_cells_begin_with_red(pattern, row, column):
     part, whole = other(cut), network(spikes)[..., 2 * row :, 2 * column :]
     torch.testing.assert_close(part[..., 20:-20, 20:-20], whole[..., 20:-20, 20:-20])
     torch.testing.assert_close(forward_in_tiles(other, cut, 16), part)
+    for dtype in (torch.bool, torch.int64, torch.float64):
+        torch.testing.assert_close(network(spikes.to(dtype)), network(spikes))
 
 
 def test_skip_starts_from_a_smooth_classical_picture():
