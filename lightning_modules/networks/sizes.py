@@ -13,8 +13,8 @@ _CLIP = dict(_SENSOR, width=32, representation_width=16, features=2, stages=3)
 #: fields of :class:`lightning_modules.networks.CSCSRConfig` by size. Parameters, and million multiplications per sensor
 #: pixel, at x4: without motion, nano 0.15 M and 0.037, and micro 0.66 M and 0.16; tiny 0.30 M and 0.36, small 1.08 M
 #: and 1.48, base 1.32 M and 1.72, huge 3.78 M and 4.18, full_small 0.17 M and 1.86, full_base 0.73 M and 9.06,
-#: full_large 2.83 M and 42.7. At x1 for a grey sensor: small_x1 0.53 M and 0.67, large_x1 1.72 M and 2.02. Sizes for x1 have more
-#: features, as there is one temporal pixel per sensor pixel
+#: full_large 2.83 M and 42.7. At x1 for a grey sensor: small_x1 0.53 M and 0.67, large_x1 1.72 M and 2.02. Sizes for x1
+#: have more features, as there is one temporal pixel per sensor pixel
 SIZES: dict[str, dict[str, Any]] = {
     "nano": dict(_CLIP, resolution="cell", width=32, end_blocks=2),
     "micro": dict(_CLIP, resolution="cell", width=64, end_blocks=6),
