@@ -127,7 +127,7 @@ def usual_settings(
 
 
 def _reference(models: Sequence[Model]) -> Model:
-    """Return the reference of the ratios, which also gets most variants: medium in size, with motion and short clips."""
+    """Return the reference of the ratios, which also gets most variants: of medium size, with motion, short clips."""
     short = min(one.frames for one in models)
     those = [one for one in models if one.search and one.frames == short]
     return those[(len(those) - 1) // 2]
