@@ -197,8 +197,8 @@ class CSCSR(Network):
         told = self._told(noise, planes)
         auto = torch.is_autocast_enabled(spikes.device.type)
         dtype = torch.get_autocast_dtype(spikes.device.type) if auto else planes.dtype
-        if any(border) or spikes.dtype.itemsize > dtype.itemsize:
-            spikes = spikes.to(dtype)  # bytes are packed faster than floating-point numbers
+        if any(border) or spikes.dtype.itemsize > dtype.itemsize:  # bytes are packed as they are, which is faster
+            spikes = spikes.to(dtype)
         whole = (F.pad(part, border, "reflect") if any(border) else part for part in (spikes, planes))
         rgb = F.pixel_shuffle(self.reconstruction(*whole, **told), self.fold)
         top, left, height, width = (self.scale * length for length in (top, left, height, width))
