@@ -219,7 +219,10 @@ def test_default_settings_are_the_networks_of_the_package_and_the_decoders():
     assert own["TFI"].args[-2:] == ["--ckpt_path", "null"]
     whole = usual_settings(4, ["--ckpt_path"], TSCNN(width=8, blocks=1))
     assert [one.name for one in whole if "own" in one.name and "tiles" in one.name] == []
-    assert "cscsr_huge_long_x4" in networks_of(usual_settings(4, film=True, frames=101))
+    films = [setting.name for setting in usual_settings(4, film=True, frames=101)]
+    assert {"cscsr_huge_long_x4", "cscsr_micro_x4, self-ensemble of 4"} < {*films}
+    assert "cscsr_tiny_x4, self-ensemble of 2" not in films
+    assert usual_settings(1)[0].name == "cscsr_small_x1"  # the reference has motion
 
 
 @pytest.mark.parametrize(
